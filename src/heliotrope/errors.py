@@ -1,0 +1,75 @@
+"""The one exception tree of Heliotrope.
+
+::
+
+    HeliotropeError
+    ├── InputError            a value, a file or an argument that cannot be used
+    │   ├── FormatError       a file: names the file, the place in it, the value
+    │   ├── TimeError         a naive or unusable time
+    │   └── UnknownNameError  a heliostat, target, parameter or model not known
+    └── FetchError            a download that could not be completed
+
+Every text says what is wrong, where, the value with its unit, the limit and what
+to do. The outcome of a solver (unreachable, not converged) is a value with a text,
+never an exception.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class HeliotropeError(Exception):
+    """Root of everything that Heliotrope raises on purpose."""
+
+
+class InputError(HeliotropeError, ValueError):
+    """A value, a file or an argument that cannot be used."""
+
+
+class FormatError(InputError):
+    """A file that cannot be read as what it claims to be.
+
+    Parameters
+    ----------
+    path
+        The file.
+    problem
+        What is wrong, with the value and the limit, and what to do.
+    where
+        The place in the file ("line 12, column east"), if known.
+    """
+
+    def __init__(self, path: object, problem: str, where: str = "") -> None:
+        self.path = str(path)
+        self.where = where
+        self.problem = problem
+        place = f"{self.path}: {where}" if where else self.path
+        super().__init__(f"{place}: {problem}")
+
+
+class TimeError(InputError):
+    """A time without a time zone, or outside the range of validity."""
+
+
+class UnknownNameError(InputError, KeyError):
+    """A name that is not in the collection it was looked up in."""
+
+    def __init__(self, what: str, name: str, known: Iterable[str]) -> None:
+        self.name = name
+        names = list(known)
+        close = get_close_matches(name, names, n=3, cutoff=0.5)
+        if close:
+            hint = f"did you mean {', '.join(close)}?"
+        elif not names:
+            hint = "there are none"
+        else:
+            shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
+            hint = f"known: {shown}"
+        super().__init__(f"there is no {what} {name!r}; {hint}")
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class FetchError(HeliotropeError):
+    """A download that could not be completed; what is already there is kept."""

@@ -1,0 +1,219 @@
+"""Vectors, rotations and frames.
+
+Frame: ENU (x east, y north, z up), metres, right-handed. Azimuth is clockwise
+from north in [0, 2π), elevation above the horizon. Arrays carry their batch axes
+first and the vector last, ``(..., 3)``.
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+
+FloatArray = npt.NDArray[np.float64]
+
+TAU = 2.0 * np.pi
+#: One milliradian, so that tolerances can be written as ``0.01 * MRAD``.
+MRAD = 1e-3
+
+
+def as_float(value: npt.ArrayLike) -> FloatArray:
+    """Return ``value`` as a float64 array without copying one that already is."""
+    return np.asarray(value, dtype=np.float64)
+
+
+def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
+    """Return ``value`` as finite vectors of shape (..., 3).
+
+    Raises
+    ------
+    InputError
+        If the last axis is not 3 or a number is not finite.
+    """
+    try:
+        array = as_float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {value!r} is not an array of numbers") from None
+    if array.ndim == 0 or array.shape[-1] != 3:
+        raise InputError(f"{name}: shape {array.shape}; the last axis must have 3 numbers")
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise InputError(f"{name}{list(where)}: {array[where]} is not a finite number")
+    return array
+
+
+def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
+    """Return unit vectors.
+
+    Parameters
+    ----------
+    vectors
+        Shape (..., 3), any non-zero length.
+    name
+        What an error calls them.
+
+    Raises
+    ------
+    InputError
+        If a vector is zero or not finite.
+    """
+    array = as_vectors(vectors, name)
+    # Scaled by the largest component, so that neither tiny nor huge vectors lose digits.
+    largest = np.abs(array).max(axis=-1, keepdims=True, initial=0.0)
+    if (largest == 0.0).any():
+        raise InputError(f"{name}: a vector of length 0 has no direction; give a direction")
+    scaled = array / largest
+    return as_float(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True))
+
+
+def cross_matrix(vectors: npt.ArrayLike) -> FloatArray:
+    """Return K with ``K @ x == cross(v, x)``; shapes (..., 3) to (..., 3, 3)."""
+    v = as_float(vectors)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
+    return matrix
+
+
+def rotation(axis: npt.ArrayLike, angle: npt.ArrayLike) -> FloatArray:
+    """Return the right-handed rotation about an axis (Rodrigues).
+
+    Parameters
+    ----------
+    axis
+        Shape (..., 3); need not be of unit length. A zero axis gives the identity,
+        which is how a missing second axis is written.
+    angle
+        Radians, shape (...).
+
+    Returns
+    -------
+    Rotation matrices, shape (..., 3, 3).
+    """
+    a = as_float(axis)
+    length = np.linalg.norm(a, axis=-1, keepdims=True)
+    unit = np.divide(a, length, out=np.zeros_like(a), where=length > 0)
+    theta = as_float(angle)[..., None, None]
+    k = cross_matrix(unit)
+    # 2 sin²(θ/2) keeps the digits of 1 − cos θ at small angles.
+    return np.eye(3) + np.sin(theta) * k + 2.0 * np.sin(0.5 * theta) ** 2 * (k @ k)
+
+
+def direction(azimuth: npt.ArrayLike, elevation: npt.ArrayLike) -> FloatArray:
+    """Return unit vectors (..., 3) in ENU from azimuth and elevation in radians."""
+    az, el = np.broadcast_arrays(as_float(azimuth), as_float(elevation))
+    cos_el = np.cos(el)
+    return np.stack([cos_el * np.sin(az), cos_el * np.cos(az), np.sin(el)], axis=-1)
+
+
+def azimuth_elevation(vectors: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Return azimuth in [0, 2π) and elevation in [−π/2, π/2] of vectors (..., 3).
+
+    The elevation comes from atan2 and so keeps its digits near the zenith. At the
+    zenith itself the azimuth is 0.
+    """
+    v = as_float(vectors)
+    azimuth = wrap_positive(np.arctan2(v[..., 0], v[..., 1]))
+    elevation = np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1]))
+    return azimuth, as_float(elevation)
+
+
+def wrap_positive(angle: npt.ArrayLike) -> FloatArray:
+    """Return the angle in [0, 2π)."""
+    wrapped = np.mod(as_float(angle), TAU)
+    # A tiny negative angle rounds up to 2π itself.
+    return as_float(np.where(wrapped >= TAU, 0.0, wrapped))
+
+
+def wrap_signed(angle: npt.ArrayLike) -> FloatArray:
+    """Return the angle in [−π, π)."""
+    wrapped = wrap_positive(as_float(angle) + np.pi) - np.pi
+    return as_float(wrapped)
+
+
+def angle_between(a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray:
+    """Return the angle between unit vectors (..., 3) in radians, exact near 0 and π.
+
+    Kahan's formula 2·atan2(|a − b|, |a + b|); arccos of the scalar product loses
+    half of the digits for small angles.
+    """
+    u, v = as_float(a), as_float(b)
+    return as_float(
+        2.0 * np.arctan2(np.linalg.norm(u - v, axis=-1), np.linalg.norm(u + v, axis=-1))
+    )
+
+
+def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
+    """Return the unit normal that sends light from ``source`` towards ``destination``.
+
+    The one law: n ∥ s + t, both unit vectors (..., 3) that point away from the mirror.
+
+    Raises
+    ------
+    InputError
+        Where both are opposite, so that no mirror can do it.
+    """
+    total = as_float(source) + as_float(destination)
+    length = np.linalg.norm(total, axis=-1, keepdims=True)
+    if (length < 1e-12).any():
+        raise InputError(
+            "source and destination are opposite as seen from the mirror: no normal exists"
+        )
+    return as_float(total / length)
+
+
+def reflect(direction_in: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
+    """Return where light from unit direction ``direction_in`` leaves: 2 (n·s) n − s."""
+    s, n = as_float(direction_in), as_float(normal)
+    return 2.0 * np.sum(s * n, axis=-1, keepdims=True) * n - s
+
+
+def tangent_axes(normals: npt.ArrayLike) -> FloatArray:
+    """Return two unit axes perpendicular to each normal, shape (..., 2, 3).
+
+    The first is horizontal (to the right of someone looking along the normal), the
+    second completes it upwards; for a vertical normal they are east and north.
+    """
+    n = as_float(normals)
+    horizontal = np.stack([n[..., 1], -n[..., 0], np.zeros(n.shape[:-1])], axis=-1)
+    length = np.linalg.norm(horizontal, axis=-1, keepdims=True)
+    east = np.zeros_like(n)
+    east[..., 0] = 1.0
+    first = np.where(length > 1e-9, horizontal / np.maximum(length, 1e-300), east)
+    first = first - np.sum(first * n, axis=-1, keepdims=True) * n
+    first = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(first, n)], axis=-2)
+
+
+def geodetic_to_enu(
+    latitude_deg: npt.ArrayLike,
+    longitude_deg: npt.ArrayLike,
+    height: npt.ArrayLike,
+    origin: tuple[float, float, float],
+) -> FloatArray:
+    """Return ENU metres (..., 3) about ``origin`` of WGS84 positions.
+
+    Exact (geodetic to Earth-centred to local); a linearised conversion is 3 mm off
+    at 210 m. ``origin`` is latitude and longitude in degrees and height in metres.
+    """
+    import pymap3d
+
+    lat, lon, up = np.broadcast_arrays(
+        as_float(latitude_deg), as_float(longitude_deg), as_float(height)
+    )
+    enu: tuple[Any, Any, Any] = pymap3d.geodetic2enu(lat, lon, up, *origin)
+    return np.stack([as_float(c) for c in enu], axis=-1)
+
+
+def enu_to_geodetic(
+    points: npt.ArrayLike, origin: tuple[float, float, float]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return latitude and longitude in degrees and height in metres of ENU points (..., 3)."""
+    import pymap3d
+
+    p = as_float(points)
+    lat, lon, height = pymap3d.enu2geodetic(p[..., 0], p[..., 1], p[..., 2], *origin)
+    return as_float(lat), as_float(lon), as_float(height)

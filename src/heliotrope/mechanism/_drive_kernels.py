@@ -1,0 +1,208 @@
+"""Compiled: counts to joint angle, its derivatives, and back."""
+
+import math
+
+from numba import njit
+
+from heliotrope.mechanism._slots import (
+    BIAS,
+    KIND,
+    LINEAR,
+    OFFSET,
+    RADIUS,
+    RATE,
+    SAG,
+    SAG_PHASE,
+    SCALE,
+    SENSE,
+    STROKE,
+    WORM_COS,
+    WORM_RATIO,
+    WORM_SIN,
+    ZERO,
+)
+
+_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
+
+
+@njit(**_OPTIONS)
+def triangle_angle(length, offset, radius):
+    """Angle at the joint of the triangle (offset, radius, length), clamped to [0, π]."""
+    cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
+    return math.acos(min(1.0, max(-1.0, cosine)))
+
+
+@njit(**_OPTIONS)
+def _triangle_slope(length, offset, radius):
+    """dΦ/dL of the triangle; infinite where it is stretched flat."""
+    return length / (offset * radius * math.sin(triangle_angle(length, offset, radius)))
+
+
+@njit(**_OPTIONS)
+def ideal_angle(d, counts):
+    """Angle φ of drive row ``d`` before bias, scale, worm and sag."""
+    if d[KIND] == LINEAR:
+        length = d[STROKE] + d[RATE] * counts
+        return d[ZERO] + d[SENSE] * (
+            triangle_angle(d[STROKE], d[OFFSET], d[RADIUS])
+            - triangle_angle(length, d[OFFSET], d[RADIUS])
+        )
+    return d[ZERO] + d[RATE] * counts
+
+
+@njit(**_OPTIONS)
+def _worm_argument(d, counts, phi):
+    if d[KIND] == LINEAR:
+        return d[WORM_RATIO] * d[RATE] * counts
+    return d[WORM_RATIO] * phi
+
+
+@njit(**_OPTIONS)
+def drive_angle(d, counts):
+    """Joint angle θ = bias + (1 + scale) φ + worm + sag of drive row ``d``."""
+    phi = ideal_angle(d, counts)
+    theta = d[BIAS] + (1.0 + d[SCALE]) * phi
+    if d[WORM_COS] != 0.0 or d[WORM_SIN] != 0.0:
+        u = _worm_argument(d, counts, phi)
+        theta += d[WORM_COS] * math.cos(u) + d[WORM_SIN] * math.sin(u)
+    if d[SAG] != 0.0:
+        theta += d[SAG] * math.cos(phi + d[SAG_PHASE])
+    return theta
+
+
+@njit(**_OPTIONS)
+def angle_per_ideal(d, counts, phi):
+    """Return (dθ/dφ with the worm's argument held, dθ/du of the worm)."""
+    slope = 1.0 + d[SCALE] - d[SAG] * math.sin(phi + d[SAG_PHASE])
+    worm = 0.0
+    if d[WORM_COS] != 0.0 or d[WORM_SIN] != 0.0:
+        u = _worm_argument(d, counts, phi)
+        worm = -d[WORM_COS] * math.sin(u) + d[WORM_SIN] * math.cos(u)
+    return slope, worm
+
+
+@njit(**_OPTIONS)
+def angle_per_count(d, counts):
+    """dθ/dcounts of drive row ``d``."""
+    phi = ideal_angle(d, counts)
+    slope, worm = angle_per_ideal(d, counts, phi)
+    if d[KIND] == LINEAR:
+        length = d[STROKE] + d[RATE] * counts
+        phi_rate = -d[SENSE] * d[RATE] * _triangle_slope(length, d[OFFSET], d[RADIUS])
+        return slope * phi_rate + worm * d[WORM_RATIO] * d[RATE]
+    return (slope + worm * d[WORM_RATIO]) * d[RATE]
+
+
+@njit(**_OPTIONS)
+def angle_per_slot(d, counts, slot):  # noqa: C901 - one branch a parameter of the table
+    """dθ/d(slot) of drive row ``d`` at constant counts."""
+    phi = ideal_angle(d, counts)
+    if slot == BIAS:
+        return 1.0
+    if slot == SCALE:
+        return phi
+    if slot == WORM_COS:
+        return math.cos(_worm_argument(d, counts, phi))
+    if slot == WORM_SIN:
+        return math.sin(_worm_argument(d, counts, phi))
+    if slot == SAG:
+        return math.cos(phi + d[SAG_PHASE])
+    slope, worm = angle_per_ideal(d, counts, phi)
+    if d[KIND] != LINEAR:
+        slope += worm * d[WORM_RATIO]
+        if slot == ZERO:
+            return slope
+        if slot == RATE:
+            return slope * counts
+        return 0.0
+    if slot == ZERO:
+        return slope
+    c, r, k = d[OFFSET], d[RADIUS], d[STROKE]
+    length = k + d[RATE] * counts
+    if slot == STROKE:
+        return slope * d[SENSE] * (_triangle_slope(k, c, r) - _triangle_slope(length, c, r))
+    if slot == RATE:
+        stretch = -d[SENSE] * counts * _triangle_slope(length, c, r)
+        return slope * stretch + worm * d[WORM_RATIO] * counts
+    # ∂cosΦ/∂c = (c² − r² + L²)/(2 c² r), and the same with c and r exchanged.
+    if slot == RADIUS:
+        c, r = r, c
+    elif slot != OFFSET:
+        return 0.0
+    first = (c * c - r * r + k * k) / (2.0 * c * c * r) / math.sin(triangle_angle(k, c, r))
+    second = (c * c - r * r + length * length) / (2.0 * c * c * r)
+    second /= math.sin(triangle_angle(length, c, r))
+    return slope * d[SENSE] * (second - first)
+
+
+@njit(**_OPTIONS)
+def _counts_of_ideal(d, phi):
+    """Counts at which the ideal angle is ``phi``; a jack's reach is clamped to its triangle."""
+    if d[KIND] == LINEAR:
+        c, r = d[OFFSET], d[RADIUS]
+        angle = triangle_angle(d[STROKE], c, r) - d[SENSE] * (phi - d[ZERO])
+        angle = min(math.pi, max(0.0, angle))
+        # (c − r)² + 4 c r sin²(Φ/2) keeps the digits where the jack is folded.
+        half = math.sin(0.5 * angle)
+        length = math.sqrt((c - r) * (c - r) + 4.0 * c * r * half * half)
+        return (length - d[STROKE]) / d[RATE]
+    return (phi - d[ZERO]) / d[RATE]
+
+
+@njit(**_OPTIONS)
+def drive_counts(d, theta):
+    """Counts at which drive row ``d`` stands at joint angle ``theta``.
+
+    Closed form without periodic terms; with them a bracketed Newton iteration in
+    counts, which cannot leave the bracket that the size of the terms gives.
+    """
+    phi = (theta - d[BIAS]) / (1.0 + d[SCALE])
+    counts = _counts_of_ideal(d, phi)
+    span = (abs(d[WORM_COS]) + abs(d[WORM_SIN]) + abs(d[SAG])) / abs(1.0 + d[SCALE])
+    if span == 0.0:
+        return counts
+    low = _counts_of_ideal(d, phi - span)
+    high = _counts_of_ideal(d, phi + span)
+    f_low = drive_angle(d, low) - theta
+    for _ in range(100):
+        error = drive_angle(d, counts) - theta
+        if error == 0.0:
+            break
+        if (error > 0.0) == (f_low > 0.0):
+            low = counts
+        else:
+            high = counts
+        slope = angle_per_count(d, counts)
+        new = counts - error / slope
+        inside = min(low, high) < new < max(low, high)
+        if not (inside and math.isfinite(new)):
+            new = 0.5 * (low + high)
+        if abs(new - counts) <= 4e-16 * max(abs(new), 1.0) or abs(error) < 1e-15:
+            counts = new
+            break
+        counts = new
+    return counts
+
+
+@njit(**_OPTIONS)
+def angles_block(drives, counts, rows, out, start, stop):
+    """θ of every drive: ``drives`` (N, D, S), ``counts`` (M, D), ``rows`` (M,)."""
+    for i in range(start, stop):
+        for k in range(counts.shape[1]):
+            out[i, k] = drive_angle(drives[rows[i], k], counts[i, k])
+
+
+@njit(**_OPTIONS)
+def counts_block(drives, angles, rows, out, start, stop):
+    """Counts of every drive, the inverse of :func:`angles_block`."""
+    for i in range(start, stop):
+        for k in range(angles.shape[1]):
+            out[i, k] = drive_counts(drives[rows[i], k], angles[i, k])
+
+
+@njit(**_OPTIONS)
+def slopes_block(drives, counts, rows, out, start, stop):
+    """dθ/dcounts of every drive."""
+    for i in range(start, stop):
+        for k in range(counts.shape[1]):
+            out[i, k] = angle_per_count(drives[rows[i], k], counts[i, k])

@@ -1,0 +1,67 @@
+"""Splits independent rows over threads.
+
+The numeric kernels are compiled with ``nogil`` and treat every row (heliostat,
+time) on its own, so rows can be cut into contiguous blocks and run on as many
+threads as there are cores. The outcome cannot depend on the number of threads,
+because no row reads what another writes.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+from heliotrope.errors import InputError
+
+#: Below this number of rows a second thread costs more than it gains.
+MINIMUM_ROWS = 256
+
+
+def threads() -> int:
+    """Return the number of threads: ``HELIOTROPE_THREADS`` or the cores at hand.
+
+    Raises
+    ------
+    InputError
+        If ``HELIOTROPE_THREADS`` is not a whole number from 1 to 1024.
+    """
+    text = os.environ.get("HELIOTROPE_THREADS", "")
+    if text:
+        if not text.isdigit() or not 1 <= int(text) <= 1024:
+            raise InputError(
+                f"HELIOTROPE_THREADS={text!r}: give a whole number from 1 to 1024, or unset it"
+            )
+        return int(text)
+    return len(os.sched_getaffinity(0))
+
+
+@cache
+def _pool(workers: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(workers, thread_name_prefix="heliotrope")
+
+
+def run_blocks(
+    kernel: Callable[[int, int], None], rows: int, minimum_rows: int = MINIMUM_ROWS
+) -> None:
+    """Call ``kernel(start, stop)`` so that the blocks together cover ``range(rows)``.
+
+    Parameters
+    ----------
+    kernel
+        Writes rows ``start`` to ``stop`` of its outputs and nothing else.
+    rows
+        Number of rows.
+    minimum_rows
+        Fewer rows than this stay on the calling thread.
+    """
+    workers = threads()
+    if workers == 1 or rows < minimum_rows:
+        kernel(0, rows)
+        return
+    # Four blocks a thread even out rows of unequal cost.
+    blocks = min(4 * workers, rows)
+    edges = [rows * k // blocks for k in range(blocks + 1)]
+    pool = _pool(workers)
+    pending = [pool.submit(kernel, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    for future in pending:
+        future.result()
