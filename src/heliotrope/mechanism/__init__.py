@@ -1,0 +1,1 @@
+"""One heliostat, or an array of them: joints, drives, parameters, armature, tracking."""

@@ -1,0 +1,165 @@
+"""Heliostats of one kind, as arrays."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.mechanism.chain import Mechanism
+
+
+@dataclass(frozen=True)
+class Facets:
+    """F facets of each of N heliostats, in the mirror's frame (x right, y up, z out of it).
+
+    Attributes
+    ----------
+    center
+        From the mirror's vertex, m, (N, F, 3).
+    half_width, half_height
+        Vectors from a facet's centre to the middle of its right and its upper edge, m,
+        (N, F, 3); their cross product is the facet's normal.
+    """
+
+    center: FloatArray
+    half_width: FloatArray
+    half_height: FloatArray
+
+    def __post_init__(self) -> None:
+        shapes = {a.shape for a in (self.center, self.half_width, self.half_height)}
+        if len(shapes) != 1 or self.center.ndim != 3 or self.center.shape[-1] != 3:
+            raise InputError(f"facets: shapes {sorted(shapes)} must all be (N, F, 3)")
+
+
+@dataclass(frozen=True)
+class Heliostats:
+    """N heliostats of one kind.
+
+    Attributes
+    ----------
+    names
+        Unique.
+    mechanism
+        Nominal mechanisms, batch shape (N,), in ENU metres about the plant's reference.
+    width, height
+        Of the mirror, m, (N,).
+    facets
+        If known.
+    parameters
+        Deviations from the nominal mechanism as calibration found them, by name of the
+        parameter table, in rad, m or 1, each (N,).
+    aim
+        Where each is aimed in operation, ENU metres, (N, 3); NaN where not given.
+    cluster
+        Name of the controller each hangs on, "" if none.
+    """
+
+    names: tuple[str, ...]
+    mechanism: Mechanism
+    width: FloatArray
+    height: FloatArray
+    facets: Facets | None = None
+    parameters: Mapping[str, FloatArray] = field(default_factory=dict)
+    aim: FloatArray | None = None
+    cluster: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        count = len(self.names)
+        if self.mechanism.shape != (count,):
+            raise InputError(
+                f"heliostats: {count} names but mechanisms of shape {self.mechanism.shape}"
+            )
+        seen: set[str] = set()
+        for name in self.names:
+            if not name:
+                raise InputError("heliostats: an empty name; every heliostat needs one")
+            if name in seen:
+                raise InputError(f"heliostat {name}: the name occurs twice; names are unique")
+            seen.add(name)
+        for what in ("width", "height"):
+            values = np.broadcast_to(as_float(getattr(self, what)), (count,))
+            wrong = ~(np.isfinite(values) & (values > 0))
+            if wrong.any():
+                i = int(np.flatnonzero(wrong)[0])
+                raise InputError(
+                    f"heliostat {self.names[i]}: {what} {values[i]} m must be above 0"
+                )
+            object.__setattr__(self, what, values)
+        clean = {}
+        for name, given in self.parameters.items():
+            self.mechanism.parameter(name)
+            values = np.array(np.broadcast_to(as_float(given), (count,)))
+            if not np.isfinite(values).all():
+                i = int(np.flatnonzero(~np.isfinite(values))[0])
+                raise InputError(
+                    f"heliostat {self.names[i]}: parameter {name} is {values[i]}; give a number"
+                )
+            clean[name] = values
+        object.__setattr__(self, "parameters", clean)
+        if self.cluster and len(self.cluster) != count:
+            raise InputError(f"heliostats: {len(self.cluster)} cluster names for {count}")
+        if self.aim is not None and self.aim.shape != (count, 3):
+            raise InputError(f"heliostats: aim of shape {self.aim.shape}; it must be ({count}, 3)")
+        if self.facets is not None and len(self.facets.center) != count:
+            raise InputError(f"heliostats: {len(self.facets.center)} rows of facets for {count}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def position(self) -> FloatArray:
+        """Nominal positions, ENU metres, (N, 3)."""
+        return self.mechanism.position
+
+    @cached_property
+    def calibrated(self) -> Mechanism:
+        """The mechanisms with the calibrated deviations applied."""
+        return self.mechanism.with_parameters(self.parameters)
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+    def index(self, name: str) -> int:
+        """Return the row of heliostat ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name.
+        """
+        try:
+            return self._index[name]
+        except KeyError:
+            raise UnknownNameError("heliostat", name, self.names) from None
+
+    def take(self, rows: npt.ArrayLike) -> "Heliostats":
+        """Return the heliostats at ``rows`` (indices or a mask), in that order."""
+        index = np.asarray(rows)
+        if index.dtype == bool:
+            index = np.flatnonzero(index)
+        index = index.reshape(-1).astype(np.intp)
+        facets = self.facets
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in index),
+            mechanism=self.mechanism[index],
+            width=self.width[index],
+            height=self.height[index],
+            facets=None
+            if facets is None
+            else Facets(
+                facets.center[index], facets.half_width[index], facets.half_height[index]
+            ),
+            parameters={name: values[index] for name, values in self.parameters.items()},
+            aim=None if self.aim is None else self.aim[index],
+            cluster=tuple(self.cluster[i] for i in index) if self.cluster else (),
+        )
+
+    def with_parameters(self, parameters: Mapping[str, npt.ArrayLike]) -> "Heliostats":
+        """Return the heliostats with the calibrated deviations replaced by ``parameters``."""
+        return replace(self, parameters={n: as_float(v) for n, v in parameters.items()})

@@ -1,0 +1,130 @@
+"""A plant: site, tower, targets, receivers and the heliostats, group by group."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TypeVar
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
+from heliotrope.sun import Site
+
+Surface = TypeVar("Surface", Target, Receiver)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A solar tower plant.
+
+    Attributes
+    ----------
+    name
+        Of the plant.
+    site
+        Its reference point: the origin of ENU.
+    groups
+        Heliostats by kind of mechanism, by name of the group; names of heliostats are
+        unique over all groups.
+    targets, receivers
+        Surfaces that beams are sent to.
+    """
+
+    name: str
+    site: Site
+    groups: Mapping[str, Heliostats]
+    targets: tuple[Target, ...] = ()
+    receivers: tuple[Receiver, ...] = ()
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        seen: dict[str, str] = {}
+        for group, heliostats in self.groups.items():
+            for name in heliostats.names:
+                if name in seen:
+                    raise InputError(
+                        f"heliostat {name}: in group {seen[name]} and in group {group}; "
+                        "names are unique in a plant"
+                    )
+                seen[name] = group
+        surfaces = [s.name for s in (*self.targets, *self.receivers)]
+        for name in surfaces:
+            if surfaces.count(name) > 1:
+                raise InputError(f"target or receiver {name}: the name occurs twice")
+
+    def __len__(self) -> int:
+        return sum(len(group) for group in self.groups.values())
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of all heliostats, group after group."""
+        return tuple(name for group in self.groups.values() for name in group.names)
+
+    @cached_property
+    def _place(self) -> dict[str, tuple[str, int]]:
+        return {
+            name: (group, i)
+            for group, heliostats in self.groups.items()
+            for i, name in enumerate(heliostats.names)
+        }
+
+    def find(self, name: str) -> tuple[Heliostats, int]:
+        """Return the group and the row of heliostat ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name.
+        """
+        try:
+            group, row = self._place[name]
+        except KeyError:
+            raise UnknownNameError("heliostat", name, self.names) from None
+        return self.groups[group], row
+
+    def heliostat(self, name: str) -> Mechanism:
+        """Return the calibrated mechanism of one heliostat, batch shape ()."""
+        group, row = self.find(name)
+        return group.calibrated[row]
+
+    def target(self, name: str) -> Target:
+        """Return a target by name."""
+        return _named("target", name, self.targets)
+
+    def receiver(self, name: str) -> Receiver:
+        """Return a receiver by name."""
+        return _named("receiver", name, self.receivers)
+
+    @cached_property
+    def position(self) -> FloatArray:
+        """Nominal positions of all heliostats, ENU metres, (N, 3)."""
+        return np.concatenate([g.position for g in self.groups.values()] or [np.empty((0, 3))])
+
+    @cached_property
+    def armature(self) -> Armature:
+        """Calibrated armatures of all heliostats, whatever their kind, (N,)."""
+        tables = [g.calibrated.armature.table for g in self.groups.values()]
+        return Armature(np.concatenate(tables or [np.empty((0, 18))]))
+
+    @cached_property
+    def drives(self) -> Drive:
+        """Calibrated drives of all heliostats, batch shape (N, 2)."""
+        tables = [g.calibrated.drives.table for g in self.groups.values()]
+        return Drive(np.concatenate(tables or [np.empty((0, 2, 19))]))
+
+    def with_groups(self, groups: Mapping[str, Heliostats]) -> "Plant":
+        """Return the plant with other heliostats."""
+        return replace(self, groups=dict(groups))
+
+
+def _named(what: str, name: str, surfaces: tuple[Surface, ...]) -> Surface:
+    for surface in surfaces:
+        if surface.name == name:
+            return surface
+    raise UnknownNameError(what, name, [s.name for s in surfaces])

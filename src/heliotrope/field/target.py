@@ -1,0 +1,150 @@
+"""Targets and receivers: the surfaces that beams are sent to."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_vectors, normalize
+
+
+@dataclass(frozen=True)
+class Target:
+    """A flat calibration target.
+
+    Attributes
+    ----------
+    name
+        Unique in the plant.
+    corners
+        Upper left, upper right, lower right, lower left as seen from the front (from
+        where the beams come), ENU metres, (4, 3).
+    center
+        Where heliostats are aimed, ENU metres, (3,).
+    markers
+        Further known points by name, ENU metres.
+    """
+
+    name: str
+    corners: FloatArray
+    center: FloatArray
+    markers: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        corners = as_vectors(self.corners, f"target {self.name}: corners")
+        center = as_vectors(self.center, f"target {self.name}: center")
+        if corners.shape != (4, 3) or center.shape != (3,):
+            raise InputError(
+                f"target {self.name}: corners {corners.shape} and center {center.shape} must "
+                "have shapes (4, 3) and (3,)"
+            )
+        object.__setattr__(self, "corners", corners)
+        object.__setattr__(self, "center", center)
+        if np.linalg.norm(np.cross(self._across, self._up)) < 1e-6:
+            raise InputError(
+                f"target {self.name}: its corners span no area; give four corners of a rectangle"
+            )
+
+    @property
+    def _across(self) -> FloatArray:
+        """From the left edge to the right edge."""
+        c = self.corners
+        return 0.5 * (c[1] + c[2] - c[0] - c[3])
+
+    @property
+    def _up(self) -> FloatArray:
+        c = self.corners
+        return 0.5 * (c[0] + c[1] - c[2] - c[3])
+
+    @property
+    def width(self) -> float:
+        """Mean width, m."""
+        return float(np.linalg.norm(self._across))
+
+    @property
+    def height(self) -> float:
+        """Mean height, m."""
+        return float(np.linalg.norm(self._up))
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal out of the front, (3,)."""
+        return normalize(np.cross(self._across, self._up))
+
+    @property
+    def axes(self) -> FloatArray:
+        """Unit axes in the plane, to the right as seen from the front, and up, (2, 3)."""
+        right = normalize(self._across)
+        return np.stack([right, np.cross(self.normal, right)])
+
+    def plane_coordinates(self, points: npt.ArrayLike) -> FloatArray:
+        """Return metres to the right of and above the center, (..., 2), of ENU points (..., 3)."""
+        return (as_vectors(points, "points") - self.center) @ self.axes.T
+
+    def point(self, plane: npt.ArrayLike) -> FloatArray:
+        """Return ENU points (..., 3) from metres right of and above the center (..., 2)."""
+        return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
+
+    def intersect(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> FloatArray:
+        """Return where rays (..., 3) meet the target's plane, ENU; NaN where they never do."""
+        o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
+        towards = np.asarray(d @ self.normal)
+        gap = np.asarray((self.center - o) @ self.normal)
+        # The beam must come from the front, so against the normal.
+        length = np.where(towards < 0.0, gap / np.where(towards == 0.0, 1.0, towards), np.nan)
+        length = np.where(length > 0.0, length, np.nan)
+        return o + length[..., None] * d
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """What the field heats.
+
+    Attributes
+    ----------
+    name
+        Unique in the plant.
+    kind
+        "planar", "convex_cylinder" or "external_cylinder".
+    center
+        ENU metres, (3,).
+    normal
+        Unit normal out of the aperture, (3,).
+    width, height
+        Of the aperture, m; of an external cylinder the diameter and height.
+    corners
+        Of the aperture as for :class:`Target`, (4, 3), if known.
+    radius, opening_angle
+        Of a curved receiver, m and rad; 0 if flat.
+    """
+
+    name: str
+    kind: str
+    center: FloatArray
+    normal: FloatArray
+    width: float
+    height: float
+    corners: FloatArray | None = None
+    radius: float = 0.0
+    opening_angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        kinds = ("planar", "convex_cylinder", "external_cylinder")
+        if self.kind not in kinds:
+            raise InputError(
+                f"receiver {self.name}: kind {self.kind!r}; known: {', '.join(kinds)}"
+            )
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"receiver {self.name}: {name} {value} m must be above 0")
+        for name in ("radius", "opening_angle"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise InputError(f"receiver {self.name}: {name} {value} must be 0 or more")
+        center = as_vectors(self.center, f"receiver {self.name}: center")
+        object.__setattr__(self, "center", center)
+        normal = normalize(self.normal, f"receiver {self.name}: normal")
+        object.__setattr__(self, "normal", normal)

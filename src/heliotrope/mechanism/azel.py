@@ -1,0 +1,708 @@
+r"""Guo's closed form for azimuth-elevation heliostats.
+
+Six small angles and the offset of the mirror describe the machine; its two joint
+angles follow from the position of the sun without iteration. In the frame ENU the
+normal at drive positions (γ, α) is
+
+.. math:: n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ + γ_0))\,R_N(-τ_1)\,R_E(α + α_0)
+          \,(\sin μ, \cos μ, 0)
+
+where R_X is the right-handed rotation about X and R_tilt leans the azimuth axis by ψ_t
+towards the azimuth ψ_a. :func:`forward` evaluates it, :func:`angles` inverts it,
+:func:`track` inverts it for the normal that the sun and the target demand.
+
+Source: Guo, Sun, Wang and Zhang, "Properties of a general azimuth-elevation tracking
+angle formula for a heliostat with a mirror-pivot offset and other angular errors",
+Solar Energy 96 (2013) 159-167; here "Guo". Its frame is left-handed (north, east,
+height); the angles are the same in ours. Its actuator, (41)-(42), is
+:func:`heliotrope.mechanism.drives.linear_guo`. An equation called *reconstructed* is
+derived here; its printed form may look different. The derivations, and the proof that
+:func:`regularise` uses every symmetry there is, stand in ``docs/explanation/guo.md``.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import (
+    FloatArray,
+    angle_between,
+    as_float,
+    as_vectors,
+    bisector,
+    normalize,
+    rotation,
+    wrap_positive,
+    wrap_signed,
+)
+
+#: A demanded normal counts as reached within this angle, rad: a thousand times what
+#: rounding leaves, and a millionth of what any drive resolves.
+REACHED = 1e-12
+
+#: Least |cos μ cos τ₁|. Below it rounding alone moves α by 1e-7 rad.
+LEAST_COSINE = 1e-9
+
+#: Steps from (5) to the exact offset: two do at field distances, six up to an offset of
+#: 0.99 of the distance.
+_NEWTON_STEPS = 6
+
+#: Malan's names of the parameters that his model shares with ours.
+MALAN_NAMES = {
+    "eptN": "tilt_north",
+    "eptE": "tilt_east",
+    "gb": "azimuth_bias",
+    "ab": "elevation_bias",
+    "eNO": "non_orthogonality",
+}
+
+_HELIOTROPE_NAMES = (*MALAN_NAMES.values(), "canting", "pivot_offset")
+
+
+@dataclass(frozen=True, init=False, eq=False)
+class GuoParameters:
+    """Guo's parameters of one heliostat or of a field; the shapes broadcast together.
+
+    Attributes
+    ----------
+    tilt
+        ψ_t, angle of the azimuth axis from the vertical, rad.
+    tilt_azimuth
+        ψ_a, azimuth towards which the azimuth axis leans, rad.
+    azimuth_zero, elevation_zero
+        γ₀ and α₀, rad: joint angle = drive position + zero, so they are our
+        ``azimuth_bias`` and ``elevation_bias``. A zero that a paper subtracts from the
+        nominal angle enters with the opposite sign.
+    tau_1
+        τ₁, elevation of the elevation axis above the plane normal to the azimuth axis
+        (its end at the right of someone who looks along the mirror's heading), rad.
+    mu
+        μ, angle of the mirror's normal from the plane normal to the elevation axis,
+        towards that same end, rad.
+    offset
+        H_z, distance of the mirror's surface in front of the pivot, m.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or the shapes do not broadcast.
+    """
+
+    tilt: FloatArray
+    tilt_azimuth: FloatArray
+    azimuth_zero: FloatArray
+    elevation_zero: FloatArray
+    tau_1: FloatArray
+    mu: FloatArray
+    offset: FloatArray
+
+    def __init__(
+        self,
+        *,
+        tilt: npt.ArrayLike = 0.0,
+        tilt_azimuth: npt.ArrayLike = 0.0,
+        azimuth_zero: npt.ArrayLike = 0.0,
+        elevation_zero: npt.ArrayLike = 0.0,
+        tau_1: npt.ArrayLike = 0.0,
+        mu: npt.ArrayLike = 0.0,
+        offset: npt.ArrayLike = 0.0,
+    ) -> None:
+        values = (tilt, tilt_azimuth, azimuth_zero, elevation_zero, tau_1, mu, offset)
+        for field, value in zip(fields(self), values, strict=True):
+            array = _numbers(value, f"Guo's parameter {field.name}").copy()
+            array.flags.writeable = False
+            object.__setattr__(self, field.name, array)
+        _common_shape(**{f.name: getattr(self, f.name) for f in fields(self)})
+
+
+@dataclass(frozen=True, eq=False)
+class MirrorNormal:
+    """The normal that the sun and the target demand.
+
+    Attributes
+    ----------
+    normal
+        Unit normals in ENU, shape (..., 3).
+    theta
+        θ, half of the angle between sun and target at the pivot, rad, shape (...).
+    tau
+        τ, by which the offset turns the normal from the sun towards the target, rad,
+        shape (...). The mirror sees the sun under the incidence angle θ + τ.
+    """
+
+    normal: FloatArray
+    theta: FloatArray
+    tau: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class GuoTracking:
+    """Drive positions for a demanded normal, on both branches.
+
+    Attributes
+    ----------
+    alpha
+        Elevation drive, rad, shape (..., 2). The joint angle ``alpha + elevation_zero``
+        lies in [−π/2, π/2] on branch 0 and in [π/2, 3π/2], over the top, on branch 1.
+    gamma
+        Azimuth drive in [0, 2π), rad, shape (..., 2).
+    normal
+        The demanded unit normals in ENU, shape (..., 3).
+    residual
+        Angle from the demanded normal to the one that the positions give, rad, the
+        larger of the two branches, shape (...). It is a tracking error.
+    reachable
+        Whether the residual is no more than :data:`REACHED`, shape (...).
+    """
+
+    alpha: FloatArray
+    gamma: FloatArray
+    normal: FloatArray
+    residual: FloatArray
+    reachable: npt.NDArray[np.bool_]
+
+    @property
+    def status(self) -> npt.NDArray[np.str_]:
+        """Return "ok" or "unreachable", shape (...)."""
+        return np.where(self.reachable, "ok", "unreachable")
+
+
+@dataclass(frozen=True, eq=False)
+class AxisAccuracy:
+    """Zeros and scatter of the two axes, all in rad, shape (...).
+
+    Attributes
+    ----------
+    gamma_0, alpha_0
+        Mean of demanded minus measured, the estimates of ``azimuth_zero`` and
+        ``elevation_zero``.
+    sigma_gamma, sigma_alpha
+        Standard deviation about the mean.
+    sigma_normal
+        Standard deviation of the normal in two dimensions (a tracking error): a turn
+        of the azimuth axis moves the normal by cos α times as much.
+    """
+
+    gamma_0: FloatArray
+    sigma_gamma: FloatArray
+    alpha_0: FloatArray
+    sigma_alpha: FloatArray
+    sigma_normal: FloatArray
+
+
+def mirror_normal(
+    to_target: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    offset: npt.ArrayLike = 0.0,
+    *,
+    exact: bool = False,
+) -> MirrorNormal:
+    """Return the normal that sends the sun to the target from a mirror off its pivot.
+
+    Parameters
+    ----------
+    to_target
+        Vectors from the pivot to the target in ENU, m, shape (..., 3).
+    sun
+        Vectors to the sun in ENU, of any length, shape (..., 3).
+    offset
+        H_z, m, shape (...).
+    exact
+        Solve for τ exactly instead of by Guo's (5).
+
+    Raises
+    ------
+    InputError
+        If a vector is zero, sun and target are opposite, or the offset reaches the target.
+
+    Notes
+    -----
+    Validity: |offset| below the distance. With h = offset / distance the error of (5) is
+    below h⁴/50 rad up to h = 1/2, so 3e-9 rad for 0.5 m at 25 m; the exact form leaves
+    1e-15 rad up to h = 0.99. There is no division by sin θ: retroreflection (θ = 0) is
+    an ordinary case. Source: Guo (5) and (26), reconstructed.
+    """
+    target = as_vectors(to_target, "to_target")
+    distance = as_float(np.linalg.norm(target, axis=-1))
+    _refuse(
+        distance == 0.0,
+        "to_target",
+        lambda _: "the target is at the pivot (0 m); give the vector from pivot to target",
+    )
+    s, t = normalize(sun, "sun"), normalize(target, "to_target")
+    height = _numbers(offset, "offset")
+    shape = _common_shape(to_target=t[..., 0], sun=s[..., 0], offset=height)
+    distance, height = np.broadcast_to(distance, shape), np.broadcast_to(height, shape)
+    _refuse(
+        np.abs(height) >= distance,
+        "offset",
+        lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; check units",
+    )
+    b = bisector(s, t)
+    cos_theta = 0.5 * np.linalg.norm(s + t, axis=-1)
+    sin_theta = 0.5 * np.linalg.norm(t - s, axis=-1)
+    q = _offset_slope(height / distance, sin_theta, cos_theta, exact=exact)
+    # tan τ = q sin θ and t − s = 2 sin θ u, so cos τ b + sin τ u ∥ b + q (t − s) / 2.
+    return MirrorNormal(
+        normal=normalize(b + 0.5 * q[..., None] * (t - s)),
+        theta=np.broadcast_to(np.arctan2(sin_theta, cos_theta), shape),
+        tau=as_float(np.arctan(q * sin_theta)),
+    )
+
+
+def _offset_slope(
+    h: FloatArray, sin_theta: FloatArray, cos_theta: FloatArray, *, exact: bool
+) -> FloatArray:
+    """Return q = tan τ / sin θ for h = offset / distance.
+
+    The triangle of pivot, vertex and target gives sin 2τ = h sin(θ + τ), and divided by
+    cos τ: 2 sin τ = h (sin θ + cos θ tan τ). Guo's (5) puts sin τ for tan τ.
+    """
+    p = h / (2.0 - h * cos_theta)
+    q = p / np.sqrt(1.0 - (p * sin_theta) ** 2)
+    for _ in range(_NEWTON_STEPS if exact else 0):
+        root = 1.0 + (q * sin_theta) ** 2
+        error = 2.0 * q / np.sqrt(root) - h * (1.0 + q * cos_theta)
+        q = q - error / (2.0 * root**-1.5 - h * cos_theta)
+    return as_float(q)
+
+
+def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameters) -> FloatArray:
+    """Return the mirror's normal at drive positions.
+
+    Parameters
+    ----------
+    alpha, gamma
+        Elevation and azimuth drive, rad, shape (...).
+    parameters
+        Shapes that broadcast against (...).
+
+    Returns
+    -------
+    Unit normals in ENU, shape (..., 3), to 1e-15.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite or the shapes do not broadcast.
+
+    Notes
+    -----
+    Source: Guo (29).
+    """
+    p = parameters
+    a = _numbers(alpha, "alpha") + p.elevation_zero
+    g = _numbers(gamma, "gamma") + p.azimuth_zero
+    x = np.sin(p.mu) * np.cos(p.tau_1) - np.cos(p.mu) * np.sin(a) * np.sin(p.tau_1)
+    y = np.cos(p.mu) * np.cos(a)
+    z = np.sin(p.mu) * np.sin(p.tau_1) + np.cos(p.mu) * np.sin(a) * np.cos(p.tau_1)
+    c = _stack(x * np.cos(g) + y * np.sin(g), y * np.cos(g) - x * np.sin(g), z)
+    return as_float(np.einsum("...ij,...j->...i", _tilt_rotation(p.tilt, p.tilt_azimuth), c))
+
+
+def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
+    """Return the drive positions at which the mirror has a given normal.
+
+    Parameters
+    ----------
+    normal
+        Vectors in ENU of any length, shape (..., 3).
+    parameters
+        Shapes that broadcast against (...).
+
+    Returns
+    -------
+    Both branches. A normal in the dead cone, whose angle from the azimuth axis is below
+    |μ − τ₁| or above π − |μ + τ₁|, gets the nearest pose and its residual. Where every
+    azimuth serves (normal along the azimuth axis) the joint angle is 0.
+
+    Raises
+    ------
+    InputError
+        If cos μ cos τ₁ = 0, a vector is zero or not finite, or shapes do not broadcast.
+
+    Notes
+    -----
+    Accuracy: the residual is a few 1e-16 rad everywhere, at the keyhole too; sin α by
+    arcsin would leave 1e-8 rad there.
+
+    Source: Guo (16)-(25), reconstructed in half angles; (22) by atan2.
+    """
+    p = parameters
+    n = normalize(normal, "normal")
+    shape = _common_shape(normal=n[..., 0], **{f.name: getattr(p, f.name) for f in fields(p)})
+    tau_1, mu = np.broadcast_to(p.tau_1, shape), np.broadcast_to(p.mu, shape)
+    scale = np.cos(mu) * np.cos(tau_1)
+    _refuse(
+        np.abs(scale) < LEAST_COSINE,
+        "Guo's parameters",
+        lambda i: (
+            f"tau_1 {np.degrees(tau_1[i]):g}° and mu {np.degrees(mu[i]):g}° make "
+            "cos μ cos τ₁ = 0, so the elevation drive cannot raise the normal; "
+            "both must be away from ±90°"
+        ),
+    )
+    c = np.einsum("...ji,...j->...i", _tilt_rotation(p.tilt, p.tilt_azimuth), n)
+    # The branches lie along a first axis here, so that the parameters broadcast.
+    co_elevation = _co_elevation(c, tau_1, mu, scale)
+    beta = np.stack([co_elevation, -co_elevation])
+    alpha = 0.5 * np.pi - beta - p.elevation_zero
+    gamma = wrap_positive(_azimuth(c, beta, tau_1, mu) - p.azimuth_zero)
+    residual = as_float(angle_between(n, forward(alpha, gamma, p)).max(axis=0))
+    return GuoTracking(
+        alpha=np.moveaxis(alpha, 0, -1),
+        gamma=np.moveaxis(gamma, 0, -1),
+        normal=np.broadcast_to(n, (*shape, 3)),
+        residual=residual,
+        reachable=residual <= REACHED,
+    )
+
+
+def _co_elevation(
+    c: FloatArray, tau_1: FloatArray, mu: FloatArray, scale: FloatArray
+) -> FloatArray:
+    """Return β = π/2 − α in [0, π] for normals c in the tilted frame.
+
+    sin α = (cos ζ − sin μ sin τ₁) / (cos μ cos τ₁), ζ the angle from the azimuth axis.
+    Then tan²(β/2) = (1 − sin α) / (1 + sin α), where both differences are products:
+    cos(μ − τ₁) − cos ζ above and cos(μ + τ₁) + cos ζ below. Where a product is negative
+    the normal lies in a dead cone; its clamp gives the nearest pose.
+    """
+    zeta = np.arctan2(np.hypot(c[..., 0], c[..., 1]), c[..., 2])
+    near, far = 0.5 * (mu - tau_1), 0.5 * (mu + tau_1)
+    half = 0.5 * zeta
+    sign = np.sign(scale)
+    above = sign * np.sin(half - near) * np.sin(half + near)
+    below = sign * np.cos(half - far) * np.cos(half + far)
+    return as_float(2.0 * np.arctan2(np.sqrt(np.maximum(above, 0)), np.sqrt(np.maximum(below, 0))))
+
+
+def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArray:
+    """Return the azimuth joint angle that turns the normal (x, y) at azimuth 0 onto c."""
+    # x = sin μ cos τ₁ − cos μ sin τ₁ sin α, about the nearer of α = ±π/2, where it may
+    # cancel to nothing: 1 − sin α = 2 sin²(β/2), 1 + sin α = 2 cos²(β/2).
+    lean = 2.0 * np.cos(mu) * np.sin(tau_1)
+    x = np.where(
+        np.cos(beta) >= 0.0,
+        np.sin(mu - tau_1) + lean * np.sin(0.5 * beta) ** 2,
+        np.sin(mu + tau_1) - lean * np.cos(0.5 * beta) ** 2,
+    )
+    y = np.cos(mu) * np.sin(beta)
+    east = c[..., 0] * y - c[..., 1] * x
+    north = c[..., 1] * y + c[..., 0] * x
+    free = (east == 0.0) & (north == 0.0)
+    return as_float(np.where(free, 0.0, np.arctan2(east, north)))
+
+
+def track(
+    to_target: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    parameters: GuoParameters,
+    *,
+    exact: bool = False,
+) -> GuoTracking:
+    """Return the drive positions that keep the sun on the target.
+
+    Parameters
+    ----------
+    to_target
+        Vectors from the pivot to the target in ENU, m, shape (..., 3).
+    sun
+        Vectors to the sun in ENU, of any length, shape (..., 3).
+    parameters
+        Shapes that broadcast against (...): a field of N at T times takes ``to_target``
+        (N, 3), ``sun`` (T, 1, 3) and parameters (N,).
+    exact
+        Take the offset exactly instead of by Guo's (5).
+
+    Raises
+    ------
+    InputError
+        As :func:`mirror_normal` and :func:`angles`.
+
+    Notes
+    -----
+    Validity and accuracy: see :func:`mirror_normal` and :func:`angles`. Stops are not
+    considered. Source: Guo (1)-(28), reconstructed.
+    """
+    demanded = mirror_normal(to_target, sun, parameters.offset, exact=exact)
+    return angles(demanded.normal, parameters)
+
+
+def regularise(parameters: GuoParameters) -> GuoParameters:
+    """Return the same machine with its parameters in their natural ranges.
+
+    A fit may stop at any of the equivalent sets. This one has ψ_t in [0, π/2] (in
+    (π/2, π] only if the azimuth axis points below the horizon, which no relation can
+    raise), ψ_a, in [0, 2π), γ₀ and α₀ in [−π, π), τ₁ and μ in [−π/2, π/2]. ψ_a is 0
+    where there is no tilt.
+
+    Notes
+    -----
+    :func:`forward` is the same to 1e-15 for every drive position. Values already in
+    their ranges are not touched, so a second call changes nothing. Source: Guo
+    (31)-(40), reconstructed from (29) except (37), (ψ_a, ψ_t) ~ (ψ_a + π, −ψ_t).
+    """
+    p = parameters
+    tilt = _wrap(p.tilt)
+    turned = np.where(tilt < 0.0, p.tilt_azimuth + np.pi, p.tilt_azimuth)
+    tau_1, tau_folded = _fold(_wrap(p.tau_1))
+    mu, mu_folded = _fold(_wrap(p.mu))
+    return replace(
+        p,
+        tilt=np.abs(tilt),
+        tilt_azimuth=np.where(tilt == 0.0, 0.0, wrap_positive(turned)),
+        azimuth_zero=_wrap(p.azimuth_zero + np.pi * tau_folded),
+        elevation_zero=_wrap(p.elevation_zero + np.pi * (tau_folded ^ mu_folded)),
+        tau_1=tau_1,
+        mu=mu,
+    )
+
+
+def _wrap(angle: npt.ArrayLike) -> FloatArray:
+    """Return the angle in [−π, π), bit for bit where it is there already."""
+    a = as_float(angle)
+    return as_float(np.where((a >= -np.pi) & (a < np.pi), a, wrap_signed(a)))
+
+
+def _fold(angle: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Return π − angle (modulo 2π) where |angle| > π/2, and where that is."""
+    folded = np.abs(angle) > 0.5 * np.pi
+    return as_float(np.where(folded, np.copysign(np.pi, angle) - angle, angle)), folded
+
+
+def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
+    """Return the parameters of our azimuth-elevation chain that make the same machine.
+
+    Returns
+    -------
+    ``tilt_north``, ``tilt_east``, ``azimuth_bias``, ``elevation_bias``,
+    ``non_orthogonality``, ``canting`` (rad) and ``pivot_offset`` (m), shape (...).
+
+    Notes
+    -----
+    Exact to 1e-15. Both descriptions of the tilt put the axis in the same place but
+    differ by a turn about it, tilt_north · tilt_east / 2 to second order, which goes
+    into ``azimuth_bias``.
+    """
+    p = parameters
+    east = np.sin(p.tilt) * np.sin(p.tilt_azimuth)
+    north = np.sin(p.tilt) * np.cos(p.tilt_azimuth)
+    tilt_north = as_float(np.arctan2(north, np.cos(p.tilt)))
+    tilt_east = as_float(np.arctan2(east, np.hypot(north, np.cos(p.tilt))))
+    twist = _twist(p.tilt, p.tilt_azimuth, tilt_north, tilt_east)
+    return {
+        "tilt_north": tilt_north,
+        "tilt_east": tilt_east,
+        "azimuth_bias": as_float(p.azimuth_zero - twist),
+        "elevation_bias": p.elevation_zero,
+        "non_orthogonality": -p.tau_1,
+        "canting": p.mu,
+        "pivot_offset": p.offset,
+    }
+
+
+def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
+    """Return Guo's parameters of our azimuth-elevation chain.
+
+    Parameters
+    ----------
+    values
+        Any of the names that :func:`to_heliotrope` gives; the others are 0.
+
+    Raises
+    ------
+    UnknownNameError
+        If Guo's model has no such parameter.
+    InputError
+        If a number is not finite or the shapes do not broadcast.
+
+    Notes
+    -----
+    The inverse of :func:`to_heliotrope` up to the relations of :func:`regularise`; the
+    tilt comes out in [0, π]. Exact to 1e-15.
+    """
+    for name in values:
+        if name not in _HELIOTROPE_NAMES:
+            raise UnknownNameError("parameter of Guo's model", name, _HELIOTROPE_NAMES)
+    v = {name: _numbers(values.get(name, 0.0), name) for name in _HELIOTROPE_NAMES}
+    _common_shape(**v)
+    tilt_north, tilt_east = v["tilt_north"], v["tilt_east"]
+    east = np.sin(tilt_east)
+    north = np.cos(tilt_east) * np.sin(tilt_north)
+    tilt = as_float(np.arctan2(np.hypot(east, north), np.cos(tilt_east) * np.cos(tilt_north)))
+    tilt_azimuth = wrap_positive(np.arctan2(east, north))
+    return GuoParameters(
+        tilt=tilt,
+        tilt_azimuth=tilt_azimuth,
+        azimuth_zero=v["azimuth_bias"] + _twist(tilt, tilt_azimuth, tilt_north, tilt_east),
+        elevation_zero=v["elevation_bias"],
+        tau_1=-v["non_orthogonality"],
+        mu=v["canting"],
+        offset=v["pivot_offset"],
+    )
+
+
+def to_malan(parameters: GuoParameters) -> dict[str, FloatArray]:
+    """Return Malan's ``eptN``, ``eptE``, ``gb``, ``ab`` and ``eNO``, rad, shape (...).
+
+    Exact: with the misprints of (4.7)-(4.17) resolved, Malan's order of turns is ours.
+
+    Raises
+    ------
+    InputError
+        If μ or the offset is not 0: Malan's model has neither.
+    """
+    ours = to_heliotrope(parameters)
+    for name, unit in (("canting", "rad"), ("pivot_offset", "m")):
+        largest = np.abs(ours[name]).max(initial=0.0)
+        if largest > 0.0:
+            raise InputError(
+                f"{name}: up to {largest:g} {unit}, but Malan's model has none; it must be 0 "
+                "everywhere, or keep Guo's parameters"
+            )
+    return {malan: ours[name] for malan, name in MALAN_NAMES.items()}
+
+
+def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
+    """Return Guo's parameters from any of Malan's (rad), the missing ones being 0.
+
+    Raises
+    ------
+    UnknownNameError
+        If a name is not one of those that :func:`to_malan` gives.
+    InputError
+        If a number is not finite or the shapes do not broadcast.
+    """
+    for name in values:
+        if name not in MALAN_NAMES:
+            raise UnknownNameError("parameter of Malan's model", name, MALAN_NAMES)
+    return from_heliotrope({MALAN_NAMES[name]: value for name, value in values.items()})
+
+
+def axis_accuracy(
+    measured_alpha: npt.ArrayLike,
+    measured_gamma: npt.ArrayLike,
+    ideal_alpha: npt.ArrayLike,
+    ideal_gamma: npt.ArrayLike,
+    *,
+    azimuth_weight: npt.ArrayLike = 1.0,
+) -> AxisAccuracy:
+    """Return the zero and the scatter of each axis from a set of measurements.
+
+    Parameters
+    ----------
+    measured_alpha, measured_gamma
+        Encoder positions, rad, shape (..., n), n ≥ 2 measurements.
+    ideal_alpha, ideal_gamma
+        Angles that the model demands for the same sightings, rad, shape (..., n).
+    azimuth_weight
+        Weights of the azimuth, shape (..., n). Equal if the axis itself scatters;
+        cos² α if the measured normals do, whose scatter the azimuth shows magnified.
+
+    Raises
+    ------
+    InputError
+        If fewer than two measurements are given, shapes differ, weights are negative or
+        all 0, or the differences spread over half a turn (branches mixed).
+
+    Notes
+    -----
+    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
+    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
+    """
+    values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
+    names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
+    given = {k: _numbers(v, k) for k, v in zip(names, values, strict=True)}
+    shape = _common_shape(**given)
+    if not shape or shape[-1] < 2:
+        raise InputError(
+            f"axis accuracy: shape {shape}; the last axis must hold at least 2 measurements"
+        )
+    alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
+    if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
+        raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
+    gamma_0, gamma_rest = _circular(gamma_i - gamma, weight, "gamma")
+    alpha_0, alpha_rest = _circular(alpha_i - alpha, np.ones(shape), "alpha")
+    n = shape[-1]
+    along = np.cos(alpha_i) ** 2 * gamma_rest**2
+    variance_gamma = (weight * gamma_rest**2).sum(axis=-1) / weight.sum(axis=-1) * n / (n - 1)
+    return AxisAccuracy(
+        gamma_0=gamma_0,
+        sigma_gamma=as_float(np.sqrt(variance_gamma)),
+        alpha_0=alpha_0,
+        sigma_alpha=as_float(np.sqrt((alpha_rest**2).sum(axis=-1) / (n - 1))),
+        sigma_normal=as_float(np.sqrt((alpha_rest**2 + along).sum(axis=-1) / (n - 1))),
+    )
+
+
+def _circular(
+    difference: FloatArray, weight: FloatArray, name: str
+) -> tuple[FloatArray, FloatArray]:
+    """Return the weighted mean of angles along the last axis, and what remains."""
+    middle = np.arctan2(
+        (weight * np.sin(difference)).sum(axis=-1, keepdims=True),
+        (weight * np.cos(difference)).sum(axis=-1, keepdims=True),
+    )
+    rest = wrap_signed(difference - middle)
+    _refuse(
+        np.abs(rest) > 0.5 * np.pi,
+        f"ideal minus measured {name}",
+        lambda i: (
+            f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; measured and ideal "
+            "angles must be on the same branch"
+        ),
+    )
+    shift = (weight * rest).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
+    return wrap_signed(middle + shift)[..., 0], as_float(rest - shift)
+
+
+def _tilt_rotation(tilt: FloatArray, tilt_azimuth: FloatArray) -> FloatArray:
+    """Return the rotation by ψ_t that leans the vertical towards the azimuth ψ_a."""
+    # About U × d for the horizontal direction d at azimuth ψ_a.
+    level = np.zeros_like(tilt_azimuth)
+    return rotation(_stack(-np.cos(tilt_azimuth), np.sin(tilt_azimuth), level), tilt)
+
+
+def _twist(
+    tilt: FloatArray, tilt_azimuth: FloatArray, tilt_north: FloatArray, tilt_east: FloatArray
+) -> FloatArray:
+    """Return the angle w with R_guo = R_ours R_U(w), both leaning the vertical alike."""
+    guo = _tilt_rotation(tilt, tilt_azimuth)
+    ours = rotation([-1.0, 0.0, 0.0], tilt_north) @ rotation([0.0, 1.0, 0.0], tilt_east)
+    sine = np.sum(ours[..., :, 1] * guo[..., :, 0], axis=-1)
+    cosine = np.sum(ours[..., :, 0] * guo[..., :, 0], axis=-1)
+    return as_float(np.arctan2(sine, cosine))
+
+
+def _stack(east: npt.ArrayLike, north: npt.ArrayLike, up: npt.ArrayLike) -> FloatArray:
+    return np.stack(np.broadcast_arrays(as_float(east), as_float(north), as_float(up)), axis=-1)
+
+
+def _numbers(value: npt.ArrayLike, name: str) -> FloatArray:
+    try:
+        array = as_float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name}: {value!r} is not an array of numbers") from None
+    _refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; give a number")
+    return array
+
+
+def _common_shape(**arrays: FloatArray) -> tuple[int, ...]:
+    try:
+        return np.broadcast_shapes(*(a.shape for a in arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
+        raise InputError(f"shapes do not broadcast together: {shapes}") from None
+
+
+def _refuse(
+    wrong: npt.NDArray[np.bool_], what: str, problem: Callable[[tuple[int, ...]], str]
+) -> None:
+    """Raise for the first place where ``wrong`` holds, naming it."""
+    if np.any(wrong):
+        i = tuple(int(k) for k in np.argwhere(wrong)[0])
+        raise InputError(f"{what}{list(i) if i else ''}: {problem(i)}")

@@ -1,0 +1,306 @@
+"""A mechanism is data: joints from ground to mirror, two of them driven."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from types import EllipsisType
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism._chain_kernels import armature_block, jacobian_block, pose_block
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.parameters import Parameter
+from heliotrope.parallel import run_blocks
+
+#: What a mechanism may be indexed with.
+Index = int | slice | EllipsisType | tuple[int | slice | EllipsisType, ...] | npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where mirrors are.
+
+    Attributes
+    ----------
+    normal
+        Unit normals in ENU, shape (..., 3).
+    vertex
+        Vertices in ENU metres, shape (..., 3).
+    """
+
+    normal: FloatArray
+    vertex: FloatArray
+
+
+@dataclass(frozen=True)
+class Jacobian:
+    """A pose with its derivatives by P parameters and by the counts of D drives.
+
+    Attributes
+    ----------
+    pose
+        Normal and vertex.
+    names
+        The P parameters, in order.
+    normal, vertex
+        Derivatives by the parameters, shape (..., P, 3), per rad, m or 1.
+    normal_counts, vertex_counts
+        Derivatives by the counts, shape (..., D, 3).
+    """
+
+    pose: Pose
+    names: tuple[str, ...]
+    normal: FloatArray
+    vertex: FloatArray
+    normal_counts: FloatArray
+    vertex_counts: FloatArray
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """One mechanism, or an array of mechanisms of one kind; batch shape (...).
+
+    Build it with a function of :mod:`heliotrope.mechanism.kinds`.
+
+    Attributes
+    ----------
+    kind
+        Name of the builder, for example "azimuth_elevation".
+    joints
+        Names of the J joints from ground to mirror.
+    driven
+        Indices of the D driven joints (two, or one for a single-axis tracker).
+    position
+        Foot of the chain in ENU metres, (..., 3).
+    orientation
+        Rotation from the chain's first frame to ENU, (..., 3, 3).
+    axes, origins
+        Unit axis and origin (m) of each joint in its parent's frame, (..., J, 3).
+    angles
+        Fixed part of each joint's angle, rad, (..., J).
+    drives
+        Batch shape (..., D).
+    vertex, normal
+        Mirror's vertex (m) and unit normal in the mirror's frame, (..., 3).
+    """
+
+    kind: str
+    joints: tuple[str, ...]
+    driven: tuple[int, ...]
+    position: FloatArray
+    orientation: FloatArray
+    axes: FloatArray
+    origins: FloatArray
+    angles: FloatArray
+    drives: Drive
+    vertex: FloatArray
+    normal: FloatArray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The batch shape."""
+        return self.position.shape[:-1]
+
+    def __len__(self) -> int:
+        if not self.shape:
+            raise TypeError("a single mechanism has no length")
+        return self.shape[0]
+
+    def __getitem__(self, index: Index) -> "Mechanism":
+        """Return the mechanisms at ``index`` of the batch axes."""
+        if not self.shape:
+            raise InputError("a single mechanism cannot be indexed")
+        return replace(
+            self,
+            position=self.position[index],
+            orientation=self.orientation[index],
+            axes=self.axes[index],
+            origins=self.origins[index],
+            angles=self.angles[index],
+            drives=Drive(self.drives.table[index]),
+            vertex=self.vertex[index],
+            normal=self.normal[index],
+        )
+
+    @cached_property
+    def parameters(self) -> dict[str, Parameter]:
+        """The parameter table of this kind, by name."""
+        kinds = self.drives.table[..., slot.KIND].reshape(-1, len(self.driven))
+        linear = tuple(bool((kinds[:, d] == slot.LINEAR).all()) for d in range(kinds.shape[1]))
+        return parameter_table.table(self.joints, self.driven, linear)
+
+    def parameter(self, name: str) -> Parameter:
+        """Return the row of parameter ``name``.
+
+        Raises
+        ------
+        UnknownNameError
+            If this kind of mechanism has no such parameter.
+        """
+        try:
+            return self.parameters[name]
+        except KeyError:
+            raise UnknownNameError(
+                f"parameter of a {self.kind} mechanism", name, self.parameters
+            ) from None
+
+    def codes(self, names: tuple[str, ...]) -> npt.NDArray[np.int64]:
+        """Return what the kernels move for each parameter, shape (P, 3)."""
+        rows = [self.parameter(name).code for name in names]
+        return np.array(rows, dtype=np.int64).reshape(-1, 3)
+
+    def with_parameters(self, values: Mapping[str, npt.ArrayLike]) -> "Mechanism":
+        """Return the mechanism with parameters moved by ``values``.
+
+        Parameters
+        ----------
+        values
+            For each name the deviation from this mechanism, in rad, m or 1;
+            shape (...) or anything that broadcasts to it.
+
+        Raises
+        ------
+        UnknownNameError
+            If a name is not in the table.
+        InputError
+            If a value is not finite.
+        """
+        position, origins = self.position.copy(), self.origins.copy()
+        angles, vertex = self.angles.copy(), self.vertex.copy()
+        table = self.drives.table.copy()
+        for name, value in values.items():
+            delta = as_float(value)
+            if not np.isfinite(delta).all():
+                raise InputError(f"parameter {name}: {value} is not finite")
+            what, index, sub = self.parameter(name).code
+            if what == slot.MOVES_JOINT:
+                angles[..., index] += delta
+            elif what == slot.MOVES_DRIVE:
+                table[..., index, sub] += delta
+            elif what == slot.MOVES_POSITION:
+                position[..., sub] += delta
+            elif what == slot.MOVES_ORIGIN:
+                origins[..., index, sub] += delta
+            elif what == slot.MOVES_VERTEX:
+                vertex[..., sub] += delta
+            else:
+                vertex += delta[..., None] * self.normal
+        return replace(
+            self, position=position, origins=origins, angles=angles, vertex=vertex,
+            drives=Drive(table),
+        )  # fmt: skip
+
+    def pose(self, counts: npt.ArrayLike) -> Pose:
+        """Return normals and vertices at drive counts.
+
+        Parameters
+        ----------
+        counts
+            Shape (..., D); its batch axes broadcast against the mechanism's.
+        """
+        flat, rows, shape = self._flatten(counts)
+        normal, vertex = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+        arrays = self._arrays
+        run_blocks(
+            lambda a, b: pose_block(*arrays, flat, rows, normal, vertex, a, b), len(rows)
+        )
+        return Pose(normal.reshape(*shape, 3), vertex.reshape(*shape, 3))
+
+    def jacobian(self, counts: npt.ArrayLike, names: tuple[str, ...]) -> Jacobian:
+        """Return the pose and its derivatives by parameters ``names`` and by the counts.
+
+        Parameters
+        ----------
+        counts
+            Shape (..., D); its batch axes broadcast against the mechanism's.
+        names
+            Parameters of the table, P of them.
+
+        Notes
+        -----
+        The screw formula: a joint's small turn moves the normal by w × n and the
+        vertex by w × (m − o). It is exact wherever the chain itself is differentiable,
+        so in every pose but a jack stretched flat.
+        """
+        flat, rows, shape = self._flatten(counts)
+        codes = self.codes(names)
+        m, p, d = len(rows), len(names), len(self.driven)
+        n, v = np.empty((m, 3)), np.empty((m, 3))
+        dn, dv = np.empty((m, p, 3)), np.empty((m, p, 3))
+        dn_counts, dv_counts = np.empty((m, d, 3)), np.empty((m, d, 3))
+        arrays = self._arrays
+        run_blocks(
+            lambda a, b: jacobian_block(
+                *arrays, flat, rows, codes, n, v, dn, dv, dn_counts, dv_counts, a, b
+            ),
+            m,
+        )
+        return Jacobian(
+            Pose(n.reshape(*shape, 3), v.reshape(*shape, 3)),
+            names,
+            dn.reshape(*shape, p, 3),
+            dv.reshape(*shape, p, 3),
+            dn_counts.reshape(*shape, d, 3),
+            dv_counts.reshape(*shape, d, 3),
+        )
+
+    @cached_property
+    def armature(self) -> Armature:
+        """The reduction to two axes, two points, vertex and normal (Grigoriev's armature)."""
+        position, orientation, axes, origins, angles, _, driven, vertex, normal = self._arrays
+        table = np.zeros((len(position), slot.ARMATURE_SIZE))
+        run_blocks(
+            lambda a, b: armature_block(
+                position, orientation, axes, origins, angles, driven, vertex, normal, table, a, b
+            ),
+            len(table),
+        )
+        return Armature(table.reshape(*self.shape, slot.ARMATURE_SIZE))
+
+    @cached_property
+    def _arrays(self) -> tuple[np.ndarray, ...]:
+        """The arrays of the kernels, with one batch axis."""
+        joints, drives = len(self.joints), len(self.driven)
+
+        def flat(array: FloatArray, *tail: int) -> FloatArray:
+            return np.ascontiguousarray(array).reshape(-1, *tail)
+
+        return (
+            flat(self.position, 3),
+            flat(self.orientation, 3, 3),
+            flat(self.axes, joints, 3),
+            flat(self.origins, joints, 3),
+            flat(self.angles, joints),
+            flat(self.drives.table, drives, slot.DRIVE_SLOTS),
+            np.array(self.driven, dtype=np.int64),
+            flat(self.vertex, 3),
+            flat(self.normal, 3),
+        )
+
+    def _flatten(
+        self, counts: npt.ArrayLike
+    ) -> tuple[FloatArray, npt.NDArray[np.intp], tuple[int, ...]]:
+        """Return counts (M, D), the mechanism's row of each, and the batch shape."""
+        given, drives = as_float(counts), len(self.driven)
+        if given.ndim == 0 or given.shape[-1] != drives:
+            raise InputError(
+                f"counts: shape {given.shape}; the last axis must hold the {drives} drives"
+            )
+        if not np.isfinite(given).all():
+            raise InputError("counts: a value is not finite; give the motor positions")
+        try:
+            shape = np.broadcast_shapes(self.shape, given.shape[:-1])
+        except ValueError:
+            raise InputError(
+                f"counts: shape {given.shape[:-1]} does not fit mechanisms of shape {self.shape}"
+            ) from None
+        index = np.arange(int(np.prod(self.shape, dtype=np.int64))).reshape(self.shape)
+        rows = np.ascontiguousarray(np.broadcast_to(index, shape)).ravel()
+        flat = np.ascontiguousarray(np.broadcast_to(given, (*shape, drives)))
+        return flat.reshape(-1, drives), rows, shape

@@ -1,0 +1,382 @@
+r"""Drives: motor counts to the angle of a joint, and back.
+
+A drive turns counts into an ideal angle φ and that into the angle of the joint
+
+.. math:: θ = bias + (1 + scale)\,φ + worm_{cos} \cos u + worm_{sin} \sin u
+          + sag \cos(φ + phase)
+
+where u is the worm's angle (a known ratio times φ, or times the stroke of a jack).
+For a rotary drive φ is linear in the counts. For a linear drive (jack) the law of
+cosines holds in the triangle of joint, fixed end and moving end:
+
+.. math:: Φ(L) = \arccos\frac{c^2 + r^2 - L^2}{2 c r}, \qquad
+          φ = φ_0 + σ\,(Φ(k) - Φ(k + counts \cdot rate))
+
+A linear drive has been written in three ways, all of which are this one: PAINT
+(:func:`linear_paint`), Grigoriev et al. 2021 (:func:`linear_grigoriev`) and Guo et
+al. 2013, (41)-(42) (:func:`linear_guo`).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import TAU, FloatArray, as_float
+from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism._drive_kernels import angles_block, counts_block, slopes_block
+from heliotrope.parallel import run_blocks
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One drive, or an array of drives of the same or of different kinds.
+
+    Attributes
+    ----------
+    table
+        Shape (..., 19), the numbers that the kernels read. Build it with
+        :func:`rotary`, :func:`direct`, :func:`linear_paint`,
+        :func:`linear_grigoriev` or :func:`linear_guo`.
+    """
+
+    table: FloatArray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The batch shape."""
+        return self.table.shape[:-1]
+
+    def angles(self, counts: npt.ArrayLike) -> FloatArray:
+        """Return the joint angle in radians at motor counts, both of shape (...)."""
+        return self._run(angles_block, counts, "counts")
+
+    def counts(self, angles: npt.ArrayLike) -> FloatArray:
+        """Return the (real) counts at joint angles in radians, both of shape (...).
+
+        Exact to 1e-9 rad with all periodic terms on. A jack's angle beyond its
+        triangle gives the counts of its end.
+        """
+        return self._run(counts_block, angles, "angles")
+
+    def radians_per_count(self, counts: npt.ArrayLike) -> FloatArray:
+        """Return dθ/dcounts, shape (...)."""
+        return self._run(slopes_block, counts, "counts")
+
+    def replace(self, **values: npt.ArrayLike) -> "Drive":
+        """Return a drive with some of its numbers set, by the names of ``SLOTS``.
+
+        Raises
+        ------
+        InputError
+            If a name is not one of them.
+        """
+        table = self.table.copy()
+        for name, value in values.items():
+            if name not in SLOTS:
+                raise InputError(f"drive: there is no {name!r}; known: {', '.join(SLOTS)}")
+            table[..., SLOTS[name]] = value
+        return _checked(Drive(table))
+
+    def _run(self, block: Any, values: npt.ArrayLike, what: str) -> FloatArray:
+        given = as_float(values)
+        if np.isnan(given).any():
+            raise InputError(f"drive: {what} hold NaN; give finite numbers")
+        shape = np.broadcast_shapes(self.shape, given.shape)
+        rows = np.broadcast_to(np.arange(_size(self.shape)).reshape(self.shape), shape).ravel()
+        flat = np.ascontiguousarray(np.broadcast_to(given, shape)).reshape(-1, 1)
+        table = np.ascontiguousarray(self.table).reshape(-1, 1, slot.DRIVE_SLOTS)
+        out = np.empty_like(flat)
+        run_blocks(lambda a, b: block(table, flat, rows, out, a, b), len(rows))
+        return out.reshape(shape)
+
+
+#: Names of a drive's numbers, for :meth:`Drive.replace` and the parameter table.
+SLOTS = {
+    "zero": slot.ZERO,
+    "initial_angle": slot.ZERO,
+    "rate": slot.RATE,
+    "stroke_offset": slot.STROKE,
+    "offset": slot.OFFSET,
+    "pivot_radius": slot.RADIUS,
+    "bias": slot.BIAS,
+    "scale": slot.SCALE,
+    "worm_cos": slot.WORM_COS,
+    "worm_sin": slot.WORM_SIN,
+    "worm_ratio": slot.WORM_RATIO,
+    "sag": slot.SAG,
+    "sag_phase": slot.SAG_PHASE,
+    "min_angle": slot.MIN_ANGLE,
+    "max_angle": slot.MAX_ANGLE,
+    "min_count": slot.MIN_COUNT,
+    "max_count": slot.MAX_COUNT,
+    "speed": slot.SPEED,
+}
+
+
+def _size(shape: tuple[int, ...]) -> int:
+    return int(np.prod(shape, dtype=np.int64))
+
+
+def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
+    numbers = {
+        slot.KIND: kind,
+        slot.MIN_ANGLE: -np.inf,
+        slot.MAX_ANGLE: np.inf,
+        slot.MIN_COUNT: -np.inf,
+        slot.MAX_COUNT: np.inf,
+        slot.SPEED: np.inf,
+        **numbers,
+    }
+    shape = np.broadcast_shapes(*(np.shape(value) for value in numbers.values()))
+    table = np.zeros((*shape, slot.DRIVE_SLOTS))
+    for index, value in numbers.items():
+        table[..., index] = as_float(value)
+    return _checked(Drive(table))
+
+
+def _checked(drive: Drive) -> Drive:
+    """Return the drive if its numbers describe a machine that can move.
+
+    Raises
+    ------
+    InputError
+        If stops are reversed, a rate is zero or a jack's triangle cannot close.
+    """
+    t = drive.table
+    if np.isnan(t).any():
+        raise InputError("drive: a number is NaN; every constant of a drive must be given")
+    rate = t[..., slot.RATE]
+    if (rate == 0.0).any() or not np.isfinite(rate).all():
+        raise InputError("drive: the angle (or stroke) per count is 0 or infinite; give counts")
+    for low, high, what in (
+        (slot.MIN_ANGLE, slot.MAX_ANGLE, "angle"),
+        (slot.MIN_COUNT, slot.MAX_COUNT, "count"),
+    ):
+        reversed_ = t[..., low] > t[..., high]
+        if reversed_.any():
+            i = tuple(np.argwhere(reversed_)[0])
+            raise InputError(
+                f"drive: lower {what} stop {t[i][low]:g} is above the upper stop "
+                f"{t[i][high]:g}; exchange them"
+            )
+    if (t[..., slot.SPEED] <= 0.0).any():
+        raise InputError("drive: speed must be above 0 counts per second")
+    if (np.abs(1.0 + t[..., slot.SCALE]) < 1e-3).any():
+        raise InputError("drive: scale −1 makes the drive stand still; give a scale near 0")
+    _check_triangles(t[t[..., slot.KIND] == slot.LINEAR])
+    _check_monotone(t)
+    return drive
+
+
+def _check_triangles(jacks: FloatArray) -> None:
+    c, r, k = jacks[:, slot.OFFSET], jacks[:, slot.RADIUS], jacks[:, slot.STROKE]
+    wrong = (c <= 0) | (r <= 0) | (k <= np.abs(c - r)) | (k >= c + r)
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"linear drive: offset {c[i]:g} m, pivot radius {r[i]:g} m and initial stroke "
+            f"length {k[i]:g} m make no triangle; the stroke must lie between "
+            f"{abs(c[i] - r[i]):g} m and {c[i] + r[i]:g} m"
+        )
+
+
+def _check_monotone(t: FloatArray) -> None:
+    """Refuse periodic terms so large that one angle belongs to several counts."""
+    rotary = t[..., slot.KIND] == slot.ROTARY
+    worm = np.hypot(t[..., slot.WORM_COS], t[..., slot.WORM_SIN]) * np.abs(t[..., slot.WORM_RATIO])
+    swing = (worm + np.abs(t[..., slot.SAG])) / np.abs(1.0 + t[..., slot.SCALE])
+    if (rotary & (swing >= 1.0)).any():
+        raise InputError(
+            f"drive: worm amplitude times ratio is {swing.max():g}, so the drive would run "
+            "backwards within a turn; it must stay below 1"
+        )
+
+
+def direct(**values: npt.ArrayLike) -> Drive:
+    """Return a drive whose counts are the angle itself, in radians."""
+    return _build(slot.ROTARY, {slot.RATE: 1.0}).replace(**values)
+
+
+def rotary(
+    steps_per_turn: npt.ArrayLike,
+    gear_ratio: npt.ArrayLike,
+    *,
+    microsteps: npt.ArrayLike = 1,
+    zero: npt.ArrayLike = 0.0,
+    sense: npt.ArrayLike = 1,
+    **values: npt.ArrayLike,
+) -> Drive:
+    """Return a stepper or encoder drive through a gear.
+
+    Parameters
+    ----------
+    steps_per_turn
+        Full steps (or encoder counts) of a turn of the motor.
+    gear_ratio
+        Turns of the motor for one turn of the joint.
+    microsteps
+        Counts per full step.
+    zero
+        Angle at 0 counts, rad.
+    sense
+        +1 if the angle grows with the counts, −1 if it falls.
+    values
+        Any of ``SLOTS``: bias, scale, worm_cos, worm_sin, worm_ratio, sag, stops, speed.
+
+    Raises
+    ------
+    InputError
+        If a number makes no drive.
+    """
+    per_turn = as_float(steps_per_turn) * as_float(microsteps) * as_float(gear_ratio)
+    if not (np.isfinite(per_turn) & (per_turn > 0)).all():
+        raise InputError(
+            f"rotary drive: steps {steps_per_turn} × microsteps {microsteps} × gear ratio "
+            f"{gear_ratio} must be above 0 and finite"
+        )
+    _check_sense(sense)
+    rate = as_float(sense) * TAU / per_turn
+    return _build(slot.ROTARY, {slot.RATE: rate, slot.ZERO: zero}).replace(**values)
+
+
+def linear_paint(
+    increment: npt.ArrayLike,
+    initial_stroke_length: npt.ArrayLike,
+    offset: npt.ArrayLike,
+    pivot_radius: npt.ArrayLike,
+    initial_angle: npt.ArrayLike,
+    *,
+    clockwise: npt.ArrayLike = 1,
+    **values: npt.ArrayLike,
+) -> Drive:
+    """Return a jack with the constants of PAINT's heliostat properties.
+
+    Parameters
+    ----------
+    increment
+        Counts per metre of stroke.
+    initial_stroke_length
+        k, distance of the actuator's ends at 0 counts, m.
+    offset, pivot_radius
+        c and r, the two fixed sides of the triangle, m.
+    initial_angle
+        θ₀, angle at 0 counts, rad.
+    clockwise
+        σ = +1 where ``clockwise_axis_movement`` is 1, else −1.
+    values
+        Any of ``SLOTS``.
+    """
+    counts_per_metre = as_float(increment)
+    if not (np.isfinite(counts_per_metre) & (counts_per_metre != 0)).all():
+        raise InputError(f"linear drive: increment {increment} counts per metre must not be 0")
+    sense = np.where(as_float(clockwise) == 1, 1.0, -1.0)
+    return _build(
+        slot.LINEAR,
+        {
+            slot.RATE: 1.0 / counts_per_metre,
+            slot.STROKE: initial_stroke_length,
+            slot.OFFSET: offset,
+            slot.RADIUS: pivot_radius,
+            slot.ZERO: initial_angle,
+            slot.SENSE: sense,
+        },
+    ).replace(**values)
+
+
+def linear_grigoriev(
+    side_a: npt.ArrayLike,
+    side_b: npt.ArrayLike,
+    length_at_zero: npt.ArrayLike,
+    metres_per_count: npt.ArrayLike,
+    *,
+    angle_zero: npt.ArrayLike = 0.0,
+    sense: npt.ArrayLike = 1,
+    **values: npt.ArrayLike,
+) -> Drive:
+    """Return a jack by the law of cosines, θ = angle_zero + sense · Φ(L).
+
+    Parameters
+    ----------
+    side_a, side_b
+        Distances from the joint to the ends of the actuator, m.
+    length_at_zero
+        Length of the actuator at 0 counts, m.
+    metres_per_count
+        Change of its length per count, m.
+    angle_zero
+        Joint angle at which the two sides coincide, rad.
+    sense
+        +1 if the angle grows with the length.
+    values
+        Any of ``SLOTS``.
+
+    Notes
+    -----
+    Grigoriev et al. 2021 (HelioK) measure the angle from the folded triangle; PAINT
+    measures it from the position at 0 counts. The two zeros differ by Φ(length_at_zero).
+    """
+    _check_sense(sense)
+    a, b, length = as_float(side_a), as_float(side_b), as_float(length_at_zero)
+    jack = _build(
+        slot.LINEAR,
+        {
+            slot.RATE: metres_per_count,
+            slot.STROKE: length,
+            slot.OFFSET: a,
+            slot.RADIUS: b,
+            slot.SENSE: -as_float(sense),
+        },
+    )
+    folded = np.arccos((a**2 + b**2 - length**2) / (2.0 * a * b))
+    return jack.replace(zero=as_float(angle_zero) + as_float(sense) * folded).replace(**values)
+
+
+def linear_guo(
+    side_a: npt.ArrayLike,
+    side_b: npt.ArrayLike,
+    angle_at_zero: npt.ArrayLike,
+    included_at_zero: npt.ArrayLike,
+    metres_per_count: npt.ArrayLike,
+    *,
+    sense: npt.ArrayLike = 1,
+    **values: npt.ArrayLike,
+) -> Drive:
+    """Return a jack given by its included angle at the encoder's zero.
+
+    Guo et al. 2013, (41)-(42), reconstructed: the length is that of the triangle
+    with included angle β₀ + sense · (α − α₀), and the counts are proportional to its change.
+
+    Parameters
+    ----------
+    side_a, side_b
+        Distances from the joint to the ends of the actuator, m.
+    angle_at_zero
+        α₀, joint angle at 0 counts, rad.
+    included_at_zero
+        β₀, angle between the two sides at 0 counts, rad, in (0, π).
+    metres_per_count
+        Change of the actuator's length per count, m.
+    sense
+        +1 if the included angle grows with the joint's angle.
+    values
+        Any of ``SLOTS``.
+    """
+    _check_sense(sense)
+    a, b, included = as_float(side_a), as_float(side_b), as_float(included_at_zero)
+    if not ((included > 0) & (included < np.pi)).all():
+        raise InputError(
+            f"linear drive: included angle at zero {included_at_zero} rad must lie in (0, π)"
+        )
+    length = np.sqrt((a - b) ** 2 + 4.0 * a * b * np.sin(0.5 * included) ** 2)
+    zero = as_float(angle_at_zero) - as_float(sense) * included
+    return linear_grigoriev(
+        a, b, length, metres_per_count, angle_zero=zero, sense=sense, **values
+    )
+
+
+def _check_sense(sense: npt.ArrayLike) -> None:
+    if not np.isin(as_float(sense), (-1.0, 1.0)).all():
+        raise InputError(f"drive: sense {sense} must be +1 or −1")

@@ -1,0 +1,395 @@
+"""Builders of the kinds of mechanism that heliostats have.
+
+Every two-axis kind is the same chain with other axes::
+
+    position, orientation
+      two tilts of the primary axis            (fixed)
+      primary axis                             (driven)
+      non-orthogonality                        (fixed)
+      secondary axis                           (driven)
+      canting, canting_secondary               (fixed)
+    vertex, normal
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+from heliotrope.mechanism.armature import check_axes
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive, direct
+
+EAST, NORTH, UP = np.eye(3)
+_LEANS = {"east": EAST, "north": NORTH, "up": UP}
+
+
+def two_axis(
+    position: npt.ArrayLike,
+    axis_1: npt.ArrayLike,
+    axis_2: npt.ArrayLike,
+    normal: npt.ArrayLike,
+    *,
+    kind: str = "two_axis",
+    names: tuple[str, str] = ("primary", "secondary"),
+    leans: tuple[str, str] | None = None,
+    pole: npt.ArrayLike | None = None,
+    origin_1: npt.ArrayLike = (0.0, 0.0, 0.0),
+    origin_2: npt.ArrayLike = (0.0, 0.0, 0.0),
+    arm: npt.ArrayLike = (0.0, 0.0, 0.0),
+    vertex: npt.ArrayLike = (0.0, 0.0, 0.0),
+    orientation: npt.ArrayLike | None = None,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return mechanisms with two arbitrary axes (Grigoriev et al. 2021).
+
+    Parameters
+    ----------
+    position
+        Foot of the chain, ENU metres, (..., 3).
+    axis_1, axis_2, normal
+        Primary axis, secondary axis and mirror normal at zero angles, in the
+        heliostat's frame, (..., 3), any length.
+    kind, names
+        Name of the kind and of the two driven joints.
+    leans
+        The two directions ("east", "north", "up") that the primary axis can lean to;
+        by default the two that are most perpendicular to the first mechanism's axis.
+    pole
+        The end of the primary axis that the leaning refers to; default ``axis_1``.
+    origin_1
+        Point on the primary axis, from the position, m.
+    origin_2
+        Point on the secondary axis, from ``origin_1``, m.
+    arm
+        From ``origin_2`` to where canting turns the mirror, m.
+    vertex
+        Mirror's vertex from there, m; it turns with the canting.
+    orientation
+        Rotation from the heliostat's frame to ENU, (..., 3, 3); default identity.
+    drives
+        Primary and secondary; default: counts are radians.
+
+    Raises
+    ------
+    InputError
+        If a direction is zero, the axes are parallel, the normal lies along the
+        secondary axis, or the orientation is no rotation.
+    """
+    p = as_vectors(position, "position")
+    a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
+    n = normalize(normal, "normal")
+    check_axes(a1, a2)
+    if (np.linalg.norm(np.cross(n, a2), axis=-1) < 1e-6).any():
+        raise InputError("normal: it lies along the secondary axis, which then cannot turn it")
+    end = a1 if pole is None else normalize(pole, "pole")
+    lean_names = _lean_names(end) if leans is None else leans
+    lean_axes = [normalize(np.cross(end, _LEANS[name]), "tilt axis") for name in lean_names]
+    steps = [
+        (f"tilt_{lean_names[0]}", lean_axes[0], origin_1),
+        (f"tilt_{lean_names[1]}", lean_axes[1], 0.0),
+        (names[0], a1, 0.0),
+        ("non_orthogonality", normalize(np.cross(a2, a1), "axis"), origin_2),
+        (names[1], a2, 0.0),
+        ("canting", normalize(np.cross(n, a2), "axis"), arm),
+        ("canting_secondary", a2, 0.0),
+    ]
+    return _assemble(kind, steps, (2, 4), p, orientation, drives, vertex, n)
+
+
+def _lean_names(end: FloatArray) -> tuple[str, str]:
+    first = end.reshape(-1, 3)[0]
+    kept = np.argsort(np.abs(first), kind="stable")[:2]
+    order = [("north", 1), ("east", 0), ("up", 2)]
+    found = [name for name, i in order if i in kept]
+    return found[0], found[1]
+
+
+def _assemble(
+    kind: str,
+    steps: list[tuple[str, FloatArray, npt.ArrayLike]],
+    driven: tuple[int, ...],
+    position: FloatArray,
+    orientation: npt.ArrayLike | None,
+    drives: tuple[Drive, ...] | None,
+    vertex: npt.ArrayLike,
+    normal: FloatArray,
+) -> Mechanism:
+    turned = np.eye(3) if orientation is None else as_float(orientation)
+    _check_rotation(turned)
+    tables = [d.table for d in (drives or tuple(direct() for _ in driven))]
+    if len(tables) != len(driven):
+        raise InputError(f"drives: {len(tables)} given; this kind has {len(driven)}")
+    v = as_vectors(vertex, "vertex")
+    offsets = [as_float(step[2]) for step in steps]
+    shape = np.broadcast_shapes(
+        position.shape[:-1], turned.shape[:-2], v.shape[:-1], normal.shape[:-1],
+        *(step[1].shape[:-1] for step in steps), *(o.shape[:-1] for o in offsets),
+        *(t.shape[:-1] for t in tables),
+    )  # fmt: skip
+
+    def spread(array: FloatArray, *tail: int) -> FloatArray:
+        return np.array(np.broadcast_to(array, (*shape, *tail)))
+
+    return Mechanism(
+        kind=kind,
+        joints=tuple(step[0] for step in steps),
+        driven=driven,
+        position=spread(position, 3),
+        orientation=spread(turned, 3, 3),
+        axes=np.stack([spread(step[1], 3) for step in steps], axis=-2),
+        origins=np.stack([spread(o, 3) for o in offsets], axis=-2),
+        angles=np.zeros((*shape, len(steps))),
+        drives=Drive(np.stack([spread(t, t.shape[-1]) for t in tables], axis=-2)),
+        vertex=spread(v, 3),
+        normal=spread(normal, 3),
+    )
+
+
+def _check_rotation(matrix: FloatArray) -> None:
+    if matrix.shape[-2:] != (3, 3) or not np.isfinite(matrix).all():
+        raise InputError("orientation: give finite rotation matrices of shape (..., 3, 3)")
+    deviation = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max()
+    if deviation > 1e-9 or (np.linalg.det(matrix) < 0).any():
+        raise InputError(
+            f"orientation: not a rotation (deviates by {deviation:.2g}, limit 1e-9); "
+            "its columns must be unit, perpendicular and right-handed"
+        )
+
+
+def azimuth_elevation(
+    position: npt.ArrayLike,
+    *,
+    pivot_height: npt.ArrayLike = 0.0,
+    pivot_offset: npt.ArrayLike = 0.0,
+    orientation: npt.ArrayLike | None = None,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return azimuth-elevation mechanisms.
+
+    At zero angles the mirror looks north; azimuth grows clockwise from north and
+    elevation upwards, so that without imperfections the joint angles are azimuth and
+    elevation of the normal.
+
+    Parameters
+    ----------
+    position
+        Foot of the pedestal, ENU metres, (..., 3).
+    pivot_height
+        Height of the crossing of the axes above it, m, (...).
+    pivot_offset
+        Distance of the mirror's surface in front of the pivot, m, (...).
+    orientation, drives
+        As for :func:`two_axis`.
+    """
+    height, front = as_float(pivot_height), as_float(pivot_offset)
+    return two_axis(
+        position, -UP, EAST, NORTH, kind="azimuth_elevation", names=("azimuth", "elevation"),
+        leans=("north", "east"), pole=UP, origin_1=height[..., None] * UP,
+        vertex=front[..., None] * NORTH, orientation=orientation, drives=drives,
+    )  # fmt: skip
+
+
+def tilt_roll(
+    position: npt.ArrayLike,
+    axis: npt.ArrayLike = (1.0, 0.0, 0.0),
+    *,
+    kind: str = "tilt_roll",
+    pivot_height: npt.ArrayLike = 0.0,
+    spacing: npt.ArrayLike = 0.0,
+    pivot_offset: npt.ArrayLike = 0.0,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return mechanisms whose first axis (tilt) lies along ``axis``.
+
+    At zero angles the mirror looks up as far as the first axis allows; the second
+    axis (roll) lies in the mirror's plane, perpendicular to the first.
+
+    Parameters
+    ----------
+    position
+        ENU metres, (..., 3).
+    axis
+        Direction of the first axis in ENU, (..., 3); it must not be vertical.
+    kind
+        Name of the kind.
+    pivot_height, spacing, pivot_offset
+        First axis above ground, second axis above the first, mirror's surface above
+        the second, m.
+    drives
+        Tilt and roll.
+
+    Raises
+    ------
+    InputError
+        If the first axis is vertical.
+    """
+    a1 = normalize(axis, "axis")
+    flat = np.linalg.norm(a1[..., :2], axis=-1)
+    if (flat < 1e-6).any():
+        raise InputError("axis: the first axis of a tilt-roll mechanism must not be vertical")
+    n = normalize(UP - a1[..., 2:] * a1, "normal")
+    height, gap, front = as_float(pivot_height), as_float(spacing), as_float(pivot_offset)
+    return two_axis(
+        position, a1, np.cross(n, a1), n, kind=kind, names=("tilt", "roll"),
+        origin_1=height[..., None] * UP, origin_2=gap[..., None] * n,
+        vertex=front[..., None] * n, drives=drives,
+    )  # fmt: skip
+
+
+def target_aligned(
+    position: npt.ArrayLike,
+    aim: npt.ArrayLike,
+    *,
+    pivot_height: npt.ArrayLike = 0.0,
+    pivot_offset: npt.ArrayLike = 0.0,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return target-aligned (spinning-elevation) mechanisms: the first axis points at ``aim``.
+
+    Parameters
+    ----------
+    position, aim
+        ENU metres, (..., 3).
+    pivot_height, pivot_offset, drives
+        As for :func:`tilt_roll`.
+    """
+    p, a = as_vectors(position, "position"), as_vectors(aim, "aim")
+    towards = a - (p + as_float(pivot_height)[..., None] * UP)
+    return tilt_roll(
+        p, towards, kind="target_aligned", pivot_height=pivot_height,
+        pivot_offset=pivot_offset, drives=drives,
+    )  # fmt: skip
+
+
+def pitch_roll(
+    position: npt.ArrayLike,
+    azimuth: npt.ArrayLike = 0.0,
+    *,
+    pivot_height: npt.ArrayLike = 0.0,
+    spacing: npt.ArrayLike = 0.0,
+    pivot_offset: npt.ArrayLike = 0.0,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return pitch-roll mechanisms: a horizontal first axis, at right angles to ``azimuth``.
+
+    A positive pitch leans the mirror, which looks up at zero angles, away from the
+    azimuth (rad) it faces; the roll axis lies in the mirror.
+    """
+    facing = as_float(azimuth)
+    axis = np.stack([np.cos(facing), -np.sin(facing), np.zeros_like(facing)], axis=-1)
+    return tilt_roll(
+        position, axis, kind="pitch_roll", pivot_height=pivot_height, spacing=spacing,
+        pivot_offset=pivot_offset, drives=drives,
+    )  # fmt: skip
+
+
+def polar(
+    position: npt.ArrayLike,
+    latitude: npt.ArrayLike,
+    *,
+    pivot_height: npt.ArrayLike = 0.0,
+    pivot_offset: npt.ArrayLike = 0.0,
+    drives: tuple[Drive, Drive] | None = None,
+) -> Mechanism:
+    """Return polar mechanisms: the first axis is parallel to the Earth's.
+
+    At zero angles the mirror looks at the crossing of the meridian and the celestial
+    equator; a positive declination turns it towards the north pole, and the hour angle
+    follows the sun westwards.
+
+    Parameters
+    ----------
+    position
+        ENU metres, (..., 3).
+    latitude
+        Radians, north positive, (...).
+    pivot_height, pivot_offset, drives
+        As for :func:`tilt_roll`.
+    """
+    phi = as_float(latitude)
+    zero = np.zeros_like(phi)
+    north_pole = np.stack([zero, np.cos(phi), np.sin(phi)], axis=-1)
+    equator = np.stack([zero, -np.sin(phi), np.cos(phi)], axis=-1)
+    height, front = as_float(pivot_height), as_float(pivot_offset)
+    return two_axis(
+        position, -north_pole, -EAST, equator, kind="polar", names=("hour_angle", "declination"),
+        leans=_lean_names(north_pole), pole=north_pole, origin_1=height[..., None] * UP,
+        vertex=front[..., None] * equator, drives=drives,
+    )  # fmt: skip
+
+
+def two_jacks(
+    position: npt.ArrayLike,
+    drives: tuple[Drive, Drive],
+    *,
+    joint_translation_1: npt.ArrayLike = (0.0, 0.0, 0.0),
+    joint_translation_2: npt.ArrayLike = (0.0, 0.0, 0.0),
+    concentrator_translation: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> Mechanism:
+    """Return the mechanism of Jülich's heliostats, moved by two linear actuators.
+
+    The first joint turns about east (elevation), the second about an axis that is up
+    in the frame of the first (azimuth); the mirror looks south at zero angles.
+
+    Parameters
+    ----------
+    position
+        ENU metres, (..., 3).
+    drives
+        Two of :func:`heliotrope.mechanism.drives.linear_paint`.
+    joint_translation_1, joint_translation_2, concentrator_translation
+        As in PAINT's heliostat properties, m, (..., 3).
+    """
+    return two_axis(
+        position, EAST, UP, -NORTH, kind="two_jacks", names=("elevation", "azimuth"),
+        leans=("up", "north"), origin_1=joint_translation_1, origin_2=joint_translation_2,
+        arm=concentrator_translation, drives=drives,
+    )  # fmt: skip
+
+
+def single_axis(
+    position: npt.ArrayLike,
+    axis: npt.ArrayLike,
+    normal: npt.ArrayLike = (0.0, 0.0, 1.0),
+    *,
+    pivot_height: npt.ArrayLike = 0.0,
+    vertex: npt.ArrayLike = (0.0, 0.0, 0.0),
+    drive: Drive | None = None,
+) -> Mechanism:
+    """Return single-axis trackers (parabolic trough, linear Fresnel).
+
+    Only the plane perpendicular to the axis can be served: source and destination are
+    projected on it (Grigoriev et al. 2021, (9)).
+
+    Parameters
+    ----------
+    position
+        ENU metres, (..., 3).
+    axis, normal
+        Axis, and normal at zero angle, ENU, (..., 3).
+    pivot_height
+        Axis above the position, m.
+    vertex
+        Mirror's vertex from the axis at zero angle, m.
+    drive
+        Default: counts are radians.
+
+    Raises
+    ------
+    InputError
+        If the normal lies along the axis.
+    """
+    p, a, n = as_vectors(position, "position"), normalize(axis, "axis"), normalize(normal, "normal")
+    if (np.linalg.norm(np.cross(a, n), axis=-1) < 1e-6).any():
+        raise InputError("normal: it lies along the axis, which then cannot turn it")
+    height = as_float(pivot_height)
+    lean_names = _lean_names(a)
+    steps = [
+        (f"tilt_{lean_names[0]}", normalize(np.cross(a, _LEANS[lean_names[0]])),
+         height[..., None] * UP),
+        (f"tilt_{lean_names[1]}", normalize(np.cross(a, _LEANS[lean_names[1]])), 0.0),
+        ("rotation", a, 0.0),
+    ]  # fmt: skip
+    drives = None if drive is None else (drive,)
+    return _assemble("single_axis", steps, (2,), p, None, drives, vertex, n)

@@ -1,0 +1,174 @@
+"""The parameters of a mechanism: one row each in one table, and the models.
+
+A parameter is never addressed by a number outside the compiled kernels. Its row says
+its unit, its physical cause with its positive sense, its names in the literature, and
+how far installation and survey let it stray (the prior's standard deviation).
+"""
+
+from dataclasses import dataclass, replace
+
+from heliotrope.errors import UnknownNameError
+from heliotrope.mechanism import _slots as slot
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A row of the parameter table.
+
+    Attributes
+    ----------
+    name
+        Its name, for example ``tilt_north``.
+    unit
+        "rad", "m" or "1" (relative).
+    cause
+        What it is in the machine.
+    positive
+        What a positive value means.
+    prior
+        Standard deviation before any measurement, in ``unit``.
+    aliases
+        Names in the literature.
+    code
+        What the kernels move: (kind, joint or drive, component).
+    """
+
+    name: str
+    unit: str
+    cause: str
+    positive: str
+    prior: float
+    aliases: tuple[str, ...] = ()
+    code: tuple[int, int, int] = (0, 0, 0)
+
+
+#: Rows that every mechanism has; their code does not depend on the joints.
+_PLACE = (
+    Parameter("position_east", "m", "survey error", "stands further east", 0.05,
+              ("Malan ΔE",), (slot.MOVES_POSITION, 0, 0)),
+    Parameter("position_north", "m", "survey error", "stands further north", 0.05,
+              ("Malan ΔN",), (slot.MOVES_POSITION, 0, 1)),
+    Parameter("position_up", "m", "survey error", "stands higher", 0.05,
+              ("Malan ΔZ",), (slot.MOVES_POSITION, 0, 2)),
+    Parameter("pivot_offset", "m", "distance of the mirror's surface from the pivot",
+              "surface further in front", 0.02, ("Guo H_z",), (slot.MOVES_ALONG_NORMAL, 0, 0)),
+)  # fmt: skip
+
+#: Rows by the name of a fixed joint.
+_JOINTS = {
+    row.name: row
+    for row in (
+        Parameter("tilt_north", "rad", "pedestal not upright", "primary axis leans to north",
+                  0.010, ("Malan ε_ptN", "Guo ψ_t, ψ_a in polar form")),
+        Parameter("tilt_east", "rad", "pedestal not upright", "primary axis leans to east",
+                  0.010, ("Malan ε_ptE", "Guo ψ_t, ψ_a in polar form")),
+        Parameter("tilt_up", "rad", "primary bearing not level", "primary axis leans up",
+                  0.010, ("PAINT −first_joint_tilt_n",)),
+        Parameter("non_orthogonality", "rad", "secondary axis not perpendicular to primary",
+                  "secondary axis leans towards the positive primary axis", 0.005,
+                  ("Malan ε_NO", "Guo −τ₁", "PAINT second_joint_tilt_n")),
+        Parameter("canting", "rad", "normal not perpendicular to the secondary axis",
+                  "normal leans towards the positive secondary axis", 0.005,
+                  ("Guo μ", "boresight (Khalsa)")),
+        Parameter("canting_secondary", "rad", "normal turned about the secondary axis",
+                  "right-handed about it", 0.005),
+    )
+}  # fmt: skip
+
+#: Rows of a drive: (suffix, slot, row). The name is "<joint>_<suffix>".
+_ANY_DRIVE = (
+    ("bias", slot.BIAS, Parameter("", "rad", "encoder zero", "actual = ideal + bias", 0.010,
+     ("Malan γ_bias, α_bias", "Guo γ₀, α₀"))),
+    ("scale", slot.SCALE, Parameter("", "1", "gear ratio error", "moves further than ideal",
+     1e-3, ("Baheti & Scott", "linear error (Khalsa)"))),
+    ("worm_cos", slot.WORM_COS, Parameter("", "rad", "once-per-turn gear error, cosine part",
+     "adds cos(ratio · angle)", 0.002, ("Malan (6.1)",))),
+    ("worm_sin", slot.WORM_SIN, Parameter("", "rad", "once-per-turn gear error, sine part",
+     "adds sin(ratio · angle)", 0.002, ("Malan (6.1)",))),
+)  # fmt: skip
+
+_LINEAR_DRIVE = (
+    ("stroke_offset", slot.STROKE, Parameter("", "m", "length of the jack at 0 counts",
+     "longer", 0.005, ("PAINT initial_stroke_length",))),
+    ("initial_angle", slot.ZERO, Parameter("", "rad", "angle at 0 counts", "larger", 0.020,
+     ("PAINT initial_angle",))),
+    ("offset", slot.OFFSET, Parameter("", "m", "joint to the fixed end", "longer", 0.003,
+     ("PAINT offset",))),
+    ("pivot_radius", slot.RADIUS, Parameter("", "m", "joint to the moving end", "longer", 0.003,
+     ("PAINT pivot_radius",))),
+)  # fmt: skip
+
+_SAG = Parameter("sag", "rad", "gravity bends the structure, ∝ cos(elevation)",
+                 "adds to the angle of the elevation joint", 0.002,
+                 ("Stone & Kiefer",))  # fmt: skip
+
+
+def table(
+    joints: tuple[str, ...], driven: tuple[int, ...], linear: tuple[bool, ...]
+) -> dict[str, Parameter]:
+    """Return the parameter table of a kind of mechanism, by name.
+
+    Parameters
+    ----------
+    joints
+        Names of the joints from ground to mirror.
+    driven
+        Indices of the driven joints.
+    linear
+        For each driven joint, whether its drive is a jack.
+    """
+    rows = list(_PLACE)
+    for index, name in enumerate(joints):
+        if name in _JOINTS:
+            rows.append(replace(_JOINTS[name], code=(slot.MOVES_JOINT, index, 0)))
+    for d, index in enumerate(driven):
+        kinds = _ANY_DRIVE + (_LINEAR_DRIVE if linear[d] else ())
+        for suffix, place, row in kinds:
+            name = f"{joints[index]}_{suffix}"
+            rows.append(
+                replace(
+                    row, name=name, cause=f"{joints[index]}: {row.cause}",
+                    code=(slot.MOVES_DRIVE, d, place),
+                )
+            )  # fmt: skip
+        if joints[index] == "elevation":
+            rows.append(replace(_SAG, code=(slot.MOVES_DRIVE, d, slot.SAG)))
+    return {row.name: row for row in rows}
+
+
+_POSITION = ("position_east", "position_north", "position_up")
+_AZEL = ("tilt_north", "tilt_east", "azimuth_bias", "elevation_bias", "non_orthogonality")
+_JACKS = (
+    "tilt_north", "tilt_up", "non_orthogonality", "canting",
+    "elevation_initial_angle", "azimuth_initial_angle",
+    "elevation_stroke_offset", "azimuth_stroke_offset",
+    "elevation_offset", "azimuth_offset",
+)  # fmt: skip
+
+#: Named subsets to be estimated. ``full`` is every row but the worm, whose ratio must be known.
+MODELS: dict[str, tuple[str, ...]] = {
+    "malan8": _POSITION + _AZEL,
+    "guo6": (*_AZEL, "canting"),
+    "khalsa8": (*_AZEL, "canting", "azimuth_scale", "elevation_scale"),
+    "jacks": _JACKS,
+}
+
+
+def model(name: str, known: dict[str, Parameter]) -> tuple[str, ...]:
+    """Return the parameter names of model ``name`` for a mechanism with table ``known``.
+
+    Raises
+    ------
+    UnknownNameError
+        If there is no such model, or the mechanism lacks one of its parameters.
+    """
+    if name == "full":
+        return tuple(n for n in known if "_worm_" not in n and not n.endswith("pivot_radius"))
+    if name not in MODELS:
+        raise UnknownNameError("model", name, [*MODELS, "full"])
+    for parameter in MODELS[name]:
+        if parameter not in known:
+            raise UnknownNameError(
+                f"parameter (of model {name!r}) in this kind of mechanism:", parameter, known
+            )
+    return MODELS[name]

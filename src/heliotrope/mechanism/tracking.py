@@ -1,0 +1,234 @@
+"""Tracking: where the drives must stand so that the beam reaches its aim.
+
+Global aiming sends light from a direction (the sun) to a point in the field; local
+aiming sends it to a point that is fixed to the mirror (dish, CPV, trough). Both run
+on the armature, hence for every mechanism and every error model alike.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors
+from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism._track_block import track_block
+from heliotrope.mechanism._track_kernels import (
+    DEGENERATE,
+    NOT_CONVERGED,
+    OK,
+    STOPPED,
+    UNREACHABLE,
+)
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive, direct
+from heliotrope.parallel import run_blocks
+
+Branch = Literal["both", 0, 1]
+
+
+class Status(IntEnum):
+    """How a solution ended."""
+
+    OK = OK
+    UNREACHABLE = UNREACHABLE
+    STOPPED = STOPPED
+    NOT_CONVERGED = NOT_CONVERGED
+    DEGENERATE = DEGENERATE
+
+    @property
+    def text(self) -> str:
+        """One sentence on what it means."""
+        return _TEXTS[self]
+
+
+_TEXTS = {
+    Status.OK: "the beam reaches its aim",
+    Status.UNREACHABLE: "the axes cannot turn the mirror there; this is the nearest pose",
+    Status.STOPPED: "a stop is in the way; this is the nearest pose within the stops",
+    Status.NOT_CONVERGED: "the iteration did not settle; do not use this pose",
+    Status.DEGENERATE: "no mirror can do it: source and aim are opposite, or the aim is in the "
+    "mirror",
+}
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Solutions of one or both branches; B branches, D drives.
+
+    Attributes
+    ----------
+    angles
+        Joint angles, rad, (..., B, D).
+    counts
+        Drive counts, real numbers, (..., B, D).
+    normal, vertex
+        Pose of the mirror, ENU, (..., B, 3).
+    status
+        :class:`Status` as integers, (..., B).
+    residual
+        Angle of the normal from where it should be, rad, (..., B).
+    iterations
+        (..., B).
+    best
+        The branch to take, (...): one that reaches the aim with the least motion from
+        the current counts, else the one with the smallest residual.
+    """
+
+    angles: FloatArray
+    counts: FloatArray
+    normal: FloatArray
+    vertex: FloatArray
+    status: npt.NDArray[np.int8]
+    residual: FloatArray
+    iterations: npt.NDArray[np.int32]
+    best: npt.NDArray[np.int8]
+
+    @property
+    def reachable(self) -> npt.NDArray[np.bool_]:
+        """Whether the beam reaches its aim, (..., B)."""
+        return self.status == Status.OK
+
+    def chosen(self, values: np.ndarray) -> np.ndarray:
+        """Return the best branch's part of one of the arrays above, (..., rest)."""
+        extra = values.ndim - self.best.ndim - 1
+        index = self.best.reshape(*self.best.shape, 1, *(1,) * extra).astype(np.intp)
+        return np.take_along_axis(values, index, axis=self.best.ndim).squeeze(self.best.ndim)
+
+
+def track(
+    mechanism: Mechanism | Armature,
+    sun: npt.ArrayLike,
+    aim: npt.ArrayLike,
+    *,
+    drives: Drive | None = None,
+    current: npt.ArrayLike | None = None,
+    branch: Branch = "both",
+    local: bool = False,
+    tolerance: float = 1e-9,
+    max_iterations: int = 50,
+    newton: bool = True,
+) -> Tracking:
+    """Return the drive positions that send light from the sun to the aim.
+
+    All batch shapes broadcast: heliostats with one sun, one heliostat with a day of
+    suns, or (times, 1) suns with (heliostats,) mechanisms.
+
+    Parameters
+    ----------
+    mechanism
+        Mechanisms, or armatures.
+    sun
+        Unit vectors to the source, ENU, (..., 3).
+    aim
+        Points in ENU metres, (..., 3); with ``local`` the points fixed to the mirror,
+        where they are at zero joint angles.
+    drives
+        Batch shape (..., D); default the mechanism's, or radians for an armature.
+    current
+        Counts where the drives stand, (..., D). Decides between the branches and
+        between angles that differ by a turn; without it the middle of the stops does.
+    branch
+        "both", or the one to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
+    local
+        Aim at a point fixed to the mirror.
+    tolerance
+        Largest miss of the beam at the aim, m.
+    max_iterations
+        Of the fixed point.
+    newton
+        Whether Newton takes over where the fixed point converges slowly.
+
+    Returns
+    -------
+    Poses that cannot be reached are the nearest ones, and say so in ``status`` and
+    ``residual``; they raise nothing.
+
+    Raises
+    ------
+    InputError
+        If an input is not finite, a sun is not a unit vector, or shapes do not fit.
+
+    Notes
+    -----
+    Grigoriev et al. 2021, (3)-(9). The fixed point on the vertex contracts by about
+    offset / (2 · slant · sin ζ), ζ being the angle from the primary axis; where a step
+    gains less than a factor of 3.3, Newton with the screw derivative takes over.
+    """
+    armature, table = _tables(mechanism, drives)
+    s, p = as_vectors(sun, "sun"), as_vectors(aim, "aim")
+    if (np.abs(np.sum(s * s, axis=-1) - 1.0) > 1e-6).any():
+        raise InputError("sun: a vector's length differs from 1 by more than 5e-7; normalise it")
+    if branch not in ("both", 0, 1):
+        raise InputError(f"branch {branch!r}: give 'both', 0 or 1")
+    if not (np.isfinite(tolerance) and tolerance > 0 and max_iterations >= 1):
+        raise InputError(
+            f"tolerance {tolerance} m and max_iterations {max_iterations} must be above 0"
+        )
+    axes = table.shape[-2]
+    now = None if current is None else _current(current, axes)
+    batches = [armature.shape, table.shape[:-2], s.shape[:-1], p.shape[:-1]]
+    batches += [] if now is None else [now.shape[:-1]]
+    try:
+        shape = np.broadcast_shapes(*batches)
+    except ValueError:
+        raise InputError(
+            f"shapes of mechanism {armature.shape}, sun {s.shape[:-1]}, aim {p.shape[:-1]} and "
+            "current counts do not fit together"
+        ) from None
+    rows = int(np.prod(shape, dtype=np.int64))
+    index = np.full((rows, 5), -1, dtype=np.int64)
+    for column, batch in enumerate(batches):
+        place = np.arange(int(np.prod(batch, dtype=np.int64))).reshape(batch)
+        index[:, column] = np.broadcast_to(place, shape).ravel()
+    many = 2 if branch == "both" else 1
+    result = Tracking(
+        angles=np.empty((rows, many, axes)),
+        counts=np.empty((rows, many, axes)),
+        normal=np.empty((rows, many, 3)),
+        vertex=np.empty((rows, many, 3)),
+        status=np.empty((rows, many), dtype=np.int8),
+        residual=np.empty((rows, many)),
+        iterations=np.empty((rows, many), dtype=np.int32),
+        best=np.empty(rows, dtype=np.int8),
+    )
+    arguments = (
+        _flat(armature.table, slot.ARMATURE_SIZE), _flat(table, axes, slot.DRIVE_SLOTS),
+        _flat(s, 3), _flat(p, 3), np.empty((0, axes)) if now is None else _flat(now, axes),
+        index, local, 2 if branch == "both" else int(branch), float(tolerance),
+        int(max_iterations), newton, result.angles, result.counts, result.normal, result.vertex,
+        result.status, result.iterations, result.residual, result.best,
+    )  # fmt: skip
+    run_blocks(lambda a, b: track_block(*arguments, a, b), rows)
+    return Tracking(
+        **{name: array.reshape((*shape, *array.shape[1:])) for name, array in vars(result).items()}
+    )
+
+
+def _tables(mechanism: Mechanism | Armature, drives: Drive | None) -> tuple[Armature, FloatArray]:
+    if isinstance(mechanism, Mechanism):
+        table = mechanism.drives.table if drives is None else drives.table
+        axes = len(mechanism.driven)
+        armature = mechanism.armature
+    else:
+        armature = mechanism
+        axes = 2
+        table = np.stack([direct().table] * 2) if drives is None else drives.table
+    if table.ndim < 2 or table.shape[-2] != axes:
+        raise InputError(f"drives: batch shape {table.shape[:-1]}; its last axis must be {axes}")
+    return armature, table
+
+
+def _current(current: npt.ArrayLike, axes: int) -> FloatArray:
+    counts = as_float(current)
+    if counts.ndim == 0 or counts.shape[-1] != axes or not np.isfinite(counts).all():
+        raise InputError(f"current: give finite counts of the {axes} drives, shape (..., {axes})")
+    return counts
+
+
+def _flat(array: FloatArray, *tail: int) -> FloatArray:
+    return np.ascontiguousarray(array).reshape(-1, *tail)

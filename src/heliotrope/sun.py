@@ -1,0 +1,520 @@
+"""The sun: where it stands, as angles and as a vector, and when it rises and sets.
+
+Positions come from NREL's solar position algorithm (Reda & Andreas 2004, "SPA") as
+pvlib implements it, with the pressure and temperature of the site. *True* means
+without the atmosphere, *apparent* with its refraction: the sun as a mirror sees it.
+Refraction lifts the sun by 1.5 mrad at 10° of elevation and by 0.3 mrad at 45°, so
+mirrors track the apparent sun.
+
+Times carry a time zone or they are refused; inside they are unix seconds (UTC).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from numbers import Real
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError, TimeError, UnknownNameError
+from heliotrope.geometry import FloatArray, as_float, direction, wrap_positive
+from heliotrope.parallel import run_blocks
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: What is taken as time: an aware datetime, an ISO 8601 text with an offset or Z, unix
+#: seconds (UTC), a list or an array of these, or a time-zone aware pandas index or column.
+Times: TypeAlias = datetime | Sequence[datetime] | npt.ArrayLike
+
+#: True elevation of the sun's centre at rise and set by convention: 34′ of refraction
+#: and 16′ of the sun's radius below the horizon, so that the upper limb touches it.
+UPPER_LIMB = float(np.radians(-0.8333))
+
+#: Refraction at the horizon in degrees, by which SPA decides whether the sun is up.
+HORIZON_REFRACTION_DEG = 0.5667
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_DAY = 86400.0
+_FIRST_YEAR, _LAST_YEAR = -2000, 6000  # validity of SPA
+_FIRST_DELTA_T, _LAST_DELTA_T = -1999, 3000  # validity of pvlib's polynomials of ΔT
+# pvlib holds some twenty intermediate arrays at a time: 3 MB a chunk stay in the cache.
+_CHUNK = 16384
+
+
+@dataclass(frozen=True)
+class Site:
+    """A place on Earth and its air.
+
+    Parameters
+    ----------
+    latitude_deg
+        North positive, −90 to 90 (WGS84).
+    longitude_deg
+        East positive, −180 to 180.
+    height
+        Above the ellipsoid in m, −500 to 9000.
+    pressure
+        Air pressure at the site (not reduced to sea level) in Pa, 30,000 to 120,000;
+        None takes the standard atmosphere at ``height``.
+    temperature_c
+        Air temperature in °C, −90 to 60.
+    name
+        For people; nothing depends on it.
+    delta_t
+        TT − UT1 in s, −8000 to 8000; None takes pvlib's polynomials by year and month
+        (Espenak & Meeus), which were 5 s too high in 2025: 1 µrad of sun.
+
+    Raises
+    ------
+    InputError
+        If a number is missing, not finite or out of its range.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height: float
+    pressure: float | None = None
+    temperature_c: float = 12.0
+    name: str = ""
+    delta_t: float | None = None
+
+    def __post_init__(self) -> None:
+        for field, low, high, unit, advice in _SITE_LIMITS:
+            value = getattr(self, field)
+            if value is None and field in {"pressure", "delta_t"}:
+                continue
+            if not low <= _number(value) <= high:
+                raise InputError(
+                    f"site {self.name!r}: {field} = {value} {unit} is not a number from "
+                    f"{low:g} to {high:g} {unit}; {advice}"
+                )
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Latitude and longitude in degrees and height in m: the origin of ENU frames."""
+        return self.latitude_deg, self.longitude_deg, self.height
+
+    @property
+    def air_pressure(self) -> float:
+        """``pressure``, or that of the standard atmosphere at ``height``, in Pa."""
+        if self.pressure is not None:
+            return self.pressure
+        from pvlib.atmosphere import alt2pres
+
+        return float(alt2pres(self.height))
+
+
+_SITE_LIMITS = (
+    ("latitude_deg", -90.0, 90.0, "°", "north is positive"),
+    ("longitude_deg", -180.0, 180.0, "°", "east is positive"),
+    ("height", -500.0, 9000.0, "m", "give metres above the ellipsoid"),
+    ("pressure", 3e4, 1.2e5, "Pa", "give pascal (1 hPa is 100 Pa)"),
+    ("temperature_c", -90.0, 60.0, "°C", "give degrees Celsius (0 °C is 273.15 K)"),
+    ("delta_t", -8000.0, 8000.0, "s", "give TT − UT1 in seconds, about 69 in 2025"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SunPosition:
+    """Where the sun stands; the shape (...) is that of the times asked for.
+
+    Attributes
+    ----------
+    azimuth
+        Clockwise from north in [0, 2π), shape (...), rad.
+    elevation
+        Apparent (refracted) elevation of the sun's centre, shape (...), rad. Below a
+        true elevation of −0.8334° it is the true one: SPA switches refraction off
+        there, and the elevation jumps by 0.6°.
+    true_elevation
+        Without the atmosphere, shape (...), rad.
+    vector
+        Unit vectors to the apparent sun, ENU, shape (..., 3).
+    true_vector
+        Unit vectors to the true sun, ENU, shape (..., 3).
+    """
+
+    azimuth: FloatArray
+    elevation: FloatArray
+    true_elevation: FloatArray
+    vector: FloatArray
+    true_vector: FloatArray
+
+
+@dataclass(frozen=True)
+class SunEvents:
+    """Rise, culmination and set of one solar day, in UTC.
+
+    Attributes
+    ----------
+    sunrise, sunset
+        None where the sun does not cross the elevation asked for: both in a polar
+        night; in a polar day at least one (the first and last day of it have one).
+    culmination
+        When the sun crosses the meridian on its upper side.
+    culmination_elevation
+        Apparent elevation then, rad.
+    kind
+        "polar night": below the elevation asked for when it culminates; "normal": it
+        rises and sets; "polar day": any other.
+    """
+
+    sunrise: datetime | None
+    sunset: datetime | None
+    culmination: datetime
+    culmination_elevation: float
+    kind: Literal["normal", "polar day", "polar night"]
+
+
+def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition:
+    """Return the position of the sun.
+
+    Parameters
+    ----------
+    times
+        Of any shape (...): see ``Times``. Numbers are unix seconds (UTC).
+    site
+        Place, pressure and temperature.
+    algorithm
+        "spa" is the only one.
+
+    Raises
+    ------
+    TimeError
+        If a time has no time zone, is not a time, or lies outside the years −2000 to
+        6000 (−1999 to 3000 without ``Site.delta_t``).
+    InputError
+        If ``algorithm`` is Grena's of 2008, which expired with 2022.
+    UnknownNameError
+        If ``algorithm`` is any other.
+
+    Notes
+    -----
+    Source: Reda & Andreas (2004), equations 4 to 47; refraction is their equation 42
+    with the pressure and temperature of the site. Accuracy: ±5 µrad (0.0003°) by the
+    authors, ±5 µrad against IAU 2006/2000A (ERFA) for 2020 to 2035, refraction
+    and UT1 − UTC (below 0.9 s, 65 µrad) apart. Refraction close to the horizon varies
+    with the weather by more than 1 mrad.
+    """
+    if algorithm.casefold() in {"grena", "grena2008"}:
+        raise InputError(
+            f"algorithm {algorithm!r} is refused: it is out of its validity since 2023 "
+            "and 1.6 mrad wrong in 2029; use 'spa'"
+        )
+    if algorithm != "spa":
+        raise UnknownNameError("sun algorithm", algorithm, ["spa"])
+    seconds = _unix_seconds(times)
+    _check_years(seconds, site)
+    azimuth, elevation, true_elevation = np.radians(_spa(seconds.ravel(), site)).reshape(
+        3, *seconds.shape
+    )
+    azimuth = wrap_positive(azimuth)
+    return SunPosition(
+        azimuth=azimuth,
+        elevation=as_float(elevation),
+        true_elevation=as_float(true_elevation),
+        vector=direction(azimuth, elevation),
+        true_vector=direction(azimuth, true_elevation),
+    )
+
+
+def vector(times: Times, site: Site, *, apparent: bool = True) -> FloatArray:
+    """Return unit vectors to the sun, ENU, shape (..., 3).
+
+    Parameters
+    ----------
+    times, site
+        As for `position`, with its errors and accuracy.
+    apparent
+        With refraction, as mirrors see it (default), or without.
+    """
+    sun = position(times, site)
+    return sun.vector if apparent else sun.true_vector
+
+
+def events(
+    day: date | str, site: Site, *, elevation: float = UPPER_LIMB, apparent: bool = False
+) -> SunEvents:
+    """Return sunrise, culmination and sunset of a solar day.
+
+    Parameters
+    ----------
+    day
+        Date of local mean solar time, that is by longitude and not by any civil time
+        zone; a date or an ISO text. The day is the 12 hours before and after the
+        culmination.
+    site
+        Place, pressure and temperature.
+    elevation
+        Of the sun's centre when it rises and sets, rad. By default the convention for
+        the upper limb, −0.8333° of true elevation.
+    apparent
+        Whether ``elevation`` is the apparent one. It must then not be negative, for
+        the apparent elevation jumps below the horizon (see `SunPosition`).
+
+    Raises
+    ------
+    TimeError
+        If ``day`` is not a date, or lies outside the years of `position`.
+    InputError
+        If ``elevation`` is not within −π/2 to π/2, or is apparent and negative.
+
+    Notes
+    -----
+    At sunrise and sunset `position` gives the elevation asked for to 0.1 µrad, which is
+    2 ms where the sun climbs by 11° an hour. The weather's refraction makes a real
+    sunrise uncertain by a minute.
+    """
+    from scipy.interpolate import CubicSpline
+
+    noon = _mean_noon(day, site)
+    level = float(np.sin(_true_level(elevation, site) if apparent else _checked(elevation)))
+    # The components of the true vector are nearly sinusoids of the day. A cubic spline
+    # through 10-minute nodes follows them to (ωh)⁴/384 = 1e-8.
+    offsets = np.arange(-13 * 3600.0, 13 * 3600.0 + 1.0, 600.0)
+    sun = vector(noon + offsets, site, apparent=False)
+    meridian = CubicSpline(offsets, sun[:, 0]).roots(extrapolate=False)
+    # The equation of time stays within 20 minutes.
+    culmination = float(meridian[np.abs(meridian).argmin()])
+    height = CubicSpline(offsets, sun[:, 2])
+    crossings = height.solve(level, extrapolate=False)
+    up = height(crossings, 1) > 0
+    half_day = np.abs(crossings - culmination) <= 0.5 * _DAY
+    rises = crossings[half_day & up & (crossings < culmination)]
+    sets = crossings[half_day & ~up & (crossings > culmination)]
+    night = float(height(culmination)) < level
+    sunrise = None if night or not rises.size else _utc(noon + rises[-1])
+    sunset = None if night or not sets.size else _utc(noon + sets[0])
+    kind: Literal["normal", "polar day"] = "normal" if sunrise and sunset else "polar day"
+    return SunEvents(
+        sunrise=sunrise,
+        sunset=sunset,
+        culmination=_utc(noon + culmination),
+        culmination_elevation=float(position(noon + culmination, site).elevation),
+        kind="polar night" if night else kind,
+    )
+
+
+def daylight(
+    day: date | str,
+    site: Site,
+    *,
+    every: timedelta = timedelta(minutes=1),
+    min_elevation: float = 0.0,
+) -> "pd.DatetimeIndex":
+    """Return the times of a solar day at which the sun is up, in UTC.
+
+    Parameters
+    ----------
+    day
+        Date of local mean solar time, as for `events`. The days of a year follow each
+        other without gap or overlap.
+    site
+        Place, pressure and temperature.
+    every
+        Step, 0.1 s to a day. Times are whole multiples of it since 1970, so that two
+        sites or two days share one grid.
+    min_elevation
+        Lowest apparent elevation to keep, rad.
+
+    Returns
+    -------
+    Index of aware times, empty in a polar night; `position` takes it as it is.
+
+    Raises
+    ------
+    TimeError
+        If ``day`` is not a date, or lies outside the years of `position`.
+    InputError
+        If ``every`` or ``min_elevation`` is out of its range.
+    """
+    import pandas as pd
+
+    limit = _checked(min_elevation, "min_elevation")
+    if not timedelta(seconds=0.1) <= every <= timedelta(days=1):
+        raise InputError(f"every: {every} is not within 0.1 s to 1 day")
+    step = every.total_seconds()
+    noon = _mean_noon(day, site)
+    first, last = np.ceil((noon + np.array([-0.5, 0.5]) * _DAY) / step)
+    seconds = np.arange(first, last) * step
+    seconds = seconds[position(seconds, site).elevation >= limit]
+    stamps = np.round(seconds * 1e6).astype(np.int64).astype("datetime64[us]")
+    return pd.DatetimeIndex(stamps).tz_localize("UTC")
+
+
+def _spa(seconds: FloatArray, site: Site) -> FloatArray:
+    """Azimuth, apparent and true elevation in degrees, shape (3, n), of n unix times.
+
+    Chunks have fixed borders, so memory is bounded (340 MB for a million times in one
+    piece) and the outcome cannot depend on the number of threads.
+    """
+    from pvlib import spa
+
+    result = np.empty((3, seconds.size))
+    pressure_hpa = site.air_pressure / 100.0
+
+    def run(start: int, stop: int) -> None:
+        for chunk in range(start, stop):
+            rows = slice(chunk * _CHUNK, (chunk + 1) * _CHUNK)
+            _, _, apparent, true, azimuth, _ = spa.solar_position(
+                seconds[rows],
+                *site.origin,
+                pressure_hpa,
+                site.temperature_c,
+                _delta_t(seconds[rows], site),
+                HORIZON_REFRACTION_DEG,
+                numthreads=1,
+            )
+            result[:, rows] = azimuth, apparent, true
+
+    run_blocks(run, -(-seconds.size // _CHUNK), minimum_rows=2)
+    return result
+
+
+def _delta_t(seconds: FloatArray, site: Site) -> FloatArray:
+    from pvlib import spa
+
+    if site.delta_t is not None:
+        return np.full(seconds.shape, site.delta_t)
+    months = np.floor(seconds).astype("datetime64[s]").astype("datetime64[M]").astype(np.int64)
+    return as_float(spa.calculate_deltat(1970 + months // 12, months % 12 + 1))
+
+
+def _true_level(apparent: float, site: Site) -> float:
+    """Return the true elevation at which SPA's refraction gives ``apparent``."""
+    from pvlib import spa
+    from scipy.optimize import brentq
+
+    if _checked(apparent) < 0.0:
+        raise InputError(
+            f"elevation: {apparent:g} rad is below the horizon, where the apparent "
+            "elevation jumps; give at least 0, or the true elevation with apparent=False"
+        )
+    target = float(np.degrees(apparent))
+
+    def excess(true: float) -> float:
+        refraction = spa.atmospheric_refraction_correction(
+            site.air_pressure / 100.0, site.temperature_c, true, HORIZON_REFRACTION_DEG
+        )
+        return true + float(refraction) - target
+
+    # Below 0.8° at the horizon for any air that Site accepts, and −0.0001° at the zenith.
+    return float(np.radians(brentq(excess, target - 0.8, target + 0.001)))
+
+
+def _number(value: Any) -> float:
+    """Return a number as float, and NaN, which no range holds, for anything else."""
+    return float(value) if isinstance(value, Real) and type(value) is not bool else np.nan
+
+
+def _checked(elevation: float, name: str = "elevation") -> float:
+    if not -np.pi / 2 <= _number(elevation) <= np.pi / 2:
+        raise InputError(
+            f"{name}: {elevation} rad is not within −π/2 to π/2; degrees need numpy.radians"
+        )
+    return float(elevation)
+
+
+def _mean_noon(day: Any, site: Site) -> float:
+    """Return local mean solar noon in unix seconds: 4 minutes later a degree westwards."""
+    if isinstance(day, str):
+        try:
+            day = date.fromisoformat(day)
+        except ValueError:
+            raise TimeError(f"day: {day!r} is not an ISO 8601 date like 2024-06-21") from None
+    if isinstance(day, datetime) or not isinstance(day, date):
+        raise TimeError(f"day: {day!r} is not a date; give a datetime.date or an ISO date")
+    if day == date.min:
+        raise TimeError(f"day: {day} begins before the calendar of datetime; give a later day")
+    midnight = (day - _EPOCH.date()).days * _DAY
+    return midnight + _DAY * (0.5 - site.longitude_deg / 360.0)
+
+
+def _utc(seconds: float) -> datetime:
+    return _EPOCH + timedelta(seconds=float(seconds))
+
+
+def _unix_seconds(times: Times) -> FloatArray:
+    """Return ``times`` as finite unix seconds of the same shape."""
+    import pandas as pd
+
+    if isinstance(times, pd.Series | pd.Index) and isinstance(times.dtype, pd.DatetimeTZDtype):
+        seconds = as_float((pd.DatetimeIndex(times) - _EPOCH) / pd.Timedelta(seconds=1))
+    else:
+        try:
+            array = np.asarray(times)
+        except ValueError:
+            raise TimeError("times: the lists in it differ in length") from None
+        if array.dtype.kind == "M":
+            raise TimeError(
+                f"times: {array.dtype} has no time zone; say which one, for example "
+                "pandas.DatetimeIndex(times).tz_localize('UTC')"
+            )
+        if array.dtype.kind in "iuf":
+            seconds = as_float(array)
+        else:
+            seconds = np.empty(array.shape)
+            for index, value in np.ndenumerate(array):
+                seconds[index] = _one_time(value, index)
+    for index in np.argwhere(~np.isfinite(seconds))[:1]:
+        raise TimeError(f"{_label(tuple(index))}: missing or not finite; leave it out")
+    return seconds
+
+
+def _one_time(value: Any, index: tuple[int, ...]) -> float:
+    import pandas as pd
+
+    time = value
+    if isinstance(value, str):
+        try:
+            time = datetime.fromisoformat(value)
+        except ValueError:
+            raise TimeError(
+                f"{_label(index)}: '{value}' is not an ISO 8601 time; "
+                "write it like 2024-06-21T12:00:00+02:00"
+            ) from None
+    if time is pd.NaT:
+        return np.nan
+    if isinstance(time, Real) and type(time) is not bool:
+        return float(time)
+    if not isinstance(time, datetime):
+        raise TimeError(
+            f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
+            "text with an offset, or unix seconds"
+        )
+    if time.utcoffset() is None:
+        raise TimeError(
+            f"{_label(index)}: {time} has no time zone; add one, for example "
+            "tzinfo=datetime.UTC, or an offset such as +02:00 or Z in a text"
+        )
+    return time.timestamp()
+
+
+def _label(index: tuple[int, ...]) -> str:
+    return f"times[{', '.join(str(i) for i in index)}]" if index else "times"
+
+
+def _check_years(seconds: FloatArray, site: Site) -> None:
+    """Refuse times for which SPA, or its ΔT, is not made."""
+    _refuse_outside(
+        seconds, _FIRST_YEAR, _LAST_YEAR, "the validity of SPA; numbers are unix seconds"
+    )
+    if site.delta_t is None:
+        _refuse_outside(
+            seconds, _FIRST_DELTA_T, _LAST_DELTA_T, "the known ΔT; give Site(delta_t=...) in s"
+        )
+
+
+def _refuse_outside(seconds: FloatArray, first: int, last: int, advice: str) -> None:
+    low, high = (
+        float(np.datetime64(year - 1970, "Y").astype("datetime64[s]").astype(np.int64))
+        for year in (first, last + 1)
+    )
+    for index in np.argwhere((seconds < low) | (seconds >= high))[:1]:
+        raise TimeError(
+            f"{_label(tuple(index))}: {seconds[tuple(index)]:.17g} s since 1970 is outside "
+            f"the years {first} to {last}, {advice}"
+        )
