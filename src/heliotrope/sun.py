@@ -33,8 +33,9 @@ Times: TypeAlias = datetime | Sequence[datetime] | npt.ArrayLike
 #: and 16′ of the sun's radius below the horizon, so that the upper limb touches it.
 UPPER_LIMB = float(np.radians(-0.8333))
 
-#: Refraction at the horizon in degrees, by which SPA decides whether the sun is up.
-HORIZON_REFRACTION_DEG = 0.5667
+# SPA switches refraction off where the sun's centre stands lower than this, in degrees.
+_HORIZON_REFRACTION_DEG = 0.5667
+_LOWEST_REFRACTED_DEG = -(0.26667 + _HORIZON_REFRACTION_DEG)
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _DAY = 86400.0
@@ -310,8 +311,8 @@ def daylight(
     Parameters
     ----------
     day
-        Date of local mean solar time, as for `events`. The days of a year follow each
-        other without gap or overlap.
+        Date of local mean solar time. The day is the 12 hours before and after mean
+        noon, so that days follow each other without gap or overlap.
     site
         Place, pressure and temperature.
     every
@@ -365,7 +366,7 @@ def _spa(seconds: FloatArray, site: Site) -> FloatArray:
                 pressure_hpa,
                 site.temperature_c,
                 _delta_t(seconds[rows], site),
-                HORIZON_REFRACTION_DEG,
+                _HORIZON_REFRACTION_DEG,
                 numthreads=1,
             )
             result[:, rows] = azimuth, apparent, true
@@ -397,17 +398,22 @@ def _true_level(apparent: float, site: Site) -> float:
 
     def excess(true: float) -> float:
         refraction = spa.atmospheric_refraction_correction(
-            site.air_pressure / 100.0, site.temperature_c, true, HORIZON_REFRACTION_DEG
+            site.air_pressure / 100.0, site.temperature_c, true, _HORIZON_REFRACTION_DEG
         )
         return true + float(refraction) - target
 
-    # Below 0.8° at the horizon for any air that Site accepts, and −0.0001° at the zenith.
-    return float(np.radians(brentq(excess, target - 0.8, target + 0.001)))
+    # In dense, cold air the apparent elevation jumps past 0 where refraction sets in.
+    if excess(_LOWEST_REFRACTED_DEG) >= 0.0:
+        return float(np.radians(_LOWEST_REFRACTED_DEG))
+    # The refraction of SPA is slightly negative at the zenith, hence the margin.
+    return float(np.radians(brentq(excess, _LOWEST_REFRACTED_DEG, target + 0.001)))
 
 
-def _number(value: Any) -> float:
+def _number(value: object) -> float:
     """Return a number as float, and NaN, which no range holds, for anything else."""
-    return float(value) if isinstance(value, Real) and type(value) is not bool else np.nan
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return np.nan
+    return float(value)
 
 
 def _checked(elevation: float, name: str = "elevation") -> float:
@@ -460,11 +466,16 @@ def _unix_seconds(times: Times) -> FloatArray:
             for index, value in np.ndenumerate(array):
                 seconds[index] = _one_time(value, index)
     for index in np.argwhere(~np.isfinite(seconds))[:1]:
-        raise TimeError(f"{_label(tuple(index))}: missing or not finite; leave it out")
+        value = np.asarray(times, dtype=object)[tuple(index)]
+        raise TimeError(
+            f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
+            "text with an offset, or unix seconds"
+        )
     return seconds
 
 
-def _one_time(value: Any, index: tuple[int, ...]) -> float:
+def _one_time(value: Any, index: Sequence[int]) -> float:
+    """Return unix seconds, and NaN for what is not a time."""
     import pandas as pd
 
     time = value
@@ -476,15 +487,8 @@ def _one_time(value: Any, index: tuple[int, ...]) -> float:
                 f"{_label(index)}: '{value}' is not an ISO 8601 time; "
                 "write it like 2024-06-21T12:00:00+02:00"
             ) from None
-    if time is pd.NaT:
-        return np.nan
-    if isinstance(time, Real) and type(time) is not bool:
-        return float(time)
-    if not isinstance(time, datetime):
-        raise TimeError(
-            f"{_label(index)}: {value} is not a time; give an aware datetime, an ISO 8601 "
-            "text with an offset, or unix seconds"
-        )
+    if time is pd.NaT or not isinstance(time, datetime):
+        return _number(time)
     if time.utcoffset() is None:
         raise TimeError(
             f"{_label(index)}: {time} has no time zone; add one, for example "
@@ -493,8 +497,8 @@ def _one_time(value: Any, index: tuple[int, ...]) -> float:
     return time.timestamp()
 
 
-def _label(index: tuple[int, ...]) -> str:
-    return f"times[{', '.join(str(i) for i in index)}]" if index else "times"
+def _label(index: Sequence[int]) -> str:
+    return f"times[{', '.join(str(i) for i in index)}]" if len(index) else "times"
 
 
 def _check_years(seconds: FloatArray, site: Site) -> None:
@@ -515,6 +519,6 @@ def _refuse_outside(seconds: FloatArray, first: int, last: int, advice: str) -> 
     )
     for index in np.argwhere((seconds < low) | (seconds >= high))[:1]:
         raise TimeError(
-            f"{_label(tuple(index))}: {seconds[tuple(index)]:.17g} s since 1970 is outside "
+            f"{_label(index)}: {seconds[tuple(index)]:.17g} s since 1970 is outside "
             f"the years {first} to {last}, {advice}"
         )

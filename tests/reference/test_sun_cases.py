@@ -7,10 +7,10 @@ from typing import Any
 import erfa
 import numpy as np
 import pytest
-from reference import cases
 
 from heliotrope import sun
-from heliotrope.geometry import MRAD, FloatArray, angle_between, direction
+from heliotrope.geometry import MRAD, FloatArray, angle_between, as_float, direction
+from reference import cases
 
 # The stored SPA positions were computed with this TT − UT1.
 DELTA_T = 69.2
@@ -74,7 +74,7 @@ def erfa_sun(unix: FloatArray, place: sun.Site) -> FloatArray:
             [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
         ]
     )
-    return terrestrial @ R_enu_itrs.T
+    return as_float(terrestrial @ R_enu_itrs.T)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +96,7 @@ def test_a_missing_folder_of_cases_fails(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 def test_cases_of_several_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("HELIOTROPE_CASES", raising=False)
     own = cases.load("sun")
     for name in ("more", "empty"):
         (tmp_path / name).mkdir()

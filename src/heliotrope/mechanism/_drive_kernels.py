@@ -25,6 +25,15 @@ from heliotrope.mechanism._slots import (
 _OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 
+@njit(**_OPTIONS, forceinline=True)
+def load_drive(table, i, k):
+    """Drive ``k`` of row ``i`` as a tuple, which lives in registers."""
+    r = (table[i, k, 0], table[i, k, 1], table[i, k, 2], table[i, k, 3], table[i, k, 4])
+    s = (table[i, k, 5], table[i, k, 6], table[i, k, 7], table[i, k, 8], table[i, k, 9])
+    t = (table[i, k, 10], table[i, k, 11], table[i, k, 12], table[i, k, 13], table[i, k, 14])
+    return r + s + t + (table[i, k, 15], table[i, k, 16], table[i, k, 17], table[i, k, 18])
+
+
 @njit(**_OPTIONS)
 def triangle_angle(length, offset, radius):
     """Angle at the joint of the triangle (offset, radius, length), clamped to [0, π]."""

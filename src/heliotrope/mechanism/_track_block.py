@@ -5,59 +5,94 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._drive_kernels import drive_angle, drive_counts
+from heliotrope.mechanism._drive_kernels import drive_angle, drive_counts, load_drive
 from heliotrope.mechanism._slots import (
+    BIAS,
+    KIND,
     MAX_ANGLE,
     MAX_COUNT,
     MIN_ANGLE,
     MIN_COUNT,
+    RATE,
+    ROTARY,
+    SAG,
+    SCALE,
     SPEED,
+    WORM_COS,
+    WORM_SIN,
+    ZERO,
 )
 from heliotrope.mechanism._track_kernels import (
     DEGENERATE,
     OK,
     STOPPED,
-    _about,
-    _turn_between,
-    place,
+    UNREACHABLE,
+    axis_1,
+    axis_2,
+    constants,
+    is_single,
+    load_armature,
+    local_direction,
+    place_vertex,
+    residual_angle,
+    served,
     solve_aim,
-    solve_local,
+    solve_direction,
+    turned,
     wanted_normal,
 )
+from heliotrope.mechanism._vectors import about, turn_between
+from heliotrope.mechanism._warm_kernels import LANES, STEPS, warm_start
 
 _OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
+_INLINED = {**_OPTIONS, "forceinline": True}
 
 #: Angles this far (rad) beyond a stop count as on it.
 STOP_SLACK = 1e-9
 
 
-@njit(**_OPTIONS)
+@njit(**_INLINED)
 def stop_angles(d):
-    """Lowest and highest joint angle that both kinds of stops of drive row ``d`` allow."""
-    low, high = d[MIN_ANGLE], d[MAX_ANGLE]
+    """Lowest and highest joint angle that both kinds of stops of drive ``d`` allow."""
     if math.isfinite(d[MIN_COUNT]) or math.isfinite(d[MAX_COUNT]):
-        ends = (-np.inf, np.inf)
-        first, last = ends
-        if math.isfinite(d[MIN_COUNT]):
-            first = drive_angle(d, d[MIN_COUNT])
-        if math.isfinite(d[MAX_COUNT]):
-            last = drive_angle(d, d[MAX_COUNT])
-        # Counts may run against the angle.
-        probe = d[MIN_COUNT] if math.isfinite(d[MIN_COUNT]) else d[MAX_COUNT] - 1.0
-        if drive_angle(d, probe + 1.0) < drive_angle(d, probe):
-            first, last = last, first
-            if not math.isfinite(d[MIN_COUNT]):
-                last = np.inf
-            if not math.isfinite(d[MAX_COUNT]):
-                first = -np.inf
-        low, high = max(low, first), min(high, last)
+        return _count_stops(d)
+    return d[MIN_ANGLE], d[MAX_ANGLE]
+
+
+@njit(**_INLINED)
+def _counts(d, theta):
+    """Counts at a joint angle; the plain rotary drive without a call."""
+    if d[KIND] == ROTARY and d[WORM_COS] == 0.0 and d[WORM_SIN] == 0.0 and d[SAG] == 0.0:
+        return ((theta - d[BIAS]) / (1.0 + d[SCALE]) - d[ZERO]) / d[RATE]
+    return drive_counts(d, theta)
+
+
+@njit(**_OPTIONS)
+def _count_stops(d):
+    low, high = d[MIN_ANGLE], d[MAX_ANGLE]
+    lower, upper = d[MIN_COUNT], d[MAX_COUNT]
+    probe = lower if math.isfinite(lower) else upper - 1.0
+    rising = drive_angle(d, probe + 1.0) > drive_angle(d, probe)
+    if math.isfinite(lower):
+        end = drive_angle(d, lower)
+        if rising:
+            low = max(low, end)
+        else:
+            high = min(high, end)
+    if math.isfinite(upper):
+        end = drive_angle(d, upper)
+        if rising:
+            high = min(high, end)
+        else:
+            low = max(low, end)
     return low, high
 
 
-@njit(**_OPTIONS)
-def into_stops(theta, low, high, near):
+@njit(**_INLINED)
+def into_stops(theta, stops, near):
     """Return (angle, inside): theta + 2πk within the stops nearest to ``near``, or a stop."""
     turn = 2.0 * math.pi
+    low, high = stops
     theta += turn * math.floor((near - theta) / turn + 0.5)
     if theta < low - STOP_SLACK:
         theta += turn * math.ceil((low - STOP_SLACK - theta) / turn)
@@ -74,122 +109,106 @@ def into_stops(theta, low, high, near):
 
 
 @njit(**_OPTIONS)
-def _set_turn(theta_1, theta_2, t):
-    t[0], t[1] = math.sin(theta_1), math.cos(theta_1)
-    t[2], t[3] = math.sin(theta_2), math.cos(theta_2)
+def _turn(theta_1, theta_2):
+    return math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2)
 
 
 @njit(**_OPTIONS)
-def turned(g, t, u):
-    """Vector ``u`` of the mirror (given at zero angles) at pose t."""
-    x, y, z = u[0], u[1], u[2]
-    if not (g[6] == 0.0 and g[7] == 0.0 and g[8] == 0.0):
-        x, y, z = _about(g[6], g[7], g[8], t[2], t[3], x, y, z)
-    return _about(g[0], g[1], g[2], t[0], t[1], x, y, z)
-
-
-@njit(**_OPTIONS)
-def difference_angle(g, t, u, v):
-    """Angle between the turned ``u`` and v; within the plane across the axis if single."""
-    x, y, z = turned(g, t, u)
-    if g[6] == 0.0 and g[7] == 0.0 and g[8] == 0.0:
-        along = x * g[0] + y * g[1] + z * g[2]
-        x, y, z = x - along * g[0], y - along * g[1], z - along * g[2]
-        size = math.sqrt(x * x + y * y + z * z)
-        x, y, z = x / size, y / size, z / size
-    minus = math.sqrt((x - v[0]) ** 2 + (y - v[1]) ** 2 + (z - v[2]) ** 2)
-    plus = math.sqrt((x + v[0]) ** 2 + (y + v[1]) ** 2 + (z + v[2]) ** 2)
-    return 2.0 * math.atan2(minus, plus)
-
-
-@njit(**_OPTIONS)
-def _free_angle(g, axis, held, u, v, low, high, near):
+def _free_angle(g, axis, held, u, v, stops, near):
     """Best angle of the other joint while joint ``axis`` is held, within its stops."""
     if axis == 0:
-        x, y, z = _about(g[0], g[1], g[2], -math.sin(held), math.cos(held), v[0], v[1], v[2])
-        sine, cosine = _turn_between(g[6], g[7], g[8], u[0], u[1], u[2], x, y, z)
+        x = about(axis_1(g), -math.sin(held), math.cos(held), v)
+        sine, cosine = turn_between(axis_2(g), u, x)
     else:
-        x, y, z = _about(g[6], g[7], g[8], math.sin(held), math.cos(held), u[0], u[1], u[2])
-        sine, cosine = _turn_between(g[0], g[1], g[2], x, y, z, v[0], v[1], v[2])
-    angle, _ = into_stops(math.atan2(sine, cosine), low, high, near)
-    return angle
+        x = about(axis_2(g), math.sin(held), math.cos(held), u)
+        sine, cosine = turn_between(axis_1(g), x, v)
+    return into_stops(math.atan2(sine, cosine), stops, near)[0]
 
 
 @njit(**_OPTIONS)
-def _nearest_at_stops(g, s, p, u, local, stops, near, angles, t, n, m, v):
-    """Nearest pose on the border of the stops' rectangle; returns its residual."""
-    best = np.inf
-    best_1, best_2 = angles[0], angles[1]
-    single = g[6] == 0.0 and g[7] == 0.0 and g[8] == 0.0
-    for axis in range(1 if single else 2):
+def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
+    """Nearest pose with joint ``axis`` held at a stop; returns (residual, θ₁, θ₂)."""
+    other = 1 - axis
+    free, v_here = 0.0, v
+    one, two, t = held, 0.0, _turn(held, 0.0)
+    for _ in range(20):
+        before = free
+        if not is_single(g):
+            free = _free_angle(g, axis, held, u, v_here, stops[other], near[other])
+        one, two = (held, free) if axis == 0 else (free, held)
+        t = _turn(one, two)
+        if not local:
+            v_new, _, distance = wanted_normal(g, s, p, place_vertex(g, t))
+            if distance > 0.0:
+                v_here = v_new
+        if abs(free - before) < 1e-13:
+            break
+    return residual_angle(g, t, u, v_here), one, two
+
+
+@njit(**_OPTIONS)
+def _nearest_at_stops(g, s, p, u, v, local, stops, near):
+    """Nearest pose on the border of the stops' rectangle: (residual, θ₁, θ₂)."""
+    best, one, two = np.inf, 0.0, 0.0
+    for axis in range(1 if is_single(g) else 2):
         for side in range(2):
-            held = stops[axis, side]
-            if not math.isfinite(held):
-                continue
-            other = 1 - axis
-            free = 0.0
-            for _ in range(20):
-                before = free
-                if not single:
-                    free = _free_angle(
-                        g, axis, held, u, v, stops[other, 0], stops[other, 1], near[other]
-                    )
-                one, two = (held, free) if axis == 0 else (free, held)
-                _set_turn(one, two, t)
-                place(g, t, n, m)
-                if local or wanted_normal(g, s, p, m, v) == 0.0:
-                    break
-                if abs(free - before) < 1e-13:
-                    break
-            residual = difference_angle(g, t, u, v)
-            if residual < best:
-                best, best_1, best_2 = residual, one, two
-    angles[0], angles[1] = best_1, best_2
-    _set_turn(best_1, best_2, t)
-    place(g, t, n, m)
-    if not local:
-        wanted_normal(g, s, p, m, v)
-    return difference_angle(g, t, u, v)
+            held = stops[axis][side]
+            if math.isfinite(held):
+                rest, first, second = _along_stop(
+                    g, s, p, u, v, local, axis, held, stops, near
+                )
+                if rest < best:
+                    best, one, two = rest, first, second
+    return best, one, two
 
 
-@njit(**_OPTIONS)
-def _one_branch(
-    g, s, p, sign, local, tolerance, limit, newton, stops, near, start, angles, t, n, m, v
-):
-    """Solve one branch within the stops; returns (status, iterations, residual)."""
+@njit(**_INLINED)
+def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near):
+    """Solve one branch within the stops: (status, iterations, residual, θ₁, θ₂, n, m)."""
+    nothing = (np.nan, np.nan, np.nan)
+    s = served(g, s)
+    n = (g[15], g[16], g[17])
+    u, v, rest = n, s, np.nan
     if local:
-        status, iterations = solve_local(g, s, p, sign, t, n, m, v)
+        u = local_direction(g, p)
+        if u == (0.0, 0.0, 0.0) or s == (0.0, 0.0, 0.0):
+            return DEGENERATE, 0, np.nan, np.nan, np.nan, nothing, nothing
+        reached, t = solve_direction(g, constants(g, u), u, v, sign)
+        status, iterations, m = OK if reached else UNREACHABLE, 1, place_vertex(g, t)
     else:
-        m[:] = start
-        status, iterations = solve_aim(g, s, p, sign, tolerance, limit, newton, t, n, m, v)
-    if status == DEGENERATE:
-        angles[0], angles[1] = np.nan, np.nan
-        n[:] = np.nan
-        m[:] = np.nan
-        return status, iterations, np.nan
-    u = g[15:18]
-    if local:
-        u = v.copy()
-        v = s
-    elif wanted_normal(g, s, p, m, v) == 0.0:
-        return DEGENERATE, iterations, np.nan
-    angles[0], inside_1 = into_stops(math.atan2(t[0], t[1]), stops[0, 0], stops[0, 1], near[0])
-    angles[1], inside_2 = into_stops(math.atan2(t[2], t[3]), stops[1, 0], stops[1, 1], near[1])
+        status, iterations, t, m, v, rest = solve_aim(
+            g, s, p, m, sign, tolerance, limit, newton
+        )
+        if status == DEGENERATE or s == (0.0, 0.0, 0.0):
+            return DEGENERATE, iterations, np.nan, np.nan, np.nan, nothing, nothing
+    one, inside_1 = into_stops(math.atan2(t[0], t[1]), stops[0], near[0])
+    two, inside_2 = into_stops(math.atan2(t[2], t[3]), stops[1], near[1])
     if inside_1 and inside_2:
-        return status, iterations, difference_angle(g, t, u, v)
-    residual = _nearest_at_stops(g, s, p, u, local, stops, near, angles, t, n, m, v)
-    return STOPPED, iterations, residual
+        if status == OK and not local and not is_single(g):
+            return status, iterations, rest, one, two, v, m
+        if not local:
+            v, _, _ = wanted_normal(g, s, p, m)
+        return status, iterations, residual_angle(g, t, u, v), one, two, turned(g, t, n), m
+    rest, one, two = _nearest_at_stops(g, s, p, u, v, local, stops, near)
+    t = _turn(one, two)
+    return STOPPED, iterations, rest, one, two, turned(g, t, n), place_vertex(g, t)
+
+
+@njit(**_INLINED)
+def _home(stops):
+    if math.isfinite(stops[0]) and math.isfinite(stops[1]):
+        return 0.5 * (stops[0] + stops[1])
+    return 0.0
 
 
 @njit(**_OPTIONS)
-def _travel(drives, counts, current, angles, near):
-    """(seconds, radians) from the current position; no speed means no time."""
-    seconds, radians = 0.0, 0.0
-    for k in range(drives.shape[0]):
-        radians = max(radians, abs(angles[k] - near[k]))
-        if math.isfinite(drives[k, SPEED]):
-            seconds = max(seconds, abs(counts[k] - current[k]) / drives[k, SPEED])
-    return seconds, radians
+def _better(status, residual, seconds, radians):
+    """Whether the second branch is to be preferred to the first."""
+    if status[0] == OK and status[1] == OK:
+        return (seconds[1], radians[1]) < (seconds[0], radians[0])
+    if status[0] == OK or status[1] == OK:
+        return status[1] == OK
+    return residual[1] < residual[0]
 
 
 @njit(**_OPTIONS)
@@ -203,45 +222,49 @@ def track_block(
     (−1: none). ``branch`` 0 or 1 solves that one into the only place, 2 both.
     """
     axes = drives.shape[1]
-    t, n, m, v = np.empty(4), np.empty(3), np.empty(3), np.empty(3)
-    stops, near, theta = np.empty((2, 2)), np.zeros(2), np.empty(2)
+    seconds, radians = np.zeros(2), np.zeros(2)
+    warm = newton and not local and limit > STEPS
+    begin = np.empty((2, LANES, 3))
     for i in range(start, stop):
-        g, d = armatures[index[i, 0]], drives[index[i, 1]]
-        s, p = suns[index[i, 2]], aims[index[i, 3]]
-        stops[1, 0], stops[1, 1], near[1] = -np.inf, np.inf, 0.0
-        for k in range(axes):
-            stops[k, 0], stops[k, 1] = stop_angles(d[k])
-            if index[i, 4] >= 0:
-                near[k] = drive_angle(d[k], current[index[i, 4], k])
-            elif math.isfinite(stops[k, 0]) and math.isfinite(stops[k, 1]):
-                near[k] = 0.5 * (stops[k, 0] + stops[k, 1])
-            else:
-                near[k] = 0.0
-        chosen, seconds, radians = 0, np.inf, np.inf
+        lane = (i - start) % LANES
+        if warm and lane == 0:
+            for b in range(angles.shape[1]):
+                sign = 2.0 * (b if branch == 2 else branch) - 1.0
+                warm_start(armatures, suns, aims, index, i, stop, sign, begin[b])
+        row, now = index[i, 1], index[i, 4]
+        g = load_armature(armatures, index[i, 0])
+        d1 = load_drive(drives, row, 0)
+        d2 = load_drive(drives, row, axes - 1)
+        s = (suns[index[i, 2], 0], suns[index[i, 2], 1], suns[index[i, 2], 2])
+        p = (aims[index[i, 3], 0], aims[index[i, 3], 1], aims[index[i, 3], 2])
+        stops = (stop_angles(d1), stop_angles(d2))
+        if axes == 1:
+            stops = (stops[0], (-np.inf, np.inf))
+        near = (_home(stops[0]), _home(stops[1]))
+        if now >= 0:
+            here_1, here_2 = current[now, 0], current[now, axes - 1]
+            near = (drive_angle(d1, here_1), drive_angle(d2, here_2) if axes == 2 else 0.0)
         for b in range(angles.shape[1]):
             sign = 2.0 * (b if branch == 2 else branch) - 1.0
-            state, steps, rest = _one_branch(
-                g, s, p, sign, local, tolerance, limit, newton, stops, near, g[12:15],
-                theta, t, n, m, v,
-            )  # fmt: skip
+            m, done = (g[12], g[13], g[14]), 0
+            if warm:
+                m, done = (begin[b, lane, 0], begin[b, lane, 1], begin[b, lane, 2]), STEPS
+            state, steps, rest, one, two, n, m = solve_branch(
+                g, s, p, m, sign, local, tolerance, limit - done, newton, stops, near
+            )
+            steps += done
             status[i, b], iterations[i, b], residual[i, b] = state, steps, rest
-            normals[i, b], vertices[i, b] = n, m
-            for k in range(axes):
-                angles[i, b, k] = theta[k]
-                counts[i, b, k] = drive_counts(d[k], theta[k])
-            if b == 0:
-                if branch == 2:
-                    here = current[index[i, 4]] if index[i, 4] >= 0 else counts[i, 0]
-                    seconds, radians = _travel(d, counts[i, 0], here, theta, near)
-            else:
-                here = current[index[i, 4]] if index[i, 4] >= 0 else counts[i, 1]
-                time, way = _travel(d, counts[i, 1], here, theta, near)
-                if state == OK and status[i, 0] == OK:
-                    better = time < seconds or (time == seconds and way < radians)
-                elif state == OK or status[i, 0] == OK:
-                    better = state == OK
-                else:
-                    better = rest < residual[i, 0]
-                if better:
-                    chosen = 1
-        best[i] = chosen
+            for k in range(3):
+                normals[i, b, k], vertices[i, b, k] = n[k], m[k]
+            angles[i, b, 0], counts[i, b, 0] = one, _counts(d1, one)
+            seconds[b], radians[b] = 0.0, abs(one - near[0])
+            if now >= 0 and math.isfinite(d1[SPEED]):
+                seconds[b] = abs(counts[i, b, 0] - here_1) / d1[SPEED]
+            if axes == 2:
+                angles[i, b, 1], counts[i, b, 1] = two, _counts(d2, two)
+                radians[b] = max(radians[b], abs(two - near[1]))
+                if now >= 0 and math.isfinite(d2[SPEED]):
+                    seconds[b] = max(seconds[b], abs(counts[i, b, 1] - here_2) / d2[SPEED])
+        best[i] = 0
+        if branch == 2 and _better(status[i], residual[i], seconds, radians):
+            best[i] = 1

@@ -33,21 +33,20 @@ from heliotrope.geometry import (
     as_float,
     as_vectors,
     bisector,
+    direction,
     normalize,
     rotation,
     wrap_positive,
     wrap_signed,
 )
 
-#: A demanded normal counts as reached within this angle, rad: a thousand times what
-#: rounding leaves, and a millionth of what any drive resolves.
+#: A demanded normal counts as reached within this angle, rad; rounding leaves 1e-15.
 REACHED = 1e-12
 
 #: Least |cos μ cos τ₁|. Below it rounding alone moves α by 1e-7 rad.
 LEAST_COSINE = 1e-9
 
-#: Steps from (5) to the exact offset: two do at field distances, six up to an offset of
-#: 0.99 of the distance.
+#: Steps from (5) to the exact offset: one does at field distances, six up to h = 0.99.
 _NEWTON_STEPS = 6
 
 #: Malan's names of the parameters that his model shares with ours.
@@ -68,20 +67,18 @@ class GuoParameters:
 
     Attributes
     ----------
-    tilt
-        ψ_t, angle of the azimuth axis from the vertical, rad.
-    tilt_azimuth
-        ψ_a, azimuth towards which the azimuth axis leans, rad.
+    tilt, tilt_azimuth
+        ψ_t, angle of the azimuth axis from the vertical, and ψ_a, azimuth towards which
+        it leans, rad.
     azimuth_zero, elevation_zero
         γ₀ and α₀, rad: joint angle = drive position + zero, so they are our
         ``azimuth_bias`` and ``elevation_bias``. A zero that a paper subtracts from the
         nominal angle enters with the opposite sign.
     tau_1
-        τ₁, elevation of the elevation axis above the plane normal to the azimuth axis
-        (its end at the right of someone who looks along the mirror's heading), rad.
+        τ₁, angle by which the end of the elevation axis at the right hand of someone who
+        looks the way the mirror faces is raised out of square with the azimuth axis, rad.
     mu
-        μ, angle of the mirror's normal from the plane normal to the elevation axis,
-        towards that same end, rad.
+        μ, angle of the mirror's normal towards that end, out of square with the axis, rad.
     offset
         H_z, distance of the mirror's surface in front of the pivot, m.
 
@@ -115,7 +112,7 @@ class GuoParameters:
             array = _numbers(value, f"Guo's parameter {field.name}").copy()
             array.flags.writeable = False
             object.__setattr__(self, field.name, array)
-        _common_shape(**{f.name: getattr(self, f.name) for f in fields(self)})
+        _common_shape(**vars(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,11 +123,10 @@ class MirrorNormal:
     ----------
     normal
         Unit normals in ENU, shape (..., 3).
-    theta
-        θ, half of the angle between sun and target at the pivot, rad, shape (...).
-    tau
-        τ, by which the offset turns the normal from the sun towards the target, rad,
-        shape (...). The mirror sees the sun under the incidence angle θ + τ.
+    theta, tau
+        θ, half of the angle between sun and target at the pivot, and τ, by which the
+        offset turns the normal from the sun to the target, rad, shape (...). The mirror
+        sees the sun under the incidence angle θ + τ.
     """
 
     normal: FloatArray
@@ -151,11 +147,10 @@ class GuoTracking:
         Azimuth drive in [0, 2π), rad, shape (..., 2).
     normal
         The demanded unit normals in ENU, shape (..., 3).
-    residual
+    residual, reachable
         Angle from the demanded normal to the one that the positions give, rad, the
-        larger of the two branches, shape (...). It is a tracking error.
-    reachable
-        Whether the residual is no more than :data:`REACHED`, shape (...).
+        larger of the two branches (a tracking error), and whether it is no more than
+        :data:`REACHED`, shape (...).
     """
 
     alpha: FloatArray
@@ -202,6 +197,11 @@ def mirror_normal(
 ) -> MirrorNormal:
     """Return the normal that sends the sun to the target from a mirror off its pivot.
 
+    Validity: |offset| below the distance. With h = offset / distance the error of (5) is
+    below h⁴/40 rad up to h = 1/2, so 4e-9 rad for 0.5 m at 25 m; the exact form leaves
+    1e-15 rad up to h = 0.99. There is no division by sin θ: retroreflection (θ = 0) is
+    an ordinary case. Source: Guo (5) and (26), reconstructed.
+
     Parameters
     ----------
     to_target
@@ -217,21 +217,11 @@ def mirror_normal(
     ------
     InputError
         If a vector is zero, sun and target are opposite, or the offset reaches the target.
-
-    Notes
-    -----
-    Validity: |offset| below the distance. With h = offset / distance the error of (5) is
-    below h⁴/50 rad up to h = 1/2, so 3e-9 rad for 0.5 m at 25 m; the exact form leaves
-    1e-15 rad up to h = 0.99. There is no division by sin θ: retroreflection (θ = 0) is
-    an ordinary case. Source: Guo (5) and (26), reconstructed.
     """
     target = as_vectors(to_target, "to_target")
     distance = as_float(np.linalg.norm(target, axis=-1))
-    _refuse(
-        distance == 0.0,
-        "to_target",
-        lambda _: "the target is at the pivot (0 m); give the vector from pivot to target",
-    )
+    at_pivot = "the target is at the pivot (0 m); give the vector from pivot to target"
+    _refuse(distance == 0.0, "to_target", lambda _: at_pivot)
     s, t = normalize(sun, "sun"), normalize(target, "to_target")
     height = _numbers(offset, "offset")
     shape = _common_shape(to_target=t[..., 0], sun=s[..., 0], offset=height)
@@ -239,7 +229,7 @@ def mirror_normal(
     _refuse(
         np.abs(height) >= distance,
         "offset",
-        lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; check units",
+        lambda i: f"{height[i]:g} m reaches the target, {distance[i]:g} m away; give metres",
     )
     b = bisector(s, t)
     cos_theta = 0.5 * np.linalg.norm(s + t, axis=-1)
@@ -271,7 +261,7 @@ def _offset_slope(
 
 
 def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameters) -> FloatArray:
-    """Return the mirror's normal at drive positions.
+    """Return the unit normals (..., 3) in ENU at drive positions, to 1e-15, Guo (29).
 
     Parameters
     ----------
@@ -280,31 +270,33 @@ def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameter
     parameters
         Shapes that broadcast against (...).
 
-    Returns
-    -------
-    Unit normals in ENU, shape (..., 3), to 1e-15.
-
     Raises
     ------
     InputError
         If a number is not finite or the shapes do not broadcast.
-
-    Notes
-    -----
-    Source: Guo (29).
     """
     p = parameters
-    a = _numbers(alpha, "alpha") + p.elevation_zero
-    g = _numbers(gamma, "gamma") + p.azimuth_zero
+    a, g = _numbers(alpha, "alpha"), _numbers(gamma, "gamma")
+    _common_shape(alpha=a, gamma=g, **vars(p))
+    a, g = a + p.elevation_zero, g + p.azimuth_zero
     x = np.sin(p.mu) * np.cos(p.tau_1) - np.cos(p.mu) * np.sin(a) * np.sin(p.tau_1)
     y = np.cos(p.mu) * np.cos(a)
     z = np.sin(p.mu) * np.sin(p.tau_1) + np.cos(p.mu) * np.sin(a) * np.cos(p.tau_1)
-    c = _stack(x * np.cos(g) + y * np.sin(g), y * np.cos(g) - x * np.sin(g), z)
+    east, north = x * np.cos(g) + y * np.sin(g), y * np.cos(g) - x * np.sin(g)
+    c = np.stack(np.broadcast_arrays(east, north, z), axis=-1)
     return as_float(np.einsum("...ij,...j->...i", _tilt_rotation(p.tilt, p.tilt_azimuth), c))
 
 
 def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
-    """Return the drive positions at which the mirror has a given normal.
+    """Return the drive positions at which the mirror has a given normal, on both branches.
+
+    A normal in a dead cone, closer than |μ − τ₁| to the azimuth axis or than |μ + τ₁| to
+    its foot, gets the nearest pose and its residual. Where every azimuth serves (the
+    normal along the azimuth axis) the azimuth joint is at 0.
+
+    Accuracy: the residual is below 1e-14 rad everywhere, at the keyhole too, where α by
+    arcsin would leave 1e-8 rad. Source: the part of Guo (1)-(28) that leads from the
+    normal to the angles, reconstructed in half angles, with (22) by atan2.
 
     Parameters
     ----------
@@ -313,41 +305,26 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     parameters
         Shapes that broadcast against (...).
 
-    Returns
-    -------
-    Both branches. A normal in the dead cone, whose angle from the azimuth axis is below
-    |μ − τ₁| or above π − |μ + τ₁|, gets the nearest pose and its residual. Where every
-    azimuth serves (normal along the azimuth axis) the joint angle is 0.
-
     Raises
     ------
     InputError
         If cos μ cos τ₁ = 0, a vector is zero or not finite, or shapes do not broadcast.
-
-    Notes
-    -----
-    Accuracy: the residual is a few 1e-16 rad everywhere, at the keyhole too; sin α by
-    arcsin would leave 1e-8 rad there.
-
-    Source: Guo (16)-(25), reconstructed in half angles; (22) by atan2.
     """
     p = parameters
     n = normalize(normal, "normal")
-    shape = _common_shape(normal=n[..., 0], **{f.name: getattr(p, f.name) for f in fields(p)})
+    shape = _common_shape(normal=n[..., 0], **vars(p))
     tau_1, mu = np.broadcast_to(p.tau_1, shape), np.broadcast_to(p.mu, shape)
-    scale = np.cos(mu) * np.cos(tau_1)
     _refuse(
-        np.abs(scale) < LEAST_COSINE,
+        np.abs(np.cos(mu) * np.cos(tau_1)) < LEAST_COSINE,
         "Guo's parameters",
         lambda i: (
-            f"tau_1 {np.degrees(tau_1[i]):g}° and mu {np.degrees(mu[i]):g}° make "
-            "cos μ cos τ₁ = 0, so the elevation drive cannot raise the normal; "
-            "both must be away from ±90°"
+            f"cos μ cos τ₁ = 0 at mu {mu[i]:g} rad, tau_1 {tau_1[i]:g} rad: no elevation "
+            "raises the normal; keep both away from ±π/2"
         ),
     )
     c = np.einsum("...ji,...j->...i", _tilt_rotation(p.tilt, p.tilt_azimuth), n)
     # The branches lie along a first axis here, so that the parameters broadcast.
-    co_elevation = _co_elevation(c, tau_1, mu, scale)
+    co_elevation = _co_elevation(c, tau_1, mu)
     beta = np.stack([co_elevation, -co_elevation])
     alpha = 0.5 * np.pi - beta - p.elevation_zero
     gamma = wrap_positive(_azimuth(c, beta, tau_1, mu) - p.azimuth_zero)
@@ -361,9 +338,7 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     )
 
 
-def _co_elevation(
-    c: FloatArray, tau_1: FloatArray, mu: FloatArray, scale: FloatArray
-) -> FloatArray:
+def _co_elevation(c: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArray:
     """Return β = π/2 − α in [0, π] for normals c in the tilted frame.
 
     sin α = (cos ζ − sin μ sin τ₁) / (cos μ cos τ₁), ζ the angle from the azimuth axis.
@@ -374,7 +349,7 @@ def _co_elevation(
     zeta = np.arctan2(np.hypot(c[..., 0], c[..., 1]), c[..., 2])
     near, far = 0.5 * (mu - tau_1), 0.5 * (mu + tau_1)
     half = 0.5 * zeta
-    sign = np.sign(scale)
+    sign = np.sign(np.cos(mu) * np.cos(tau_1))
     above = sign * np.sin(half - near) * np.sin(half + near)
     below = sign * np.cos(half - far) * np.cos(half + far)
     return as_float(2.0 * np.arctan2(np.sqrt(np.maximum(above, 0)), np.sqrt(np.maximum(below, 0))))
@@ -382,51 +357,35 @@ def _co_elevation(
 
 def _azimuth(c: FloatArray, beta: FloatArray, tau_1: FloatArray, mu: FloatArray) -> FloatArray:
     """Return the azimuth joint angle that turns the normal (x, y) at azimuth 0 onto c."""
-    # x = sin μ cos τ₁ − cos μ sin τ₁ sin α, about the nearer of α = ±π/2, where it may
-    # cancel to nothing: 1 − sin α = 2 sin²(β/2), 1 + sin α = 2 cos²(β/2).
-    lean = 2.0 * np.cos(mu) * np.sin(tau_1)
-    x = np.where(
-        np.cos(beta) >= 0.0,
-        np.sin(mu - tau_1) + lean * np.sin(0.5 * beta) ** 2,
-        np.sin(mu + tau_1) - lean * np.cos(0.5 * beta) ** 2,
-    )
+    x = np.sin(mu) * np.cos(tau_1) - np.cos(mu) * np.sin(tau_1) * np.cos(beta)
     y = np.cos(mu) * np.sin(beta)
     east = c[..., 0] * y - c[..., 1] * x
     north = c[..., 1] * y + c[..., 0] * x
+    # atan2 of zeros is ±π where their signs say so.
     free = (east == 0.0) & (north == 0.0)
     return as_float(np.where(free, 0.0, np.arctan2(east, north)))
 
 
 def track(
-    to_target: npt.ArrayLike,
-    sun: npt.ArrayLike,
-    parameters: GuoParameters,
-    *,
-    exact: bool = False,
+    to_target: npt.ArrayLike, sun: npt.ArrayLike, parameters: GuoParameters, *, exact: bool = False
 ) -> GuoTracking:
-    """Return the drive positions that keep the sun on the target.
+    """Return the drive positions that send the sun to the target: Guo's formula.
+
+    Validity, accuracy, source: see :func:`mirror_normal` and :func:`angles`. Stops are
+    not considered.
 
     Parameters
     ----------
-    to_target
-        Vectors from the pivot to the target in ENU, m, shape (..., 3).
-    sun
-        Vectors to the sun in ENU, of any length, shape (..., 3).
+    to_target, sun, exact
+        As :func:`mirror_normal` takes them.
     parameters
         Shapes that broadcast against (...): a field of N at T times takes ``to_target``
         (N, 3), ``sun`` (T, 1, 3) and parameters (N,).
-    exact
-        Take the offset exactly instead of by Guo's (5).
 
     Raises
     ------
     InputError
         As :func:`mirror_normal` and :func:`angles`.
-
-    Notes
-    -----
-    Validity and accuracy: see :func:`mirror_normal` and :func:`angles`. Stops are not
-    considered. Source: Guo (1)-(28), reconstructed.
     """
     demanded = mirror_normal(to_target, sun, parameters.offset, exact=exact)
     return angles(demanded.normal, parameters)
@@ -437,17 +396,16 @@ def regularise(parameters: GuoParameters) -> GuoParameters:
 
     A fit may stop at any of the equivalent sets. This one has ψ_t in [0, π/2] (in
     (π/2, π] only if the azimuth axis points below the horizon, which no relation can
-    raise), ψ_a, in [0, 2π), γ₀ and α₀ in [−π, π), τ₁ and μ in [−π/2, π/2]. ψ_a is 0
-    where there is no tilt.
+    raise), ψ_a in [0, 2π), γ₀ and α₀ in [−π, π), τ₁ and μ in [−π/2, π/2]; ψ_a is 0
+    where there is no tilt. :func:`forward` is the same to 1e-14 for every drive position.
+    Values already in their ranges are not touched, so a second call changes nothing.
 
-    Notes
-    -----
-    :func:`forward` is the same to 1e-15 for every drive position. Values already in
-    their ranges are not touched, so a second call changes nothing. Source: Guo
-    (31)-(40), reconstructed from (29) except (37), (ψ_a, ψ_t) ~ (ψ_a + π, −ψ_t).
+    Source: Guo (31)-(40), reconstructed from (29) except (37).
     """
     p = parameters
     tilt = _wrap(p.tilt)
+    # Without this the second call would take π for −π and turn ψ_a.
+    tilt = np.where(tilt == -np.pi, np.pi, tilt)
     turned = np.where(tilt < 0.0, p.tilt_azimuth + np.pi, p.tilt_azimuth)
     tau_1, tau_folded = _fold(_wrap(p.tau_1))
     mu, mu_folded = _fold(_wrap(p.mu))
@@ -477,16 +435,14 @@ def _fold(angle: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
 def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
     """Return the parameters of our azimuth-elevation chain that make the same machine.
 
+    Exact to 1e-15. Both descriptions of the tilt put the axis in the same place but
+    differ by a turn about it, tilt_north · tilt_east / 2 to second order, which goes
+    into ``azimuth_bias``.
+
     Returns
     -------
     ``tilt_north``, ``tilt_east``, ``azimuth_bias``, ``elevation_bias``,
     ``non_orthogonality``, ``canting`` (rad) and ``pivot_offset`` (m), shape (...).
-
-    Notes
-    -----
-    Exact to 1e-15. Both descriptions of the tilt put the axis in the same place but
-    differ by a turn about it, tilt_north · tilt_east / 2 to second order, which goes
-    into ``azimuth_bias``.
     """
     p = parameters
     east = np.sin(p.tilt) * np.sin(p.tilt_azimuth)
@@ -508,6 +464,9 @@ def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
 def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     """Return Guo's parameters of our azimuth-elevation chain.
 
+    The inverse of :func:`to_heliotrope` up to the relations of :func:`regularise`; the
+    tilt comes out in [0, π]. Exact to 1e-15.
+
     Parameters
     ----------
     values
@@ -515,15 +474,8 @@ def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
 
     Raises
     ------
-    UnknownNameError
-        If Guo's model has no such parameter.
     InputError
-        If a number is not finite or the shapes do not broadcast.
-
-    Notes
-    -----
-    The inverse of :func:`to_heliotrope` up to the relations of :func:`regularise`; the
-    tilt comes out in [0, π]. Exact to 1e-15.
+        If Guo's model has no such name, a number is not finite or shapes do not broadcast.
     """
     for name in values:
         if name not in _HELIOTROPE_NAMES:
@@ -560,10 +512,8 @@ def to_malan(parameters: GuoParameters) -> dict[str, FloatArray]:
     for name, unit in (("canting", "rad"), ("pivot_offset", "m")):
         largest = np.abs(ours[name]).max(initial=0.0)
         if largest > 0.0:
-            raise InputError(
-                f"{name}: up to {largest:g} {unit}, but Malan's model has none; it must be 0 "
-                "everywhere, or keep Guo's parameters"
-            )
+            text = "but Malan's model has none; set it to 0 or keep Guo's parameters"
+            raise InputError(f"{name}: up to {largest:g} {unit}, {text}")
     return {malan: ours[name] for malan, name in MALAN_NAMES.items()}
 
 
@@ -572,10 +522,8 @@ def from_malan(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
 
     Raises
     ------
-    UnknownNameError
-        If a name is not one of those that :func:`to_malan` gives.
     InputError
-        If a number is not finite or the shapes do not broadcast.
+        If Malan's model has no such name, a number is not finite or shapes do not broadcast.
     """
     for name in values:
         if name not in MALAN_NAMES:
@@ -593,14 +541,16 @@ def axis_accuracy(
 ) -> AxisAccuracy:
     """Return the zero and the scatter of each axis from a set of measurements.
 
+    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
+    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
+
     Parameters
     ----------
-    measured_alpha, measured_gamma
-        Encoder positions, rad, shape (..., n), n ≥ 2 measurements.
-    ideal_alpha, ideal_gamma
-        Angles that the model demands for the same sightings, rad, shape (..., n).
+    measured_alpha, measured_gamma, ideal_alpha, ideal_gamma
+        Encoder positions, and the angles that the model demands for the same sightings,
+        rad, shape (..., n), n ≥ 2 measurements.
     azimuth_weight
-        Weights of the azimuth, shape (..., n). Equal if the axis itself scatters;
+        Weights of the azimuth, shape (..., n): equal if the axis itself scatters,
         cos² α if the measured normals do, whose scatter the azimuth shows magnified.
 
     Raises
@@ -608,34 +558,27 @@ def axis_accuracy(
     InputError
         If fewer than two measurements are given, shapes differ, weights are negative or
         all 0, or the differences spread over half a turn (branches mixed).
-
-    Notes
-    -----
-    Differences are taken on the circle, so 359.9° and 0.1° are 0.2° apart. Source: Guo
-    (43)-(47), reconstructed: mean and standard deviation (n − 1) per axis.
     """
     values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
     names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
     given = {k: _numbers(v, k) for k, v in zip(names, values, strict=True)}
     shape = _common_shape(**given)
     if not shape or shape[-1] < 2:
-        raise InputError(
-            f"axis accuracy: shape {shape}; the last axis must hold at least 2 measurements"
-        )
+        raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
     alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
     if (weight < 0.0).any() or (weight.sum(axis=-1) == 0.0).any():
         raise InputError("azimuth_weight: weights must not be negative nor all 0; give cos² α")
     gamma_0, gamma_rest = _circular(gamma_i - gamma, weight, "gamma")
     alpha_0, alpha_rest = _circular(alpha_i - alpha, np.ones(shape), "alpha")
     n = shape[-1]
-    along = np.cos(alpha_i) ** 2 * gamma_rest**2
+    across = np.cos(alpha_i) ** 2 * gamma_rest**2
     variance_gamma = (weight * gamma_rest**2).sum(axis=-1) / weight.sum(axis=-1) * n / (n - 1)
     return AxisAccuracy(
         gamma_0=gamma_0,
         sigma_gamma=as_float(np.sqrt(variance_gamma)),
         alpha_0=alpha_0,
         sigma_alpha=as_float(np.sqrt((alpha_rest**2).sum(axis=-1) / (n - 1))),
-        sigma_normal=as_float(np.sqrt((alpha_rest**2 + along).sum(axis=-1) / (n - 1))),
+        sigma_normal=as_float(np.sqrt((alpha_rest**2 + across).sum(axis=-1) / (n - 1))),
     )
 
 
@@ -651,10 +594,7 @@ def _circular(
     _refuse(
         np.abs(rest) > 0.5 * np.pi,
         f"ideal minus measured {name}",
-        lambda i: (
-            f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; measured and ideal "
-            "angles must be on the same branch"
-        ),
+        lambda i: f"{np.degrees(rest[i]):.1f}° from the mean, limit ±90°; do not mix branches",
     )
     shift = (weight * rest).sum(axis=-1, keepdims=True) / weight.sum(axis=-1, keepdims=True)
     return wrap_signed(middle + shift)[..., 0], as_float(rest - shift)
@@ -663,8 +603,7 @@ def _circular(
 def _tilt_rotation(tilt: FloatArray, tilt_azimuth: FloatArray) -> FloatArray:
     """Return the rotation by ψ_t that leans the vertical towards the azimuth ψ_a."""
     # About U × d for the horizontal direction d at azimuth ψ_a.
-    level = np.zeros_like(tilt_azimuth)
-    return rotation(_stack(-np.cos(tilt_azimuth), np.sin(tilt_azimuth), level), tilt)
+    return rotation(direction(tilt_azimuth - 0.5 * np.pi, 0.0), tilt)
 
 
 def _twist(
@@ -673,13 +612,8 @@ def _twist(
     """Return the angle w with R_guo = R_ours R_U(w), both leaning the vertical alike."""
     guo = _tilt_rotation(tilt, tilt_azimuth)
     ours = rotation([-1.0, 0.0, 0.0], tilt_north) @ rotation([0.0, 1.0, 0.0], tilt_east)
-    sine = np.sum(ours[..., :, 1] * guo[..., :, 0], axis=-1)
-    cosine = np.sum(ours[..., :, 0] * guo[..., :, 0], axis=-1)
-    return as_float(np.arctan2(sine, cosine))
-
-
-def _stack(east: npt.ArrayLike, north: npt.ArrayLike, up: npt.ArrayLike) -> FloatArray:
-    return np.stack(np.broadcast_arrays(as_float(east), as_float(north), as_float(up)), axis=-1)
+    turn = np.swapaxes(ours, -1, -2) @ guo
+    return as_float(np.arctan2(turn[..., 1, 0], turn[..., 0, 0]))
 
 
 def _numbers(value: npt.ArrayLike, name: str) -> FloatArray:

@@ -1,0 +1,85 @@
+"""Compiled: three-vectors as tuples of floats, which live in registers."""
+
+import math
+
+from numba import njit
+
+_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy", "forceinline": True}
+
+
+@njit(**_OPTIONS)
+def dot(a, b):
+    """a · b."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(**_OPTIONS)
+def cross(a, b):
+    """a × b."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+@njit(**_OPTIONS)
+def add(a, b):
+    """a + b."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
+
+
+@njit(**_OPTIONS)
+def minus(a, b):
+    """a − b."""
+    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
+
+
+@njit(**_OPTIONS)
+def times(factor, a):
+    """factor · a."""
+    return factor * a[0], factor * a[1], factor * a[2]
+
+
+@njit(**_OPTIONS)
+def norm(a):
+    """|a|."""
+    return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+
+
+@njit(**_OPTIONS)
+def across(a, axis):
+    """The part of a perpendicular to the unit axis."""
+    along = dot(a, axis)
+    return a[0] - along * axis[0], a[1] - along * axis[1], a[2] - along * axis[2]
+
+
+@njit(**_OPTIONS)
+def about(axis, sine, cosine, u):
+    """Turn u about the unit axis by the angle of known sine and cosine (Rodrigues)."""
+    along = (1.0 - cosine) * dot(axis, u)
+    return (
+        cosine * u[0] + sine * (axis[1] * u[2] - axis[2] * u[1]) + along * axis[0],
+        cosine * u[1] + sine * (axis[2] * u[0] - axis[0] * u[2]) + along * axis[1],
+        cosine * u[2] + sine * (axis[0] * u[1] - axis[1] * u[0]) + along * axis[2],
+    )
+
+
+@njit(**_OPTIONS)
+def turn_between(axis, u, v):
+    """Sine and cosine of the turn about the axis that brings u as near to v as can be."""
+    sine = dot(axis, cross(u, v))
+    cosine = dot(u, v) - dot(axis, u) * dot(axis, v)
+    size = math.sqrt(sine * sine + cosine * cosine)
+    if size < 1e-15:
+        return 0.0, 1.0
+    return sine / size, cosine / size
+
+
+@njit(**_OPTIONS)
+def angle(u, v):
+    """Angle between unit vectors, exact near 0 and π."""
+    apart = norm(minus(u, v))
+    if apart < 1e-5:
+        return apart * (1.0 + apart * apart / 24.0)
+    return 2.0 * math.atan2(apart, norm(add(u, v)))
