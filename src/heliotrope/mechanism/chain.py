@@ -206,7 +206,7 @@ class Mechanism:
         """
         flat, rows, shape = self._flatten(counts)
         normal, vertex = np.empty((len(rows), 3)), np.empty((len(rows), 3))
-        arrays = self._arrays
+        arrays = self.kernel_arrays
         run_blocks(
             lambda a, b: pose_block(*arrays, flat, rows, normal, vertex, a, b), len(rows)
         )
@@ -234,7 +234,7 @@ class Mechanism:
         n, v = np.empty((m, 3)), np.empty((m, 3))
         dn, dv = np.empty((m, p, 3)), np.empty((m, p, 3))
         dn_counts, dv_counts = np.empty((m, d, 3)), np.empty((m, d, 3))
-        arrays = self._arrays
+        arrays = self.kernel_arrays
         run_blocks(
             lambda a, b: jacobian_block(
                 *arrays, flat, rows, codes, n, v, dn, dv, dn_counts, dv_counts, a, b
@@ -253,7 +253,7 @@ class Mechanism:
     @cached_property
     def armature(self) -> Armature:
         """The reduction to two axes, two points, vertex and normal (Grigoriev's armature)."""
-        position, orientation, axes, origins, angles, _, driven, vertex, normal = self._arrays
+        position, orientation, axes, origins, angles, _, driven, vertex, normal = self.kernel_arrays
         table = np.zeros((len(position), slot.ARMATURE_SIZE))
         run_blocks(
             lambda a, b: armature_block(
@@ -264,8 +264,8 @@ class Mechanism:
         return Armature(table.reshape(*self.shape, slot.ARMATURE_SIZE))
 
     @cached_property
-    def _arrays(self) -> tuple[np.ndarray, ...]:
-        """The arrays of the kernels, with one batch axis."""
+    def kernel_arrays(self) -> tuple[np.ndarray, ...]:
+        """The arrays that compiled kernels read, with one batch axis (N, …)."""
         joints, drives = len(self.joints), len(self.driven)
 
         def flat(array: FloatArray, *tail: int) -> FloatArray:

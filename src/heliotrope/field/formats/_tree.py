@@ -106,7 +106,7 @@ def read_document(path: str | Path, what: str) -> Document:
         resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False
     )
     try:
-        tree = etree.parse(str(file), parser)
+        tree: Any = etree.parse(str(file), parser)
     except etree.XMLSyntaxError as error:
         raise FormatError(
             file, f"not well-formed XML ({error.msg}); it should be {what}", f"line {error.lineno}"

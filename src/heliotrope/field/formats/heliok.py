@@ -1,42 +1,521 @@
-"""HelioK XML: heliostats with arbitrary axes, nested nodes, facets (Grigoriev et al. 2021).
+"""HelioK XML: heliostats with arbitrary axes, nested nodes and facets (Grigoriev et al. 2021).
 
-A file is kept as a :class:`~heliotrope.field.formats._tree.Document`, word for word, so
-that reading, writing and reading again gives the same numbers and the same structure,
-with every attribute and comment, known or not. The functions below read its meaning::
+A file is kept word for word as a :class:`Document`, so that reading, writing and reading
+again gives the same numbers and the same structure, with every attribute and comment,
+known or not. The functions below read its meaning::
 
     HelioK   version, unitLength, unitAngle
       World    Location (name, longitude, latitude); Sun (azimuth, elevation, irradiance)
-      Factory  Material; HeliostatKit name: Primary, Secondary (translation, rotationAxis,
-               rotationAngles = stops), Facet (translation, rotation; ShapeKit), Angles,
-               Tracking (point, normal), Aiming (point)
+      Factory  Material; HeliostatKit (name): Primary, Secondary (translation,
+               rotationAxis, rotationAngles = stops), Facet (translation, rotation;
+               ShapeKit), Angles, Tracking (point, normal), Aiming (point)
       Scene    Node (name, translation, rotation), nested; in it ShapeKit or HeliostatKit ref
 
-The frame is ENU; the azimuth of the sun is clockwise from north. A rotation is three
-Euler angles applied about x, then y, then z, each about the fixed axis: R = Rz·Ry·Rx. A
-facet's own frame has the mirror in x and y and its normal along z.
+The frame is ENU; the sun's azimuth is clockwise from north. A rotation is three Euler
+angles about the fixed axes x, then y, then z: R = Rz·Ry·Rx. A mirror or another surface
+lies in x and y of its own frame, its normal along z.
 
-A number may carry its own unit behind a space ("1.000 mrad"). HelioK reads ``Angles``
-without one as radians, drops the last digit of it and ignores ``unitLength``; here the
-units of the root hold for all, and what is written names the unit of ``Angles``.
+A number may carry its own unit behind a space ("1.000 mrad"). HelioK itself reads
+``Angles`` without one as radians, less their last digit, and ignores ``unitLength``; here
+the units of the root hold for all numbers, and what :func:`from_plant` writes names the
+unit of ``Angles``.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from heliotrope.errors import FormatError, UnknownNameError
-from heliotrope.field.formats._heliok_build import from_plant
-from heliotrope.field.formats._tree import Document, Element, read_document, write_document
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._frames import euler_matrix, mirror_frame
+from heliotrope.field.formats._heliok_values import Values
+from heliotrope.field.formats._heliok_write import from_plant
+from heliotrope.field.formats._tree import (
+    Document,
+    Element,
+    Remark,
+    read_document,
+    write_document,
+)
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, direction, mirror_frame, rotation
+from heliotrope.geometry import FloatArray, as_float, direction, normalize
+from heliotrope.mechanism.armature import check_axes
 from heliotrope.mechanism.drives import direct
-from heliotrope.mechanism.kinds import EAST, NORTH, UP, two_axis
+from heliotrope.mechanism.kinds import two_axis
 from heliotrope.sun import Site
 
 __all__ = [
-    "Axis", "Document", "Model", "Placed", "Surface", "from_plant", "heliostats", "models",
-    "read", "site", "sun", "surfaces", "to_plant", "write",
+    "Axis", "Document", "Element", "Model", "PlacedModel", "PlacedSurface", "Remark", "Surface",
+    "from_plant", "heliostats", "models", "read", "site", "sun", "surfaces", "to_plant", "write",
 ]  # fmt: skip
+
+_LEANS = ("east", "north", "up")
+#: A normal closer than this (rad) to the secondary axis is not turned by it.
+ALONG_LIMIT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """A driven axis of a heliostat.
+
+    Attributes
+    ----------
+    origin
+        Point on it in its parent's frame, m, (3,).
+    direction
+        In its parent's frame, of unit length, (3,).
+    stops
+        Least and largest angle, rad, (2,).
+    """
+
+    origin: FloatArray
+    direction: FloatArray
+    stops: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A rectangular mirror or another surface.
+
+    Attributes
+    ----------
+    center
+        Of the rectangle in the parent's frame, m, (3,).
+    axes
+        Columns x (width), y (height) and z (normal) in the parent's frame, (3, 3).
+    width, height
+        m.
+    """
+
+    center: FloatArray
+    axes: FloatArray
+    width: float
+    height: float
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A heliostat of the factory, that nodes of the scene refer to.
+
+    Attributes
+    ----------
+    name
+        Unique.
+    primary, secondary
+        The driven axes.
+    facets
+        In the frame beyond the secondary axis.
+    angles
+        Primary and secondary angle at the start, rad, (2,).
+    point, normal
+        Vertex (m) and unit normal that tracking uses, beyond the secondary axis, (3,).
+    aim
+        Where it is aimed, ENU metres, (3,); None if the file does not say.
+    """
+
+    name: str
+    primary: Axis
+    secondary: Axis
+    facets: tuple[Surface, ...]
+    angles: FloatArray
+    point: FloatArray
+    normal: FloatArray
+    aim: FloatArray | None
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedModel:
+    """A heliostat of the scene.
+
+    Attributes
+    ----------
+    name
+        Of its node.
+    model
+        What stands there.
+    position
+        ENU metres, (3,).
+    orientation
+        From the heliostat's frame to ENU, (3, 3).
+    """
+
+    name: str
+    model: Model
+    position: FloatArray
+    orientation: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSurface:
+    """A surface of the scene that is no part of a heliostat.
+
+    Attributes
+    ----------
+    path
+        Names of its nodes from the outermost to its own.
+    surface
+        In ENU metres.
+    """
+
+    path: tuple[str, ...]
+    surface: Surface
+
+
+def read(path: str | Path) -> Document:
+    """Read a HelioK file, word for word.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read, is not well-formed, defines entities, is no HelioK
+        file or names no units.
+    """
+    document = read_document(path, "a HelioK file")
+    Values(document)
+    return document
+
+
+def write(document: Document, path: str | Path) -> None:
+    """Write a document: whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written or a value holds a character that XML cannot.
+    """
+    write_document(document, path)
+
+
+def models(document: Document) -> dict[str, Model]:
+    """Return the heliostats of the factory by name.
+
+    Raises
+    ------
+    FormatError
+        If a name occurs twice, or an element or a number is missing or wrong.
+    """
+    values = Values(document)
+    found: dict[str, Model] = {}
+    for factory in document.root.elements("Factory"):
+        for element in factory.elements("HeliostatKit"):
+            name = values.text(element, "name")
+            if name in found:
+                raise values.error(element, f"HeliostatKit {name}: the name occurs twice")
+            found[name] = _model(values, element, name)
+    return found
+
+
+def _model(values: Values, element: Element, name: str) -> Model:
+    tracking = values.child(element, "Tracking")
+    angles = values.child(element, "Angles")
+    aiming = list(element.elements("Aiming"))
+    normal = values.ratios(tracking, "normal", 3)
+    if not normal.any():
+        raise values.error(tracking, "<Tracking> normal: a vector of length 0 has no direction")
+    primary = _axis(values, values.child(element, "Primary"))
+    secondary = _axis(values, values.child(element, "Secondary"))
+    try:
+        check_axes(primary.direction, secondary.direction)
+    except InputError as error:
+        raise values.error(element, f"HeliostatKit {name}: {error}") from None
+    normal = normalize(normal)
+    if np.linalg.norm(np.cross(normal, secondary.direction)) < ALONG_LIMIT:
+        raise values.error(
+            tracking, f"HeliostatKit {name}: the normal lies along the secondary axis, which "
+            "then cannot turn it"
+        )  # fmt: skip
+    return Model(
+        name=name,
+        primary=primary,
+        secondary=secondary,
+        facets=tuple(_facet(values, facet) for facet in element.elements("Facet")),
+        angles=np.concatenate(
+            [values.angles(angles, part, 1) for part in ("primary", "secondary")]
+        ),
+        point=values.lengths(tracking, "point", 3),
+        normal=normal,
+        aim=values.lengths(aiming[0], "point", 3) if aiming else None,
+    )
+
+
+def _axis(values: Values, element: Element) -> Axis:
+    along = values.ratios(element, "rotationAxis", 3)
+    if not along.any():
+        raise values.error(
+            element, f"<{element.tag}> rotationAxis: a vector of length 0 has no direction"
+        )
+    stops = values.angles(element, "rotationAngles", 2)
+    if stops[0] >= stops[1]:
+        raise values.error(
+            element, f"<{element.tag}> rotationAngles {np.degrees(stops[0]):g}° to "
+            f"{np.degrees(stops[1]):g}°: the lower stop stands first; exchange them"
+        )  # fmt: skip
+    return Axis(values.lengths(element, "translation", 3), normalize(along), stops)
+
+
+def _facet(values: Values, element: Element) -> Surface:
+    center, axes = _place(values, element)
+    return _surface(values, values.child(element, "ShapeKit"), center, axes)
+
+
+def _surface(values: Values, kit: Element, origin: FloatArray, axes: FloatArray) -> Surface:
+    aperture = values.child(kit, "ApertureRectangular")
+    if aperture.get("xWidth") is not None:
+        width = float(values.lengths(aperture, "xWidth", 1)[0])
+        height = float(values.lengths(aperture, "yWidth", 1)[0])
+        middle = np.zeros(3)
+    else:
+        x, y = values.lengths(aperture, "x", 2), values.lengths(aperture, "y", 2)
+        width, height = float(x[1] - x[0]), float(y[1] - y[0])
+        middle = np.array([x.mean(), y.mean(), 0.0])
+    if width <= 0.0 or height <= 0.0:
+        raise values.error(
+            aperture, f"<ApertureRectangular> {width:g} m × {height:g} m: both must be above 0"
+        )
+    return Surface(origin + axes @ middle, axes, width, height)
+
+
+def _place(values: Values, element: Element) -> tuple[FloatArray, FloatArray]:
+    """Return the translation and the rotation of a node or facet; both may be missing."""
+    moved, turned = np.zeros(3), np.eye(3)
+    if element.get("translation") is not None:
+        moved = values.lengths(element, "translation", 3)
+    if element.get("rotation") is not None:
+        turned = euler_matrix(values.angles(element, "rotation", 3))
+    return moved, turned
+
+
+@dataclass(frozen=True, eq=False)
+class _Kit:
+    """A HeliostatKit or ShapeKit of the scene with what its nodes add up to."""
+
+    element: Element
+    path: tuple[str, ...]
+    position: FloatArray = field(default_factory=lambda: np.zeros(3))
+    axes: FloatArray = field(default_factory=lambda: np.eye(3))
+
+
+def _kits(values: Values, node: Element, place: _Kit) -> Iterator[_Kit]:
+    for child in node.elements():
+        if child.tag == "Node":
+            moved, turned = _place(values, child)
+            yield from _kits(
+                values, child,
+                _Kit(child, (*place.path, child.get("name") or ""),
+                     place.position + place.axes @ moved, place.axes @ turned),
+            )  # fmt: skip
+        elif child.tag in {"HeliostatKit", "ShapeKit"}:
+            yield _Kit(child, place.path, place.position, place.axes)
+
+
+def _scene(document: Document, values: Values, tag: str) -> Iterator[_Kit]:
+    for scene in document.root.elements("Scene"):
+        for kit in _kits(values, scene, _Kit(scene, ())):
+            if kit.element.tag == tag:
+                yield kit
+
+
+def heliostats(document: Document) -> list[PlacedModel]:
+    """Return the heliostats of the scene, in the order of the file.
+
+    Raises
+    ------
+    FormatError
+        As :func:`models`, and if a node has no name, a name occurs twice or a model is
+        not known.
+    """
+    values, known = Values(document), models(document)
+    found: dict[str, PlacedModel] = {}
+    for kit in _scene(document, values, "HeliostatKit"):
+        name = kit.path[-1] if kit.path else ""
+        if not name:
+            raise values.error(kit.element, "a heliostat whose node has no name; give it one")
+        if name in found:
+            raise values.error(
+                kit.element, f"heliostat {name}: the name occurs twice; names are unique"
+            )
+        ref = values.text(kit.element, "ref")
+        if ref not in known:
+            raise values.error(kit.element, str(UnknownNameError("HeliostatKit", ref, known)))
+        found[name] = PlacedModel(name, known[ref], kit.position, kit.axes)
+    return list(found.values())
+
+
+def surfaces(document: Document) -> list[PlacedSurface]:
+    """Return the surfaces of the scene (receivers, targets), in the order of the file.
+
+    Raises
+    ------
+    FormatError
+        If an aperture is not rectangular or a number is missing or wrong.
+    """
+    values = Values(document)
+    return [
+        PlacedSurface(kit.path, _surface(values, kit.element, kit.position, kit.axes))
+        for kit in _scene(document, values, "ShapeKit")
+    ]
+
+
+def site(document: Document, height: float) -> Site:
+    """Return the site that ``Location`` names, at ``height`` m, which the file does not hold.
+
+    Raises
+    ------
+    FormatError
+        If there is no location.
+    """
+    values = Values(document)
+    location = values.child(values.child(document.root, "World"), "Location")
+    longitude, latitude = (values.angles(location, n, 1)[0] for n in ("longitude", "latitude"))
+    return Site(
+        float(np.degrees(latitude)), float(np.degrees(longitude)), height,
+        name=location.get("name") or "",
+    )  # fmt: skip
+
+
+def sun(document: Document) -> FloatArray:
+    """Return the unit vector to the document's sun, ENU, (3,).
+
+    Raises
+    ------
+    FormatError
+        If there is no sun.
+    """
+    values = Values(document)
+    element = values.child(values.child(document.root, "World"), "Sun")
+    azimuth, elevation = (values.angles(element, n, 1)[0] for n in ("azimuth", "elevation"))
+    return direction(azimuth, elevation)
+
+
+def to_plant(document: Document, site: Site) -> Plant:
+    """Return the plant that a document describes.
+
+    Heliostats become mechanisms of kind "two_axis" with angles as counts; those whose
+    primary axes point alike and that have as many facets share a group. Surfaces below a
+    node named "Targets" become targets, all others receivers. What a plant has no place
+    for (materials, curved shapes, the sun and its shape, starting angles) stays in the
+    document.
+
+    Parameters
+    ----------
+    document
+        From :func:`read`.
+    site
+        The plant's reference point; see :func:`site`.
+
+    Raises
+    ------
+    FormatError
+        As :func:`heliostats` and :func:`surfaces`, and if a mirror has no facet, axes are
+        parallel or a name occurs twice.
+    """
+    path = document.path or "HelioK document"
+    members: dict[tuple[int, int], list[PlacedModel]] = {}
+    for placed in heliostats(document):
+        model = placed.model
+        if not model.facets:
+            raise FormatError(
+                path, f"HeliostatKit {model.name}: no <Facet>, so its mirror has no size; add one"
+            )
+        upright = int(np.argmax(np.abs(model.primary.direction)))
+        members.setdefault((upright, len(model.facets)), []).append(placed)
+    several = len(members) > 1
+    groups = {
+        f"heliostats-{k}" if several else "heliostats": _group(same, upright)
+        for k, ((upright, _), same) in enumerate(members.items(), start=1)
+    }
+    targets: list[Target] = []
+    receivers: list[Receiver] = []
+    for placed_surface, name in _named(surfaces(document)):
+        if "Targets" in placed_surface.path[:-1]:
+            targets.append(_target(placed_surface.surface, name))
+        else:
+            receivers.append(_receiver(placed_surface.surface, name))
+    return Plant(site.name, site, groups, tuple(targets), tuple(receivers))
+
+
+def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
+    """Give each surface a name of its own: a node may hold several, or have no name."""
+    taken: set[str] = set()
+    for one in placed:
+        wanted = name = (one.path[-1] if one.path else "") or "surface"
+        count = 1
+        while name in taken:
+            count += 1
+            name = f"{wanted}-{count}"
+        taken.add(name)
+        yield one, name
+
+
+def _corners(surface: Surface) -> FloatArray:
+    """Return upper left, upper right, lower right and lower left, m, (4, 3)."""
+    across = 0.5 * surface.width * surface.axes[:, 0]
+    up = 0.5 * surface.height * surface.axes[:, 1]
+    corners = np.array([up - across, up + across, across - up, -across - up])
+    return as_float(surface.center + corners)
+
+
+def _target(surface: Surface, name: str) -> Target:
+    return Target(name, _corners(surface), surface.center)
+
+
+def _receiver(surface: Surface, name: str) -> Receiver:
+    return Receiver(
+        name, "planar", surface.center, surface.axes[:, 2], surface.width, surface.height,
+        _corners(surface),
+    )  # fmt: skip
+
+
+def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
+    """Return heliostats whose primary axes all lie nearest to axis ``upright`` of their frame."""
+    models_ = [one.model for one in placed]
+    primary, secondary = [m.primary for m in models_], [m.secondary for m in models_]
+    stops = [np.array([axis.stops for axis in axes]) for axes in (primary, secondary)]
+    normal, point = np.array([m.normal for m in models_]), np.array([m.point for m in models_])
+    first, second = (name for k, name in enumerate(_LEANS) if k != upright)
+    mechanism = two_axis(
+        np.array([one.position for one in placed]),
+        np.array([axis.direction for axis in primary]),
+        np.array([axis.direction for axis in secondary]),
+        normal,
+        leans=(first, second),
+        origin_1=np.array([axis.origin for axis in primary]),
+        origin_2=np.array([axis.origin for axis in secondary]),
+        vertex=point,
+        orientation=np.array([one.orientation for one in placed]),
+        drives=(
+            direct(min_angle=stops[0][:, 0], max_angle=stops[0][:, 1]),
+            direct(min_angle=stops[1][:, 0], max_angle=stops[1][:, 1]),
+        ),
+    )
+    facets = _facets(models_, mirror_frame(normal), point)
+    corners = facets.center[:, :, None] + np.stack(
+        [a * facets.half_width + b * facets.half_height for a in (-1, 1) for b in (-1, 1)], axis=2
+    )
+    size = np.ptp(corners.reshape(len(placed), -1, 3), axis=1)
+    aims = [np.full(3, np.nan) if m.aim is None else m.aim for m in models_]
+    return Heliostats(
+        names=tuple(one.name for one in placed),
+        mechanism=mechanism,
+        width=size[:, 0],
+        height=size[:, 1],
+        facets=facets,
+        aim=None if np.isnan(aims).all() else np.array(aims),
+    )
+
+
+def _facets(models_: list[Model], frame: FloatArray, point: FloatArray) -> Facets:
+    def turned(vectors: FloatArray) -> FloatArray:
+        return as_float(np.einsum("nji,nfj->nfi", frame, vectors))
+
+    center = np.array([[f.center for f in m.facets] for m in models_]) - point[:, None]
+    axes = np.array([[f.axes for f in m.facets] for m in models_])
+    half = 0.5 * np.array([[(f.width, f.height) for f in m.facets] for m in models_])
+    return Facets(
+        turned(center),
+        turned(half[..., :1] * axes[..., 0]),
+        turned(half[..., 1:] * axes[..., 1]),
+    )

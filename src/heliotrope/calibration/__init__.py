@@ -1,0 +1,1 @@
+"""From sightings to the parameters of each mirror, with their covariance."""

@@ -1,0 +1,55 @@
+"""The mirror's own frame in a mechanism's last frame, and Euler angles of files."""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray, as_float, normalize, rotation
+from heliotrope.mechanism.kinds import EAST, NORTH, UP
+
+
+def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
+    """Return the mirror's axes (x right, y up, z along the normal) in the chain's last frame.
+
+    Facets are given in these axes. At zero joint angles y is as close to up as the mirror
+    allows (to north for a mirror that lies face up), and x is to the right as seen from
+    the front.
+
+    Parameters
+    ----------
+    normal
+        ``Mechanism.normal``, unit vectors (..., 3).
+
+    Returns
+    -------
+    Rotations from the mirror's axes to the chain's last frame, (..., 3, 3).
+    """
+    n = normalize(normal, "normal")
+    lies_flat = np.linalg.norm(n[..., :2], axis=-1, keepdims=True) < 1e-6
+    towards = np.where(lies_flat, NORTH, UP)
+    y = normalize(towards - np.sum(towards * n, axis=-1, keepdims=True) * n)
+    return np.stack([np.cross(y, n), y, n], axis=-1)
+
+
+def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
+    """Return R = Rz·Ry·Rx, (..., 3, 3), of angles about x, y and z, rad, (..., 3)."""
+    a = as_float(angles)
+    about_x, about_y = rotation(EAST, a[..., 0]), rotation(NORTH, a[..., 1])
+    return rotation(UP, a[..., 2]) @ about_y @ about_x
+
+
+def euler_angles(matrix: npt.ArrayLike) -> FloatArray:
+    """Return angles about x, y and z, rad, (..., 3), with R = Rz·Ry·Rx.
+
+    Where y is ±π/2 only the difference (or sum) of the others is defined: z is then 0.
+    """
+    r = as_float(matrix)
+    across = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    locked = across < 1e-9
+    x = np.where(
+        locked,
+        np.arctan2(-r[..., 1, 2], r[..., 1, 1]),
+        np.arctan2(r[..., 2, 1], r[..., 2, 2]),
+    )
+    y = np.arctan2(-r[..., 2, 0], across)
+    z = np.where(locked, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    return np.stack([x, y, z], axis=-1)

@@ -1,0 +1,185 @@
+"""Where an imperfect heliostat throws its beam: the error model of Malan as a forward model.
+
+A controller knows the *nominal* mechanism and moves the drives so that this one would send
+the sun to the aim. The *actual* mechanism, which has imperfections, stands at the same
+counts. Its beam misses the aim by what this module returns. Nothing here depends on the
+kind of mechanism or of imperfection: both are data of the chain.
+
+Source: Malan, §4.2 (nine steps), for azimuth-elevation heliostats; his steps as readings
+of the chain stand in ``docs/explanation/malan.md``.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect, tangent_axes
+from heliotrope.mechanism.chain import Mechanism, Pose
+from heliotrope.mechanism.tracking import Status, track
+
+
+@dataclass(frozen=True)
+class ImageOffsets:
+    """Where beams cross the plane through the aim that is perpendicular to the line of sight.
+
+    NaN stands where there is nothing to compare: the nominal mechanism cannot send the sun
+    to the aim, or the beam never reaches the plane.
+
+    Attributes
+    ----------
+    right, up
+        From the aim, as seen from the heliostat, m, (...).
+    slant
+        Distance from the nominal vertex to the aim, m, (...).
+    normal, beam
+        Unit normal of the actual mirror, and the direction that its beam takes, ENU,
+        (..., 3).
+    """
+
+    right: FloatArray
+    up: FloatArray
+    slant: FloatArray
+    normal: FloatArray
+    beam: FloatArray
+
+    @property
+    def distance(self) -> FloatArray:
+        """Distance of the beam from the aim, m, (...)."""
+        return as_float(np.hypot(self.right, self.up))
+
+    @property
+    def beam_error(self) -> FloatArray:
+        """Beam error to the right and upwards, rad, (..., 2).
+
+        Offset over slant range, as Malan divides; it is the tangent of the angle where the
+        heliostat stands where it should.
+        """
+        return np.stack([self.right / self.slant, self.up / self.slant], axis=-1)
+
+    def rms(self, axis: int | tuple[int, ...] | None = None) -> FloatArray:
+        """Return the two-dimensional RMS of the beam error, rad.
+
+        Parameters
+        ----------
+        axis
+            Batch axes to average over, such as that of the times; default all. NaN are
+            left out, and the RMS of nothing is NaN.
+        """
+        square = (self.distance / self.slant) ** 2
+        known = np.isfinite(square)
+        total = np.sum(square, axis=axis, where=known)
+        count = np.sum(known, axis=axis)
+        mean = np.divide(total, count, out=np.full(np.shape(total), np.nan), where=count > 0)
+        return as_float(np.sqrt(mean))
+
+
+def image_offsets(
+    nominal: Mechanism, actual: Mechanism, sun: npt.ArrayLike, aim: npt.ArrayLike
+) -> ImageOffsets:
+    """Return where the beams of actual heliostats fall that are driven as nominal ones.
+
+    All batch shapes broadcast: a day of suns with one heliostat, (times, 1) suns with
+    (heliostats,) mechanisms, or one nominal mechanism with many actual ones.
+
+    Parameters
+    ----------
+    nominal
+        What the controller believes.
+    actual
+        What is there: a mechanism of the same kind, as ``nominal.with_parameters`` gives it.
+    sun
+        Unit vectors to the sun, ENU, (..., 3).
+    aim
+        ENU metres, (..., 3).
+
+    Raises
+    ------
+    InputError
+        If the mechanisms are of different kinds, an input is not finite, a sun is not a
+        unit vector, or shapes do not fit.
+
+    Notes
+    -----
+    Of two poses that reach the aim the controller takes the one within the stops of the
+    nominal drives. An azimuth-elevation mechanism without stops may go over the top,
+    where an elevation bias acts the other way round.
+
+    Malan, §4.2 with (4.26) resolved: +right and +up are those of someone who stands at the
+    heliostat and looks at the aim. Accuracy: 1e-13 m at 40 m against an independent
+    implementation of his model.
+    """
+    towards, pose, beam = _stand(nominal, actual, sun, as_vectors(aim, "aim"))
+    slant = np.linalg.norm(towards, axis=-1)
+    sight = towards / slant[..., None]
+    gap = as_vectors(aim, "aim") - pose.vertex
+    closing = np.sum(beam * sight, axis=-1)
+    ahead = np.sum(gap * sight, axis=-1)
+    meets = (closing > 0.0) & (ahead > 0.0)
+    length = np.divide(ahead, closing, out=np.full(meets.shape, np.nan), where=meets)
+    axes = tangent_axes(sight)
+    miss = length[..., None] * beam - gap
+    return ImageOffsets(
+        right=np.sum(miss * axes[..., 0, :], axis=-1),
+        up=np.sum(miss * axes[..., 1, :], axis=-1),
+        slant=np.broadcast_to(slant, meets.shape),
+        normal=np.broadcast_to(pose.normal, beam.shape),
+        beam=beam,
+    )
+
+
+def target_offsets(
+    nominal: Mechanism,
+    actual: Mechanism,
+    sun: npt.ArrayLike,
+    target: Target,
+    aim: npt.ArrayLike | None = None,
+) -> FloatArray:
+    """Return where the same beams fall on a real target, as its camera sees them.
+
+    Parameters
+    ----------
+    nominal, actual, sun
+        As for :func:`image_offsets`, with its errors.
+    target
+        The target whose plane they fall on.
+    aim
+        ENU metres, (..., 3); default the target's centre.
+
+    Returns
+    -------
+    Metres to the right of and above the target's centre as seen from its front,
+    (..., 2). NaN as for :func:`image_offsets`, and where the beam comes from behind.
+    """
+    point = target.center if aim is None else as_vectors(aim, "aim")
+    _, pose, beam = _stand(nominal, actual, sun, point)
+    hits = target.intersect(pose.vertex, beam)
+    known = np.isfinite(hits)
+    plane = target.plane_coordinates(np.where(known, hits, target.center))
+    return np.where(known.all(axis=-1, keepdims=True), plane, np.nan)
+
+
+def _stand(
+    nominal: Mechanism, actual: Mechanism, sun: npt.ArrayLike, aim: FloatArray
+) -> tuple[FloatArray, Pose, FloatArray]:
+    """Return nominal vertex to aim, the actual pose, and the beam (NaN if out of reach)."""
+    if (nominal.kind, nominal.joints) != (actual.kind, actual.joints):
+        raise InputError(
+            f"actual: a {actual.kind} mechanism, but the nominal one is {nominal.kind}; "
+            "make it with nominal.with_parameters"
+        )
+    tracked = track(nominal, sun, aim)
+    counts = tracked.chosen(tracked.counts)
+    try:
+        np.broadcast_shapes(counts.shape[:-1], actual.shape)
+    except ValueError:
+        raise InputError(
+            f"actual: mechanisms of shape {actual.shape} do not fit nominal ones, suns and "
+            f"aims of shape {counts.shape[:-1]}"
+        ) from None
+    pose = actual.pose(counts)
+    beam = reflect(as_vectors(sun, "sun"), pose.normal)
+    reached = tracked.chosen(tracked.status) == Status.OK
+    return aim - tracked.chosen(tracked.vertex), pose, np.where(reached[..., None], beam, np.nan)
