@@ -305,13 +305,12 @@ def _median_scale(squares, keep, rows):
 
 @njit(**_OPTIONS)
 def fit_block(
-    arrays, codes, sigma, begin, offsets, data, loss, rounds, limit, lowest_scale,
+    arrays, codes, sigma, offsets, data, loss, rounds, limit, lowest_scale,
     x, covariance, scales, squares, costs, iterations, status, start, stop,
 ):  # fmt: skip
     """Fit heliostats ``start`` to ``stop``.
 
-    ``begin`` (N, P) are the starting values, ``offsets`` (N + 1,) the sightings of each,
-    ``rounds`` how often the scale of the residuals is estimated anew (0: it stays 1).
+    ``offsets`` (N + 1,) are the sightings of each, ``rounds`` how often the scale of the residuals is estimated anew (0: it stays 1).
     """
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]
@@ -331,8 +330,7 @@ def fit_block(
         kept = 0
         for k in range(rows[0], rows[1]):
             kept += keep[k]
-        for p in range(size):
-            y[p] = begin[i, p] / sigma[i, p]
+        y[:] = 0.0
         scale, total, converged, cost = 1.0, 0, False, np.nan
         scratch = (hessian, gradient, damped, factor, step, trial, squares)
         if kept > 0:

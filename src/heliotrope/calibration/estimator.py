@@ -172,16 +172,19 @@ def fit(
     data = _data(started, ordered, used[order])
     offsets = np.searchsorted(ordered.heliostat, np.arange(count + 1))
     squares, costs = np.full(rows, np.nan), np.empty(count)
-    arrays = mechanism.kernel_arrays
+    arrays = started.kernel_arrays
     run_blocks(
         lambda a, b: kernels.fit_block(
-            arrays, codes, sigma, begin, offsets, data, _LOSSES[loss], 4 if adapt_scale else 0,
+            arrays, codes, sigma, offsets, data, _LOSSES[loss], 4 if adapt_scale else 0,
             max_iterations, 1e-3, result.values, result.covariance, result.scale, squares, costs,
             result.iterations, result.outcome, a, b,
         ),
         count,
         minimum_rows=2,
     )  # fmt: skip
+    # The prior stands around the start: a zero that is off by a radian is a wrong entry,
+    # not an improbable installation.
+    result.values[:] += begin
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
     return result
 

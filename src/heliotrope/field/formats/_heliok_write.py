@@ -12,7 +12,7 @@ from heliotrope.field.formats._tree import Document, Element
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, normalize
+from heliotrope.geometry import TAU, FloatArray, as_float, normalize
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.sun import Site
@@ -211,23 +211,21 @@ def _stops(names: tuple[str, ...], drives: Drive) -> FloatArray:
     high = np.minimum(ends.max(axis=-1), t[..., SLOTS["max_angle"]])
     # A free axis goes all the way round, in HelioK as half a turn to either side.
     free_low, free_high = np.isinf(low), np.isinf(high)
-    low, high = (
-        np.where(free_low, np.where(free_high, -np.pi, high - 2.0 * np.pi), low),
-        np.where(free_high, np.where(free_low, np.pi, low + 2.0 * np.pi), high),
-    )
-    stuck = np.asarray(low >= high)
-    if stuck.any():
-        i, axis = np.argwhere(stuck)[0]
+    least = as_float(np.where(free_low, np.where(free_high, -np.pi, high - TAU), low))
+    most = as_float(np.where(free_high, np.where(free_low, np.pi, low + TAU), high))
+    stuck = np.argwhere(least >= most)
+    if len(stuck):
+        i, axis = stuck[0].tolist()
         raise InputError(
             f"heliostat {names[i]}: the stops of its {('primary', 'secondary')[axis]} axis leave "
-            f"no motion ({low[i, axis]:g} to {high[i, axis]:g} rad); HelioK needs an interval"
+            f"no motion ({least[i, axis]:g} to {most[i, axis]:g} rad); HelioK needs an interval"
         )
-    return np.stack([low, high], axis=-1)
+    return np.stack([least, most], axis=-1)
 
 
 def _aims(heliostats: Heliostats, default: FloatArray | None) -> FloatArray:
     aims = np.full((len(heliostats), 3), np.nan) if heliostats.aim is None else heliostats.aim
-    missing = np.isnan(aims).any(axis=-1)
+    missing = np.asarray(np.isnan(aims).any(axis=-1))
     if missing.any() and default is None:
         name = heliostats.names[int(np.flatnonzero(missing)[0])]
         raise InputError(

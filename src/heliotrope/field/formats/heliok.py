@@ -41,9 +41,9 @@ from heliotrope.field.formats._tree import (
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, as_float, direction, normalize
+from heliotrope.geometry import FloatArray, angle_between, as_float, direction, normalize
 from heliotrope.mechanism.armature import check_axes
-from heliotrope.mechanism.drives import direct
+from heliotrope.mechanism.drives import Drive, direct
 from heliotrope.mechanism.kinds import two_axis
 from heliotrope.sun import Site
 
@@ -55,6 +55,8 @@ __all__ = [
 _LEANS = ("east", "north", "up")
 #: A normal closer than this (rad) to the secondary axis is not turned by it.
 ALONG_LIMIT = 1e-6
+#: A facet further from the mirror's normal is a mistake, not canting.
+FACET_LIMIT_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +233,7 @@ def _model(values: Values, element: Element, name: str) -> Model:
         name=name,
         primary=primary,
         secondary=secondary,
-        facets=tuple(_facet(values, facet) for facet in element.elements("Facet")),
+        facets=tuple(_facet(values, facet, normal) for facet in element.elements("Facet")),
         angles=np.concatenate(
             [values.angles(angles, part, 1) for part in ("primary", "secondary")]
         ),
@@ -256,8 +258,14 @@ def _axis(values: Values, element: Element) -> Axis:
     return Axis(values.lengths(element, "translation", 3), normalize(along), stops)
 
 
-def _facet(values: Values, element: Element) -> Surface:
+def _facet(values: Values, element: Element, normal: FloatArray) -> Surface:
     center, axes = _place(values, element)
+    away = np.degrees(angle_between(axes[:, 2], normal))
+    if away > FACET_LIMIT_DEG:
+        raise values.error(
+            element, f"<Facet> rotation: its normal stands {away:.0f}° from that of <Tracking>, "
+            f"which is more than {FACET_LIMIT_DEG:g}°; turn the facet"
+        )  # fmt: skip
     return _surface(values, values.child(element, "ShapeKit"), center, axes)
 
 
@@ -473,7 +481,6 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     """Return heliostats whose primary axes all lie nearest to axis ``upright`` of their frame."""
     models_ = [one.model for one in placed]
     primary, secondary = [m.primary for m in models_], [m.secondary for m in models_]
-    stops = [np.array([axis.stops for axis in axes]) for axes in (primary, secondary)]
     normal, point = np.array([m.normal for m in models_]), np.array([m.point for m in models_])
     first, second = (name for k, name in enumerate(_LEANS) if k != upright)
     mechanism = two_axis(
@@ -486,10 +493,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
         origin_2=np.array([axis.origin for axis in secondary]),
         vertex=point,
         orientation=np.array([one.orientation for one in placed]),
-        drives=(
-            direct(min_angle=stops[0][:, 0], max_angle=stops[0][:, 1]),
-            direct(min_angle=stops[1][:, 0], max_angle=stops[1][:, 1]),
-        ),
+        drives=(_drive(primary), _drive(secondary)),
     )
     facets = _facets(models_, mirror_frame(normal), point)
     corners = facets.center[:, :, None] + np.stack(
@@ -505,6 +509,13 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
         facets=facets,
         aim=None if np.isnan(aims).all() else np.array(aims),
     )
+
+
+def _drive(axes: list[Axis]) -> Drive:
+    """Return drives whose counts are radians, one an axis, with its stops."""
+    stops = np.array([axis.stops for axis in axes])
+    each = Drive(np.tile(direct().table, (len(axes), 1)))
+    return each.replace(min_angle=stops[:, 0], max_angle=stops[:, 1])
 
 
 def _facets(models_: list[Model], frame: FloatArray, point: FloatArray) -> Facets:
