@@ -1,0 +1,45 @@
+# Heliotrope: `make run` and `make test` do all that is needed; `make help` lists the rest.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+JOBS ?= auto
+
+.DEFAULT_GOAL := help
+.PHONY: help setup run test soak lint docs bench clean
+
+help:  ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
+
+setup: $(STAMP)  ## make the environment in .venv
+
+$(STAMP): pyproject.toml constraints.txt scripts/setup.sh
+	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/setup.sh
+	@touch $@
+
+run: $(STAMP)  ## make an example plant, measure, calibrate and track it, and write a report
+	@$(BIN)/heliotrope demo --into out/demo
+
+test: $(STAMP)  ## run the tests in parallel
+	@$(BIN)/python -m heliotrope.warm
+	@HELIOTROPE_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m "not slow" -q
+
+soak: $(STAMP)  ## run the slow tests too
+	@$(BIN)/python -m pytest -n $(JOBS) -q
+
+lint: $(STAMP)  ## check style, types and layers
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+docs: $(STAMP)  ## build the documentation into site/
+	@$(BIN)/mkdocs build --strict --quiet
+
+bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
+	@$(BIN)/python -m benchmarks all
+
+clean:  ## remove what was built, but not the environment
+	rm -rf build dist site out .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find src tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

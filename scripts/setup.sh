@@ -1,0 +1,28 @@
+#!/usr/bin/env bash
+# Makes the environment. Called by the Makefile with PYTHON and VENV.
+set -euo pipefail
+
+fail() { printf 'setup: %s\n' "$*" >&2; exit 2; }
+
+command -v "$PYTHON" >/dev/null || fail "no $PYTHON found; install Python 3.11 or newer, or say make PYTHON=/path/to/python"
+"$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
+  fail "$("$PYTHON" --version) is too old; Python 3.11 or newer is needed: make PYTHON=/path/to/python"
+
+# Debian splits venv from Python: install it where we may, and say what is missing where not.
+if ! "$PYTHON" -c 'import ensurepip' 2>/dev/null; then
+  package="$("$PYTHON" -c 'import sys; print(f"python3.{sys.version_info.minor}-venv")')"
+  as_root=""
+  [ "$(id -u)" = 0 ] || as_root="sudo -n"
+  if command -v apt-get >/dev/null && { [ -z "$as_root" ] || sudo -n true 2>/dev/null; }; then
+    echo "setup: installing $package"
+    $as_root apt-get update -qq && $as_root apt-get install -y -qq "$package" >/dev/null ||
+      fail "could not install $package; install it by hand and try again"
+  else
+    fail "Python lacks its venv module; install the package $package (as root: apt-get install $package) and try again"
+  fi
+fi
+
+[ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
+echo "setup: installing into $VENV"
+"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input \
+  --constraint constraints.txt --editable ".[dev]"

@@ -1,0 +1,27 @@
+"""Compile the numeric kernels once, so that what comes after starts at full speed.
+
+``python -m heliotrope.warm`` takes about half a minute after an installation and a
+second later on; the compiled code stays in the package's ``__pycache__``.
+"""
+
+
+def main() -> None:
+    """Run every kernel once on a small case."""
+    import numpy as np
+
+    from heliotrope.calibration.estimator import fit
+    from heliotrope.calibration.sightings import sightings
+    from heliotrope.mechanism import kinds
+    from heliotrope.mechanism.tracking import track
+
+    mechanism = kinds.azimuth_elevation(np.array([[0.0, 50.0, 0.0]]), pivot_offset=0.2)
+    sun, aim = np.array([0.0, -0.6, 0.8]), np.array([0.0, 0.0, 30.0])
+    tracking = track(mechanism, sun, aim)
+    counts = tracking.chosen(tracking.counts)
+    mechanism.jacobian(counts, ("tilt_north", "position_up"))
+    mechanism.drives.radians_per_count(counts)
+    fit(mechanism, sightings([0], counts, sun, aim), "malan8")
+
+
+if __name__ == "__main__":
+    main()

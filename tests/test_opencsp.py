@@ -1,0 +1,274 @@
+"""OpenCSP's tables: columns by name, the pivot's place, facets, both ways."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as nps
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats import opencsp
+from heliotrope.field.formats._frames import mirror_frame
+from heliotrope.field.formats.opencsp import Centroids, Field
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import rotation
+from heliotrope.mechanism import kinds
+from heliotrope.sun import Site
+
+FILES = Path(__file__).parent / "files"
+FIELD, CENTROIDS = FILES / "opencsp-field.csv", FILES / "opencsp-centroids.csv"
+SITE = Site(34.96, -106.51, 1700.0, name="test field")
+
+
+def plant() -> Plant:
+    return opencsp.to_plant(opencsp.read_field(FIELD), SITE, opencsp.read_centroids(CENTROIDS))
+
+
+def edited(tmp_path: Path, source: Path, old: str, new: str) -> Path:
+    text = source.read_text(encoding="utf-8")
+    assert old in text
+    path = tmp_path / source.name
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    return path
+
+
+# -- reading ---------------------------------------------------------------------------
+
+
+def test_columns_are_read_by_name() -> None:
+    table = opencsp.read_field(FIELD)
+    assert table.names == ("A1", "A2", "B1")
+    np.testing.assert_array_equal(table.location[0], [-4.84, 57.93, 3.89])
+    np.testing.assert_array_equal(table.facets, [6, 6, 6])
+    np.testing.assert_array_equal(table.rows, [2, 2, 2])
+    np.testing.assert_array_equal(table.columns, [3, 3, 3])
+    np.testing.assert_array_equal(table.pivot_height, 4.02)
+    np.testing.assert_array_equal(table.pivot_offset, [0.1778, 0.1778, 0.2])
+    np.testing.assert_array_equal(table.facet_height, 1.1)
+    assert table.extra == {"Remark": ("washed, twice", "", "new")}
+
+
+def test_the_order_of_columns_is_free(tmp_path: Path) -> None:
+    text = FIELD.read_text(encoding="utf-8").replace('"washed, twice"', "")
+    rows = [line.split(",") for line in text.splitlines()]
+    path = tmp_path / "other.csv"
+    path.write_text("\ufeff" + "\n\n".join(",".join(reversed(r)) for r in rows), encoding="utf-8")
+    table = opencsp.read_field(path)
+    np.testing.assert_array_equal(table.location, opencsp.read_field(FIELD).location)
+
+
+def test_centroids_are_read() -> None:
+    table = opencsp.read_centroids(CENTROIDS)
+    assert table.ids == tuple("123456")
+    np.testing.assert_array_equal(table.center[2], [1.25, 0.6, -0.01])
+
+
+# -- geometry --------------------------------------------------------------------------
+
+#: OpenCSP's test data for heliostat 5W1 of the NSTTF: azimuth and elevation of the mirror,
+#: centroids of two facets in the mirror, and where they are in the field.
+AZIMUTH, ELEVATION = 3.091673780116996, 0.9140378446583401
+PUBLISHED = {
+    (-2.7941016, 2.5655016, -0.0115824): (-7.72694089, 59.71850473, 5.58801461),
+    (0.0, 0.0, 0.0): (-4.83458324, 57.82157893, 4.03081325),
+    (2.7941016, -2.5655016, -0.0115824): (-1.94293132, 55.93877885, 2.45526593),
+}
+
+
+def test_published_places_of_facets_are_met() -> None:
+    one = np.ones(1, dtype=np.int64)
+    table = Field(
+        ("5W1",), np.array([[-4.84, 57.93, 3.89]]), 3 * one, one, 3 * one,
+        np.array([4.02]), np.array([0.1778]), np.array([1.2192]), np.array([1.2192]),
+    )  # fmt: skip
+    centroids = Centroids(("1", "13", "25"), np.array(list(PUBLISHED)))
+    group = opencsp.to_plant(table, SITE, centroids).groups["heliostats"]
+    pose = group.mechanism.pose([[AZIMUTH, ELEVATION]])
+    turned = rotation((0, 0, -1), AZIMUTH) @ rotation((1, 0, 0), ELEVATION)
+    assert group.facets is not None
+    places = pose.vertex + group.facets.center[0] @ (turned @ mirror_frame((0, 1, 0))).T
+    np.testing.assert_allclose(places, list(PUBLISHED.values()), atol=2e-8)
+    np.testing.assert_allclose(pose.normal, [[0.03046545, -0.6097923, 0.79197551]], atol=1e-8)
+
+
+def test_a_field_becomes_a_plant() -> None:
+    group = plant().groups["heliostats"]
+    assert group.mechanism.kind == "azimuth_elevation"
+    np.testing.assert_allclose(group.position[:, 2], [-0.13, 0.0, -0.05], atol=1e-12)
+    # Extent of the centroids and a facet more.
+    np.testing.assert_allclose(group.width, 3.7)
+    np.testing.assert_allclose(group.height, 2.3)
+    assert group.facets is not None
+    np.testing.assert_allclose(group.facets.half_width[2, 5], [0.6, 0, 0])
+    np.testing.assert_allclose(group.facets.half_height[2, 5], [0, 0.55, 0])
+
+
+def test_without_centroids_facets_stand_edge_to_edge() -> None:
+    group = opencsp.to_plant(opencsp.read_field(FIELD), SITE).groups["heliostats"]
+    assert group.facets is not None
+    np.testing.assert_allclose(
+        group.facets.center[0],
+        [[x, y, 0] for y in (0.55, -0.55) for x in (-1.2, 0, 1.2)],
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(group.width, 3.6)
+    np.testing.assert_allclose(group.height, 2.2)
+
+
+def test_heliostats_of_different_grids_form_groups(tmp_path: Path) -> None:
+    path = edited(tmp_path, FIELD, "3.97,6,2,3", "3.97,4,2,2")
+    made = opencsp.to_plant(opencsp.read_field(path), SITE)
+    assert {name: g.names for name, g in made.groups.items()} == {
+        "heliostats-2x2": ("B1",),
+        "heliostats-2x3": ("A1", "A2"),
+    }
+
+
+# -- both ways -------------------------------------------------------------------------
+
+number = st.floats(-1e5, 1e5, allow_subnormal=False)
+size = st.floats(1e-3, 100)
+cell = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), max_size=8)
+
+
+@st.composite
+def fields(draw: st.DrawFn) -> Field:
+    names = draw(st.lists(cell.filter(bool), min_size=1, max_size=5, unique=True))
+    count = len(names)
+    rows, columns = (draw(nps.arrays(np.int64, count, elements=st.integers(1, 9))) for _ in "rc")
+
+    def column(elements: st.SearchStrategy[float]) -> np.ndarray:
+        return draw(nps.arrays(np.float64, count, elements=elements))
+
+    return Field(
+        tuple(names), draw(nps.arrays(np.float64, (count, 3), elements=number)),
+        rows * columns, rows, columns, column(number), column(number), column(size), column(size),
+        {"Note": tuple(draw(st.lists(cell, min_size=count, max_size=count)))},
+    )  # fmt: skip
+
+
+@settings(max_examples=60, deadline=None)
+@given(fields())
+def test_any_field_survives(tmp_path_factory: pytest.TempPathFactory, table: Field) -> None:
+    path = tmp_path_factory.mktemp("field") / "field.csv"
+    opencsp.write_field(table, path)
+    again = opencsp.read_field(path)
+    assert again.names == table.names
+    assert again.extra == table.extra
+    for name in ("location", "facets", "rows", "columns", "pivot_height", "pivot_offset",
+                 "facet_width", "facet_height"):  # fmt: skip
+        np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
+
+
+def test_a_plant_survives(tmp_path: Path) -> None:
+    table, centroids = opencsp.from_plant(plant())
+    opencsp.write_field(table, tmp_path / "field.csv")
+    opencsp.write_centroids(centroids, tmp_path / "centroids.csv")
+    again = opencsp.read_field(tmp_path / "field.csv")
+    first = opencsp.read_field(FIELD)
+    assert again.names == first.names
+    for name in ("location", "pivot_height", "pivot_offset", "facet_width", "facet_height"):
+        np.testing.assert_allclose(getattr(again, name), getattr(first, name), atol=1e-12)
+    np.testing.assert_array_equal(again.rows, first.rows)
+    np.testing.assert_array_equal(again.columns, first.columns)
+    places = opencsp.read_centroids(tmp_path / "centroids.csv")
+    np.testing.assert_array_equal(places.center, opencsp.read_centroids(CENTROIDS).center)
+
+
+def test_a_mirror_without_facets_is_one() -> None:
+    group = Heliostats(
+        ("h",), kinds.azimuth_elevation([[1.0, 2, 0.5]], pivot_height=2.0), np.full(1, 3.0),
+        np.full(1, 2.0),
+    )  # fmt: skip
+    table, centroids = opencsp.from_plant(Plant("p", SITE, {"g": group}))
+    assert (table.facets[0], table.rows[0], table.columns[0]) == (1, 1, 1)
+    assert (table.facet_width[0], table.facet_height[0]) == (3.0, 2.0)
+    np.testing.assert_array_equal(table.location, [[1, 2, 2.5]])
+    np.testing.assert_array_equal(centroids.center, [[0, 0, 0]])
+
+
+def test_facets_in_no_grid_count_as_a_row() -> None:
+    scattered = Centroids(("a", "b", "c"), np.array([[0.0, 1, 0], [-1, -1, 0], [1.2, -1, 0]]))
+    one = np.ones(1, dtype=np.int64)
+    table = replace(
+        opencsp.read_field(FIELD), names=("h",), location=np.zeros((1, 3)), facets=3 * one,
+        rows=one, columns=3 * one, pivot_height=np.ones(1), pivot_offset=np.zeros(1),
+        facet_width=np.ones(1), facet_height=np.ones(1), extra={},
+    )  # fmt: skip
+    again, _ = opencsp.from_plant(opencsp.to_plant(table, SITE, scattered))
+    assert (again.rows[0], again.columns[0]) == (1, 3)
+
+
+# -- refusals --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("Pivot Offset,", "", "header: no column 'Pivot Offset'; an OpenCSP heliostat field has"),
+        ("Remark", "Name", "header: column 'Name' occurs twice"),
+        ("A2,4.89", "A2,4.89,1", "line 3: 13 cells, but the header has 12"),
+        ("A2,4.89,", "A2,", "line 3: 11 cells, but the header has 12"),
+        ("4.89", "x", "line 3, column X: A2: 'x' is not a finite number; give metres"),
+        ("4.89", "nan", "line 3, column X: A2: 'nan' is not a finite number"),
+        ("4.89", "1_0", "'1_0' is not a finite number"),
+        ("4.89", "", "A2: '' is not a finite number"),
+        ("6,2,3,4.02", "6,2,2,4.02", "heliostat A1: 6 facets are not 2 rows × 2 columns"),
+        ("6,2,3,4.02", "6.5,2,3,4.02", "column Num. Facets: A1: '6.5' is not a number of pieces"),
+        ("6,2,3,4.02", "0,2,3,4.02", "A1: '0' is not a number of pieces"),
+        ("1.2,1.1,new", "0,1.1,new", "line 4, column Facet Width: B1: 0 m must be above 0"),
+        ("1.2,1.1,new", "1.2,-1,new", "column Facet Height: B1: -1 m must be above 0"),
+        ("A2", "A1", "line 3, column Name: heliostat A1: the name is that of line 2 too"),
+        ("A2", "", "line 3, column Name: a heliostat without a name; give it one"),
+        ('"washed, twice"', '"washed, twice', "not a table (unexpected end of data)"),
+    ],
+)
+def test_a_wrong_field_gets_one_line(tmp_path: Path, old: str, new: str, problem: str) -> None:
+    path = edited(tmp_path, FIELD, old, new)
+    with pytest.raises(FormatError) as error:
+        opencsp.read_field(path)
+    assert problem in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "problem"),
+    [
+        (b"", "the file is empty; it should be an OpenCSP table of facet centroids"),
+        (b"Facet id,X,Y,Z\n", "there is no row below the header"),
+        (b"Facet id,X,Y\n1,2,3\n", "no column 'Z'"),
+        (b"\n\n", "no column 'Facet id', 'X', 'Y', 'Z'"),
+        (b"Facet id,X,Y,Z\n1,0,0,0\n1,1,0,0\n", "facet 1: the name is that of line 2 too"),
+        (b"\x89PNG\0\0\0", "the file is binary"),
+        (b"Facet id,X,Y,Z\n1,0,0,\xe9\n", "not UTF-8 text"),
+    ],
+)
+def test_wrong_centroids_get_one_line(tmp_path: Path, content: bytes, problem: str) -> None:
+    path = tmp_path / "centroids.csv"
+    path.write_bytes(content)
+    with pytest.raises(FormatError) as error:
+        opencsp.read_centroids(path)
+    assert problem in str(error.value)
+
+
+def test_plants_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="heliostat A1: 6 facets, but there are 2 centroids"):
+        opencsp.to_plant(opencsp.read_field(FIELD), SITE, Centroids(("1", "2"), np.zeros((2, 3))))
+    with pytest.raises(InputError, match="plant 'bare': it has no heliostats"):
+        opencsp.from_plant(Plant("bare", SITE, {}))
+    polar = Heliostats(("p",), kinds.polar([[0.0, 1, 0]], 0.6), np.ones(1), np.ones(1))
+    with pytest.raises(InputError, match="group g: OpenCSP's tables hold azimuth_elevation"):
+        opencsp.from_plant(Plant("p", SITE, {"g": polar}))
+    path = edited(tmp_path, FIELD, "3.97,6,2,3", "3.97,4,2,2")
+    mixed = opencsp.to_plant(opencsp.read_field(path), SITE)
+    with pytest.raises(
+        InputError, match="heliostat A1: its facets stand elsewhere than those of B1"
+    ):
+        opencsp.from_plant(mixed)
+    with pytest.raises(InputError, match="cannot be written"):
+        opencsp.write_field(opencsp.read_field(FIELD), tmp_path / "nowhere" / "field.csv")
