@@ -12,6 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.field.formats.measurements import Measurements
+from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, normalize
 
 
@@ -144,3 +146,33 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
         way = np.where(far[:, None], points, points - m)
         ends.append(way / np.linalg.norm(way, axis=-1, keepdims=True))
     return ends[0], ends[1]
+
+
+def of_measurements(
+    measurements: Measurements, heliostats: Heliostats, sigma: float = 5e-4
+) -> tuple[Sightings, list[str]]:
+    """Return sightings of camera-target measurements, and what was left out and why.
+
+    Parameters
+    ----------
+    measurements
+        As read from files.
+    heliostats
+        Those that the names refer to.
+    sigma
+        Standard deviation of a centroid as seen from the mirror, rad of beam.
+    """
+    known = {name: i for i, name in enumerate(heliostats.names)}
+    rows = np.array([known.get(name, -1) for name in measurements.heliostat], dtype=np.intp)
+    kept = rows >= 0
+    strangers = sorted({n for n, ok in zip(measurements.heliostat, kept, strict=True) if not ok})
+    left_out = [f"measurements of {name}: the plant has no such heliostat" for name in strangers]
+    seen = sightings(
+        rows[kept],
+        measurements.counts[kept],
+        measurements.sun[kept],
+        measurements.centroid[kept],
+        time=measurements.time[kept],
+        sigma=sigma,
+    )
+    return seen, left_out

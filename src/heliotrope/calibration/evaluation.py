@@ -1,0 +1,115 @@
+"""How well parameters predict: beam and normal errors, and splits of the sightings."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
+from heliotrope.mechanism.chain import Mechanism
+
+Split = Literal["random", "chronological"]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of M sightings under a mechanism.
+
+    Attributes
+    ----------
+    beam
+        Angle between the reflected ray and the way to the destination, rad, (M,).
+    normal
+        Angle between the normal and the bisector, rad, (M,).
+    plane
+        Where the reflected ray passes the destination, m to the right of and above it
+        as seen from the mirror, in the plane across the way, (M, 2); NaN at infinity.
+    """
+
+    beam: FloatArray
+    normal: FloatArray
+    plane: FloatArray
+
+
+def errors(mechanism: Mechanism, sightings: Sightings) -> Errors:
+    """Return the errors of sightings under mechanisms of batch shape (N,)."""
+    pose = mechanism[sightings.heliostat].pose(sightings.counts)
+    source, way = ray_directions(sightings, pose.vertex)
+    ray = reflect(source, pose.normal)
+    right = np.stack([way[:, 1], -way[:, 0], np.zeros(len(way))], axis=-1)
+    right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
+    up = np.cross(right, way)
+    distance = np.where(
+        sightings.destination_at_infinity,
+        np.nan,
+        np.linalg.norm(sightings.destination - pose.vertex, axis=-1),
+    )
+    forward = np.sum(ray * way, axis=-1)
+    offset = np.stack([np.sum(ray * right, axis=-1), np.sum(ray * up, axis=-1)], axis=-1)
+    plane = offset * (distance / np.where(forward > 0, forward, np.nan))[:, None]
+    return Errors(
+        beam=angle_between(ray, way),
+        normal=angle_between(pose.normal, bisector(source, way)),
+        plane=plane,
+    )
+
+
+def split(
+    sightings: Sightings, kind: Split = "random", fraction: float = 0.7, seed: int = 0
+) -> npt.NDArray[np.bool_]:
+    """Return the mask (M,) of the training part, ``fraction`` of each heliostat's sightings.
+
+    Parameters
+    ----------
+    sightings
+        Of any number of heliostats.
+    kind
+        "random", or "chronological" (the earliest are for training).
+    fraction
+        Between 0 and 1.
+    seed
+        Of the random choice.
+
+    Raises
+    ------
+    InputError
+        If the fraction or the kind is none.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
+    if kind not in ("random", "chronological"):
+        raise InputError(f"split {kind!r}: give random or chronological")
+    chosen = np.zeros(len(sightings), dtype=np.bool_)
+    for heliostat in np.unique(sightings.heliostat):
+        rows = np.flatnonzero(sightings.heliostat == heliostat)
+        if kind == "random":
+            rows = np.random.default_rng((seed, int(heliostat))).permutation(rows)
+        else:
+            rows = rows[np.argsort(sightings.time[rows], kind="stable")]
+        chosen[rows[: round(fraction * len(rows))]] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Beam errors of one heliostat, rad."""
+
+    count: int
+    median: float
+    rms: float
+    p95: float
+
+
+def summary(beam: FloatArray) -> Summary:
+    """Return median, RMS and 95th percentile of beam errors (M,), NaN if there are none."""
+    if not len(beam):
+        return Summary(0, np.nan, np.nan, np.nan)
+    return Summary(
+        len(beam),
+        float(np.median(beam)),
+        float(np.sqrt(np.mean(beam**2))),
+        float(np.percentile(beam, 95)),
+    )

@@ -1,0 +1,70 @@
+"""The command line: ``heliotrope COMMAND``. Each command is a thin shell over the library.
+
+Heavy libraries are imported inside the commands, so that help appears at once.
+"""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from heliotrope import __version__
+from heliotrope.cli.calibrate import calibrate
+from heliotrope.cli.demo import demo
+from heliotrope.cli.fetch import fetch
+from heliotrope.cli.field import app as field_app
+from heliotrope.cli.sun import sun
+from heliotrope.cli.track import track
+from heliotrope.errors import HeliotropeError
+
+app = typer.Typer(
+    help="Run the heliostat field of a solar power tower.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"heliotrope {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Run the heliostat field of a solar power tower."""
+
+
+app.command()(sun)
+app.command()(track)
+app.add_typer(field_app, name="field")
+app.command()(calibrate)
+app.command()(fetch)
+app.command()(demo)
+
+
+def main() -> None:
+    """Run the command line; bad input ends in one line and exit code 2."""
+    try:
+        app()
+    except HeliotropeError as error:
+        print(f"heliotrope: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("heliotrope: interrupted", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output has gone, as `head` does.
+        sys.stderr.close()
+        sys.exit(141)
+    except OSError as error:
+        print(f"heliotrope: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,109 @@
+"""What the commands share: arguments to values, values to the screen."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from heliotrope.errors import InputError, TimeError
+
+if TYPE_CHECKING:
+    from heliotrope.field.plant import Plant
+
+
+def parse_time(text: str) -> datetime:
+    """Return a time with its zone from ISO 8601, or the present for "now"."""
+    from datetime import UTC
+
+    if text == "now":
+        return datetime.now(UTC)
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError:
+        raise TimeError(
+            f"time {text!r} is not ISO 8601; write it as 2026-06-21T12:00:00Z or with +02:00"
+        ) from None
+    if time.tzinfo is None:
+        raise TimeError(f"time {text!r} has no time zone; append Z for UTC or an offset as +02:00")
+    return time
+
+
+def parse_duration(text: str) -> timedelta:
+    """Return a duration from "30s", "5min", "1h"."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min|m|h)\s*", text)
+    seconds = {"s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+    if not match or float(match[1]) <= 0:
+        raise InputError(f"duration {text!r}: write it as 30s, 5min or 1h, above 0")
+    return timedelta(seconds=float(match[1]) * seconds[match[2]])
+
+
+def parse_point(text: str, what: str) -> tuple[float, float, float]:
+    """Return three finite numbers from "E,N,U"."""
+    parts = text.split(",")
+    try:
+        values = [float(part) for part in parts]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(math.isfinite(v) for v in values):
+        raise InputError(f"{what} {text!r}: give three numbers in metres, east,north,up")
+    return values[0], values[1], values[2]
+
+
+def open_plant(path: Path) -> "Plant":
+    """Return the plant of a TOML file, a HelioK XML file or a folder in PAINT's form."""
+    from heliotrope.errors import FormatError
+
+    if path.is_dir():
+        from heliotrope.field.formats import paint
+
+        return paint.read_plant(path)
+    if not path.exists():
+        raise FormatError(path, "there is no such file; give a plant file or a folder")
+    if path.suffix.lower() == ".xml":
+        from heliotrope.field.formats import heliok
+        from heliotrope.sun import Site
+
+        return heliok.to_plant(heliok.read(path), Site(0.0, 0.0, 0.0))
+    from heliotrope.field.formats import plant_file
+
+    return plant_file.read_plant(path)
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON document; what is not a number becomes null."""
+    print(json.dumps(_plain(value), ensure_ascii=False, indent=1))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, datetime):
+        return value.isoformat()
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
+    """Print a table, the first column to the left and the others to the right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=SIMPLE_HEAD, title=title or None, title_justify="left", pad_edge=False)
+    for i, name in enumerate(header):
+        table.add_column(name, justify="left" if i == 0 else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console = Console()
+    if not console.is_terminal:
+        # A file or a pipe has no width: never cut a number.
+        console = Console(width=200)
+    console.print(table)

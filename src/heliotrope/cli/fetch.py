@@ -1,0 +1,45 @@
+"""``heliotrope fetch``: bring published measurements here."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from heliotrope.cli._common import print_json
+from heliotrope.errors import UnknownNameError
+
+
+def fetch(
+    source: Annotated[str, typer.Argument(help="Data set: juelich (PAINT).")],
+    heliostats: Annotated[list[str], typer.Argument(help="Names, for example AA39.")],
+    into: Annotated[Path, typer.Option(help="Folder to put the files in.")],
+    base_url: Annotated[
+        str | None, typer.Option(help="Address of another copy of the catalogue.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Fetch properties and measurements of heliostats; what is already there is kept."""
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from heliotrope.field.formats import fetch as fetching
+
+    if source != "juelich":
+        raise UnknownNameError("data set", source, ["juelich"])
+    address = fetching.DEFAULT_BASE_URL if base_url is None else base_url
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} of {task.total:.0f} files"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, disable=as_json) as bar:
+        task = bar.add_task("fetching", total=None)
+
+        def show(done: int, total: int, _name: str) -> None:
+            bar.update(task, completed=done, total=total)
+
+        files = fetching.fetch_heliostats(heliostats, into, base_url=address, progress=show)
+    if as_json:
+        print_json({"files": [str(file) for file in files]})
+    else:
+        print(f"{len(files)} files in {into}")

@@ -1,0 +1,40 @@
+"""``heliotrope field``: look at plant files."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from heliotrope.cli._common import print_json, print_table
+
+app = typer.Typer(help="Check plant files.", no_args_is_help=True)
+
+
+@app.callback()
+def _root() -> None:
+    """Check plant files."""
+
+
+@app.command()
+def check(
+    file: Annotated[Path, typer.Argument(help="Plant file (TOML).")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print everything that is wrong or strange in a plant file; exit code 2 if it cannot run."""
+    from heliotrope.field.formats import plant_file
+
+    findings = plant_file.check_plant(file)
+    wrong = any(finding.severity == "error" for finding in findings)
+    if as_json:
+        print_json({"file": str(file), "ok": not wrong, "findings": [vars(f) for f in findings]})
+    else:
+        if findings:
+            print_table(
+                ["severity", "what"], [[f.severity, f.text] for f in findings], title=str(file)
+            )
+        if not wrong:
+            plant = plant_file.read_plant(file)
+            print(f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
+                  f"{'can run, see above' if findings else 'all is well'}")  # fmt: skip
+    if wrong:
+        raise typer.Exit(2)

@@ -1,0 +1,79 @@
+"""``heliotrope sun``: where the sun stands."""
+
+from typing import Annotated
+
+import typer
+
+from heliotrope.cli._common import parse_duration, parse_time, print_json, print_table
+
+
+def sun(
+    latitude: Annotated[float, typer.Option(help="Degrees, north positive.")] = -33.93,
+    longitude: Annotated[float, typer.Option(help="Degrees, east positive.")] = 18.87,
+    height: Annotated[float, typer.Option(help="Metres above the ellipsoid.")] = 120.0,
+    time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
+    pressure: Annotated[
+        float | None, typer.Option(help="hPa at the site; default from the height.")
+    ] = None,
+    temperature: Annotated[float, typer.Option(help="°C.")] = 12.0,
+    every: Annotated[
+        str | None, typer.Option(help="A table of the day of TIME at this interval: 30s, 10min, 1h.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print the sun's position, and when it rises, culminates and sets."""
+    import numpy as np
+
+    from heliotrope import sun as solar
+
+    moment = parse_time(time)
+    site = solar.Site(
+        latitude,
+        longitude,
+        height,
+        pressure=None if pressure is None else 100.0 * pressure,
+        temperature_c=temperature,
+    )
+    events = solar.events(moment.date(), site)
+    if every is not None:
+        moments = solar.daylight(moment.date(), site, every=parse_duration(every))
+    else:
+        import pandas as pd
+
+        moments = pd.DatetimeIndex([moment]).tz_convert("UTC")
+    found = solar.position(moments, site)
+    rows = [
+        {
+            "time": t.isoformat(),
+            "azimuth_deg": float(np.degrees(found.azimuth[i])),
+            "elevation_deg": float(np.degrees(found.elevation[i])),
+            "true_elevation_deg": float(np.degrees(found.true_elevation[i])),
+            "vector": found.vector[i],
+        }
+        for i, t in enumerate(moments)
+    ]
+    day = {
+        "sunrise": events.sunrise,
+        "culmination": events.culmination,
+        "sunset": events.sunset,
+        "kind": events.kind,
+    }
+    if as_json:
+        print_json({"positions": rows, **day} if every else {**rows[0], **day})
+        return
+    print_table(
+        ["time", "azimuth", "elevation", "without refraction"],
+        [
+            [
+                str(r["time"]),
+                f"{r['azimuth_deg']:.4f}°",
+                f"{r['elevation_deg']:.4f}°",
+                f"{r['true_elevation_deg']:.4f}°",
+            ]
+            for r in rows
+        ],
+    )
+    for name in ("sunrise", "culmination", "sunset"):
+        event = day[name]
+        shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({day['kind']})"
+        print(f"{name:12}{shown}")

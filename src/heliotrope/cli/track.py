@@ -1,0 +1,186 @@
+"""``heliotrope track``: where the drives of a heliostat must stand."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from heliotrope.cli._common import (
+    open_plant,
+    parse_duration,
+    parse_point,
+    parse_time,
+    print_json,
+    print_table,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from heliotrope.field.plant import Plant
+    from heliotrope.mechanism.tracking import Tracking
+
+
+def track(
+    field: Annotated[Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")],
+    heliostat: Annotated[str, typer.Option(help="Name of the heliostat.")],
+    aim: Annotated[
+        str | None, typer.Option(help="East,north,up in metres; default the first target.")
+    ] = None,
+    target: Annotated[str | None, typer.Option(help="Aim at the centre of this target.")] = None,
+    time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
+    sun: Annotated[
+        str | None, typer.Option(help="Vector to the sun east,north,up instead of the time's.")
+    ] = None,
+    every: Annotated[
+        str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Print normal, joint angles and drive counts of both branches, or of a day."""
+    import numpy as np
+
+    from heliotrope import sun as solar
+    from heliotrope.geometry import normalize
+    from heliotrope.mechanism import tracking
+
+    plant = open_plant(field)
+    mechanism = plant.heliostat(heliostat)
+    goal = np.array(_aim(plant, aim, target))
+    moment = parse_time(time)
+    if every is not None:
+        times = solar.daylight(moment.date(), plant.site, every=parse_duration(every))
+        result = tracking.track(mechanism, solar.vector(times, plant.site), goal)
+        _day(heliostat, [t.isoformat() for t in times], result, mechanism.joints, as_json)
+        return
+    if sun is not None:
+        vector = normalize(parse_point(sun, "sun"), "sun")
+    else:
+        vector = solar.vector(moment, plant.site)
+    result = tracking.track(mechanism, vector, goal)
+    joints = [mechanism.joints[j] for j in mechanism.driven]
+    document = {
+        "heliostat": heliostat,
+        "time": moment,
+        "sun_vector": vector,
+        "sun_elevation_deg": float(np.degrees(np.arcsin(vector[2]))),
+        "aim": goal,
+        "joints": joints,
+        "best": int(result.best),
+        "branches": [_branch(result, b) for b in range(2)],
+    }
+    if as_json:
+        print_json(document)
+        return
+    _print_branches(document, heliostat)
+
+
+def _aim(plant: "Plant", aim: str | None, target: str | None) -> Any:
+    from heliotrope.errors import InputError
+
+    if aim is not None and target is not None:
+        raise InputError("give --aim or --target, not both")
+    if aim is not None:
+        return parse_point(aim, "aim")
+    if target is not None:
+        return plant.target(target).center
+    if not plant.targets:
+        raise InputError("this plant has no target; give --aim east,north,up in metres")
+    return plant.targets[0].center
+
+
+def _branch(result: "Tracking", b: int) -> dict[str, Any]:
+    import numpy as np
+
+    from heliotrope.geometry import azimuth_elevation
+    from heliotrope.mechanism.tracking import Status
+
+    status = Status(int(result.status[b]))
+    azimuth, elevation = azimuth_elevation(result.normal[b])
+    return {
+        "branch": b,
+        "azimuth_deg": float(np.degrees(azimuth)),
+        "elevation_deg": float(np.degrees(elevation)),
+        "normal": result.normal[b],
+        "vertex": result.vertex[b],
+        "angles_rad": result.angles[b],
+        "counts": result.counts[b],
+        "reachable": bool(result.reachable[b]),
+        "residual_mrad": float(1e3 * result.residual[b]),
+        "iterations": int(result.iterations[b]),
+        "status": status.name.lower(),
+        "text": status.text,
+    }
+
+
+def _print_branches(document: dict[str, Any], heliostat: str) -> None:
+    import numpy as np
+
+    rows = []
+    for branch in document["branches"]:
+        mark = " *" if branch["branch"] == document["best"] else ""
+        rows.append(
+            [
+                f"{branch['branch']}{mark}",
+                f"{branch['azimuth_deg']:.4f}°",
+                f"{branch['elevation_deg']:.4f}°",
+                "  ".join(f"{np.degrees(a):.4f}°" for a in branch["angles_rad"]),
+                "  ".join(f"{c:.1f}" for c in branch["counts"]),
+                f"{branch['residual_mrad']:.3g} mrad",
+                branch["text"],
+            ]
+        )
+    print(f"{heliostat} at {document['time'].isoformat()}, sun at "
+          f"{document['sun_elevation_deg']:.2f}° of elevation")  # fmt: skip
+    names = " and ".join(document["joints"])
+    print_table(
+        ["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows
+    )
+    print("* the one to take")
+
+
+def _day(
+    heliostat: str, times: list[str], result: "Tracking", joints: tuple[str, ...], as_json: bool
+) -> None:
+    import numpy as np
+
+    from heliotrope.geometry import azimuth_elevation
+
+    azimuth, elevation = azimuth_elevation(result.chosen(result.normal))
+    angles: np.ndarray = result.chosen(result.angles)
+    counts: np.ndarray = result.chosen(result.counts)
+    reachable: np.ndarray = result.chosen(result.reachable)
+    residual: np.ndarray = result.chosen(result.residual)
+    iterations: np.ndarray = result.chosen(result.iterations)
+    rows = [
+        {
+            "time": time,
+            "branch": int(result.best[i]),
+            "azimuth_deg": float(np.degrees(azimuth[i])),
+            "elevation_deg": float(np.degrees(elevation[i])),
+            "angles_rad": angles[i],
+            "counts": counts[i],
+            "reachable": bool(reachable[i]),
+            "residual_mrad": float(1e3 * residual[i]),
+            "iterations": int(iterations[i]),
+        }
+        for i, time in enumerate(times)
+    ]
+    if as_json:
+        print_json({"heliostat": heliostat, "joints": joints, "day": rows})
+        return
+    print_table(
+        ["time", "branch", "azimuth", "elevation", "counts", "residual"],
+        [
+            [
+                str(r["time"]),
+                str(r["branch"]),
+                f"{r['azimuth_deg']:.4f}°",
+                f"{r['elevation_deg']:.4f}°",
+                "  ".join(f"{c:.1f}" for c in counts[i]),
+                f"{r['residual_mrad']:.3g} mrad" + ("" if r["reachable"] else " !"),
+            ]
+            for i, r in enumerate(rows)
+        ],
+        title=f"{heliostat}, {len(rows)} positions",
+    )

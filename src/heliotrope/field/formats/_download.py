@@ -1,0 +1,372 @@
+"""One file from a server to the disk: resumed where it broke off, whole or not there.
+
+A file grows under its name with ``.part`` behind it and gets its own name when it is
+complete and checked. What the server said of it (ETag, date, size) is kept in a journal,
+one line of JSON a file, so that a later run asks only whether it has changed, and a
+broken one goes on only if it has not.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from http import HTTPStatus
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from heliotrope.errors import FetchError
+
+if TYPE_CHECKING:
+    import httpx
+
+Result = TypeVar("Result")
+
+JOURNAL = ".fetch.jsonl"
+#: A catalogue is read into memory; the largest known has 2,000 links and 0.6 MB.
+DOCUMENT_LIMIT = 64 * 2**20
+
+_CHUNK = 64 * 2**10
+_LONGEST_PAUSE = 60.0
+_LATER = {HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS}
+
+
+class NotFoundError(FetchError):
+    """The server has no such file."""
+
+
+class StoppedError(FetchError):
+    """Another download failed or the user broke off; what is there is kept."""
+
+
+class _LaterError(Exception):
+    """It may work if tried again, after a pause (s) if the server asks for one."""
+
+    def __init__(self, problem: str, pause: float = 0.0) -> None:
+        super().__init__(problem)
+        self.pause = pause
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What the server said of a file.
+
+    Attributes
+    ----------
+    etag, modified
+        Its ETag and Last-Modified, "" if none.
+    size
+        Of the whole file, bytes; −1 if it did not say.
+    done
+        Whether the file is complete.
+    """
+
+    etag: str
+    modified: str
+    size: int
+    done: bool
+
+
+class Journal:
+    """Entries by name of the file, appended to a file in the folder.
+
+    Parameters
+    ----------
+    folder
+        Where the files go; names are relative to it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / JOURNAL
+        self._lock = threading.Lock()
+        self._entries: dict[str, Entry] = {}
+        try:
+            lines = self._path.read_bytes().splitlines()
+        except FileNotFoundError:
+            return
+        for line in lines:
+            try:
+                record = json.loads(line)
+                self._entries[record.pop("file")] = Entry(**record)
+            except (ValueError, KeyError, TypeError, AttributeError):
+                # A line that a power cut broke off: its file is asked for again.
+                continue
+
+    def get(self, name: str) -> Entry | None:
+        """Return the last entry of a file."""
+        return self._entries.get(name)
+
+    def put(self, name: str, entry: Entry) -> None:
+        """Note an entry."""
+        # The line end stands first, so that it also ends a line that was broken off.
+        line = "\n" + json.dumps({"file": name, **asdict(entry)})
+        with self._lock:
+            self._entries[name] = entry
+            with self._path.open("a", encoding="utf-8") as stream:
+                stream.write(line)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A file to be fetched.
+
+    Attributes
+    ----------
+    url
+        Where it is.
+    path, name
+        Where it goes, and its name in the journal.
+    size, sha256
+        What the catalogue says of it, bytes and hexadecimal digits, if it does.
+    """
+
+    url: str
+    path: Path
+    name: str
+    size: int | None = None
+    sha256: str | None = None
+
+    @property
+    def part(self) -> Path:
+        """Where it grows."""
+        return self.path.with_name(self.path.name + ".part")
+
+
+@dataclass(frozen=True)
+class Session:
+    """What all downloads of a run share.
+
+    Attributes
+    ----------
+    client
+        Of HTTP.
+    journal
+        Of the folder.
+    retries
+        How often in a row a download may fail without a byte more.
+    backoff
+        Pause after the first failure, s; it doubles with each.
+    received
+        Called with the number of bytes that came.
+    stop
+        Ends all downloads when set.
+    """
+
+    client: "httpx.Client"
+    journal: Journal
+    retries: int
+    backoff: float
+    received: Callable[[int], None]
+    stop: threading.Event = field(default_factory=threading.Event)
+
+
+def download(job: Job, session: Session) -> bool:
+    """Fetch a file; return whether it came, or False if it was there and has not changed.
+
+    Raises
+    ------
+    FetchError
+        If it cannot be had, is not what the catalogue says, or cannot be stored.
+    """
+    if job.sha256 is not None and job.path.is_file() and _sha256(job.path) == job.sha256:
+        return False
+    try:
+        return _repeated(job.url, session, lambda: _attempt(job, session), job.part)
+    except OSError as error:
+        if error.errno == errno.ENOSPC:
+            raise FetchError(
+                f"{job.path}: the disk is full; make room and run it again, what is there is kept"
+            ) from None
+        raise FetchError(f"{job.path}: cannot be written ({error.strerror})") from None
+
+
+def get_document(url: str, session: Session) -> tuple[Any, str]:
+    """Return a JSON document and the address that it came from in the end.
+
+    Raises
+    ------
+    FetchError
+        If it cannot be had, is larger than 64 MiB or is not JSON.
+    """
+
+    def attempt() -> tuple[Any, str]:
+        content = bytearray()
+        with session.client.stream("GET", url) as response:
+            _check_status(response, url)
+            for chunk in response.iter_bytes(_CHUNK):
+                _check_stop(session)
+                content += chunk
+                if len(content) > DOCUMENT_LIMIT:
+                    raise FetchError(
+                        f"{url}: more than {DOCUMENT_LIMIT / 2**20:.0f} MiB; this is no catalogue"
+                    )
+            return _json(url, bytes(content)), str(response.url)
+
+    return _repeated(url, session, attempt)
+
+
+def _repeated(
+    url: str, session: Session, attempt: Callable[[], Result], part: Path | None = None
+) -> Result:
+    """Return what ``attempt`` gives, after pauses if it fails for a while."""
+    import httpx
+
+    failures = 0
+    while True:
+        _check_stop(session)
+        before = _size(part)
+        try:
+            return attempt()
+        except (httpx.InvalidURL, httpx.UnsupportedProtocol, httpx.TooManyRedirects) as error:
+            raise FetchError(f"{url}: {error}") from None
+        except (httpx.TransportError, httpx.DecodingError) as error:
+            problem = _LaterError(f"{_cause(error)} ({str(error) or type(error).__name__})")
+        except _LaterError as error:
+            problem = error
+        # A line that breaks often but moves on is not given up.
+        failures = 1 if _size(part) > before else failures + 1
+        if failures > session.retries:
+            raise FetchError(
+                f"{url}: {problem}; gave up after {failures} attempts, run it again later, what "
+                "is there is kept"
+            )
+        pause = max(problem.pause, session.backoff * 2.0 ** (failures - 1))
+        session.stop.wait(min(pause, _LONGEST_PAUSE))
+
+
+def _cause(error: Exception) -> str:
+    import httpx
+
+    if isinstance(error, httpx.ConnectError | httpx.ConnectTimeout):
+        return "no connection; check the network and the address"
+    if isinstance(error, httpx.TimeoutException):
+        return "the server does not answer in time"
+    return "the connection broke off"
+
+
+def _check_stop(session: Session) -> None:
+    if session.stop.is_set():
+        raise StoppedError("stopped; what is there is kept, run it again to go on")
+
+
+def _check_status(response: "httpx.Response", url: str) -> None:
+    status = response.status_code
+    if status < HTTPStatus.BAD_REQUEST:
+        return
+    answer = f"the server answers {status} {response.reason_phrase}".rstrip()
+    if status in {HTTPStatus.NOT_FOUND, HTTPStatus.GONE}:
+        raise NotFoundError(f"{url}: there is no such file ({answer})")
+    if status >= HTTPStatus.INTERNAL_SERVER_ERROR or status in _LATER:
+        after = response.headers.get("retry-after", "")
+        raise _LaterError(answer, float(after) if after.isdigit() else 0.0)
+    raise FetchError(f"{url}: {answer}")
+
+
+def _attempt(job: Job, session: Session) -> bool:
+    have, entry = _size(job.path), session.journal.get(job.name)
+    sure = entry is not None and entry.done and entry.size == have
+    start = 0
+    # Compressed bytes could be neither counted nor resumed.
+    headers = {"Accept-Encoding": "identity"}
+    if have >= 0 and sure and entry is not None:
+        headers |= _if_changed(entry)
+    elif have < 0 and entry is not None and not entry.done and _unchanged_mark(entry):
+        start = max(_size(job.part), 0)
+        if start:
+            headers |= {"Range": f"bytes={start}-", "If-Range": _unchanged_mark(entry)}
+    with session.client.stream("GET", job.url, headers=headers) as response:
+        status = response.status_code
+        if status == HTTPStatus.NOT_MODIFIED and have >= 0:
+            return False
+        if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and start:
+            job.part.unlink(missing_ok=True)
+            raise _LaterError("the part that is there does not fit")
+        _check_status(response, job.url)
+        if status != HTTPStatus.PARTIAL_CONTENT or not _continues(response, start):
+            start = 0
+        length = _length(response)
+        said = Entry(
+            response.headers.get("etag", ""), response.headers.get("last-modified", ""),
+            -1 if length is None else start + length, done=False,
+        )  # fmt: skip
+        # Without anything to compare but the size, the same size is the same file.
+        comparable = entry is not None and sure and _if_changed(entry)
+        if have >= 0 and have == said.size and not comparable and job.sha256 is None:
+            session.journal.put(job.name, Entry(said.etag, said.modified, have, done=True))
+            return False
+        if not start:
+            session.journal.put(job.name, said)
+        _store(job, session, response, start)
+    _finish(job, session, said)
+    return True
+
+
+def _if_changed(entry: Entry) -> dict[str, str]:
+    if entry.etag:
+        return {"If-None-Match": entry.etag}
+    return {"If-Modified-Since": entry.modified} if entry.modified else {}
+
+
+def _unchanged_mark(entry: Entry) -> str:
+    """Return what If-Range takes: a weak ETag does not promise the same bytes."""
+    return entry.modified if entry.etag.startswith("W/") or not entry.etag else entry.etag
+
+
+def _continues(response: "httpx.Response", start: int) -> bool:
+    return bool(response.headers.get("content-range", "").startswith(f"bytes {start}-"))
+
+
+def _length(response: "httpx.Response") -> int | None:
+    if response.headers.get("content-encoding", "identity") != "identity":
+        return None
+    length = response.headers.get("content-length", "")
+    return int(length) if length.isdigit() else None
+
+
+def _store(job: Job, session: Session, response: "httpx.Response", start: int) -> None:
+    with job.part.open("ab" if start else "wb") as stream:
+        for chunk in response.iter_bytes(_CHUNK):
+            _check_stop(session)
+            stream.write(chunk)
+            session.received(len(chunk))
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def _finish(job: Job, session: Session, said: Entry) -> None:
+    """Give a complete file its name."""
+    size = _size(job.part)
+    if said.size >= 0 and size != said.size:
+        raise _LaterError(f"{size} of {said.size} bytes came")
+    try:
+        if job.size is not None and size != job.size:
+            raise FetchError(f"{job.url}: {size} bytes came, but the catalogue says {job.size}")
+        if job.sha256 is not None and _sha256(job.part) != job.sha256:
+            raise FetchError(f"{job.url}: its checksum is not the one in the catalogue")
+        if job.path.suffix == ".json":
+            _json(job.url, job.part.read_bytes())
+    except FetchError:
+        job.part.unlink()
+        raise
+    job.part.replace(job.path)
+    session.journal.put(job.name, Entry(said.etag, said.modified, size, done=True))
+
+
+def _json(url: str, content: bytes) -> Any:
+    try:
+        return json.loads(content)
+    except ValueError:
+        start = content[:40].decode("utf-8", "replace")
+        raise FetchError(f"{url}: what came is not JSON; it begins {start!r}") from None
+
+
+def _size(path: Path | None) -> int:
+    """Return the size of a file, −1 if there is none."""
+    return path.stat().st_size if path is not None and path.is_file() else -1
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -1,0 +1,114 @@
+"""JSON files with errors that name the file and the place in it."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from heliotrope.errors import FormatError
+from heliotrope.field.formats._textfile import read_text
+
+
+class Node:
+    """A value in a JSON document that knows where it stands.
+
+    Parameters
+    ----------
+    path
+        The file.
+    value
+        What stands there.
+    where
+        The keys that lead to it, "" at the root.
+    """
+
+    def __init__(self, path: Path, value: Any, where: str = "") -> None:
+        self.path, self.value, self.where = path, value, where
+
+    def fail(self, problem: str) -> FormatError:
+        """Return the error that says what is wrong here."""
+        return FormatError(self.path, problem, self.where)
+
+    def has(self, key: str) -> bool:
+        """Whether this is an object with such a key."""
+        return isinstance(self.value, dict) and key in self.value
+
+    def __getitem__(self, key: str) -> "Node":
+        """Return the value of a key, or fail with the keys that are there."""
+        if not isinstance(self.value, dict):
+            raise self.fail(f"expected an object with {key!r}, found {self.value!r:.60}")
+        if key not in self.value:
+            there = ", ".join(list(self.value)[:8]) or "nothing"
+            raise self.fail(f"{key!r} is missing; there is {there}")
+        return Node(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
+
+    def any_of(self, *keys: str) -> "Node":
+        """Return the value of the first key that is there (formats have changed names)."""
+        for key in keys:
+            if self.has(key):
+                return self[key]
+        return self[keys[0]]
+
+    def items(self) -> list["tuple[str, Node]"]:
+        """Return the members of an object."""
+        if not isinstance(self.value, dict):
+            raise self.fail(f"expected an object, found {self.value!r:.60}")
+        return [(key, self[key]) for key in self.value]
+
+    def elements(self) -> list["Node"]:
+        """Return the elements of a list."""
+        if not isinstance(self.value, list):
+            raise self.fail(f"expected a list, found {self.value!r:.60}")
+        return [Node(self.path, v, f"{self.where}[{i}]") for i, v in enumerate(self.value)]
+
+    def number(self, low: float = -math.inf, high: float = math.inf) -> float:
+        """Return a finite number between limits."""
+        value = self.value
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.fail(f"expected a number, found {value!r:.60}")
+        if not math.isfinite(value) or not low <= value <= high:
+            raise self.fail(f"{value} is outside {low:g} to {high:g}")
+        return float(value)
+
+    def text(self) -> str:
+        """Return a text."""
+        if not isinstance(self.value, str):
+            raise self.fail(f"expected a text, found {self.value!r:.60}")
+        return self.value
+
+    def vector(self) -> tuple[float, float, float]:
+        """Return three finite numbers."""
+        parts = self.elements()
+        if len(parts) != 3:
+            raise self.fail(f"expected 3 numbers, found {len(parts)}")
+        return parts[0].number(), parts[1].number(), parts[2].number()
+
+    def geodetic(self) -> tuple[float, float, float]:
+        """Return latitude and longitude in degrees and height in m."""
+        parts = self.elements()
+        if len(parts) != 3:
+            raise self.fail(f"expected latitude, longitude and height, found {len(parts)} values")
+        return (
+            parts[0].number(-90.0, 90.0),
+            parts[1].number(-180.0, 180.0),
+            parts[2].number(-500.0, 9000.0),
+        )
+
+
+def read_json(path: str | Path, what: str) -> Node:
+    """Return the root of a JSON file.
+
+    Raises
+    ------
+    FormatError
+        If it is no readable text of a plausible size, or no JSON.
+    """
+    text = read_text(path, what)
+    try:
+        return Node(Path(path), json.loads(text))
+    except (json.JSONDecodeError, RecursionError) as error:
+        line = getattr(error, "lineno", 1)
+        reason = getattr(error, "msg", "nested too deeply")
+        raise FormatError(
+            path, f"no JSON ({reason}); the file may be cut off", f"line {line}"
+        ) from None

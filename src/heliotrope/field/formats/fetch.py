@@ -1,0 +1,481 @@
+"""Fetches heliostats and the tower from PAINT's public database.
+
+The database is a tree of static files after the STAC convention. A heliostat has a
+catalogue, which links to collections (properties, calibration, deflectometry), these to
+items, and an item names its files::
+
+    WRI1030197-catalog-stac.json                     all heliostats
+    AA39/AA39-heliostat-catalog-stac.json            one
+    AA39/Calibration/AA39-calibration-collection-stac.json
+    AA39/Calibration/123456-….json                   an item: assets with addresses
+
+Files are stored as PAINT's own client stores them: ``AA39/Properties/…`` and
+``AA39/Calibration/…`` below the folder given, the tower's beside the heliostats. A run
+that was broken off goes on where it stopped; a file that is there and has not changed is
+not fetched again.
+
+The data are published by DLR and KIT under CDLA-Permissive-2.0.
+"""
+
+import re
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import nullcontext
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from urllib.parse import unquote, urljoin, urlsplit
+
+from heliotrope.errors import FetchError, InputError, UnknownNameError
+from heliotrope.field.formats._download import (
+    Job,
+    Journal,
+    NotFoundError,
+    Session,
+    download,
+    get_document,
+)
+
+if TYPE_CHECKING:
+    import httpx
+
+#: The power plant of Jülich in the database.
+PAINT_URL = "https://paint-database.org/WRI1030197"
+#: What there is of a heliostat; a collection is known by this word in its file's name.
+KINDS = ("properties", "calibration", "deflectometry")
+#: Photographs that belong to a calibration measurement, by the name of their asset.
+IMAGES = ("raw_image", "cropped_image", "flux_image", "flux_centered_image")
+
+_HELIOSTAT = re.compile(r"[A-Za-z0-9_-]{1,64}")
+_FILE = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+ -]{0,199}")
+_CATALOGUE = re.compile(r"([^/]+)-heliostat-catalog-stac\.json$")
+_SHA256 = re.compile(r"1220([0-9a-f]{64})")  # as a multihash
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class FetchState:
+    """How far a run is.
+
+    Attributes
+    ----------
+    stage
+        "looking" through the catalogue or "fetching" files.
+    done, total
+        Documents read and known so far, or files ready and to be fetched.
+    received
+        Bytes of files that came.
+    name
+        The document or file that is ready; "" if nothing new is.
+    """
+
+    stage: str
+    done: int
+    total: int
+    received: int
+    name: str = ""
+
+
+class Progress(Protocol):
+    """Is told how far a run is, from one thread at a time."""
+
+    def __call__(self, state: FetchState, /) -> None:
+        """Take note of the state."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to fetch.
+
+    Attributes
+    ----------
+    workers
+        Files at a time, 1 to 32.
+    timeout
+        For a connection and for the next bytes, s.
+    retries
+        How often in a row a file may fail without a byte more.
+    backoff
+        Pause after the first failure, s; it doubles with each.
+
+    Raises
+    ------
+    InputError
+        If a number is out of its range.
+    """
+
+    workers: int = 8
+    timeout: float = 30.0
+    retries: int = 5
+    backoff: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.workers <= 32:
+            raise InputError(f"workers {self.workers}: give 1 to 32")
+        if not self.timeout > 0.0 or not self.backoff >= 0.0 or self.retries < 0:
+            raise InputError(
+                f"timeout {self.timeout} s must be above 0, backoff {self.backoff} s and retries "
+                f"{self.retries} not below"
+            )
+
+
+@dataclass(frozen=True)
+class Fetched:
+    """What a run left on the disk.
+
+    Attributes
+    ----------
+    files
+        All files that were asked for, in the order of the catalogue.
+    new
+        Those of them that came in this run; the others were there.
+    received
+        Bytes that came.
+    missing
+        What the catalogue does not have, in words.
+    """
+
+    files: tuple[Path, ...]
+    new: tuple[Path, ...]
+    received: int
+    missing: tuple[str, ...]
+
+
+def fetch_heliostat(
+    ids: str | Sequence[str],
+    into: str | Path,
+    *,
+    base_url: str = PAINT_URL,
+    kinds: Sequence[str] = ("properties", "calibration"),
+    images: Sequence[str] = (),
+    progress: Progress | None = None,
+    client: "httpx.Client | None" = None,
+    settings: Settings | None = None,
+) -> Fetched:
+    """Fetch what the database has of one or several heliostats.
+
+    Parameters
+    ----------
+    ids
+        Their names, as "AA39".
+    into
+        The folder; it is made if need be.
+    base_url
+        Of the plant in the database or in a copy of it.
+    kinds
+        Some of ``KINDS``.
+    images
+        Some of ``IMAGES``, to come with the calibration measurements; they are large.
+    progress
+        Told of each document, file and piece of a file.
+    client
+        Of HTTP; the caller closes it. Default: one of its own that follows redirects.
+    settings
+        How to fetch; default ``Settings()``.
+
+    Raises
+    ------
+    InputError
+        If a name, a kind or an image is none.
+    FetchError
+        If a heliostat is not in the database, the network or the server fails, the
+        catalogue is not one, a file is not what it should be or cannot be stored. What is
+        there is kept, so that the next run goes on.
+    """
+    names = [ids] if isinstance(ids, str) else list(dict.fromkeys(ids))
+    for name in names:
+        if not _HELIOSTAT.fullmatch(name):
+            raise InputError(f"heliostat {name!r}: give a name of letters and digits, as AA39")
+    for what, given, known in (("kind", kinds, KINDS), ("image", images, IMAGES)):
+        for one in given:
+            if one not in known:
+                raise UnknownNameError(what, one, known)
+    return _run(
+        lambda run: run.heliostats(names, kinds, images),
+        into, base_url, progress, client, settings,
+    )  # fmt: skip
+
+
+def fetch_tower(
+    into: str | Path,
+    *,
+    base_url: str = PAINT_URL,
+    progress: Progress | None = None,
+    client: "httpx.Client | None" = None,
+    settings: Settings | None = None,
+) -> Fetched:
+    """Fetch the measurements of the tower: its targets and its receiver.
+
+    Parameters and errors are those of :func:`fetch_heliostat`.
+    """
+    return _run(lambda run: run.tower(), into, base_url, progress, client, settings)
+
+
+@dataclass(frozen=True)
+class _Link:
+    """A document of the catalogue that belongs to a heliostat ("" for the tower)."""
+
+    heliostat: str
+    kind: str
+    url: str
+
+
+@dataclass(frozen=True)
+class _Document:
+    """A document and where it came from, to which relative addresses refer."""
+
+    link: _Link
+    url: str
+    content: dict[str, Any]
+
+    def hrefs(self, *relations: str) -> list[str]:
+        """Return the addresses of links of some relations.
+
+        Raises
+        ------
+        FetchError
+            If the document has no list of links.
+        """
+        links = self.content.get("links")
+        if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
+            raise FetchError(f"{self.url}: no STAC catalogue, it has no list of links")
+        found = [link.get("href") for link in links if link.get("rel") in relations]
+        if not all(isinstance(href, str) for href in found):
+            raise FetchError(f"{self.url}: no STAC catalogue, a link has no address")
+        return [urljoin(self.url, str(href)) for href in found]
+
+    def assets(self) -> dict[str, dict[str, Any]]:
+        """Return the files that an item names.
+
+        Raises
+        ------
+        FetchError
+            If there are none, or one has no address.
+        """
+        assets = self.content.get("assets")
+        if not isinstance(assets, dict) or not all(
+            isinstance(asset, dict) and isinstance(asset.get("href"), str)
+            for asset in assets.values()
+        ):
+            raise FetchError(f"{self.url}: no STAC item, it names no files with addresses")
+        return assets
+
+
+def _run(
+    find: "Callable[[_Run], list[Job]]",
+    into: str | Path,
+    base_url: str,
+    progress: Progress | None,
+    client: "httpx.Client | None",
+    settings: Settings | None,
+) -> Fetched:
+    """Find the files and fetch them."""
+    import httpx
+
+    how, folder = settings or Settings(), Path(into)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        journal = Journal(folder)
+    except OSError as error:
+        raise FetchError(f"{folder}: cannot be used ({error.strerror})") from None
+    opened = (
+        httpx.Client(follow_redirects=True, timeout=how.timeout)
+        if client is None
+        else nullcontext(client)
+    )
+    with opened as http:
+        run = _Run(folder, base_url.rstrip("/"), progress, how, http, journal)
+        jobs = _distinct(find(run))
+        new = run.fetch(jobs)
+    came = tuple(job.path for job, is_new in zip(jobs, new, strict=True) if is_new)
+    return Fetched(tuple(job.path for job in jobs), came, run.bytes, tuple(run.missing))
+
+
+class _Run:
+    """One run of the fetcher."""
+
+    def __init__(
+        self,
+        folder: Path,
+        base: str,
+        progress: Progress | None,
+        settings: Settings,
+        client: "httpx.Client",
+        journal: Journal,
+    ) -> None:
+        self.folder, self.base = folder, base
+        self.missing: list[str] = []
+        self.bytes = self._done = self._total = 0
+        self._progress, self._workers = progress, settings.workers
+        self._lock = threading.Lock()
+        self._session = Session(client, journal, settings.retries, settings.backoff, self._received)
+
+    def fetch(self, jobs: list[Job]) -> list[bool]:
+        """Fetch the files; return for each whether it came or was there."""
+        self._done = self._total = 0
+        return self._each("fetching", self._download, jobs)
+
+    def heliostats(
+        self, names: Sequence[str], kinds: Sequence[str], images: Sequence[str]
+    ) -> list[Job]:
+        """Return the files of heliostats."""
+        catalogues = [
+            _Link(name, "", f"{self.base}/{name}/{name}-heliostat-catalog-stac.json")
+            for name in names
+        ]
+        collections = []
+        for catalogue in self._each("looking", self._catalogue, catalogues):
+            children, name = catalogue.hrefs("child"), catalogue.link.heliostat
+            for kind in kinds:
+                found = [url for url in children if f"{kind}-collection" in url.split("/")[-1]]
+                collections += [_Link(name, kind, url) for url in found]
+                if not found:
+                    self.missing.append(f"heliostat {name}: the database has no {kind} of it")
+        items = [
+            _Link(collection.link.heliostat, collection.link.kind, url)
+            for collection in self._each("looking", self._document, collections)
+            for url in collection.hrefs("item")
+        ]
+        return [
+            job
+            for item in self._each("looking", self._document, items)
+            for asset, entry in item.assets().items()
+            if asset not in IMAGES or asset in images
+            for job in [self._job(item, entry)]
+        ]
+
+    def tower(self) -> list[Job]:
+        """Return the files of the tower."""
+        plant = PAINT_URL.rsplit("/", 1)[-1]
+        link = _Link("", "", f"{self.base}/{plant}-tower-measurements-item-stac.json")
+        (item,) = self._each("looking", self._document, [link])
+        return [self._job(item, entry) for entry in item.assets().values()]
+
+    def _catalogue(self, link: _Link) -> _Document:
+        try:
+            return self._document(link)
+        except NotFoundError:
+            raise FetchError(
+                f"heliostat {link.heliostat}: {self.base} has none of this name"
+                + self._suggestion(link.heliostat)
+            ) from None
+
+    def _suggestion(self, name: str) -> str:
+        """Return names that are close to one that is not there."""
+        plant = PAINT_URL.rsplit("/", 1)[-1]
+        try:
+            root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
+            found = [_CATALOGUE.search(url) for url in root.hrefs("child")]
+        except FetchError:
+            return "; look at its catalogue"
+        close = get_close_matches(name, [match[1] for match in found if match])
+        return f"; did you mean {', '.join(close)}?" if close else "; look at its catalogue"
+
+    def _document(self, link: _Link) -> _Document:
+        url = self._address(link.url)
+        try:
+            content, source = get_document(url, self._session)
+        except NotFoundError as error:
+            raise NotFoundError(_of(link.heliostat, error)) from None
+        except FetchError as error:
+            raise FetchError(_of(link.heliostat, error)) from None
+        if not isinstance(content, dict):
+            raise FetchError(_of(link.heliostat, f"{url}: no STAC document, but a list or value"))
+        return _Document(link, source, content)
+
+    def _address(self, url: str) -> str:
+        """Return an address in the database or in the copy of it that was asked for."""
+        if url.startswith(PAINT_URL + "/"):
+            url = self.base + url[len(PAINT_URL) :]
+        if urlsplit(url).scheme not in {"http", "https"}:
+            raise FetchError(f"{url}: the address is neither http nor https; refused")
+        return url
+
+    def _job(self, item: _Document, asset: dict[str, Any]) -> Job:
+        url = self._address(urljoin(item.url, asset["href"]))
+        name = unquote(urlsplit(url).path.rsplit("/", 1)[-1])
+        if not _FILE.fullmatch(name) or name.endswith(".part"):
+            raise FetchError(
+                _of(item.link.heliostat, f"{item.url}: the file's name {name!r} is not a plain "
+                    "one; refused")
+            )  # fmt: skip
+        place = [item.link.heliostat, item.link.kind.capitalize(), name]
+        parts = [part for part in place if part]
+        size, checksum = asset.get("file:size"), str(asset.get("file:checksum", ""))
+        match = _SHA256.fullmatch(checksum)
+        return Job(
+            url,
+            self.folder.joinpath(*parts),
+            "/".join(parts),
+            size if isinstance(size, int) else None,
+            match[1] if match else None,
+        )
+
+    def _download(self, job: Job) -> bool:
+        try:
+            job.path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FetchError(f"{job.path.parent}: cannot be made ({error.strerror})") from None
+        try:
+            return download(job, self._session)
+        except FetchError as error:
+            heliostat = job.name.split("/")[0] if "/" in job.name else ""
+            raise FetchError(_of(heliostat, error)) from None
+
+    def _each(
+        self, stage: str, work: Callable[[Task], Result], tasks: Sequence[Task]
+    ) -> list[Result]:
+        """Return what ``work`` gives for each task, in order; the first failure ends all."""
+
+        def one(task: Task) -> Result:
+            result = work(task)
+            self._tell(stage, getattr(task, "url", "").split("/")[-1])
+            return result
+
+        self._total += len(tasks)
+        with ThreadPoolExecutor(self._workers, thread_name_prefix="fetch") as pool:
+            futures = [pool.submit(one, task) for task in tasks]
+            try:
+                for future in as_completed(futures):
+                    future.result()
+            except BaseException:
+                self._session.stop.set()
+                pool.shutdown(cancel_futures=True)
+                raise
+        return [future.result() for future in futures]
+
+    def _tell(self, stage: str, name: str) -> None:
+        with self._lock:
+            self._done += 1
+            if self._progress is not None:
+                self._progress(FetchState(stage, self._done, self._total, self.bytes, name))
+
+    def _received(self, count: int) -> None:
+        with self._lock:
+            self.bytes += count
+            if self._progress is not None:
+                self._progress(FetchState("fetching", self._done, self._total, self.bytes))
+
+
+def _of(heliostat: str, problem: object) -> str:
+    return f"heliostat {heliostat}: {problem}" if heliostat else str(problem)
+
+
+def _distinct(jobs: Iterable[Job]) -> list[Job]:
+    """Return the jobs without repetitions.
+
+    Raises
+    ------
+    FetchError
+        If two different files would go to one place.
+    """
+    found: dict[Path, Job] = {}
+    for job in jobs:
+        first = found.setdefault(job.path, job)
+        if first.url != job.url:
+            raise FetchError(f"{job.url}: would be stored where {first.url} is; refused")
+    return list(found.values())

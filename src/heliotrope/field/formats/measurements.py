@@ -1,0 +1,177 @@
+"""Camera-target measurements: where the beam of a heliostat stood on a target.
+
+Read from ``measurements.csv`` or from PAINT's calibration properties. A row that cannot
+be used is left out and named.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError
+from heliotrope.field.formats._textfile import check_file
+from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
+from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Centroid = Literal["utis", "helios"]
+
+_COLUMNS = (
+    "heliostat", "id", "timestamp", "target", "sun_azimuth_deg_south0_east",
+    "sun_elevation_deg_apparent", "axis_1_motor_position", "axis_2_motor_position",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """M measurements.
+
+    Attributes
+    ----------
+    heliostat, ids, target
+        Names, (M,).
+    time
+        Unix seconds (UTC); NaN where only the sun's angles are known, (M,).
+    counts
+        Motor counts, (M, 2).
+    sun
+        Apparent sun, unit vectors in ENU, (M, 3).
+    centroid
+        Of the beam on the target, ENU metres about the plant's reference, (M, 3).
+    left_out
+        One line for each row that could not be used.
+    """
+
+    heliostat: tuple[str, ...]
+    ids: tuple[str, ...]
+    target: tuple[str, ...]
+    time: FloatArray
+    counts: FloatArray
+    sun: FloatArray
+    centroid: FloatArray
+    left_out: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.heliostat)
+
+
+def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measurements:
+    """Return the measurements of a folder with the tower's file.
+
+    Parameters
+    ----------
+    folder
+        With ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json``.
+    centroid
+        Which published extractor to believe.
+
+    Raises
+    ------
+    FormatError
+        If there are no measurements, or the table lacks a column.
+    """
+    place = Path(folder)
+    origin = read_tower(find_tower(place)).origin
+    table = place / "measurements.csv"
+    if table.exists():
+        frame = _read_table(table, centroid)
+    else:
+        frame = _read_files(place, centroid)
+    columns = ("lat", "lon", "alt")
+    spots = frame[[f"{centroid}_{c}" for c in columns]].to_numpy(dtype=np.float64)
+    enu = np.full((len(frame), 3), np.nan)
+    known = np.isfinite(spots).all(axis=1)
+    enu[known] = geodetic_to_enu(*spots[known].T, origin)
+    return _keep_good(frame, enu, centroid)
+
+
+def _read_table(path: Path, centroid: Centroid) -> "pd.DataFrame":
+    import pandas as pd
+
+    check_file(path, "a table of measurements")
+    try:
+        frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+    except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+        raise FormatError(path, f"no table in CSV ({str(error).strip()})") from None
+    wanted = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
+    for column in wanted:
+        if column not in frame.columns:
+            there = ", ".join(map(str, frame.columns[:12]))
+            raise FormatError(path, f"there is no column {column}; there are {there}", "line 1")
+    for column in wanted:
+        if column not in ("heliostat", "id", "timestamp", "target"):
+            frame[column] = pd.to_numeric(frame[column], errors="coerce")
+    return frame
+
+
+def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
+    import pandas as pd
+
+    files = sorted(place.glob("*/Calibration/*-calibration-properties.json"))
+    if not files:
+        raise FormatError(
+            place, "there is neither measurements.csv nor ID/Calibration/*.json; fetch some"
+        )
+    rows = []
+    for file in files:
+        found = read_calibration_properties(file)
+        key = {"utis": "UTIS", "helios": "HeliOS"}[centroid]
+        spot = found.focal_spots.get(key, (np.nan, np.nan, np.nan))
+        name = file.parent.parent.name
+        numbers = (found.sun_azimuth_deg, found.sun_elevation_deg, *found.motors)
+        rows.append((name, file.name.split("-")[0], "", found.target, *numbers, *spot))
+    spots = [f"{centroid}_{c}" for c in ("lat", "lon", "alt")]
+    return pd.DataFrame(rows, columns=[*_COLUMNS, *spots])
+
+
+def _seconds(texts: "pd.Series[str]") -> FloatArray:
+    import pandas as pd
+
+    # A text without a zone is no time; PAINT writes Z.
+    zoned = texts.where(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True), "")
+    times = pd.to_datetime(zoned, utc=True, errors="coerce", format="ISO8601")
+    seconds = (times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)
+    return np.asarray(seconds, dtype=np.float64)
+
+
+def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Measurements:
+    azimuth = frame["sun_azimuth_deg_south0_east"].to_numpy(dtype=np.float64)
+    elevation = frame["sun_elevation_deg_apparent"].to_numpy(dtype=np.float64)
+    counts = frame[["axis_1_motor_position", "axis_2_motor_position"]].to_numpy(dtype=np.float64)
+    time = _seconds(frame["timestamp"].astype(str))
+    reasons: list[tuple[npt.NDArray[np.bool_], str]] = [
+        (frame["heliostat"].astype(str).to_numpy() == "", "no heliostat is named"),
+        (~np.isfinite(counts).all(axis=1), "a motor position is missing or no number"),
+        (~np.isfinite(azimuth) | ~np.isfinite(elevation), "the sun's angles are missing"),
+        (~((elevation > -5.0) & (elevation <= 90.0)), "the sun's elevation is not above −5°"),
+        (~np.isfinite(enu).all(axis=1), f"there is no {centroid.upper()} centroid"),
+        (np.linalg.norm(enu, axis=1) > 5e3, "the centroid lies more than 5 km from the plant"),
+    ]
+    good = np.ones(len(frame), dtype=np.bool_)
+    left_out = []
+    for wrong, reason in reasons:
+        for i in np.flatnonzero(wrong & good):
+            left_out.append(f"{frame['heliostat'][i]} {frame['id'][i]}: {reason}")
+        good &= ~wrong
+    rows = np.flatnonzero(good)
+    # 0 is south and east is positive: the angle from north, clockwise, is 180° minus it.
+    suns = direction(np.pi - np.radians(azimuth[rows]), np.radians(elevation[rows]))
+
+    def texts(column: str) -> tuple[str, ...]:
+        return tuple(str(frame[column][i]) for i in rows)
+
+    return Measurements(
+        heliostat=texts("heliostat"),
+        ids=texts("id"),
+        target=texts("target"),
+        time=time[rows],
+        counts=counts[rows],
+        sun=suns,
+        centroid=enu[rows],
+        left_out=tuple(left_out),
+    )

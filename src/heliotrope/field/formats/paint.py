@@ -1,0 +1,447 @@
+"""PAINT: the published data of the Jülich solar tower (DLR, KIT), as JSON files.
+
+Heliostat properties, tower measurements and calibration properties, in the variants that
+have been published. Positions are WGS84; they are converted exactly.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._json import Node, read_json
+from heliotrope.field.formats._textfile import write_text
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray, enu_to_geodetic, geodetic_to_enu
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.drives import Drive, linear_paint
+from heliotrope.sun import Site
+
+TOWER_FILE = "tower-measurements.json"
+Origin = tuple[float, float, float]
+
+# θ₀ of the first joint counts from the horizontal, the file's from the vertical.
+_AXIS_1_ZERO = -0.5 * np.pi
+
+
+@dataclass(frozen=True)
+class Properties:
+    """Properties of one heliostat as the file gives them.
+
+    Attributes
+    ----------
+    name
+        From the file's name.
+    geodetic
+        Latitude and longitude in degrees, height in m.
+    width, height
+        m.
+    drives
+        Of the two actuators.
+    translations
+        First joint, second joint, concentrator, m, (3, 3).
+    tilts
+        Deviations of the joints that the file may hold, by parameter name, rad.
+    facets
+        Centre and half edges in the mirror's frame, (F, 3) each; empty if not given.
+    renovation
+        Date of the last renovation, "" if not given.
+    """
+
+    name: str
+    geodetic: Origin
+    width: float
+    height: float
+    drives: tuple[Drive, Drive]
+    translations: FloatArray
+    tilts: dict[str, float]
+    facets: tuple[FloatArray, FloatArray, FloatArray]
+    renovation: str = ""
+
+
+def read_heliostat(path: str | Path, name: str | None = None) -> Properties:
+    """Return the properties of one heliostat.
+
+    Parameters
+    ----------
+    path
+        JSON file.
+    name
+        Default: the part of the file's name before "-heliostat-properties" or the dot.
+
+    Raises
+    ------
+    FormatError
+        If something is missing or cannot be; the text names file, key and value.
+    """
+    root = read_json(path, "PAINT heliostat properties")
+    chain = root.any_of("kinematics_properties", "kinematic_properties", "kinematic")
+    actuators = chain["actuators"].elements()
+    if len(actuators) != 2:
+        raise chain["actuators"].fail(f"{len(actuators)} actuators; a heliostat has 2")
+    translations = np.array(
+        [
+            [_number_or(chain, f"{part}_{axis}{end}", 0.0) for axis in "enu"]
+            for part, end in (
+                ("joint_translation", "_1"),
+                ("joint_translation", "_2"),
+                ("concentrator_translation", ""),
+            )
+        ]
+    )
+    # ARTIST's rotation about north is left-handed, ours right-handed.
+    tilts = {
+        "tilt_up": _number_or(chain, "joint_tilt_n_1", 0.0),
+        "tilt_north": _number_or(chain, "joint_tilt_u_1", 0.0),
+        "non_orthogonality": -_number_or(chain, "joint_tilt_n_2", 0.0),
+        "elevation_bias": _number_or(chain, "joint_tilt_e_2", 0.0),
+    }
+    stem = Path(path).name.removesuffix(".json").removesuffix("-heliostat-properties")
+    return Properties(
+        name=stem if name is None else name,
+        geodetic=root["heliostat_position"].geodetic(),
+        width=root["width"].number(1e-3, 100.0),
+        height=root["height"].number(1e-3, 100.0),
+        drives=(_drive(actuators[0], _AXIS_1_ZERO), _drive(actuators[1], 0.0)),
+        translations=translations,
+        tilts={key: value for key, value in tilts.items() if value != 0.0},
+        facets=_facets(root),
+        renovation=root["renovation"].text() if root.has("renovation") else "",
+    )
+
+
+def _number_or(node: Node, key: str, default: float) -> float:
+    return node[key].number() if node.has(key) and node[key].value is not None else default
+
+
+def _drive(node: Node, zero: float) -> Drive:
+    kind = node.any_of("type_axis", "type").text()
+    # "ideal" says how ARTIST is to simulate it; the constants beside it are the jack's.
+    if kind not in ("linear", "ideal"):
+        raise node.fail(f"actuator of type {kind!r}; known are 'linear' and 'ideal'")
+    low, high = node["min_increment"].number(), node["max_increment"].number()
+    speed = _number_or(node, "movement_speed", 0.0)
+    try:
+        return linear_paint(
+            node["increment"].number(),
+            node["initial_stroke_length"].number(),
+            node["offset"].number() + _number_or(node, "offset_shift", 0.0),
+            node["pivot_radius"].number() + _number_or(node, "radius_shift", 0.0),
+            node["initial_angle"].number() + zero,
+            clockwise=node["clockwise_axis_movement"].number(0, 1),
+            min_count=low,
+            max_count=high,
+            speed=speed if speed > 0 else np.inf,
+        )
+    except FormatError:
+        raise
+    except InputError as error:
+        raise node.fail(str(error)) from None
+
+
+def _facets(root: Node) -> tuple[FloatArray, FloatArray, FloatArray]:
+    empty = np.empty((0, 3))
+    if not root.has("facet_properties"):
+        return empty, empty, empty
+    listed = root["facet_properties"]["facets"].elements()
+    return (
+        np.array([f["translation_vector"].vector() for f in listed]).reshape(-1, 3),
+        np.array([f.any_of("canting_e", "canting_vector_e").vector() for f in listed]).reshape(
+            -1, 3
+        ),
+        np.array([f.any_of("canting_n", "canting_vector_n").vector() for f in listed]).reshape(
+            -1, 3
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class Tower:
+    """The tower's file: reference point, targets and receivers.
+
+    Attributes
+    ----------
+    origin
+        Latitude and longitude in degrees and height in m of the plant's reference.
+    targets, receivers
+        In ENU about it.
+    """
+
+    origin: Origin
+    targets: tuple[Target, ...]
+    receivers: tuple[Receiver, ...]
+
+
+def read_tower(path: str | Path) -> Tower:
+    """Return the tower's reference point, targets and receivers.
+
+    The planes come from the corners: the normals in the file are rounded to the compass,
+    the real planes are yawed by some milliradians.
+
+    Raises
+    ------
+    FormatError
+        If something is missing or cannot be.
+    """
+    root = read_json(path, "PAINT tower measurements")
+    origin = root["power_plant_properties"]["coordinates"].geodetic()
+    targets, receivers = [], []
+    for name, node in root.items():
+        if name == "power_plant_properties":
+            continue
+        kind = node["type"].text()
+        points = {
+            key: geodetic_to_enu(*value.geodetic(), origin)
+            for key, value in node["coordinates"].items()
+        }
+        try:
+            if kind == "planar":
+                targets.append(_target(name, node, points))
+            else:
+                receivers.append(_receiver(name, kind, node, points))
+        except FormatError:
+            raise
+        except InputError as error:
+            raise node.fail(str(error)) from None
+    return Tower(origin, tuple(targets), tuple(receivers))
+
+
+def _corners(node: Node, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
+    """Corners from the upper left, as seen from the front."""
+    order = ("upper_left", "upper_right", "lower_right", "lower_left")
+    for corner in order:
+        if prefix + corner not in points:
+            raise node["coordinates"].fail(f"corner {prefix + corner!r} is missing")
+    return np.stack([points[prefix + corner] for corner in order])
+
+
+def _target(name: str, node: Node, points: dict[str, FloatArray]) -> Target:
+    if "center" not in points:
+        raise node["coordinates"].fail("'center' is missing")
+    corners = _corners(node, points)
+    markers = {k: v for k, v in points.items() if k != "center"}
+    return Target(name, corners, points["center"], markers)
+
+
+def _receiver(name: str, kind: str, node: Node, points: dict[str, FloatArray]) -> Receiver:
+    corners = _corners(node, points, "receiver_outer_")
+    return Receiver(
+        name=name,
+        kind=kind,
+        center=points["center"] if "center" in points else corners.mean(axis=0),
+        normal=np.array(node["normal_vector"].vector()),
+        width=float(np.linalg.norm(corners[1] - corners[0])),
+        height=float(np.linalg.norm(corners[0] - corners[3])),
+        corners=corners,
+        radius=_number_or(node, "radius", 0.0),
+        opening_angle=float(np.radians(_number_or(node, "opening_angle", 0.0))),
+    )
+
+
+def find_properties(folder: str | Path) -> list[Path]:
+    """Return the property files of a folder: ``properties/ID.json`` or PAINT's own layout."""
+    root = Path(folder)
+    flat = sorted((root / "properties").glob("*.json"))
+    nested = sorted(root.glob("*/Properties/*-heliostat-properties.json"))
+    return flat or nested
+
+
+def find_tower(folder: str | Path) -> Path:
+    """Return the tower's file of a folder, by either of its two names.
+
+    Raises
+    ------
+    FormatError
+        If there is none.
+    """
+    for name in (TOWER_FILE, "WRI1030197-tower-measurements.json"):
+        if (Path(folder) / name).exists():
+            return Path(folder) / name
+    raise FormatError(folder, f"{TOWER_FILE} is missing in this folder; fetch it too")
+
+
+def read_plant(folder: str | Path) -> Plant:
+    """Return the plant of a folder with the tower's file and heliostat properties.
+
+    Raises
+    ------
+    FormatError
+        If the folder or a file cannot be used.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise FormatError(place, "this is no folder; give one with properties and the tower's file")
+    tower = read_tower(find_tower(place))
+    files = find_properties(place)
+    if not files:
+        raise FormatError(place, "there are no heliostat properties (properties/ID.json)")
+    heliostats = to_heliostats([read_heliostat(file) for file in files], tower.origin)
+    latitude, longitude, height = tower.origin
+    return Plant(
+        name="Jülich",
+        site=Site(latitude, longitude, height),
+        groups={"jacks": heliostats},
+        targets=tower.targets,
+        receivers=tower.receivers,
+    )
+
+
+def to_heliostats(properties: Iterable[Properties], origin: Origin) -> Heliostats:
+    """Return heliostats as arrays from their properties, about ``origin``."""
+    listed = list(properties)
+    position = geodetic_to_enu(*np.array([p.geodetic for p in listed]).T, origin)
+    drives = (
+        Drive(np.stack([p.drives[0].table for p in listed])),
+        Drive(np.stack([p.drives[1].table for p in listed])),
+    )
+    translations = np.stack([p.translations for p in listed])
+    mechanism = kinds.two_jacks(
+        position, drives,
+        joint_translation_1=translations[:, 0], joint_translation_2=translations[:, 1],
+        concentrator_translation=translations[:, 2],
+    )  # fmt: skip
+    tilted = sorted({name for p in listed for name in p.tilts})
+    mechanism = mechanism.with_parameters(
+        {name: np.array([p.tilts.get(name, 0.0) for p in listed]) for name in tilted}
+    )
+    numbers = {len(p.facets[0]) for p in listed}
+    facets = None
+    if len(numbers) == 1 and numbers != {0}:
+        center, across, up = (np.stack([p.facets[k] for p in listed]) for k in range(3))
+        facets = Facets(center, across, up)
+    return Heliostats(
+        names=tuple(p.name for p in listed),
+        mechanism=mechanism,
+        width=np.array([p.width for p in listed]),
+        height=np.array([p.height for p in listed]),
+        facets=facets,
+    )
+
+
+@dataclass(frozen=True)
+class CalibrationProperties:
+    """One calibration measurement as PAINT publishes it.
+
+    Attributes
+    ----------
+    motors
+        Counts of both axes.
+    target
+        Name of the target.
+    sun_azimuth_deg, sun_elevation_deg
+        0 is south, east positive; refraction included. NaN if the file has none.
+    focal_spots
+        Geodetic centroid by the name of its extractor ("UTIS", "HeliOS").
+    """
+
+    motors: tuple[float, float]
+    target: str
+    sun_azimuth_deg: float
+    sun_elevation_deg: float
+    focal_spots: dict[str, Origin]
+
+
+def read_calibration_properties(path: str | Path) -> CalibrationProperties:
+    """Return one calibration measurement; both published styles of keys are read."""
+    root = read_json(path, "PAINT calibration properties")
+    motors = root["motor_position"]
+    spots = {name: node.geodetic() for name, node in root["focal_spot"].items() if node.value}
+    return CalibrationProperties(
+        motors=(
+            motors.any_of("axis_1_motor_position", "Axis1MotorPosition").number(),
+            motors.any_of("axis_2_motor_position", "Axis2MotorPosition").number(),
+        ),
+        target=root["target_name"].text(),
+        sun_azimuth_deg=_number_or(root, "sun_azimuth", float("nan")),
+        sun_elevation_deg=_number_or(root, "sun_elevation", float("nan")),
+        focal_spots=spots,
+    )
+
+
+def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str | Path) -> None:
+    """Write the properties of one heliostat, its calibrated parameters folded in.
+
+    Raises
+    ------
+    InputError
+        If its mechanism is not of kind ``two_jacks``, or a calibrated parameter has no
+        place in the format; use the plant file then.
+    """
+    if heliostats.mechanism.kind != "two_jacks":
+        raise InputError(
+            f"heliostat {name}: kind {heliostats.mechanism.kind}; PAINT holds only two_jacks"
+        )
+    i = heliostats.index(name)
+    one = heliostats.calibrated[i]
+    joints = dict(zip(one.joints, one.angles, strict=True))
+    for lost in ("canting", "canting_secondary"):
+        if joints[lost] != 0.0:
+            raise InputError(
+                f"heliostat {name}: PAINT has no place for {lost} ({joints[lost]:.3g} rad); "
+                "write a plant file instead"
+            )
+    latitude, longitude, height = (float(v) for v in enu_to_geodetic(one.position, origin))
+    chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
+    for part, joint in (("joint_translation_{}_1", 2), ("joint_translation_{}_2", 3),
+                        ("concentrator_translation_{}", 5)):  # fmt: skip
+        row = one.origins[joint] + (one.origins[0] if joint == 2 else 0.0)
+        chain |= {part.format(axis): float(row[k]) for k, axis in enumerate("enu")}
+    chain |= {
+        "joint_tilt_n_1": float(joints["tilt_up"]),
+        "joint_tilt_u_1": float(joints["tilt_north"]),
+        "joint_tilt_n_2": float(-joints["non_orthogonality"]),
+        "joint_tilt_e_2": float(one.drives.table[0, 7]),
+    }
+    document: dict[str, object] = {
+        "heliostat_position": [latitude, longitude, height],
+        "height": float(heliostats.height[i]),
+        "width": float(heliostats.width[i]),
+        "initial_orientation": [0.0, -1.0, 0.0],
+        "kinematics_properties": chain,
+    }
+    if heliostats.facets is not None:
+        f = heliostats.facets
+        document["facet_properties"] = {
+            "number_of_facets": int(f.center.shape[1]),
+            "facets": [
+                {"translation_vector": c.tolist(), "canting_e": e.tolist(), "canting_n": n.tolist()}
+                for c, e, n in zip(f.center[i], f.half_width[i], f.half_height[i], strict=True)
+            ],
+        }
+    write_text(path, json.dumps(document, indent=1) + "\n")
+
+
+def _actuator(row: FloatArray, axis: int) -> dict[str, object]:
+    from heliotrope.mechanism.drives import SLOTS
+
+    def of(name: str) -> float:
+        return float(row[SLOTS[name]])
+
+    for name in ("scale", "worm_cos", "worm_sin", "sag") + (("bias",) if axis else ()):
+        if of(name) != 0.0:
+            raise InputError(
+                f"PAINT has no place for {name} ({of(name):.3g}) of axis {axis + 1}; "
+                "write a plant file instead"
+            )
+    # SENSE stands before STROKE in the row; SLOTS names only what may be calibrated.
+    sense = float(row[SLOTS["stroke_offset"] - 1])
+    speed = of("speed")
+    return {
+        "type_axis": "linear",
+        "min_increment": of("min_count"),
+        "max_increment": of("max_count"),
+        "increment": 1.0 / of("rate"),
+        "offset_shift": 0.0,
+        "initial_stroke_length": of("stroke_offset"),
+        "offset": of("offset"),
+        "pivot_radius": of("pivot_radius"),
+        "radius_shift": 0.0,
+        "clockwise_axis_movement": 1 if sense > 0 else 0,
+        "initial_angle": of("initial_angle") - (_AXIS_1_ZERO if axis == 0 else 0.0),
+        "movement_speed": speed if np.isfinite(speed) else 0.0,
+    }
