@@ -12,7 +12,7 @@ import json
 import os
 import threading
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from http import HTTPStatus
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -28,7 +28,6 @@ JOURNAL = ".fetch.jsonl"
 #: A catalogue is read into memory; the largest known has 2,000 links and 0.6 MB.
 DOCUMENT_LIMIT = 64 * 2**20
 
-_CHUNK = 64 * 2**10
 _LONGEST_PAUSE = 60.0
 _LATER = {HTTPStatus.REQUEST_TIMEOUT, HTTPStatus.TOO_EARLY, HTTPStatus.TOO_MANY_REQUESTS}
 
@@ -89,7 +88,8 @@ class Journal:
         for line in lines:
             try:
                 record = json.loads(line)
-                self._entries[record.pop("file")] = Entry(**record)
+                name = str(record.pop("file"))
+                self._entries[name] = Entry(**record)
             except (ValueError, KeyError, TypeError, AttributeError):
                 # A line that a power cut broke off: its file is asked for again.
                 continue
@@ -193,9 +193,9 @@ def get_document(url: str, session: Session) -> tuple[Any, str]:
 
     def attempt() -> tuple[Any, str]:
         content = bytearray()
-        with session.client.stream("GET", url) as response:
+        with session.client.stream("GET", url, follow_redirects=True) as response:
             _check_status(response, url)
-            for chunk in response.iter_bytes(_CHUNK):
+            for chunk in response.iter_bytes():
                 _check_stop(session)
                 content += chunk
                 if len(content) > DOCUMENT_LIMIT:
@@ -243,6 +243,8 @@ def _cause(error: Exception) -> str:
         return "no connection; check the network and the address"
     if isinstance(error, httpx.TimeoutException):
         return "the server does not answer in time"
+    if isinstance(error, httpx.DecodingError):
+        return "what came cannot be unpacked"
     return "the connection broke off"
 
 
@@ -251,9 +253,9 @@ def _check_stop(session: Session) -> None:
         raise StoppedError("stopped; what is there is kept, run it again to go on")
 
 
-def _check_status(response: "httpx.Response", url: str) -> None:
+def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> None:
     status = response.status_code
-    if status < HTTPStatus.BAD_REQUEST:
+    if status == HTTPStatus.OK or status in also:
         return
     answer = f"the server answers {status} {response.reason_phrase}".rstrip()
     if status in {HTTPStatus.NOT_FOUND, HTTPStatus.GONE}:
@@ -266,39 +268,36 @@ def _check_status(response: "httpx.Response", url: str) -> None:
 
 def _attempt(job: Job, session: Session) -> bool:
     have, entry = _size(job.path), session.journal.get(job.name)
-    sure = entry is not None and entry.done and entry.size == have
-    start = 0
+    if job.sha256 is not None or (job.size is not None and job.size != have):
+        have = -1  # the catalogue has another file than the one that is there
     # Compressed bytes could be neither counted nor resumed.
-    headers = {"Accept-Encoding": "identity"}
-    if have >= 0 and sure and entry is not None:
+    headers, start = {"Accept-Encoding": "identity"}, 0
+    if entry is not None and entry.done and entry.size == have:
         headers |= _if_changed(entry)
-    elif have < 0 and entry is not None and not entry.done and _unchanged_mark(entry):
+    elif entry is not None and not entry.done and _unchanged_mark(entry):
         start = max(_size(job.part), 0)
         if start:
             headers |= {"Range": f"bytes={start}-", "If-Range": _unchanged_mark(entry)}
-    with session.client.stream("GET", job.url, headers=headers) as response:
+    with session.client.stream("GET", job.url, headers=headers, follow_redirects=True) as response:
         status = response.status_code
         if status == HTTPStatus.NOT_MODIFIED and have >= 0:
             return False
-        if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and start:
+        if start and not _fits(response, start):
             job.part.unlink(missing_ok=True)
             raise _LaterError("the part that is there does not fit")
-        _check_status(response, job.url)
-        if status != HTTPStatus.PARTIAL_CONTENT or not _continues(response, start):
-            start = 0
+        _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
+        start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
         length = _length(response)
         said = Entry(
             response.headers.get("etag", ""), response.headers.get("last-modified", ""),
             -1 if length is None else start + length, done=False,
         )  # fmt: skip
-        # Without anything to compare but the size, the same size is the same file.
-        comparable = entry is not None and sure and _if_changed(entry)
-        if have >= 0 and have == said.size and not comparable and job.sha256 is None:
-            session.journal.put(job.name, Entry(said.etag, said.modified, have, done=True))
+        # A part would mean that the file that is there is older than what the entry says.
+        same = entry is None or (entry.etag, entry.modified) == (said.etag, said.modified)
+        if have == said.size >= 0 and same and not job.part.exists():
+            session.journal.put(job.name, replace(said, done=True))
             return False
-        if not start:
-            session.journal.put(job.name, said)
-        _store(job, session, response, start)
+        _store(job, session, response, start, said)
     _finish(job, session, said)
     return True
 
@@ -314,8 +313,12 @@ def _unchanged_mark(entry: Entry) -> str:
     return entry.modified if entry.etag.startswith("W/") or not entry.etag else entry.etag
 
 
-def _continues(response: "httpx.Response", start: int) -> bool:
-    return bool(response.headers.get("content-range", "").startswith(f"bytes {start}-"))
+def _fits(response: "httpx.Response", start: int) -> bool:
+    """Return whether an answer to a request for the rest is the rest, or no rest at all."""
+    if response.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
+        return False
+    span = response.headers.get("content-range", "")
+    return response.status_code != HTTPStatus.PARTIAL_CONTENT or span.startswith(f"bytes {start}-")
 
 
 def _length(response: "httpx.Response") -> int | None:
@@ -325,9 +328,12 @@ def _length(response: "httpx.Response") -> int | None:
     return int(length) if length.isdigit() else None
 
 
-def _store(job: Job, session: Session, response: "httpx.Response", start: int) -> None:
+def _store(job: Job, session: Session, response: "httpx.Response", start: int, said: Entry) -> None:
     with job.part.open("ab" if start else "wb") as stream:
-        for chunk in response.iter_bytes(_CHUNK):
+        if not start:
+            session.journal.put(job.name, said)
+        # Pieces as they come: what is still being gathered when a line breaks is lost.
+        for chunk in response.iter_bytes():
             _check_stop(session)
             stream.write(chunk)
             session.received(len(chunk))
@@ -351,7 +357,7 @@ def _finish(job: Job, session: Session, said: Entry) -> None:
         job.part.unlink()
         raise
     job.part.replace(job.path)
-    session.journal.put(job.name, Entry(said.etag, said.modified, size, done=True))
+    session.journal.put(job.name, replace(said, size=size, done=True))
 
 
 def _json(url: str, content: bytes) -> Any:

@@ -173,7 +173,7 @@ def fetch_heliostat(
     progress
         Told of each document, file and piece of a file.
     client
-        Of HTTP; the caller closes it. Default: one of its own that follows redirects.
+        Of HTTP; the caller closes it. Default: one of its own.
     settings
         How to fetch; default ``Settings()``.
 
@@ -246,7 +246,20 @@ class _Document:
         found = [link.get("href") for link in links if link.get("rel") in relations]
         if not all(isinstance(href, str) for href in found):
             raise FetchError(f"{self.url}: no STAC catalogue, a link has no address")
-        return [urljoin(self.url, str(href)) for href in found]
+        return [self.address(str(href)) for href in found]
+
+    def address(self, href: str) -> str:
+        """Return an address that may be relative to the document.
+
+        Raises
+        ------
+        FetchError
+            If it is none.
+        """
+        try:
+            return urljoin(self.url, href)
+        except ValueError as error:
+            raise FetchError(f"{self.url}: {href!r} is no address ({error})") from None
 
     def assets(self) -> dict[str, dict[str, Any]]:
         """Return the files that an item names.
@@ -282,11 +295,7 @@ def _run(
         journal = Journal(folder)
     except OSError as error:
         raise FetchError(f"{folder}: cannot be used ({error.strerror})") from None
-    opened = (
-        httpx.Client(follow_redirects=True, timeout=how.timeout)
-        if client is None
-        else nullcontext(client)
-    )
+    opened = httpx.Client(timeout=how.timeout) if client is None else nullcontext(client)
     with opened as http:
         run = _Run(folder, base_url.rstrip("/"), progress, how, http, journal)
         jobs = _distinct(find(run))
@@ -391,12 +400,12 @@ class _Run:
         """Return an address in the database or in the copy of it that was asked for."""
         if url.startswith(PAINT_URL + "/"):
             url = self.base + url[len(PAINT_URL) :]
-        if urlsplit(url).scheme not in {"http", "https"}:
+        if not re.match(r"https?://", url):
             raise FetchError(f"{url}: the address is neither http nor https; refused")
         return url
 
     def _job(self, item: _Document, asset: dict[str, Any]) -> Job:
-        url = self._address(urljoin(item.url, asset["href"]))
+        url = self._address(item.address(asset["href"]))
         name = unquote(urlsplit(url).path.rsplit("/", 1)[-1])
         if not _FILE.fullmatch(name) or name.endswith(".part"):
             raise FetchError(

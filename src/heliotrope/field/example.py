@@ -1,0 +1,97 @@
+"""An example plant: a field like Malan's prototype at Stellenbosch.
+
+The thesis gives the place (−33.93, 18.87), eighteen heliostats in six groups of three,
+the calibrated heliostat 30.8 m south and 19.2 m east of the tower with its pivot 1.2 m
+above ground, and a target 13 m up. The other positions, the sizes of mirrors and target
+and the gears are ours, chosen so that the field could stand and work.
+"""
+
+import numpy as np
+
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray, direction
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import rotary
+from heliotrope.sun import Site
+
+#: Centres of the six groups of three, metres east and north of the tower.
+_PODS = ((-19.0, -24.0), (0.0, -24.0), (19.2, -24.0), (-19.0, -34.0), (0.0, -34.0), (19.2, -34.0))
+#: From the centre of a group to its heliostats, m: a triangle with its point to the north.
+_RADIUS = 3.2
+_PIVOT_HEIGHT = 1.2
+
+
+def prototype() -> Plant:
+    """Return the example plant of 18 azimuth-elevation heliostats south of their tower."""
+    names, positions, clusters = [], [], []
+    for pod, (east, north) in enumerate(_PODS, start=1):
+        for k in range(3):
+            east_k, north_k, _ = _RADIUS * direction(k * 2.0 * np.pi / 3.0, 0.0)
+            names.append(f"P{pod}{'ABC'[k]}")
+            positions.append((east + east_k, north + north_k, 0.0))
+            clusters.append(f"pod-{pod}")
+    # The heliostat that the thesis calibrates.
+    positions[names.index("P6A")] = (19.2, -30.8, 0.0)
+    position = np.array(positions)
+    return Plant(
+        name="prototype",
+        site=Site(-33.93, 18.87, 120.0, name="Stellenbosch"),
+        groups={
+            "azel": Heliostats(
+                names=tuple(names),
+                mechanism=azimuth_elevation(position),
+                width=np.full(len(names), 1.83),
+                height=np.full(len(names), 1.22),
+                cluster=tuple(clusters),
+            )
+        },
+        targets=(Target("target", _square((0.0, 0.0, 13.0), 3.0), np.array([0.0, 0.0, 13.0])),),
+        receivers=(
+            Receiver("receiver", "planar", np.array([0.0, 0.0, 16.5]),
+                     np.array([0.0, -1.0, 0.0]), 1.5, 1.5),
+        ),
+    )  # fmt: skip
+
+
+def azimuth_elevation(position: FloatArray) -> Mechanism:
+    """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
+
+    200 steps a turn, 16 microsteps, a worm gear of 40:1 behind a gearhead of 60:1: a
+    count is 0.8 µrad of the joint, and 20,000 counts a second turn it by 0.94 °/s.
+    """
+    gear = {"microsteps": 16, "speed": 2.0e4}
+    azimuth = rotary(200, 2400, min_angle=-np.radians(200.0), max_angle=np.radians(200.0), **gear)
+    elevation = rotary(
+        200, 2400, min_angle=np.radians(-5.0), max_angle=np.radians(95.0), worm_ratio=40.0, **gear
+    )
+    return kinds.azimuth_elevation(
+        position, pivot_height=_PIVOT_HEIGHT, pivot_offset=0.1, drives=(azimuth, elevation)
+    )
+
+
+def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
+    """Return mechanisms as a quick installation leaves them, for simulations.
+
+    Standard deviations: tilts 10 mrad, encoder zeros 5 mrad, non-orthogonality and
+    canting 2 mrad, position 20 mm.
+    """
+    rng = np.random.default_rng(seed)
+    sizes = {
+        "tilt_north": 10e-3, "tilt_east": 10e-3, "azimuth_bias": 5e-3, "elevation_bias": 5e-3,
+        "non_orthogonality": 2e-3, "canting": 2e-3, "position_east": 0.02, "position_north": 0.02,
+        "position_up": 0.02,
+    }  # fmt: skip
+    return nominal.with_parameters(
+        {name: rng.normal(0.0, size, nominal.shape) for name, size in sizes.items()}
+    )
+
+
+def _square(center: tuple[float, float, float], size: float) -> FloatArray:
+    """Corners of an upright square that faces south, from the upper left seen from the front."""
+    # Who looks north at it has west to the left.
+    half = 0.5 * size
+    shifts = np.array([(-half, half), (half, half), (half, -half), (-half, -half)])
+    return np.array(center) + np.stack([shifts[:, 0], 0 * shifts[:, 0], shifts[:, 1]], axis=-1)

@@ -1,0 +1,315 @@
+"""Groups of a plant file: from tables to mechanisms, and back number by number."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError, UnknownNameError
+from heliotrope.field.formats._plant_models import (
+    ANGLE_UNITS,
+    DRIVE_ANGLES,
+    KINDS,
+    GroupTable,
+)
+from heliotrope.field.formats._plant_table import HeliostatTable
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism import drives as drive_kinds
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS, Drive
+from heliotrope.sun import Site
+
+# Numbers of a drive as the writer names them; "rate" and its like have no unit in the
+# name because it depends on the kind.
+_RAW = {**{n: i for n, i in SLOTS.items() if n != "initial_angle"},
+        "kind": slot.KIND, "sense": slot.SENSE}  # fmt: skip
+_XYZ = "xyz"
+_POSITION = ("east_m", "north_m", "up_m")
+
+
+def build_group(
+    path: Path, name: str, group: GroupTable, table: HeliostatTable,
+    rows: npt.NDArray[np.intp], site: Site,
+) -> Heliostats:  # fmt: skip
+    """Return the heliostats of one group.
+
+    Raises
+    ------
+    FormatError, InputError
+        If the group cannot be built.
+    """
+    reader = _Reader(path, name, group, table, rows)
+    position = np.stack([table.numbers[c][rows] for c in _POSITION], axis=-1)
+    if group.chain is not None:
+        mechanism = reader.chain(position)
+    else:
+        mechanism = reader.built(position, site)
+    width = reader.number("mirror_width_m", group.mirror_width_m)
+    height = reader.number("mirror_height_m", group.mirror_height_m)
+    if width is None or height is None:
+        raise reader.fail("mirror_width_m and mirror_height_m are needed, here or in the table")
+    aim = None
+    if "aim_east_m" in table.numbers:
+        columns = ("aim_east_m", "aim_north_m", "aim_up_m")
+        aim = np.stack([table.numbers[c][rows] for c in columns], axis=-1)
+    cluster = tuple(table.cluster[i] for i in rows)
+    return Heliostats(
+        names=tuple(table.name[i] for i in rows),
+        mechanism=mechanism,
+        width=np.broadcast_to(width, rows.shape),
+        height=np.broadcast_to(height, rows.shape),
+        facets=reader.facets(),
+        parameters=reader.parameters(mechanism),
+        aim=aim,
+        cluster=cluster if any(cluster) else (),
+    )
+
+
+class _Reader:
+    """Numbers of one group, from the TOML or, where it has such a column, from the table."""
+
+    def __init__(
+        self, path: Path, name: str, group: GroupTable, table: HeliostatTable,
+        rows: npt.NDArray[np.intp],
+    ) -> None:  # fmt: skip
+        self.path, self.name, self.group, self.table, self.rows = path, name, group, table, rows
+
+    def fail(self, problem: str, where: str = "") -> FormatError:
+        place = f"groups.{self.name}" + (f".{where}" if where else "")
+        return FormatError(self.path, problem, place)
+
+    def column(self, key: str) -> FloatArray | None:
+        """The table's column for this group; None if it is not there or empty for all."""
+        column = self.table.column(key, self.rows)
+        if column is None or np.isnan(column).all():
+            return None
+        if np.isnan(column).any():
+            i = int(self.rows[np.flatnonzero(np.isnan(column))[0]])
+            raise FormatError(
+                self.table.path, f"heliostat {self.table.name[i]}: the cell is empty, but others "
+                f"of group {self.name} have a value; fill it", f"line {i + 2}, column {key}",
+            )  # fmt: skip
+        return column
+
+    def number(self, key: str, given: float | None) -> FloatArray | None:
+        column = self.column(key)
+        if column is not None:
+            return column
+        return None if given is None else np.asarray(given, dtype=np.float64)
+
+    def array(self, key: str, given: Any) -> FloatArray:
+        """An array of numbers; columns ``key.i.j`` replace single elements."""
+        base = np.asarray(given, dtype=np.float64)
+        full = np.array(np.broadcast_to(base, (len(self.rows), *base.shape)))
+        for index in np.ndindex(base.shape):
+            column = self.column(".".join([key, *map(str, index)]))
+            if column is not None:
+                full[(slice(None), *index)] = column
+        return full
+
+    def built(self, position: FloatArray, site: Site) -> Mechanism:
+        group = self.group
+        if group.kind not in KINDS:
+            raise UnknownNameError("kind of mechanism", group.kind, KINDS)
+        every = {key for keys in KINDS.values() for key in keys}
+        for key in sorted(every - set(KINDS[group.kind])):
+            if getattr(group, key) is not None:
+                raise self.fail(f"{key} does not belong to kind {group.kind}; remove it", key)
+        arguments: dict[str, Any] = {}
+        for key in KINDS[group.kind]:
+            given = getattr(group, key)
+            if isinstance(given, list):
+                arguments[key.removesuffix("_m")] = self.array(key, given)
+            elif (value := self.number(key, given)) is not None:
+                arguments[key.removesuffix("_m")] = value
+        if group.kind == "polar":
+            degrees = arguments.pop("latitude_deg", np.asarray(site.latitude_deg))
+            arguments["latitude"] = np.radians(degrees)
+        if group.kind == "pitch_roll" and "facing_deg" in arguments:
+            arguments["azimuth"] = np.radians(arguments.pop("facing_deg"))
+        builder = getattr(kinds, group.kind)
+        needed = {"target_aligned": ("aim_m",), "two_axis": ("axis_1", "axis_2", "normal")}
+        for key in needed.get(group.kind, ()):
+            if getattr(group, key) is None:
+                raise self.fail(f"{key} is missing; kind {group.kind} needs it")
+        if group.kind == "two_jacks" and not group.drives:
+            raise self.fail("drives are missing; kind two_jacks needs those of both joints")
+        names = _joint_names(group.kind)
+        for joint in group.drives:
+            if joint not in names:
+                raise self.fail(f"{joint!r} is no driven joint; they are {names}", "drives")
+        if group.drives:
+            arguments["drives"] = tuple(self.drive(joint) for joint in names)
+        mechanism: Mechanism = builder(position, **arguments)
+        return mechanism
+
+    def drive(self, joint: str) -> Drive:
+        if joint not in self.group.drives:
+            raise self.fail(f"the drive of joint {joint!r} is missing", "drives")
+        model: Any = self.group.drives[joint]
+        where = f"drives.{joint}"
+        if model.kind == "raw":
+            return self.raw_drive(joint, model.numbers)
+        values: dict[str, Any] = {}
+        for key in type(model).model_fields:
+            if key in ("kind",):
+                continue
+            value = self.number(f"{where}.{key}", getattr(model, key))
+            if value is not None:
+                values[key] = value
+        for angle in DRIVE_ANGLES:
+            units = [u for u in ANGLE_UNITS if f"{angle}_{u}" in values]
+            if len(units) > 1:
+                raise self.fail(f"{angle} is given in {' and '.join(units)}; keep one", where)
+            if units:
+                values[angle] = values.pop(f"{angle}_{units[0]}") * ANGLE_UNITS[units[0]]
+        for key in ("min_count", "max_count", "scale", "worm_ratio"):
+            values[key] = values.get(key, {"min_count": -np.inf, "max_count": np.inf}.get(key, 0.0))
+        values["speed"] = values.pop("speed_counts_per_s", np.inf)
+        if model.kind == "direct":
+            return drive_kinds.direct(**values)
+        if model.kind == "rotary":
+            return drive_kinds.rotary(
+                values.pop("steps_per_turn"), values.pop("gear_ratio"), **values
+            )
+        needed = ("increment_per_m", "initial_stroke_length_m", "offset_m", "pivot_radius_m",
+                  "initial_angle")  # fmt: skip
+        for key in needed:
+            if key not in values:
+                raise self.fail(f"{key} is missing, here and as a column {where}.{key}", where)
+        return drive_kinds.linear_paint(*(values.pop(key) for key in needed), **values)
+
+    def raw_drive(self, joint: str, numbers: Mapping[str, float]) -> Drive:
+        row = np.zeros((len(self.rows), slot.DRIVE_SLOTS))
+        for key, value in numbers.items():
+            if key not in _RAW:
+                raise UnknownNameError("number of a drive", key, _RAW)
+            row[:, _RAW[key]] = value
+        for key, index in _RAW.items():
+            column = self.column(f"drives.{joint}.{key}")
+            if column is not None:
+                row[:, index] = column
+            elif key not in numbers:
+                raise self.fail(f"{key} is missing", f"drives.{joint}.numbers")
+        return Drive(row).replace()
+
+    def chain(self, position: FloatArray) -> Mechanism:
+        chain = self.group.chain
+        if chain is None:
+            raise self.fail("chain is missing")
+        joints = len(chain.joints)
+        for key in ("axes", "origins_m", "angles_rad"):
+            if len(getattr(chain, key)) != joints:
+                raise self.fail(f"{key} has {len(getattr(chain, key))} rows for {joints} joints")
+        if not chain.driven or any(not 0 <= d < joints for d in chain.driven):
+            raise self.fail(f"driven {chain.driven}: give indices of joints from 0 to {joints - 1}")
+        driven = [self.drive(chain.joints[d]).table for d in chain.driven]
+        return Mechanism(
+            kind=self.group.kind,
+            joints=tuple(chain.joints),
+            driven=tuple(chain.driven),
+            position=position,
+            orientation=self.array("chain.orientation", chain.orientation),
+            axes=self.array("chain.axes", chain.axes),
+            origins=self.array("chain.origins_m", chain.origins_m),
+            angles=self.array("chain.angles_rad", chain.angles_rad),
+            drives=Drive(np.stack(driven, axis=-2)),
+            vertex=self.array("chain.vertex_m", chain.vertex_m),
+            normal=self.array("chain.normal", chain.normal),
+        )
+
+    def facets(self) -> Facets | None:
+        if not self.group.facets:
+            return None
+        array = self.array("facets", self.group.facets)
+        if array.ndim != 4 or array.shape[2] != 3:
+            raise self.fail("each facet needs center, half width and half height", "facets")
+        return Facets(array[:, :, 0], array[:, :, 1], array[:, :, 2])
+
+    def parameters(self, mechanism: Mechanism) -> dict[str, FloatArray]:
+        found = {}
+        for column in self.table.numbers:
+            if not column.startswith("parameters."):
+                continue
+            key = column.removeprefix("parameters.")
+            name = next((n for n in mechanism.parameters if _column(mechanism, n) == key), None)
+            values = self.column(column)
+            # A plant of several kinds has columns that are empty for the others.
+            if values is None:
+                continue
+            if name is None:
+                known = [_column(mechanism, n) for n in mechanism.parameters]
+                raise UnknownNameError(f"parameter (column {column})", key, known)
+            found[name] = values
+        return found
+
+
+def _joint_names(kind: str) -> tuple[str, str]:
+    return {
+        "azimuth_elevation": ("azimuth", "elevation"),
+        "two_jacks": ("elevation", "azimuth"),
+        "polar": ("hour_angle", "declination"),
+        "two_axis": ("primary", "secondary"),
+    }.get(kind, ("tilt", "roll"))
+
+
+def _column(mechanism: Mechanism, name: str) -> str:
+    unit = mechanism.parameter(name).unit
+    return name if unit == "1" else f"{name}_{unit}"
+
+
+def group_document(
+    name: str, heliostats: Heliostats
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return the TOML of a group, and the columns of what differs between its heliostats."""
+    m = heliostats.mechanism
+    columns: dict[str, Any] = {"name": list(heliostats.names), "group": [name] * len(heliostats)}
+    columns |= {c: m.position[:, k] for k, c in enumerate(_POSITION)}
+    columns["mirror_width_m"] = np.array(heliostats.width)
+    columns["mirror_height_m"] = np.array(heliostats.height)
+    if heliostats.cluster:
+        columns["cluster"] = list(heliostats.cluster)
+    if heliostats.aim is not None:
+        columns |= {f"aim_{c}": heliostats.aim[:, k] for k, c in enumerate(_POSITION)}
+
+    def first(key: str, array: FloatArray) -> Any:
+        """The first heliostat's numbers; where others differ, a column for all."""
+        for index in np.ndindex(array.shape[1:]):
+            values = array[(slice(None), *index)]
+            if (values != values[0]).any():
+                columns[".".join([key, *map(str, index)])] = values
+        return array[0].tolist()
+
+    chain = {
+        "joints": list(m.joints),
+        "driven": list(m.driven),
+        "orientation": first("chain.orientation", m.orientation),
+        "axes": first("chain.axes", m.axes),
+        "origins_m": first("chain.origins_m", m.origins),
+        "angles_rad": first("chain.angles_rad", m.angles),
+        "vertex_m": first("chain.vertex_m", m.vertex),
+        "normal": first("chain.normal", m.normal),
+    }
+    drives = {}
+    for d, joint in enumerate(m.driven):
+        table = m.drives.table[:, d]
+        key = m.joints[joint]
+        numbers = {n: float(table[0, i]) for n, i in _RAW.items()}
+        for n, i in _RAW.items():
+            if (table[:, i] != table[0, i]).any():
+                columns[f"drives.{key}.{n}"] = table[:, i]
+        drives[key] = {"kind": "raw", "numbers": numbers}
+    document: dict[str, Any] = {"kind": m.kind, "chain": chain, "drives": drives}
+    if heliostats.facets is not None:
+        f = heliostats.facets
+        document["facets"] = first(
+            "facets", np.stack([f.center, f.half_width, f.half_height], axis=2)
+        )
+    for parameter, values in heliostats.parameters.items():
+        columns[f"parameters.{_column(m, parameter)}"] = values
+    return document, columns

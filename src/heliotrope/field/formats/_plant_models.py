@@ -1,0 +1,172 @@
+"""What a plant's TOML file may hold: pydantic models, at the boundary only."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
+
+#: Names of mechanisms, each with the geometry that its group may give.
+KINDS: dict[str, tuple[str, ...]] = {
+    "azimuth_elevation": ("pivot_height_m", "pivot_offset_m"),
+    "tilt_roll": ("axis", "pivot_height_m", "spacing_m", "pivot_offset_m"),
+    "target_aligned": ("aim_m", "pivot_height_m", "pivot_offset_m"),
+    "pitch_roll": ("facing_deg", "pivot_height_m", "spacing_m", "pivot_offset_m"),
+    "polar": ("latitude_deg", "pivot_height_m", "pivot_offset_m"),
+    "two_axis": ("axis_1", "axis_2", "normal", "origin_1_m", "origin_2_m", "arm_m", "vertex_m"),
+    "two_jacks": (
+        "joint_translation_1_m", "joint_translation_2_m", "concentrator_translation_m",
+    ),
+}  # fmt: skip
+
+#: Angles of a drive; each may be given with ``_deg``, ``_mrad`` or ``_rad``.
+DRIVE_ANGLES = ("zero", "initial_angle", "bias", "worm_cos", "worm_sin", "sag", "sag_phase",
+                "min_angle", "max_angle")  # fmt: skip
+ANGLE_UNITS = {"deg": 0.017453292519943295, "mrad": 1e-3, "rad": 1.0}
+
+
+class Strict(BaseModel):
+    """Refuses what it does not know."""
+
+    model_config = ConfigDict(extra="forbid", strict=False)
+
+
+class PlantTable(Strict):
+    """``[plant]``."""
+
+    name: str = Field(min_length=1)
+
+
+class SiteTable(Strict):
+    """``[site]``: the reference point and its air."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)]
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)]
+    height_m: Annotated[float, Field(ge=-500, le=9000)] = 0.0
+    pressure_pa: Annotated[float, Field(ge=30e3, le=120e3)] | None = None
+    temperature_c: Annotated[float, Field(ge=-80, le=60)] = 12.0
+
+
+class TargetTable(Strict):
+    """``[[targets]]``: four corners from the upper left as seen from the front, or a size."""
+
+    name: str = Field(min_length=1)
+    corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
+    center_m: Vector | None = None
+    width_m: Positive | None = None
+    height_m: Positive | None = None
+    facing_deg: Number | None = Field(None, description="Azimuth that the front looks to.")
+    markers_m: dict[str, Vector] = Field(default_factory=dict)
+
+
+class ReceiverTable(Strict):
+    """``[[receivers]]``."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["planar", "convex_cylinder", "external_cylinder"] = "planar"
+    center_m: Vector
+    normal: Vector
+    width_m: Positive
+    height_m: Positive
+    corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
+    radius_m: Annotated[float, Field(ge=0)] = 0.0
+    opening_angle_rad: Annotated[float, Field(ge=0)] = 0.0
+
+
+class ChainTable(Strict):
+    """``chain``: a mechanism number by number, as the writer leaves it."""
+
+    joints: list[str]
+    driven: list[int]
+    orientation: list[list[Number]]
+    axes: list[Vector]
+    origins_m: list[Vector]
+    angles_rad: list[Number]
+    vertex_m: Vector
+    normal: Vector
+
+
+class RawDrive(Strict):
+    """A drive number by number, as the writer leaves it."""
+
+    kind: Literal["raw"]
+    numbers: dict[str, float]
+
+
+def _drive(name: str, kind: str, **own: Any) -> type[BaseModel]:
+    angles: dict[str, Any] = {
+        f"{angle}_{unit}": (Number | None, None) for angle in DRIVE_ANGLES for unit in ANGLE_UNITS
+    }
+    common: dict[str, Any] = {
+        "scale": (Number, 0.0),
+        "worm_ratio": (Number, 0.0),
+        "min_count": (Number | None, None),
+        "max_count": (Number | None, None),
+        "speed_counts_per_s": (Positive | None, None),
+    }
+    return create_model(
+        name, __base__=Strict, kind=(Literal[kind], ...), **own, **angles, **common
+    )
+
+
+RotaryDrive = _drive(
+    "RotaryDrive", "rotary", steps_per_turn=(Positive, ...), gear_ratio=(Positive, ...),
+    microsteps=(Positive, 1.0), sense=(Literal[1, -1], 1),
+)  # fmt: skip
+DirectDrive = _drive("DirectDrive", "direct")
+# The constants of a jack often differ from heliostat to heliostat, so that they may
+# stand in the table instead.
+LinearDrive = _drive(
+    "LinearDrive", "linear", increment_per_m=(Positive | None, None),
+    initial_stroke_length_m=(Positive | None, None), offset_m=(Positive | None, None),
+    pivot_radius_m=(Positive | None, None), clockwise=(Literal[0, 1], 1),
+)  # fmt: skip
+AnyDrive = Annotated[
+    RotaryDrive | DirectDrive | LinearDrive | RawDrive,  # type: ignore[valid-type]
+    Field(discriminator="kind"),
+]
+
+
+class GroupTable(Strict):
+    """``[groups.NAME]``: heliostats of one kind."""
+
+    kind: str
+    mirror_width_m: Positive | None = None
+    mirror_height_m: Positive | None = None
+    pivot_height_m: Number | None = None
+    pivot_offset_m: Number | None = None
+    spacing_m: Number | None = None
+    facing_deg: Number | None = None
+    latitude_deg: Number | None = None
+    aim_m: Vector | None = None
+    axis: Vector | None = None
+    axis_1: Vector | None = None
+    axis_2: Vector | None = None
+    normal: Vector | None = None
+    origin_1_m: Vector | None = None
+    origin_2_m: Vector | None = None
+    arm_m: Vector | None = None
+    vertex_m: Vector | None = None
+    joint_translation_1_m: Vector | None = None
+    joint_translation_2_m: Vector | None = None
+    concentrator_translation_m: Vector | None = None
+    chain: ChainTable | None = None
+    drives: dict[str, AnyDrive] = Field(default_factory=dict)
+    facets: list[list[Vector]] | None = Field(
+        None, description="Center, half width and half height of each, in the mirror's frame, m."
+    )
+
+
+class PlantDocument(Strict):
+    """The whole file."""
+
+    format: Literal["heliotrope-plant"]
+    version: Literal[1]
+    plant: PlantTable
+    site: SiteTable
+    heliostats: str = Field(description="Table of the heliostats (CSV or Parquet), beside.")
+    groups: dict[str, GroupTable] = Field(min_length=1)
+    targets: list[TargetTable] = Field(default_factory=list)
+    receivers: list[ReceiverTable] = Field(default_factory=list)

@@ -1,0 +1,175 @@
+"""The table of heliostats beside a plant file: CSV or Parquet, column by column."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError
+from heliotrope.field.formats._textfile import check_file, write_file
+from heliotrope.geometry import FloatArray
+
+TEXTS = ("name", "group", "cluster")
+REQUIRED = ("name", "group", "east_m", "north_m", "up_m")
+
+#: Plausible values by column: what lies outside has most likely another unit.
+PLAUSIBLE = {
+    "east_m": (-50e3, 50e3, "m from the site's reference"),
+    "north_m": (-50e3, 50e3, "m from the site's reference"),
+    "up_m": (-1000.0, 1000.0, "m above the site's reference"),
+    "mirror_width_m": (0.05, 50.0, "m"),
+    "mirror_height_m": (0.05, 50.0, "m"),
+    "pivot_height_m": (-1.0, 30.0, "m"),
+    "pivot_offset_m": (-3.0, 3.0, "m"),
+}
+#: Names of heliostats are not repeated in more than this many lines of errors.
+MOST_PROBLEMS = 50
+
+
+@dataclass(frozen=True)
+class HeliostatTable:
+    """The columns of a table that could be read.
+
+    Attributes
+    ----------
+    path
+        The file.
+    name, group, cluster
+        Texts, (N,).
+    numbers
+        Columns of numbers, each (N,).
+    problems
+        What is wrong in it.
+    """
+
+    path: Path
+    name: tuple[str, ...]
+    group: tuple[str, ...]
+    cluster: tuple[str, ...]
+    numbers: Mapping[str, FloatArray]
+    problems: list[FormatError] = field(default_factory=list)
+
+    def column(self, name: str, rows: npt.NDArray[np.intp]) -> FloatArray | None:
+        """Return the numbers of a column at ``rows``, None if there is no such column."""
+        return self.numbers[name][rows] if name in self.numbers else None
+
+
+def read_table(path: Path) -> HeliostatTable:
+    """Return the table of heliostats.
+
+    Raises
+    ------
+    FormatError
+        If it is no table at all; single values that are wrong go to ``problems``.
+    """
+    import pandas as pd
+
+    if path.suffix == ".parquet":
+        frame = _read_parquet(path)
+    else:
+        check_file(path, "the table of heliostats")
+        texts = dict.fromkeys(TEXTS, str)
+        try:
+            frame = pd.read_csv(
+                path, dtype=texts, keep_default_na=False, na_values=[""],
+                float_precision="round_trip",
+            )  # fmt: skip
+        except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
+            raise FormatError(path, f"no table in CSV: {str(error).strip()}") from None
+    missing = [name for name in REQUIRED if name not in frame.columns]
+    if missing:
+        there = ", ".join(map(str, frame.columns[:10]))
+        raise FormatError(path, f"column {missing[0]} is missing; there are {there}", "line 1")
+    if not len(frame):
+        raise FormatError(path, "the table has a header but no heliostats")
+    problems: list[FormatError] = []
+    texts_read = {
+        name: tuple("" if pd.isna(v) else str(v) for v in frame[name])
+        if name in frame.columns
+        else ("",) * len(frame)
+        for name in TEXTS
+    }
+    _check_names(path, texts_read["name"], problems)
+    numbers = {
+        str(column): _numbers(path, str(column), frame[column], texts_read["name"], problems)
+        for column in frame.columns
+        if column not in TEXTS
+    }
+    return HeliostatTable(
+        path, texts_read["name"], texts_read["group"], texts_read["cluster"], numbers, problems
+    )
+
+
+def _read_parquet(path: Path) -> Any:
+    import pandas as pd
+    import pyarrow as pa
+
+    if not path.is_file():
+        raise FormatError(path, "there is no such file; give the table of heliostats")
+    try:
+        return pd.read_parquet(path)
+    except (pa.ArrowInvalid, OSError) as error:
+        reason = str(error).split("\n", maxsplit=1)[0]
+        raise FormatError(path, f"no Parquet table: {reason}") from None
+
+
+def _check_names(path: Path, names: Sequence[str], problems: list[FormatError]) -> None:
+    first: dict[str, int] = {}
+    for i, name in enumerate(names):
+        if not name:
+            problems.append(FormatError(path, "a heliostat without a name", f"line {i + 2}"))
+        elif name in first:
+            problems.append(
+                FormatError(
+                    path, f"heliostat {name} stands in line {first[name] + 2} already; "
+                    "names are unique", f"line {i + 2}",
+                )
+            )  # fmt: skip
+        else:
+            first[name] = i
+        if len(problems) >= MOST_PROBLEMS:
+            return
+
+
+def _numbers(
+    path: Path, column: str, values: Any, names: Sequence[str], problems: list[FormatError]
+) -> FloatArray:
+    import pandas as pd
+
+    read = pd.to_numeric(values, errors="coerce").to_numpy(dtype=np.float64)
+    low, high, unit = PLAUSIBLE.get(column, (-np.inf, np.inf, ""))
+    # A cell may be empty where the heliostat's group does not need the column.
+    empty = values.isna().to_numpy()
+    wrong = np.isnan(read) & (~empty if column not in REQUIRED else True)
+    for i in np.flatnonzero(wrong)[:MOST_PROBLEMS]:
+        given = values.iloc[i]
+        shown = "nothing" if pd.isna(given) else repr(given)
+        problems.append(
+            FormatError(
+                path, f"heliostat {names[i]}: {shown} is no number", f"line {i + 2}, column {column}"
+            )
+        )
+    outside = ~np.isnan(read) & ~((read >= low) & (read <= high))
+    for i in np.flatnonzero(outside)[:MOST_PROBLEMS]:
+        problems.append(
+            FormatError(
+                path, f"heliostat {names[i]}: {read[i]:g} is outside {low:g} to {high:g} {unit}; "
+                "is it in another unit?", f"line {i + 2}, column {column}",
+            )
+        )  # fmt: skip
+    return np.asarray(read, dtype=np.float64)
+
+
+def write_table(parts: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write columns, group below group, as CSV (17 digits) or Parquet."""
+    import pandas as pd
+
+    frame = pd.concat([pd.DataFrame(dict(part)) for part in parts], ignore_index=True)
+    if path.suffix == ".parquet":
+        write_file(path, lambda stream: frame.to_parquet(stream, index=False))
+    else:
+        # repr of a float is the shortest text that reads back the same.
+        write_file(path, lambda stream: frame.to_csv(stream, index=False, na_rep=""))

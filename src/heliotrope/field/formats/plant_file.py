@@ -1,0 +1,313 @@
+"""Our own format: one TOML file for the plant, and a table of its heliostats beside it.
+
+The TOML holds what is one for all (site, tower, kinds of mechanism); the table holds
+what differs: name, group, position, and any number of the mechanism or the drives in a
+column of its dotted name. Written files give every number with all its digits, so that
+what is read again is the same plant.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import ValidationError
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._plant_groups import build_group, group_document
+from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
+from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
+from heliotrope.field.formats._textfile import read_text, write_text
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray, direction
+from heliotrope.sun import Site
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something wrong ("error") or strange ("warning") in a plant file."""
+
+    severity: Literal["error", "warning"]
+    text: str
+
+
+def read_plant(path: str | Path) -> Plant:
+    """Return the plant of a TOML file and the table that it names.
+
+    Raises
+    ------
+    FormatError
+        If something cannot be used; the text names file, place, value and limit, and
+        how many more problems there are.
+    """
+    document = _read_document(Path(path))
+    table = read_table(Path(path).parent / document.heliostats)
+    problems = list(table.problems)
+    plant = None
+    if not problems:
+        plant = _assemble(Path(path), document, table, problems)
+    if problems or plant is None:
+        more = len(problems) - 1
+        hint = f" (and {more} more: heliotrope field check shows all)" if more else ""
+        first = problems[0]
+        raise FormatError(first.path, first.problem + hint, first.where)
+    return plant
+
+
+def _read_document(path: Path) -> PlantDocument:
+    text = read_text(path, "a plant file")
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(path, f"no TOML: {error}") from None
+    if raw.get("format") != "heliotrope-plant":
+        raise FormatError(
+            path, f"format is {raw.get('format')!r}; a plant file says "
+            'format = "heliotrope-plant" and version = 1'
+        )  # fmt: skip
+    try:
+        return PlantDocument.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise FormatError(path, _explain(first), _place(first["loc"])) from None
+
+
+def _place(location: tuple[int | str, ...]) -> str:
+    return ".".join(str(part) for part in location)
+
+
+def _explain(error: Any) -> str:
+    """One line from pydantic's description of an error."""
+    value, kind = error.get("input"), error["type"]
+    key = str(error["loc"][-1]) if error["loc"] else ""
+    if kind == "missing":
+        return f"{key!r} is missing; add it"
+    if kind == "extra_forbidden":
+        known = sorted({n for m in _MODELS for n in m.model_fields})
+        close = get_close_matches(key, known, n=1)
+        return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
+    message = error["msg"][0].lower() + error["msg"][1:]
+    return f"{value!r:.80}: {message}"
+
+
+def _models() -> list[Any]:
+    from heliotrope.field.formats import _plant_models as models
+
+    return [
+        models.PlantDocument, models.PlantTable, models.SiteTable, models.TargetTable,
+        models.ReceiverTable, models.GroupTable, models.ChainTable, models.RotaryDrive,
+        models.LinearDrive,
+    ]  # fmt: skip
+
+
+_MODELS = _models()
+
+
+def _assemble(
+    path: Path, document: PlantDocument, table: HeliostatTable, problems: list[FormatError]
+) -> Plant | None:
+    """Build the plant; what is wrong is added to ``problems``."""
+    site = Site(
+        document.site.latitude_deg, document.site.longitude_deg, document.site.height_m,
+        pressure=document.site.pressure_pa, temperature_c=document.site.temperature_c,
+        name=document.plant.name,
+    )  # fmt: skip
+    groups, targets, receivers = {}, [], []
+    for group in sorted(set(table.group) - set(document.groups)):
+        known = ", ".join(document.groups)
+        problems.append(
+            FormatError(table.path, f"group {group!r} is not in {path.name}; known: {known}")
+        )
+    for name, group_table in document.groups.items():
+        try:
+            rows = np.flatnonzero(np.array(table.group) == name)
+            if len(rows):
+                groups[name] = build_group(path, name, group_table, table, rows, site)
+        except FormatError as error:
+            problems.append(error)
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"groups.{name}"))
+    for k, target in enumerate(document.targets):
+        try:
+            targets.append(_target(target))
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"targets[{k}]"))
+    for k, r in enumerate(document.receivers):
+        try:
+            corners = None if r.corners_m is None else np.array(r.corners_m)
+            receivers.append(
+                Receiver(r.name, r.kind, np.array(r.center_m), np.array(r.normal), r.width_m,
+                         r.height_m, corners, r.radius_m, r.opening_angle_rad)
+            )  # fmt: skip
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"receivers[{k}]"))
+    if problems:
+        return None
+    try:
+        return Plant(document.plant.name, site, groups, tuple(targets), tuple(receivers))
+    except InputError as error:
+        problems.append(FormatError(path, str(error)))
+        return None
+
+
+def _target(table: TargetTable) -> Target:
+    markers = {name: np.array(point) for name, point in table.markers_m.items()}
+    if table.corners_m is not None:
+        corners = np.array(table.corners_m)
+        center = corners.mean(axis=0) if table.center_m is None else np.array(table.center_m)
+        return Target(table.name, corners, center, markers)
+    size = (table.center_m, table.width_m, table.height_m, table.facing_deg)
+    if any(value is None for value in size):
+        raise InputError(
+            f"target {table.name}: give corners_m, or center_m, width_m, height_m and facing_deg"
+        )
+    center = np.array(table.center_m)
+    corners = rectangle(center, size[1] or 0.0, size[2] or 0.0, np.radians(size[3] or 0.0))
+    return Target(table.name, corners, center, markers)
+
+
+def rectangle(center: FloatArray, width: float, height: float, facing: float) -> FloatArray:
+    """Return the corners (4, 3) of an upright rectangle whose front looks to azimuth ``facing``.
+
+    From the upper left, as seen from the front; metres and radians.
+    """
+    # Seen from the front, the right hand is a quarter turn back from where it faces.
+    right = 0.5 * width * direction(facing - 0.5 * np.pi, 0.0)
+    up = np.array([0.0, 0.0, 0.5 * height])
+    return np.stack([center - right + up, center + right + up, center + right - up,
+                     center - right - up])  # fmt: skip
+
+
+def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"] = "csv") -> None:
+    """Write the TOML file and, beside it, the table of the heliostats.
+
+    Both are written beside their places and renamed, the table first: a reader never
+    sees a file that is half there.
+
+    Parameters
+    ----------
+    plant
+        Any plant; its calibrated parameters go with it.
+    path
+        Of the TOML file; the table takes its name with the other ending.
+    table
+        "csv" or "parquet".
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written to.
+    """
+    import tomli_w
+
+    place = Path(path)
+    other = place.with_suffix(f".{table}")
+    columns: list[Mapping[str, Any]] = []
+    groups = {}
+    for name, heliostats in plant.groups.items():
+        groups[name], varying = group_document(name, heliostats)
+        columns.append(varying)
+    write_table(columns, other)
+    document = {
+        "format": "heliotrope-plant",
+        "version": 1,
+        "heliostats": other.name,
+        "plant": {"name": plant.name},
+        "site": {
+            "latitude_deg": plant.site.latitude_deg,
+            "longitude_deg": plant.site.longitude_deg,
+            "height_m": plant.site.height,
+            **({} if plant.site.pressure is None else {"pressure_pa": plant.site.pressure}),
+            "temperature_c": plant.site.temperature_c,
+        },
+        "targets": [
+            {
+                "name": t.name,
+                "center_m": t.center.tolist(),
+                "corners_m": t.corners.tolist(),
+                "markers_m": {k: np.asarray(v).tolist() for k, v in t.markers.items()},
+            }
+            for t in plant.targets
+        ],
+        "receivers": [_receiver_document(r) for r in plant.receivers],
+        "groups": groups,
+    }
+    write_text(place, tomli_w.dumps(document))
+
+
+def _receiver_document(r: Receiver) -> dict[str, Any]:
+    corners = {} if r.corners is None else {"corners_m": r.corners.tolist()}
+    return {
+        "name": r.name,
+        "kind": r.kind,
+        "center_m": r.center.tolist(),
+        "normal": r.normal.tolist(),
+        "width_m": r.width,
+        "height_m": r.height,
+        **corners,
+        "radius_m": r.radius,
+        "opening_angle_rad": r.opening_angle,
+    }
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of the TOML file."""
+    return {"title": "Heliotrope plant file", **PlantDocument.model_json_schema()}
+
+
+def check_plant(path: str | Path) -> list[Finding]:
+    """Return everything that is wrong or strange in a plant file; raises nothing for its content."""
+    place = Path(path)
+    try:
+        document = _read_document(place)
+        table = read_table(place.parent / document.heliostats)
+    except FormatError as error:
+        return [Finding("error", str(error))]
+    problems = list(table.problems)
+    plant = None if problems else _assemble(place, document, table, problems)
+    found = [Finding("error", str(problem)) for problem in problems]
+    return found if plant is None else found + [Finding("warning", w) for w in _warnings(plant)]
+
+
+def _warnings(plant: Plant) -> list[str]:
+    found = []
+    if not plant.targets:
+        found.append("there is no target: calibration with a camera is not possible")
+    if not plant.receivers:
+        found.append("there is no receiver")
+    if len(plant) == 0:
+        return [*found, "there are no heliostats"]
+    found += _crowding(plant)
+    for surface in plant.targets:
+        behind = (plant.position - surface.center) @ surface.normal <= 0.0
+        if behind.any():
+            example = plant.names[int(np.flatnonzero(behind)[0])]
+            found.append(
+                f"target {surface.name}: {int(behind.sum())} heliostats stand behind its plane "
+                f"and cannot light it (for example {example})"
+            )
+    return found
+
+
+def _crowding(plant: Plant) -> list[str]:
+    from scipy.spatial import cKDTree
+
+    size = np.concatenate([np.hypot(g.width, g.height) for g in plant.groups.values()])
+    flat = plant.position[:, :2]
+    pairs = cKDTree(flat).query_pairs(float(size.max()), output_type="ndarray")
+    if not len(pairs):
+        return []
+    apart = np.linalg.norm(flat[pairs[:, 0]] - flat[pairs[:, 1]], axis=1)
+    close = apart < 0.5 * (size[pairs[:, 0]] + size[pairs[:, 1]])
+    if not close.any():
+        return []
+    i, j = pairs[close][int(np.argmin(apart[close]))]
+    return [
+        f"{int(close.sum())} pairs of mirrors can touch: the nearest, {plant.names[i]} and "
+        f"{plant.names[j]}, stand {apart[close].min():.2f} m apart with diagonals of "
+        f"{size[i]:.2f} m"
+    ]
