@@ -21,9 +21,9 @@ import httpx
 import pytest
 
 from heliotrope.errors import FetchError, InputError, UnknownNameError
-from heliotrope.field.formats import fetch
+from heliotrope.field.formats import fetch, paint
 from heliotrope.field.formats._download import JOURNAL
-from heliotrope.field.formats.fetch import FetchState, Settings, fetch_heliostat, fetch_tower
+from heliotrope.field.formats.fetch import FetchState, Settings, fetch_heliostats, fetch_tower
 
 PLANT = "WRI1030197"
 FAST = Settings(workers=4, timeout=5.0, retries=3, backoff=0.002)
@@ -48,6 +48,7 @@ class Database:
     """A small database like PAINT's, its faults, and what was asked of it."""
 
     url: str
+    client: httpx.Client
     files: dict[str, bytes] = field(default_factory=dict)
     faults: dict[str, list[Fault]] = field(default_factory=dict)
     asked: list[tuple[str, dict[str, str]]] = field(default_factory=list)
@@ -81,7 +82,7 @@ class Database:
                 {"rel": relation, "href": href} for href in hrefs
             ]
 
-        properties = f"{name}/Properties/{name}-heliostat_properties"
+        properties = f"{name}/Properties/{name}-heliostat-properties"
         calibration = f"{name}/Calibration/{name}-calibration-collection-stac.json"
         self.put(
             f"{name}/{name}-heliostat-catalog-stac.json",
@@ -97,7 +98,7 @@ class Database:
         )
         asset = {"href": f"{base}/{properties}.json"}
         self.put(
-            f"{name}/Properties/{name}-item-stac.json", {"assets": {"heliostat_properties": asset}}
+            f"{name}/Properties/{name}-item-stac.json", {"assets": {"heliostat-properties": asset}}
         )
         self.put(f"{properties}.json", {"heliostat": name})
         numbers = range(100, 100 + measurements)
@@ -212,10 +213,17 @@ class Server(ThreadingHTTPServer):
         """A client that went away is what some tests are about."""
 
 
+@pytest.fixture(scope="module")
+def client() -> Iterator[httpx.Client]:
+    """One client for most tests: to make one takes longer than what it is used for."""
+    with httpx.Client(timeout=5.0) as made:
+        yield made
+
+
 @pytest.fixture
-def database() -> Iterator[Database]:
+def database(client: httpx.Client) -> Iterator[Database]:
     server = Server(("127.0.0.1", 0), type("Bound", (Handler,), {}))
-    made = Database(f"http://127.0.0.1:{server.server_port}")
+    made = Database(f"http://127.0.0.1:{server.server_port}", client)
     server.RequestHandlerClass.database = made  # type: ignore[attr-defined]
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
@@ -243,10 +251,11 @@ def slow(pause: float) -> Fault:
 
 
 def get(database: Database, into: Path, **options: Any) -> fetch.Fetched:
-    return fetch_heliostat("AA39", into, base_url=database.base, **{"settings": FAST, **options})
+    options = {"base_url": database.base, "settings": FAST, "client": database.client} | options
+    return fetch_heliostats("AA39", into, **options)
 
 
-BIG = "AA39/Properties/AA39-heliostat_properties.json"
+BIG = "AA39/Properties/AA39-heliostat-properties.json"
 
 
 def big(database: Database, size: int = 200_000) -> bytes:
@@ -270,7 +279,7 @@ def stored(folder: Path) -> dict[str, bytes]:
 def test_properties_and_measurements_come(database: Database, tmp_path: Path) -> None:
     fetched = get(database, tmp_path / "new" / "folder")
     wanted = [
-        "AA39/Properties/AA39-heliostat_properties.json",
+        "AA39/Properties/AA39-heliostat-properties.json",
         "AA39/Calibration/100-calibration-properties.json",
         "AA39/Calibration/101-calibration-properties.json",
     ]
@@ -283,6 +292,33 @@ def test_properties_and_measurements_come(database: Database, tmp_path: Path) ->
     assert fetched.received == sum(map(len, stored(tmp_path / "new" / "folder").values()))
 
 
+def test_what_came_is_found_by_the_reader(database: Database, tmp_path: Path) -> None:
+    get(database, tmp_path)
+    assert paint.find_properties(tmp_path) == [tmp_path / BIG]
+
+
+def test_older_names_are_known_too(database: Database, tmp_path: Path) -> None:
+    old = {
+        path.replace("heliostat-properties", "heliostat_properties"): content.replace(
+            b"heliostat-properties", b"heliostat_properties"
+        )
+        for path, content in database.files.items()
+    }
+    database.files = old
+    fetched = get(database, tmp_path, kinds=("properties",))
+    assert [path.name for path in fetched.new] == ["AA39-heliostat_properties.json"]
+
+
+def test_an_image_is_known_by_its_type_too(database: Database, tmp_path: Path) -> None:
+    database.edit(
+        "AA39/Calibration/100-stac.json",
+        lambda item: item["assets"].__setitem__(
+            "new_image", {"href": "n.png", "type": "image/png"}
+        ),
+    )
+    assert not [path for path in get(database, tmp_path).files if path.suffix == ".png"]
+
+
 def test_images_come_when_they_are_asked_for(database: Database, tmp_path: Path) -> None:
     get(database, tmp_path, kinds=("calibration",), images=("flux_image",))
     names = Counter(Path(name).suffix for name in stored(tmp_path))
@@ -292,7 +328,7 @@ def test_images_come_when_they_are_asked_for(database: Database, tmp_path: Path)
 
 def test_several_heliostats_come_once_each(database: Database, tmp_path: Path) -> None:
     database.add("AB40", measurements=1)
-    fetched = fetch_heliostat(
+    fetched = fetch_heliostats(
         ["AA39", "AB40", "AA39"], tmp_path, base_url=database.base + "/", settings=FAST
     )
     assert Counter(path.relative_to(tmp_path).parts[0] for path in fetched.files) == {
@@ -318,8 +354,8 @@ def test_what_the_database_lacks_is_said(database: Database, tmp_path: Path) -> 
 def test_a_copy_of_the_database_is_used_whatever_its_links_say(
     database: Database, tmp_path: Path
 ) -> None:
-    database.add("AC41", root=fetch.PAINT_URL)
-    fetched = fetch_heliostat("AC41", tmp_path, base_url=database.base, settings=FAST)
+    database.add("AC41", root=fetch.DEFAULT_BASE_URL)
+    fetched = fetch_heliostats("AC41", tmp_path, base_url=database.base, settings=FAST)
     assert len(fetched.new) == 3
 
 
@@ -327,11 +363,11 @@ def test_relative_links_and_redirects_are_followed(database: Database, tmp_path:
     database.edit(
         "AA39/AA39-heliostat-catalog-stac.json",
         lambda c: c["links"].__setitem__(
-            2, {"rel": "child", "href": "./old/AA39-heliostat_properties-collection-stac.json"}
+            2, {"rel": "child", "href": "./old/AA39-heliostat-properties-collection-stac.json"}
         ),
     )
-    place = "AA39/Properties/AA39-heliostat_properties-collection-stac.json"
-    old = "AA39/old/AA39-heliostat_properties-collection-stac.json"
+    place = "AA39/Properties/AA39-heliostat-properties-collection-stac.json"
+    old = "AA39/old/AA39-heliostat-properties-collection-stac.json"
     database.put(old, {})
     database.fail(old, status(302, Location=f"{database.base}/{place}"))
     # Relative to where the document really is, not to where it was asked for.
@@ -382,14 +418,14 @@ def test_what_has_changed_comes_again(database: Database, tmp_path: Path, etags:
     get(database, tmp_path)
     database.put(BIG, {"heliostat": "moved since"})
     again = get(database, tmp_path)
-    assert [path.name for path in again.new] == ["AA39-heliostat_properties.json"]
+    assert [path.name for path in again.new] == ["AA39-heliostat-properties.json"]
     assert json.loads((tmp_path / BIG).read_bytes()) == {"heliostat": "moved since"}
 
 
 def test_a_file_that_was_damaged_comes_again(database: Database, tmp_path: Path) -> None:
     get(database, tmp_path)
     (tmp_path / BIG).write_bytes(b"{")
-    assert [path.name for path in get(database, tmp_path).new] == ["AA39-heliostat_properties.json"]
+    assert [path.name for path in get(database, tmp_path).new] == ["AA39-heliostat-properties.json"]
     assert (tmp_path / BIG).read_bytes() == database.files[f"/{PLANT}/{BIG}"]
 
 
@@ -456,7 +492,7 @@ def test_giving_up_keeps_what_is_there_for_the_next_run(database: Database, tmp_
         get(database, tmp_path)
     text = str(error.value)
     assert re.match(
-        r"heliostat AA39: http://127\.0\.0\.1:\d+/WRI1030197/AA39/Properties/AA39-heliostat_properties"
+        r"heliostat AA39: http://127\.0\.0\.1:\d+/WRI1030197/AA39/Properties/AA39-heliostat-properties"
         r"\.json: the server answers 503 Service Unavailable; gave up after 4 attempts, run it "
         r"again later, what is there is kept$", text,
     )  # fmt: skip
@@ -557,8 +593,8 @@ def test_a_process_that_was_killed_goes_on(database: Database, tmp_path: Path) -
     content = big(database, 3_000_000)
     database.fail(BIG, slow(0.05))
     script = (
-        "from heliotrope.field.formats.fetch import fetch_heliostat;"
-        f"fetch_heliostat('AA39', {str(tmp_path)!r}, base_url={database.base!r})"
+        "from heliotrope.field.formats.fetch import fetch_heliostats;"
+        f"fetch_heliostats('AA39', {str(tmp_path)!r}, base_url={database.base!r})"
     )
     process = subprocess.Popen([sys.executable, "-c", script])
     part = tmp_path / (BIG + ".part")
@@ -642,15 +678,15 @@ def test_an_unknown_heliostat_is_named_with_its_neighbours(
     with pytest.raises(
         FetchError, match=r"heliostat AA93: .* has none of this name; did you mean AA39\?"
     ):
-        fetch_heliostat("AA93", tmp_path, base_url=database.base, settings=FAST)
+        fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
     del database.files[f"/{PLANT}/{PLANT}-catalog-stac.json"]
     with pytest.raises(FetchError, match="has none of this name; look at its catalogue"):
-        fetch_heliostat("AA93", tmp_path, base_url=database.base, settings=FAST)
+        fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
 
 
 def test_nothing_like_it_gets_no_suggestion(database: Database, tmp_path: Path) -> None:
     with pytest.raises(FetchError, match=r"heliostat zzz: .*; look at its catalogue"):
-        fetch_heliostat("zzz", tmp_path, base_url=database.base, settings=FAST)
+        fetch_heliostats("zzz", tmp_path, base_url=database.base, settings=FAST)
 
 
 @pytest.mark.parametrize(
@@ -765,7 +801,7 @@ def test_size_and_checksum_of_the_catalogue_are_checked(database: Database, tmp_
     assert f"{len(content)} bytes came, but the catalogue says {len(content) + 1}" in text
     checked(database, checksum="1220" + "0" * 64)
     assert "its checksum is not the one in the catalogue" in refused(database, tmp_path)
-    assert not list(tmp_path.rglob("AA39-heliostat_properties*"))
+    assert not list(tmp_path.rglob("AA39-heliostat-properties*"))
     checked(database, checksum=right, size=len(content))
     get(database, tmp_path)
     database.asked.clear()
@@ -806,14 +842,16 @@ def test_no_network_is_said(tmp_path: Path) -> None:
     port = server.server_port
     server.server_close()
     with pytest.raises(FetchError) as error:
-        fetch_heliostat("AA39", tmp_path, base_url=f"http://127.0.0.1:{port}/x", settings=FAST)
+        fetch_heliostats("AA39", tmp_path, base_url=f"http://127.0.0.1:{port}/x", settings=FAST)
     assert "no connection; check the network and the address" in str(error.value)
     assert "gave up after 4 attempts" in str(error.value)
 
 
 def test_a_silent_server_is_said(database: Database, tmp_path: Path) -> None:
     database.fail(CATALOGUE, *[slow(0.5)] * 2)
-    text = refused(database, tmp_path, settings=Settings(timeout=0.1, retries=1, backoff=0.0))
+    text = refused(
+        database, tmp_path, settings=Settings(timeout=0.1, retries=1, backoff=0.0), client=None
+    )
     assert "the server does not answer in time" in text
 
 
@@ -835,22 +873,22 @@ def test_endless_redirects_are_said(database: Database, tmp_path: Path) -> None:
 
 def test_a_bad_address_is_said(tmp_path: Path) -> None:
     with pytest.raises(FetchError, match="neither http nor https"):
-        fetch_heliostat("AA39", tmp_path, base_url="paint-database.org", settings=FAST)
+        fetch_heliostats("AA39", tmp_path, base_url="paint-database.org", settings=FAST)
     with pytest.raises(FetchError, match=r"http://\[x/AA39.*: "):
-        fetch_heliostat("AA39", tmp_path, base_url="http://[x", settings=FAST)
+        fetch_heliostats("AA39", tmp_path, base_url="http://[x", settings=FAST)
 
 
 @pytest.mark.parametrize("name", ["", "../AA39", "AA 39", "AA39/x", "x" * 65])
 def test_names_of_heliostats_are_checked(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="give a name of letters and digits, as AA39"):
-        fetch_heliostat(name, tmp_path)
+        fetch_heliostats(name, tmp_path)
 
 
 def test_kinds_and_images_are_checked(tmp_path: Path) -> None:
     with pytest.raises(UnknownNameError, match="there is no kind 'calibrations'; did you mean cal"):
-        fetch_heliostat("AA39", tmp_path, kinds=("calibrations",))
+        fetch_heliostats("AA39", tmp_path, kinds=("calibrations",))
     with pytest.raises(UnknownNameError, match="there is no image 'raw'"):
-        fetch_heliostat("AA39", tmp_path, images=("raw",))
+        fetch_heliostats("AA39", tmp_path, images=("raw",))
 
 
 @pytest.mark.parametrize(

@@ -20,9 +20,17 @@ import numpy.typing as npt
 from heliotrope.calibration import _fit_kernels as kernels
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, tangent_axes, wrap_signed
+from heliotrope.geometry import (
+    FloatArray,
+    angle_between,
+    as_float,
+    bisector,
+    tangent_axes,
+    wrap_signed,
+)
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.parallel import run_blocks
 
@@ -30,7 +38,7 @@ Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
 #: A start is sought globally where the nominal mechanism misses by more than this, rad.
-FAR = 0.1
+FAR = 0.05
 
 
 class Outcome(IntEnum):
@@ -234,62 +242,86 @@ def _data(
 
 
 def _far_starts(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> FloatArray:
-    """Starting values: zero, but the two zero angles where the nominal ones are far off.
+    """Starting values: zero, but zeros and strokes where the nominal ones are far off.
 
-    Each sighting says at which joint angles the nominal axes would produce it; the
-    difference to the angles of the drives is the zero's error, the same for all
-    sightings of a heliostat if that is what is wrong. Its median over them is the start.
+    Each sighting says at which joint angles the nominal axes would produce it. Against
+    the drives' own angles that is one regression a joint: a zero, which is the median of
+    the differences, and for a jack its length at 0 counts, which is tried over all that
+    its triangle allows. A start is taken where it explains the sightings far better.
     """
     begin = np.zeros((len(mechanism), len(names)))
-    zeros = [_zero_parameter(mechanism, names, d) for d in range(len(mechanism.driven))]
-    if None in zeros or len(zeros) != 2 or not len(s):
+    places = [_start_parameters(mechanism, names, d) for d in range(len(mechanism.driven))]
+    if len(places) != 2 or any(zero is None for zero, _ in places) or not len(s):
         return begin
-    every = mechanism[s.heliostat]
-    pose = every.pose(s.counts)
+    pose = mechanism[s.heliostat].pose(s.counts)
     source, way = ray_directions(s, pose.vertex)
-    total = source + way
-    cosine = np.sum(total * pose.normal, axis=-1) / np.linalg.norm(total, axis=-1)
-    miss = np.arccos(np.clip(cosine, -1.0, 1.0))
-    rows = np.arange(len(mechanism) + 1)
-    offsets = np.searchsorted(s.heliostat, rows)
+    miss = angle_between(pose.normal, bisector(source, way))
+    offsets = np.searchsorted(s.heliostat, np.arange(len(mechanism) + 1))
     for i in range(len(mechanism)):
         part = slice(int(offsets[i]), int(offsets[i + 1]))
-        if part.start == part.stop or np.median(miss[part]) < FAR:
+        if part.stop - part.start < 3 or np.median(miss[part]) < FAR:
             continue
-        one = mechanism[i]
-        counts = s.counts[part]
-        aim = np.where(
-            s.destination_at_infinity[part, None],
-            pose.vertex[part] + 1e6 * s.destination[part],
-            s.destination[part],
-        )
-        solved = track(one.armature, source[part], aim)
-        drives = one.drives.angles(counts)
-        gaps = wrap_signed(solved.angles - drives[:, None, :])
-        shifts = [_circular_median(gaps[:, branch]) for branch in (0, 1)]
-        costs = [
-            float(np.median(np.abs(wrap_signed(gaps[:, b] - shifts[b])).max(axis=-1)))
-            for b in (0, 1)
-        ]
-        best = int(np.argmin(costs))
-        for d, place in enumerate(zeros):
-            begin[i, place] = shifts[best][d]
+        far = s.destination_at_infinity[part, None]
+        aim = np.where(far, pose.vertex[part] + 1e6 * s.destination[part], s.destination[part])
+        solved = track(mechanism[i].armature, source[part], aim)
+        found = [
+            [
+                _regress(
+                    Drive(mechanism.drives.table[i, d]), s.counts[part, d],
+                    solved.angles[:, branch, d], stroke is not None,
+                )
+                for d, (_, stroke) in enumerate(places)
+            ]
+            for branch in (0, 1)
+        ]  # fmt: skip
+        # Both joints are on the same branch; the wrong one is off by half a turn.
+        scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in found]
+        for (zero, stroke), (_, shift, longer) in zip(
+            places, found[int(np.argmin(scores))], strict=True
+        ):
+            if zero is not None:
+                begin[i, zero] = shift
+            if stroke is not None:
+                begin[i, stroke] = longer
     return begin
 
 
-def _zero_parameter(mechanism: Mechanism, names: tuple[str, ...], drive: int) -> int | None:
+def _regress(
+    drive: Drive, counts: FloatArray, wanted: FloatArray, jack: bool
+) -> tuple[float, float, float]:
+    """Return (spread of the rest, shift of the zero, longer stroke) of one drive."""
+    trials = [0.0]
+    if jack:
+        row = drive.table
+        stroke, c, r = (row[SLOTS[n]] for n in ("stroke_offset", "offset", "pivot_radius"))
+        ends = stroke + np.array([0.0, 0.0]) + np.array([counts.min(), counts.max()]) * row[
+            SLOTS["rate"]
+        ]
+        low = abs(c - r) + 1e-3 + stroke - min(ends.min(), stroke)
+        high = c + r - 1e-3 + stroke - max(ends.max(), stroke)
+        trials += list(np.linspace(low, high, 200) - stroke)
+    best = (np.inf, 0.0, 0.0)
+    for longer in trials:
+        moved = drive if longer == 0.0 else drive.replace(stroke_offset=stroke + longer)
+        gaps = wrap_signed(wanted - moved.angles(counts))
+        centre = gaps[int(np.argmin(np.abs(wrap_signed(gaps[:, None] - gaps)).sum(axis=1)))]
+        rest = wrap_signed(gaps - centre)
+        shift = float(wrap_signed(centre + np.median(rest)))
+        spread = float(np.median(np.abs(rest - np.median(rest))))
+        # A longer stroke must pay: two parameters always fit better than one.
+        if spread < (0.5 if best[2] == 0.0 and longer != 0.0 else 1.0) * best[0]:
+            best = (spread, shift, float(longer))
+    return best
+
+
+def _start_parameters(
+    mechanism: Mechanism, names: tuple[str, ...], drive: int
+) -> tuple[int | None, int | None]:
+    """Places among the names of a drive's zero and of its stroke, None if not there."""
     joint = mechanism.joints[mechanism.driven[drive]]
-    for suffix in ("initial_angle", "bias"):
-        if f"{joint}_{suffix}" in names:
-            return names.index(f"{joint}_{suffix}")
-    return None
 
+    def place(*suffixes: str) -> int | None:
+        found = [names.index(f"{joint}_{x}") for x in suffixes if f"{joint}_{x}" in names]
+        return found[0] if found else None
 
-def _circular_median(angles: FloatArray) -> FloatArray:
-    """Median of angles (M, 2) about their densest place, per column."""
-    found = []
-    for column in angles.T:
-        near = np.abs(wrap_signed(column[:, None] - column[None, :]))
-        centre = column[int(np.argmin(np.sum(np.minimum(near, 0.05), axis=1)))]
-        found.append(centre + np.median(wrap_signed(column - centre)))
-    return wrap_signed(np.array(found))
+    return place("initial_angle", "bias"), place("stroke_offset")

@@ -7,7 +7,7 @@ items, and an item names its files::
     WRI1030197-catalog-stac.json                     all heliostats
     AA39/AA39-heliostat-catalog-stac.json            one
     AA39/Calibration/AA39-calibration-collection-stac.json
-    AA39/Calibration/123456-….json                   an item: assets with addresses
+    AA39/Calibration/123456-calibration-item-stac.json    an item: files by address
 
 Files are stored as PAINT's own client stores them: ``AA39/Properties/…`` and
 ``AA39/Calibration/…`` below the folder given, the tower's beside the heliostats. A run
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     import httpx
 
 #: The power plant of Jülich in the database.
-PAINT_URL = "https://paint-database.org/WRI1030197"
+DEFAULT_BASE_URL = "https://paint-database.org/WRI1030197"
 #: What there is of a heliostat; a collection is known by this word in its file's name.
 KINDS = ("properties", "calibration", "deflectometry")
 #: Photographs that belong to a calibration measurement, by the name of their asset.
@@ -145,11 +145,11 @@ class Fetched:
     missing: tuple[str, ...]
 
 
-def fetch_heliostat(
+def fetch_heliostats(
     ids: str | Sequence[str],
     into: str | Path,
     *,
-    base_url: str = PAINT_URL,
+    base_url: str = DEFAULT_BASE_URL,
     kinds: Sequence[str] = ("properties", "calibration"),
     images: Sequence[str] = (),
     progress: Progress | None = None,
@@ -173,7 +173,7 @@ def fetch_heliostat(
     progress
         Told of each document, file and piece of a file.
     client
-        Of HTTP; the caller closes it. Default: one of its own.
+        Of HTTP, with its own timeout; the caller closes it. Default: one for this run.
     settings
         How to fetch; default ``Settings()``.
 
@@ -203,14 +203,14 @@ def fetch_heliostat(
 def fetch_tower(
     into: str | Path,
     *,
-    base_url: str = PAINT_URL,
+    base_url: str = DEFAULT_BASE_URL,
     progress: Progress | None = None,
     client: "httpx.Client | None" = None,
     settings: Settings | None = None,
 ) -> Fetched:
     """Fetch the measurements of the tower: its targets and its receiver.
 
-    Parameters and errors are those of :func:`fetch_heliostat`.
+    Parameters and errors are those of :func:`fetch_heliostats`.
     """
     return _run(lambda run: run.tower(), into, base_url, progress, client, settings)
 
@@ -353,13 +353,13 @@ class _Run:
             job
             for item in self._each("looking", self._document, items)
             for asset, entry in item.assets().items()
-            if asset not in IMAGES or asset in images
+            if asset in images or not _is_image(asset, entry)
             for job in [self._job(item, entry)]
         ]
 
     def tower(self) -> list[Job]:
         """Return the files of the tower."""
-        plant = PAINT_URL.rsplit("/", 1)[-1]
+        plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         link = _Link("", "", f"{self.base}/{plant}-tower-measurements-item-stac.json")
         (item,) = self._each("looking", self._document, [link])
         return [self._job(item, entry) for entry in item.assets().values()]
@@ -375,7 +375,7 @@ class _Run:
 
     def _suggestion(self, name: str) -> str:
         """Return names that are close to one that is not there."""
-        plant = PAINT_URL.rsplit("/", 1)[-1]
+        plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         try:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
             found = [_CATALOGUE.search(url) for url in root.hrefs("child")]
@@ -398,8 +398,8 @@ class _Run:
 
     def _address(self, url: str) -> str:
         """Return an address in the database or in the copy of it that was asked for."""
-        if url.startswith(PAINT_URL + "/"):
-            url = self.base + url[len(PAINT_URL) :]
+        if url.startswith(DEFAULT_BASE_URL + "/"):
+            url = self.base + url[len(DEFAULT_BASE_URL) :]
         if not re.match(r"https?://", url):
             raise FetchError(f"{url}: the address is neither http nor https; refused")
         return url
@@ -468,6 +468,10 @@ class _Run:
             self.bytes += count
             if self._progress is not None:
                 self._progress(FetchState("fetching", self._done, self._total, self.bytes))
+
+
+def _is_image(asset: str, entry: dict[str, Any]) -> bool:
+    return asset in IMAGES or str(entry.get("type", "")).startswith("image/")
 
 
 def _of(heliostat: str, problem: object) -> str:
