@@ -249,11 +249,17 @@ def test_a_number_may_carry_its_own_unit(tmp_path: Path) -> None:
     np.testing.assert_array_equal(model.primary.origin, [0, 0, 1.5])
 
 
-@pytest.mark.parametrize("case", cases.params("heliok"))
+#: Those of heliostats with two axes that are aimed at a point of the field.
+FIELD_CASES = [
+    pytest.param(case, id=name)
+    for name, case in cases.load("heliok")
+    if {"axis2_unit", "aim_ENZ"} <= case["inputs"].keys()
+]
+
+
+@pytest.mark.parametrize("case", FIELD_CASES)
 def test_reference_cases_pass_through_a_file(tmp_path: Path, case: dict[str, Any]) -> None:
     inputs = case["inputs"]
-    if "axis2_unit" not in inputs or "aim_ENZ" not in inputs:
-        pytest.skip("a single axis or local aiming; this tests files of heliostats")
     turn = np.array(inputs["R_heliostat_rowmajor"]).reshape(3, 3)
 
     def text(values: Any) -> str:
@@ -429,6 +435,12 @@ def test_euler_angles_come_back_at_the_gimbal(pitch: float) -> None:
     np.testing.assert_allclose(euler_matrix(euler_angles(turned)), turned, atol=1e-12)
 
 
+def test_euler_matrices_are_products_of_turns() -> None:
+    angles = np.random.default_rng(5).uniform(-3, 3, (4, 2, 3))
+    about = [rotation(axis, angles[..., k]) for k, axis in enumerate(np.eye(3))]
+    np.testing.assert_allclose(euler_matrix(angles), about[2] @ about[1] @ about[0], atol=1e-14)
+
+
 def test_euler_angles_are_applied_about_x_first() -> None:
     """HelioK's rotation (90, 0, 180)° takes (x, y, z) to (−x, z, y)."""
     turned = euler_matrix(np.radians([90, 0, 180]))
@@ -446,6 +458,21 @@ def test_euler_angles_are_applied_about_x_first() -> None:
 )
 def test_mirror_frame(normal: Any, right: Any, up: Any) -> None:
     np.testing.assert_allclose(mirror_frame(normal), np.transpose([right, up, normal]), atol=1e-15)
+
+
+# -- the reference page ----------------------------------------------------------------
+
+
+def test_the_reference_page_shows_what_comes_out(capsys: pytest.CaptureFixture[str]) -> None:
+    page = Path(__file__).parents[1] / "docs" / "reference" / "formats.md"
+    shown = re.findall(
+        r"```python\n(.*?)```\n\n```text\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
+    )
+    assert len(shown) == 3
+    names: dict[str, Any] = {}
+    for code, output in shown:
+        exec(code, names)
+        assert capsys.readouterr().out == output
 
 
 # -- refusals --------------------------------------------------------------------------

@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.geometry import FloatArray, as_float, normalize, rotation
-from heliotrope.mechanism.kinds import EAST, NORTH, UP
+from heliotrope.geometry import FloatArray, as_float, normalize
+from heliotrope.mechanism.kinds import NORTH, UP
 
 
 def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
@@ -33,8 +33,14 @@ def mirror_frame(normal: npt.ArrayLike) -> FloatArray:
 def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
     """Return R = Rz·Ry·Rx, (..., 3, 3), of angles about x, y and z, rad, (..., 3)."""
     a = as_float(angles)
-    about_x, about_y = rotation(EAST, a[..., 0]), rotation(NORTH, a[..., 1])
-    return rotation(UP, a[..., 2]) @ about_y @ about_x
+    sx, sy, sz = np.moveaxis(np.sin(a), -1, 0)
+    cx, cy, cz = np.moveaxis(np.cos(a), -1, 0)
+    rows = (
+        (cy * cz, sx * sy * cz - cx * sz, cx * sy * cz + sx * sz),
+        (cy * sz, sx * sy * sz + cx * cz, cx * sy * sz - sx * cz),
+        (-sy, sx * cy, cx * cy),
+    )
+    return as_float(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
 def euler_angles(matrix: npt.ArrayLike) -> FloatArray:
