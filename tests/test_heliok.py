@@ -1,8 +1,6 @@
 """HelioK XML: word for word, both ways, against published angles and reference cases."""
 
 import re
-import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,38 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.errors import FormatError, InputError
+from heliok_files import SCENE, SITE, edited, mixed_plant, scene
 from heliotrope.field.formats import heliok
 from heliotrope.field.formats._frames import euler_angles, euler_matrix, mirror_frame
-from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import angle_between, normalize, reflect, rotation
 from heliotrope.mechanism import kinds
-from heliotrope.mechanism.drives import direct, linear_paint, rotary
+from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
-from heliotrope.sun import Site
 from reference import cases
-
-SCENE = Path(__file__).parent / "files" / "heliok-scene.xml"
-SITE = Site(34.707, 33.261, 10.0, name="Pentakomo")
-
-
-def scene() -> heliok.Document:
-    return heliok.read(SCENE)
 
 
 def plant() -> Plant:
     return heliok.to_plant(scene(), SITE)
-
-
-def edited(tmp_path: Path, old: str, new: str) -> Path:
-    """Return the scene's file with the first occurrence of a text replaced."""
-    text = SCENE.read_text(encoding="utf-8")
-    assert old in text
-    path = tmp_path / "scene.xml"
-    path.write_text(text.replace(old, new, 1), encoding="utf-8")
-    return path
 
 
 # -- word for word ---------------------------------------------------------------------
@@ -297,40 +277,6 @@ def test_reference_cases_pass_through_a_file(tmp_path: Path, case: dict[str, Any
 # -- from a plant ----------------------------------------------------------------------
 
 
-def mixed_plant() -> Plant:
-    """Return heliostats of three kinds with errors, facets, drives, a receiver and a target."""
-    rng = np.random.default_rng(7)
-    place = rng.uniform(-100, 100, (3, 3)) * [1, 1, 0.01]
-    stepper = rotary(200, 5000, microsteps=16, min_angle=-0.1, max_angle=1.6)
-    azel = kinds.azimuth_elevation(
-        place, pivot_height=[1.2, 1.3, 1.4], pivot_offset=0.2, drives=(rotary(200, 9000), stepper)
-    )
-    jack = linear_paint(154166.67, 0.0758, 0.335, 0.338, 0.0242, min_count=0, max_count=68000)
-    jacks = kinds.two_jacks(place[:1] + 200, (jack, jack), concentrator_translation=(0, 0.175, 0))
-    polar = kinds.polar(place[:2] - 200, np.radians(34.0), pivot_offset=0.1)
-    across = np.zeros((1, 4, 3))
-    across[..., 0] = 0.8
-    up = np.zeros((1, 4, 3))
-    up[..., 1] = 0.6
-    corners = np.array([[a, b, 0.01] for a in (-0.85, 0.85) for b in (-0.65, 0.65)])[None]
-    tip = rotation((0.3, 0.7, 0.0), 0.01)
-    facets = Facets(corners, across @ tip.T, up @ tip.T)
-    errors = {"tilt_north": 0.004, "non_orthogonality": -0.003, "canting": 0.002,
-              "position_up": 0.05, "azimuth_bias": 0.01}  # fmt: skip
-    groups = {
-        "a": Heliostats(("a1", "a2", "a3"), azel, np.full(3, 2.0), np.full(3, 1.5),
-                        parameters={n: np.full(3, v) for n, v in errors.items()}),
-        "j": Heliostats(("j1",), jacks, np.array([3.3]), np.array([2.5]), facets,
-                        aim=np.array([[1.0, 2.0, 30.0]])),
-        "p": Heliostats(("p1", "p2"), polar, np.full(2, 1.0), np.full(2, 1.0),
-                        aim=np.array([[0.0, 0.0, 30.0], [np.nan] * 3])),
-    }  # fmt: skip
-    tower = np.array([[2.0, 0, 45], [-2, 0.1, 45], [-2, 0.1, 40], [2, 0, 40]])
-    receiver = Receiver("oven", "planar", (0, 1, 50), (0.1, 1, -0.3), 4.0, 5.0)
-    target = Target("white", tower, tower.mean(axis=0))
-    return Plant("mixed", SITE, groups, (target,), (receiver,))
-
-
 @pytest.mark.parametrize(("unit", "tolerance"), [("rad", 1e-13), ("deg", 1e-13), ("mrad", 1e-13)])
 def test_a_plant_survives(tmp_path: Path, unit: str, tolerance: float) -> None:
     before = mixed_plant()
@@ -473,200 +419,3 @@ def test_the_reference_page_shows_what_comes_out(capsys: pytest.CaptureFixture[s
     for code, output in shown:
         exec(code, names)
         assert capsys.readouterr().out == output
-
-
-# -- refusals --------------------------------------------------------------------------
-
-WRONG = [
-    ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; give one"),
-    ('unitLength="m"', 'unitLength="inch"', "unitLength 'inch' is not one of m, cm, mm, km"),
-    ('unitAngle="deg"', 'unitAngle="gon"', "unitAngle 'gon' is not one of rad, mrad, deg"),
-    ("<HelioK ", "<HelioQ ", "not well-formed XML"),
-    ('translation="0, 0, 1.5"', "", "<Primary> has no translation; give one"),
-    ('translation="0, 0, 1.5"', 'translation=" "', "<Primary> has no translation"),
-    ('"0, 0, 1.5"', '"0, 0"', "translation has 2 numbers; it needs 3"),
-    ('"0, 0, 1.5"', '"0, 0, nan"', "<Primary> translation: 'nan' is not a finite number"),
-    ('"0, 0, 1.5"', '"0, 0, 1e999"', "'1e999' is not a finite number"),
-    ('"0, 0, 1.5"', '"0, 0, 1_5"', "'1_5' is not a finite number"),
-    ('"0, 0, 1.5"', '"0, 0, 1.5 deg"', "unit 'deg' is not known here; known: m, cm, mm, km"),
-    ('normal="0, 1, 0"', 'normal="0, 1, 0 m"', "unit 'm' is not known here; known: none"),
-    ('rotationAxis="0, 0, -1"', 'rotationAxis="0, 0, 0"', "a vector of length 0 has no direction"),
-    (
-        'rotationAxis="0, 0, -1"',
-        'rotationAxis="1, 0, 0"',
-        "HeliostatKit AzEl: the two axes enclose 0 mrad",
-    ),
-    (
-        'rotationAngles="-90, 90"',
-        'rotationAngles="90, -90"',
-        "<Primary> rotationAngles 90° to -90°: the lower stop",
-    ),
-    ('normal="0, 1, 0"', 'normal="0, 0, 0"', "<Tracking> normal: a vector of length 0"),
-    ('normal="0, 1, 0"', 'normal="2, 0, 0"', "the normal lies along the secondary axis"),
-    (
-        '<Aiming point="0, 0, 20"/>',
-        "<Tracking/>",
-        "<HeliostatKit> AzEl has 2 elements <Tracking>; it needs one",
-    ),
-    ('xWidth="2.4"', 'xWidth="-2.4"', "<ApertureRectangular> -2.4 m × 1.8 m: both must be above 0"),
-    (
-        '<Facet rotation="90, 0, 180">',
-        "<Facet>",
-        "<Facet> rotation: its normal stands 90° from that",
-    ),
-    ('xWidth="2.4"', "", "<ApertureRectangular> has no x; give one"),
-    (
-        '<ApertureRectangular xWidth="2.4"',
-        '<ApertureDisk xWidth="2.4"',
-        "has 0 elements <ApertureRectangular>",
-    ),
-    (
-        '<HeliostatKit ref="AzEl"/>',
-        '<HeliostatKit ref="AzIl"/>',
-        "there is no HeliostatKit 'AzIl'; did you mean AzEl?",
-    ),
-    ('<HeliostatKit ref="AzEl"/>', "<HeliostatKit/>", "<HeliostatKit> has no ref; give one"),
-    ('name="HeliostatB"', 'name="HeliostatA"', "heliostat HeliostatA: the name occurs twice"),
-    ('name="HeliostatB"', "", "a heliostat whose node has no name; give it one"),
-    ('name="AzEl"', "", "<HeliostatKit> has no name; give one"),
-    (
-        "</HeliostatKit>\n  </Factory>",
-        '</HeliostatKit><HeliostatKit name="AzEl"/></Factory>',
-        "HeliostatKit AzEl: the name occurs twice",
-    ),
-]
-
-
-@pytest.mark.parametrize(("old", "new", "text"), WRONG)
-def test_a_wrong_file_gets_one_line(tmp_path: Path, old: str, new: str, text: str) -> None:
-    path = edited(tmp_path, old, new)
-    with pytest.raises(FormatError) as error:
-        heliok.to_plant(heliok.read(path), SITE)
-    assert text in str(error.value)
-    assert re.match(re.escape(str(path)) + r": (line \d+: )?\S", str(error.value))
-    assert "\n" not in str(error.value)
-
-
-def test_the_line_is_named(tmp_path: Path) -> None:
-    path = edited(tmp_path, 'name="HeliostatB"', 'name="HeliostatA"')
-    wrong = [i for i, line in enumerate(path.read_text().splitlines(), 1) if 'ref="AzEl"' in line]
-    with pytest.raises(FormatError, match=f"line {wrong[1]}: heliostat HeliostatA"):
-        heliok.heliostats(heliok.read(path))
-
-
-def test_the_world_is_needed_once(tmp_path: Path) -> None:
-    path = edited(tmp_path, "</World>", "</World><World/>")
-    with pytest.raises(FormatError, match="has 2 elements <World>; it needs one"):
-        heliok.sun(heliok.read(path))
-    with pytest.raises(FormatError, match="has 0 elements <Location>; it needs one"):
-        heliok.site(heliok.read(edited(tmp_path, "<Location", "<Place")), 0.0)
-
-
-def test_a_mirror_needs_a_facet(tmp_path: Path) -> None:
-    text = SCENE.read_text(encoding="utf-8")
-    path = tmp_path / "bare.xml"
-    path.write_text(re.sub(r"<Facet.*</Facet>", "", text, flags=re.DOTALL), encoding="utf-8")
-    with pytest.raises(
-        FormatError, match="HeliostatKit AzEl: no <Facet>, so its mirror has no size"
-    ):
-        heliok.to_plant(heliok.read(path), SITE)
-
-
-@pytest.mark.parametrize("share", [0.03, 0.3, 0.6, 0.97])
-def test_a_truncated_file_is_refused(tmp_path: Path, share: float) -> None:
-    whole = SCENE.read_bytes()
-    path = tmp_path / "cut.xml"
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(FormatError, match=r"cut\.xml: line \d+: not well-formed XML"):
-        heliok.read(path)
-
-
-def test_other_files_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.xml"
-    with pytest.raises(FormatError, match="there is no such file; give the path of a HelioK file"):
-        heliok.read(path)
-    with pytest.raises(FormatError, match="this is a folder"):
-        heliok.read(tmp_path)
-    path.write_bytes(b"")
-    with pytest.raises(FormatError, match="the file is empty; it should be a HelioK file"):
-        heliok.read(path)
-    path.write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0")
-    with pytest.raises(FormatError, match="the file is binary"):
-        heliok.read(path)
-    path.write_text("<svg/>", encoding="utf-8")
-    with pytest.raises(FormatError, match="the root element is <svg>; it should be <HelioK>"):
-        heliok.read(path)
-    (tmp_path / "loop.xml").symlink_to(tmp_path / "loop.xml")
-    with pytest.raises(FormatError, match="cannot be read"):
-        heliok.read(tmp_path / "loop.xml")
-
-
-def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
-    path = tmp_path / "huge.xml"
-    with path.open("wb") as stream:
-        stream.write(b"<HelioK>")
-        stream.truncate(200 * 2**20)
-    start = time.perf_counter()
-    with pytest.raises(FormatError, match="200 MiB are more than the limit of 64 MiB"):
-        heliok.read(path)
-    assert time.perf_counter() - start < 1.0
-
-
-BOMB = "".join(
-    f'<!ENTITY {b} "{f"&{a};" * 10}">' for a, b in zip("abcdefgh", "bcdefghi", strict=True)
-)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        f'<!DOCTYPE HelioK [<!ENTITY a "ha">{BOMB}]><HelioK>&i;</HelioK>',
-        f'<!DOCTYPE HelioK [<!ENTITY a "ha">{BOMB}]><HelioK unitLength="&i;"/>',
-        '<!DOCTYPE HelioK [<!ENTITY a SYSTEM "file:///etc/hostname">]><HelioK>&a;</HelioK>',
-        '<!DOCTYPE HelioK SYSTEM "http://127.0.0.1:9/x.dtd"><HelioK/>',
-    ],
-)
-def test_entities_are_refused(tmp_path: Path, content: str) -> None:
-    path = tmp_path / "bomb.xml"
-    path.write_text(content, encoding="utf-8")
-    start = time.perf_counter()
-    with pytest.raises(FormatError, match=r"document type|not well-formed"):
-        heliok.read(path)
-    assert time.perf_counter() - start < 2.0
-
-
-def test_nesting_without_end_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "deep.xml"
-    path.write_text("<a>" * 100_000, encoding="utf-8")
-    with pytest.raises(FormatError, match="not well-formed XML"):
-        heliok.read(path)
-
-
-def test_plants_that_do_not_fit_are_refused() -> None:
-    whole = mixed_plant()
-    with pytest.raises(InputError, match="unit_angle 'grad': give one of rad, mrad, deg"):
-        heliok.from_plant(whole, unit_angle="grad")
-    trough = kinds.single_axis([[0.0, 0, 0]], (0, 1, 0))
-    group = Heliostats(("t",), trough, np.ones(1), np.ones(1))
-    with pytest.raises(InputError, match="group t: a single_axis mechanism has 1 driven axis"):
-        heliok.from_plant(whole.with_groups({"t": group}))
-    with pytest.raises(InputError, match="heliostat a1: HelioK needs an aim"):
-        heliok.from_plant(replace(whole, targets=(), receivers=()))
-    tube = Receiver("tube", "external_cylinder", (0, 0, 50), (0, 1, 0), 4.0, 5.0)
-    with pytest.raises(InputError, match="receiver tube: HelioK has no external_cylinder"):
-        heliok.from_plant(replace(whole, receivers=(tube,)))
-    fixed = kinds.azimuth_elevation(
-        [[0.0, 9, 0]], drives=(direct(min_angle=1.0, max_angle=1.0), direct())
-    )
-    group = Heliostats(("stiff",), fixed, np.ones(1), np.ones(1))
-    with pytest.raises(InputError, match="heliostat stiff: the stops of its primary axis leave no"):
-        heliok.from_plant(whole.with_groups({"g": group}))
-
-
-def test_writing_is_refused_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"cannot be written \(No such file or directory\)"):
-        heliok.write(scene(), tmp_path / "nowhere" / "x.xml")
-    bad = heliok.Document(heliok.Element("HelioK", (("name", "bell\a"),)))
-    with pytest.raises(InputError, match=r"x\.xml: .*remove the character"):
-        heliok.write(bad, tmp_path / "x.xml")
-    assert not list(tmp_path.iterdir())

@@ -175,21 +175,16 @@ def drive_counts(d, theta):
     f_low = drive_angle(d, low) - theta
     for _ in range(100):
         error = drive_angle(d, counts) - theta
-        if error == 0.0:
-            break
+        step = error / angle_per_count(d, counts)
+        if abs(step) <= 4e-16 * max(abs(counts), 1.0) or abs(error) < 1e-15:
+            return counts - step
         if (error > 0.0) == (f_low > 0.0):
             low = counts
         else:
             high = counts
-        slope = angle_per_count(d, counts)
-        new = counts - error / slope
-        inside = min(low, high) < new < max(low, high)
-        if not (inside and math.isfinite(new)):
-            new = 0.5 * (low + high)
-        if abs(new - counts) <= 4e-16 * max(abs(new), 1.0) or abs(error) < 1e-15:
-            counts = new
-            break
-        counts = new
+        counts -= step
+        if not min(low, high) < counts < max(low, high):
+            counts = 0.5 * (low + high)
     return counts
 
 

@@ -49,6 +49,10 @@ class Drive:
         """The batch shape."""
         return self.table.shape[:-1]
 
+    def __getitem__(self, index: int) -> "Drive":
+        """Return drive ``index`` of the last batch axis."""
+        return Drive(self.table[..., index, :])
+
     def angles(self, counts: npt.ArrayLike) -> FloatArray:
         """Return the joint angle in radians at motor counts, both of shape (...)."""
         return self._run(angles_block, counts, "counts")

@@ -135,7 +135,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Session:
+class Channel:
     """What all downloads of a run share.
 
     Attributes
@@ -162,7 +162,7 @@ class Session:
     stop: threading.Event = field(default_factory=threading.Event)
 
 
-def download(job: Job, session: Session) -> bool:
+def download(job: Job, channel: Channel) -> bool:
     """Fetch a file; return whether it came, or False if it was there and has not changed.
 
     Raises
@@ -173,7 +173,7 @@ def download(job: Job, session: Session) -> bool:
     if job.sha256 is not None and job.path.is_file() and _sha256(job.path) == job.sha256:
         return False
     try:
-        return _repeated(job.url, session, lambda: _attempt(job, session), job.part)
+        return _repeated(job.url, channel, lambda: _attempt(job, channel), job.part)
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise FetchError(
@@ -182,7 +182,7 @@ def download(job: Job, session: Session) -> bool:
         raise FetchError(f"{job.path}: cannot be written ({error.strerror})") from None
 
 
-def get_document(url: str, session: Session) -> tuple[Any, str]:
+def get_document(url: str, channel: Channel) -> tuple[Any, str]:
     """Return a JSON document and the address that it came from in the end.
 
     Raises
@@ -193,10 +193,10 @@ def get_document(url: str, session: Session) -> tuple[Any, str]:
 
     def attempt() -> tuple[Any, str]:
         content = bytearray()
-        with session.client.stream("GET", url, follow_redirects=True) as response:
+        with channel.client.stream("GET", url, follow_redirects=True) as response:
             _check_status(response, url)
             for chunk in response.iter_bytes():
-                _check_stop(session)
+                _check_stop(channel)
                 content += chunk
                 if len(content) > DOCUMENT_LIMIT:
                     raise FetchError(
@@ -204,18 +204,18 @@ def get_document(url: str, session: Session) -> tuple[Any, str]:
                     )
             return _json(url, bytes(content)), str(response.url)
 
-    return _repeated(url, session, attempt)
+    return _repeated(url, channel, attempt)
 
 
 def _repeated(
-    url: str, session: Session, attempt: Callable[[], Result], part: Path | None = None
+    url: str, channel: Channel, attempt: Callable[[], Result], part: Path | None = None
 ) -> Result:
     """Return what ``attempt`` gives, after pauses if it fails for a while."""
     import httpx
 
     failures = 0
     while True:
-        _check_stop(session)
+        _check_stop(channel)
         before = _size(part)
         try:
             return attempt()
@@ -227,13 +227,13 @@ def _repeated(
             problem = error
         # A line that breaks often but moves on is not given up.
         failures = 1 if _size(part) > before else failures + 1
-        if failures > session.retries:
+        if failures > channel.retries:
             raise FetchError(
                 f"{url}: {problem}; gave up after {failures} attempts, run it again later, what "
                 "is there is kept"
             )
-        pause = max(problem.pause, session.backoff * 2.0 ** (failures - 1))
-        session.stop.wait(min(pause, _LONGEST_PAUSE))
+        pause = max(problem.pause, channel.backoff * 2.0 ** (failures - 1))
+        channel.stop.wait(min(pause, _LONGEST_PAUSE))
 
 
 def _cause(error: Exception) -> str:
@@ -248,8 +248,8 @@ def _cause(error: Exception) -> str:
     return "the connection broke off"
 
 
-def _check_stop(session: Session) -> None:
-    if session.stop.is_set():
+def _check_stop(channel: Channel) -> None:
+    if channel.stop.is_set():
         raise StoppedError("stopped; what is there is kept, run it again to go on")
 
 
@@ -266,8 +266,8 @@ def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> No
     raise FetchError(f"{url}: {answer}")
 
 
-def _attempt(job: Job, session: Session) -> bool:
-    have, entry = _size(job.path), session.journal.get(job.name)
+def _attempt(job: Job, channel: Channel) -> bool:
+    have, entry = _size(job.path), channel.journal.get(job.name)
     if job.sha256 is not None or (job.size is not None and job.size != have):
         have = -1  # the catalogue has another file than the one that is there
     # Compressed bytes could be neither counted nor resumed.
@@ -278,7 +278,7 @@ def _attempt(job: Job, session: Session) -> bool:
         start = max(_size(job.part), 0)
         if start:
             headers |= {"Range": f"bytes={start}-", "If-Range": _unchanged_mark(entry)}
-    with session.client.stream("GET", job.url, headers=headers, follow_redirects=True) as response:
+    with channel.client.stream("GET", job.url, headers=headers, follow_redirects=True) as response:
         status = response.status_code
         if status == HTTPStatus.NOT_MODIFIED and have >= 0:
             return False
@@ -295,10 +295,10 @@ def _attempt(job: Job, session: Session) -> bool:
         # A part would mean that the file that is there is older than what the entry says.
         same = entry is None or (entry.etag, entry.modified) == (said.etag, said.modified)
         if have == said.size >= 0 and same and not job.part.exists():
-            session.journal.put(job.name, replace(said, done=True))
+            channel.journal.put(job.name, replace(said, done=True))
             return False
-        _store(job, session, response, start, said)
-    _finish(job, session, said)
+        _store(job, channel, response, start, said)
+    _finish(job, channel, said)
     return True
 
 
@@ -328,20 +328,20 @@ def _length(response: "httpx.Response") -> int | None:
     return int(length) if length.isdigit() else None
 
 
-def _store(job: Job, session: Session, response: "httpx.Response", start: int, said: Entry) -> None:
+def _store(job: Job, channel: Channel, response: "httpx.Response", start: int, said: Entry) -> None:
     with job.part.open("ab" if start else "wb") as stream:
         if not start:
-            session.journal.put(job.name, said)
+            channel.journal.put(job.name, said)
         # Pieces as they come: what is still being gathered when a line breaks is lost.
         for chunk in response.iter_bytes():
-            _check_stop(session)
+            _check_stop(channel)
             stream.write(chunk)
-            session.received(len(chunk))
+            channel.received(len(chunk))
         stream.flush()
         os.fsync(stream.fileno())
 
 
-def _finish(job: Job, session: Session, said: Entry) -> None:
+def _finish(job: Job, channel: Channel, said: Entry) -> None:
     """Give a complete file its name."""
     size = _size(job.part)
     if said.size >= 0 and size != said.size:
@@ -357,7 +357,7 @@ def _finish(job: Job, session: Session, said: Entry) -> None:
         job.part.unlink()
         raise
     job.part.replace(job.path)
-    session.journal.put(job.name, replace(said, size=size, done=True))
+    channel.journal.put(job.name, replace(said, size=size, done=True))
 
 
 def _json(url: str, content: bytes) -> Any:

@@ -30,10 +30,10 @@ from urllib.parse import unquote, urljoin, urlsplit
 
 from heliotrope.errors import FetchError, InputError, UnknownNameError
 from heliotrope.field.formats._download import (
+    Channel,
     Job,
     Journal,
     NotFoundError,
-    Session,
     download,
     get_document,
 )
@@ -321,7 +321,7 @@ class _Run:
         self.bytes = self._done = self._total = 0
         self._progress, self._workers = progress, settings.workers
         self._lock = threading.Lock()
-        self._session = Session(client, journal, settings.retries, settings.backoff, self._received)
+        self._channel = Channel(client, journal, settings.retries, settings.backoff, self._received)
 
     def fetch(self, jobs: list[Job]) -> list[bool]:
         """Fetch the files; return for each whether it came or was there."""
@@ -387,7 +387,7 @@ class _Run:
     def _document(self, link: _Link) -> _Document:
         url = self._address(link.url)
         try:
-            content, source = get_document(url, self._session)
+            content, source = get_document(url, self._channel)
         except NotFoundError as error:
             raise NotFoundError(_of(link.heliostat, error)) from None
         except FetchError as error:
@@ -430,7 +430,7 @@ class _Run:
         except OSError as error:
             raise FetchError(f"{job.path.parent}: cannot be made ({error.strerror})") from None
         try:
-            return download(job, self._session)
+            return download(job, self._channel)
         except FetchError as error:
             heliostat = job.name.split("/")[0] if "/" in job.name else ""
             raise FetchError(_of(heliostat, error)) from None
@@ -452,7 +452,7 @@ class _Run:
                 for future in as_completed(futures):
                     future.result()
             except BaseException:
-                self._session.stop.set()
+                self._channel.stop.set()
                 pool.shutdown(cancel_futures=True)
                 raise
         return [future.result() for future in futures]

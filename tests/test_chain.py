@@ -1,0 +1,190 @@
+"""The chain of joints: poses, positive senses, and the screw Jacobian."""
+
+import numpy as np
+import pytest
+from machines import every_kind, imperfect, random_counts
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import azimuth_elevation, direction, rotation
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+
+KINDS = list(every_kind())
+
+
+def _central(mechanism: Mechanism, counts: np.ndarray, name: str, step: float):  # type: ignore[no-untyped-def]
+    ahead = mechanism.with_parameters({name: step}).pose(counts)
+    back = mechanism.with_parameters({name: -step}).pose(counts)
+    return (
+        (ahead.normal - back.normal) / (2 * step),
+        (ahead.vertex - back.vertex) / (2 * step),
+    )
+
+
+def _richardson(mechanism: Mechanism, counts: np.ndarray, name: str):  # type: ignore[no-untyped-def]
+    """Central differences of two steps, combined to fourth order."""
+    step = 2e-4 if not name.endswith(("stroke_offset", "offset", "radius")) else 2e-5
+    wide, narrow = (_central(mechanism, counts, name, h) for h in (2 * step, step))
+    return [(4 * n - w) / 3 for w, n in zip(wide, narrow, strict=True)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_jacobian_is_the_derivative(kind: str) -> None:
+    mechanism = imperfect(every_kind()[kind], seed=3)
+    counts = random_counts(mechanism, 200, seed=5)
+    # The keyhole: a mirror that looks along the primary axis.
+    counts[0] = 0.0 if kind != "two_jacks" else 30000.0
+    names = tuple(mechanism.parameters)
+    jacobian = mechanism.jacobian(counts, names)
+    for p, name in enumerate(names):
+        normal, vertex = _richardson(mechanism, counts, name)
+        for found, wanted in ((jacobian.normal, normal), (jacobian.vertex, vertex)):
+            size = max(1.0, float(np.abs(wanted).max()))
+            assert np.abs(found[:, p] - wanted).max() < 1e-7 * size, name
+    assert np.abs(np.sum(jacobian.normal * jacobian.pose.normal[:, None], axis=-1)).max() < 1e-12
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_jacobian_by_counts(kind: str) -> None:
+    mechanism = imperfect(every_kind()[kind], seed=4)
+    counts = random_counts(mechanism, 100, seed=6)
+    jacobian = mechanism.jacobian(counts, ())
+    for d in range(len(mechanism.driven)):
+        step = np.zeros(len(mechanism.driven))
+        # 0.1 mm of stroke, or 12 µrad of a joint behind a worm.
+        step[d] = 15.0
+        for which in ("normal", "vertex"):
+            wide, narrow = (
+                (getattr(mechanism.pose(counts + h), which)
+                 - getattr(mechanism.pose(counts - h), which)) / (2 * h.max())
+                for h in (2 * step, step)
+            )  # fmt: skip
+            wanted = (4 * narrow - wide) / 3
+            found = getattr(jacobian, f"{which}_counts")[:, d]
+            assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_armature_is_the_chain(kind: str) -> None:
+    mechanism = imperfect(every_kind()[kind], seed=7)
+    counts = random_counts(mechanism, 100, seed=8)
+    pose = mechanism.pose(counts)
+    angles = np.zeros((len(counts), 2))
+    for d in range(len(mechanism.driven)):
+        angles[:, d] = mechanism.drives[d].angles(counts[:, d])
+    normal, vertex = mechanism.armature.pose(angles)
+    np.testing.assert_allclose(normal, pose.normal, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(vertex, pose.vertex, rtol=0, atol=1e-11)
+    assert mechanism.armature.table.shape == (18,)
+
+
+def test_azimuth_elevation_without_errors() -> None:
+    mechanism = kinds.azimuth_elevation((3.0, 4.0, 0.0), pivot_height=1.5, pivot_offset=0.2)
+    angles = np.random.default_rng(1).uniform((0, 0), (6.28, 1.57), (50, 2))
+    pose = mechanism.pose(angles)
+    azimuth, elevation = azimuth_elevation(pose.normal)
+    np.testing.assert_allclose(np.stack([azimuth, elevation], -1), angles, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(pose.vertex, [3.0, 4.0, 1.5] + 0.2 * pose.normal, atol=1e-14)
+
+
+def test_positive_senses_of_azimuth_elevation() -> None:
+    mechanism = kinds.azimuth_elevation((0.0, 0.0, 0.0))
+    up = [0.0, np.pi / 2]
+    for name, towards in (("tilt_north", [0, 1, 0]), ("tilt_east", [1, 0, 0])):
+        lean = mechanism.with_parameters({name: 0.1}).pose(up).normal
+        wanted = np.sin(0.1) * np.array(towards) + [0, 0, np.cos(0.1)]
+        np.testing.assert_allclose(lean, wanted, rtol=0, atol=1e-14)
+    more = mechanism.with_parameters({"azimuth_bias": 0.1, "elevation_bias": 0.2})
+    np.testing.assert_allclose(more.pose([0.3, 0.4]).normal, direction(0.4, 0.6), atol=1e-14)
+    # The secondary axis leans towards the positive primary axis, which points down.
+    skew = mechanism.with_parameters({"non_orthogonality": 0.1})
+    assert skew.armature.axis_2[2] == pytest.approx(-np.sin(0.1))
+    canted = mechanism.with_parameters({"canting": 0.1}).armature
+    assert np.dot(canted.normal, canted.axis_2) == pytest.approx(np.sin(0.1))
+    assert mechanism.with_parameters({"sag": 0.1}).pose([0.0, 0.0]).normal[2] > 0.099
+
+
+def test_zero_poses_and_axes() -> None:
+    roll = kinds.tilt_roll((0, 0, 0))
+    np.testing.assert_allclose(roll.armature.normal, [0, 0, 1], atol=1e-15)
+    np.testing.assert_allclose(roll.armature.axis_2, [0, 1, 0], atol=1e-15)
+    aligned = kinds.target_aligned((10.0, 20.0, 0.0), (0.0, 0.0, 30.0), pivot_height=1.0)
+    way = np.array([-10.0, -20.0, 29.0])
+    np.testing.assert_allclose(aligned.armature.axis_1, way / np.linalg.norm(way), atol=1e-15)
+    pitch = kinds.pitch_roll((0, 0, 0), np.pi / 2)
+    assert pitch.pose([0.1, 0.0]).normal[0] == pytest.approx(-np.sin(0.1))
+    jack = every_kind()["two_jacks"]
+    np.testing.assert_allclose(jack.armature.normal, [0, -1, 0], atol=1e-15)
+
+
+@pytest.mark.parametrize("latitude", [0.6, -0.6])
+def test_polar_follows_the_hour_angle(latitude: float) -> None:
+    mechanism = kinds.polar((0.0, 0.0, 0.0), latitude)
+    for hour, declination in ((0.0, 0.2), (0.7, -0.3), (-1.2, 0.4)):
+        sun = np.array(
+            [
+                -np.cos(declination) * np.sin(hour),
+                np.cos(latitude) * np.sin(declination)
+                - np.sin(latitude) * np.cos(declination) * np.cos(hour),
+                np.sin(latitude) * np.sin(declination)
+                + np.cos(latitude) * np.cos(declination) * np.cos(hour),
+            ]
+        )
+        np.testing.assert_allclose(mechanism.pose([hour, declination]).normal, sun, atol=1e-14)
+
+
+def test_arrays_and_single_ones_agree() -> None:
+    positions = np.random.default_rng(0).normal(size=(5, 3)) * 50
+    field = imperfect(kinds.azimuth_elevation(positions, pivot_offset=0.3), seed=1)
+    counts = np.random.default_rng(1).uniform(0, 1, (7, 1, 2))
+    every = field.pose(counts)
+    assert every.normal.shape == (7, 5, 3)
+    for i in range(5):
+        one = field[i].pose(counts[:, 0])
+        assert (one.normal == every.normal[:, i]).all()
+        assert (one.vertex == every.vertex[:, i]).all()
+    assert len(field) == 5
+    assert field[1:3].shape == (2,)
+
+
+def test_orientation_turns_everything() -> None:
+    turn = rotation([1.0, 2.0, 3.0], 0.7)
+    plain = kinds.azimuth_elevation((0, 0, 0), pivot_height=1.0, pivot_offset=0.2)
+    turned = kinds.azimuth_elevation(
+        (5.0, 6.0, 7.0), pivot_height=1.0, pivot_offset=0.2, orientation=turn
+    )
+    a, b = plain.pose([0.3, 0.4]), turned.pose([0.3, 0.4])
+    np.testing.assert_allclose(b.normal, turn @ a.normal, atol=1e-15)
+    np.testing.assert_allclose(b.vertex, [5.0, 6.0, 7.0] + turn @ a.vertex, atol=1e-14)
+
+
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: kinds.two_axis(ORIGIN, (0, 0, 1), (0, 0, 2), (0, 1, 0)), "parallel"),
+        (lambda: kinds.two_axis(ORIGIN, (0, 0, 0), (1, 0, 0), (0, 1, 0)), "axis_1: .*length 0"),
+        (lambda: kinds.two_axis(ORIGIN, (0, 0, 1), (1, 0, 0), (1, 0, 0)), "along the secondary"),
+        (lambda: kinds.two_axis((np.nan, 0, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0)), "not a finite"),
+        (lambda: kinds.two_axis((0, 0), (0, 0, 1), (1, 0, 0), (0, 1, 0)), "must have 3 numbers"),
+        (lambda: kinds.azimuth_elevation(ORIGIN, orientation=2 * np.eye(3)), "not a rotation"),
+        (lambda: kinds.azimuth_elevation(ORIGIN, orientation=np.eye(2)), "finite rotation"),
+        (lambda: kinds.tilt_roll(ORIGIN, (0, 0, 1)), "must not be vertical"),
+        (lambda: kinds.single_axis(ORIGIN, (1, 0, 0), (1, 0, 0)), "along the axis"),
+        (lambda: kinds.azimuth_elevation(ORIGIN).pose([1.0]), "hold the 2 drives"),
+        (lambda: kinds.azimuth_elevation(ORIGIN).pose([1.0, np.inf]), "not finite"),
+        (lambda: kinds.azimuth_elevation(np.zeros((2, 3))).pose(np.zeros((3, 2))), "does not fit"),
+        (lambda: kinds.azimuth_elevation(ORIGIN)[0], "cannot be indexed"),
+        (lambda: kinds.azimuth_elevation(ORIGIN).with_parameters({"sag": np.nan}), "not finite"),
+    ],
+)
+def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InputError, match=text):
+        make()
+
+
+def test_unknown_parameter_suggests() -> None:
+    with pytest.raises(UnknownNameError, match="did you mean.*tilt_north"):
+        kinds.azimuth_elevation(ORIGIN).with_parameters({"tilt_nord": 0.1})
