@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from machines import every_kind, imperfect, random_counts
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import azimuth_elevation, direction, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
+from machines import every_kind, imperfect, random_counts
 
 KINDS = list(every_kind())
 
@@ -186,5 +186,5 @@ def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
 
 
 def test_unknown_parameter_suggests() -> None:
-    with pytest.raises(UnknownNameError, match="did you mean.*tilt_north"):
+    with pytest.raises(UnknownNameError, match=r"did you mean.*tilt_north"):
         kinds.azimuth_elevation(ORIGIN).with_parameters({"tilt_nord": 0.1})

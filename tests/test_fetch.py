@@ -358,6 +358,26 @@ def test_a_rest_that_is_another_one_is_not_appended(
     assert (tmp_path / BIG).read_bytes() == content
 
 
+def test_a_rest_that_is_only_the_next_piece_is_one_more_step(
+    database: Database, tmp_path: Path
+) -> None:
+    content = big(database)
+
+    def piece(answer: Answer) -> Answer:
+        span = answer.headers["Content-Range"]
+        start = int(span.split()[1].split("-")[0])
+        shorter = span.replace(f"-{len(content) - 1}/", f"-{start + 39_999}/")
+        return Answer(206, answer.headers | {"Content-Range": shorter}, answer.body[:40_000])
+
+    database.fail(BIG, cut(90_000), piece, piece)
+    get(database, tmp_path)
+    assert (tmp_path / BIG).read_bytes() == content
+    assert [headers.get("range") for headers in database.requests(BIG)] == [
+        None,
+        *(f"bytes={start}-" for start in (90_000, 130_000, 170_000)),
+    ]
+
+
 def test_a_rest_that_nobody_asked_for_is_refused(database: Database, tmp_path: Path) -> None:
     database.fail(BIG, lambda _: Answer(206, {"Content-Range": "bytes 0-1/9"}, b"{}"))
     assert "the server answers 206 Partial Content" in refused(database, tmp_path)

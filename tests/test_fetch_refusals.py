@@ -152,6 +152,11 @@ def test_other_kinds_of_addresses_are_refused(
     assert "the address is neither http nor https; refused" in refused(database, tmp_path)
 
 
+def test_what_is_no_address_is_refused(database: Database, tmp_path: Path) -> None:
+    database.put(ITEM, {"assets": {"a": {"href": "http://[x"}}})
+    assert "'http://[x' is no address (Invalid IPv6 URL)" in refused(database, tmp_path)
+
+
 def test_two_files_in_one_place_are_refused(database: Database, tmp_path: Path) -> None:
     hrefs = [f"{database.base}/{BIG}", f"{database.base}/elsewhere/{Path(BIG).name}"]
     database.put(ITEM, {"assets": {str(k): {"href": h} for k, h in enumerate(hrefs)}})

@@ -55,6 +55,16 @@ def test_what_nobody_reads_is_kept(tmp_path: Path, kept: str) -> None:
     assert kept in (tmp_path / "copy.xml").read_text(encoding="utf-8")
 
 
+def test_text_between_elements_is_kept(tmp_path: Path) -> None:
+    inner = heliok.Element(
+        "Note", children=("one", heliok.Element("b"), "two", heliok.Remark("c"), "3")
+    )
+    units = (("unitLength", "m"), ("unitAngle", "rad"))
+    document = heliok.Document(heliok.Element("HelioK", units, (inner,)))
+    heliok.write(document, tmp_path / "note.xml")
+    assert heliok.read(tmp_path / "note.xml") == document
+
+
 def test_lines_take_no_part_in_comparisons() -> None:
     assert heliok.Element("a", line=1) == heliok.Element("a", line=2)
 

@@ -42,6 +42,7 @@ def edited(tmp_path: Path, source: Path, old: str, new: str) -> Path:
 def test_columns_are_read_by_name() -> None:
     table = opencsp.read_field(FIELD)
     assert table.names == ("A1", "A2", "B1")
+    assert len(table) == 3
     np.testing.assert_array_equal(table.location[0], [-4.84, 57.93, 3.89])
     np.testing.assert_array_equal(table.facets, [6, 6, 6])
     np.testing.assert_array_equal(table.rows, [2, 2, 2])

@@ -247,6 +247,7 @@ ROW = "0,1,1,10,20,0,NULL,NULL,NULL,NULL,NULL,1,2,90\n"
         ("Template,Loc. X,Loc. Y,Loc. Z\n", "no line holds a number"),
         (" \n,,,\n\n", "there is no heliostat in it"),
         ("Σ" * 40, "no line holds a number"),
+        ("NULL\n", "line 1: 1 columns; a layout has 14"),
         ("", "the file is empty; it should be a SolarPILOT layout"),
     ],
 )

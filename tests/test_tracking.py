@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from machines import every_kind, imperfect
 from scipy.optimize import minimize
 
 from heliotrope.errors import InputError
@@ -20,8 +19,9 @@ from heliotrope.mechanism import azel, kinds
 from heliotrope.mechanism.armature import armature
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import Status, track
+from machines import every_kind, imperfect
 
-UNIT = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: 0.1 < np.linalg.norm(v))
+UNIT = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
 def _miss(sun, aim, normal, vertex) -> np.ndarray:  # type: ignore[no-untyped-def]
@@ -158,7 +158,7 @@ def test_count_stops_and_turns() -> None:
     # Wide stops: the turn nearest to where the drive stands.
     wide = _stopped(a_min_angle=-20.0, a_max_angle=20.0, e_min_angle=0.0, e_max_angle=1.6)
     for turns in (-2, 0, 1):
-        near = angle + [2 * np.pi * turns, 0.0]
+        near = angle + np.array([2 * np.pi * turns, 0.0])
         found = track(wide, sun, aim, current=near + 0.1)
         np.testing.assert_allclose(found.chosen(found.angles), near, rtol=0, atol=1e-8)
     # Counts as stops, running against the angle.

@@ -168,7 +168,7 @@ def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
 def reflect(direction_in: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
     """Return where light from unit direction ``direction_in`` leaves: 2 (n·s) n − s."""
     s, n = as_float(direction_in), as_float(normal)
-    return 2.0 * np.sum(s * n, axis=-1, keepdims=True) * n - s
+    return as_float(2.0 * np.sum(s * n, axis=-1, keepdims=True) * n - s)
 
 
 def tangent_axes(normals: npt.ArrayLike) -> FloatArray:

@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 from heliotrope.errors import InputError
 
@@ -62,6 +63,6 @@ def run_blocks(
     blocks = min(4 * workers, rows)
     edges = [rows * k // blocks for k in range(blocks + 1)]
     pool = _pool(workers)
-    pending = [pool.submit(kernel, a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    pending = [pool.submit(kernel, a, b) for a, b in pairwise(edges)]
     for future in pending:
         future.result()

@@ -1,14 +1,13 @@
 """Tracking against Grigoriev's method in an independent implementation, and his notebook."""
 
-
 import numpy as np
 import pytest
-from reference.cases import params
 
 from heliotrope.geometry import reflect, wrap_signed
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import Status, track
+from reference.cases import params
 
 _LIMIT = 1e-10  # rad
 

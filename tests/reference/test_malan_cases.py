@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from reference.cases import OWN, params
 
 from heliotrope.field.image import image_offsets
 from heliotrope.geometry import direction, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
+from reference.cases import OWN, params
 
 # The file gives (zenith, east, north).
 _ENU = [1, 2, 0]

@@ -12,6 +12,7 @@ from numba import njit
 
 from heliotrope.mechanism._chain_kernels import chain_derivative, chain_pose
 from heliotrope.mechanism._drive_kernels import drive_angle
+from heliotrope.mechanism._jit import OPTIONS
 from heliotrope.mechanism._slots import (
     MOVES_ALONG_NORMAL,
     MOVES_DRIVE,
@@ -20,8 +21,6 @@ from heliotrope.mechanism._slots import (
     MOVES_POSITION,
     MOVES_VERTEX,
 )
-
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 CONVERGED = 0
 NOT_CONVERGED = 1
@@ -38,7 +37,7 @@ CAUCHY = 2
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.385
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal):
     """Move the arrays of one mechanism by x (P,), in place."""
     for p in range(codes.shape[0]):
@@ -58,7 +57,7 @@ def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal
                 vertex[k] += x[p] * normal[k]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _unit_way(end, far, m, way):
     """Unit vector from m to ``end``; returns its distance, infinite for a direction."""
     if far:
@@ -74,7 +73,7 @@ def _unit_way(end, far, m, way):
     return size
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _bisector_shift(s, s_distance, t, t_distance, v, size, dm, db):
     """Change of the bisector v when the vertex moves by dm."""
     s_along = s[0] * dm[0] + s[1] * dm[1] + s[2] * dm[2]
@@ -87,7 +86,7 @@ def _bisector_shift(s, s_distance, t, t_distance, v, size, dm, db):
         db[k] = (db[k] - along * v[k]) / size
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def sighting_residual(
     mechanism, codes, counts, source, far_source, destination, far_destination, axes, whiten,
     work, residual, jacobian, derivatives,
@@ -123,7 +122,7 @@ def sighting_residual(
             _project(axes, whiten, dn, db, jacobian[:, p])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _project(axes, whiten, a, b, out):
     x, y = 0.0, 0.0
     for k in range(3):
@@ -133,7 +132,7 @@ def _project(axes, whiten, a, b, out):
     out[1] = whiten[1, 0] * x + whiten[1, 1] * y
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def loss_and_weight(square, loss, scale):
     """(ρ, dρ/d|r|²) of a squared residual, |r| measured in ``scale``."""
     square = square / (scale * scale)
@@ -146,7 +145,7 @@ def loss_and_weight(square, loss, scale):
     return square, 1.0
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def cholesky_solve(matrix, right, factor, out):
     """Solve matrix · out = right for a positive definite matrix; returns whether it is."""
     size = matrix.shape[0]
@@ -174,7 +173,7 @@ def cholesky_solve(matrix, right, factor, out):
     return True
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def inverse_from(factor, out):
     """Inverse of factor · factorᵀ."""
     size = factor.shape[0]
@@ -195,7 +194,7 @@ def inverse_from(factor, out):
             out[j, i] = total
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _moved(base, codes, x):
     """Copies of one mechanism's arrays, moved by x."""
     position, orientation, axes, origins, angles, drives, driven, vertex, normal = base
@@ -205,7 +204,7 @@ def _moved(base, codes, x):
     return position, orientation, axes, origins, angles, drives, driven, vertex, normal
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _normal_equations(
     base, codes, sigma, y, rows, loss, scale, data, work, hessian, gradient, squares, derivatives
 ):
@@ -244,7 +243,7 @@ def _normal_equations(
     return cost
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _minimise(base, codes, sigma, y, rows, loss, scale, data, work, arrays, limit):
     """Levenberg-Marquardt from y, in place; returns (cost, iterations, converged)."""
     hessian, gradient, damped, factor, step, trial, squares = arrays
@@ -288,7 +287,7 @@ def _minimise(base, codes, sigma, y, rows, loss, scale, data, work, arrays, limi
     return cost, limit, False
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _median_scale(squares, keep, rows):
     """Robust scale of residual lengths: the median of Rayleigh noise is 1.1774 σ."""
     kept = 0
@@ -303,14 +302,15 @@ def _median_scale(squares, keep, rows):
     return np.median(lengths) / 1.1774100225154747
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def fit_block(
     arrays, codes, sigma, offsets, data, loss, rounds, limit, lowest_scale,
     x, covariance, scales, squares, costs, iterations, status, start, stop,
 ):  # fmt: skip
     """Fit heliostats ``start`` to ``stop``.
 
-    ``offsets`` (N + 1,) are the sightings of each, ``rounds`` how often the scale of the residuals is estimated anew (0: it stays 1).
+    ``offsets`` (N + 1,) are the sightings of each, ``rounds`` how often the scale of the
+    residuals is estimated anew (0: it stays 1).
     """
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]

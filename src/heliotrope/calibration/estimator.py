@@ -155,9 +155,7 @@ def fit(
             f"fit: a sighting is of heliostat row {int(sightings.heliostat.max())}; there are "
             f"{count} heliostats"
         )
-    names = (
-        parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
-    )
+    names = parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
     sigma = _priors(mechanism, names, priors or {})
     used = np.ones(rows, dtype=np.bool_) if keep is None else np.asarray(keep, dtype=np.bool_)
     order = _canonical_order(sightings)
@@ -294,9 +292,11 @@ def _regress(
     if jack:
         row = drive.table
         stroke, c, r = (row[SLOTS[n]] for n in ("stroke_offset", "offset", "pivot_radius"))
-        ends = stroke + np.array([0.0, 0.0]) + np.array([counts.min(), counts.max()]) * row[
-            SLOTS["rate"]
-        ]
+        ends = (
+            stroke
+            + np.array([0.0, 0.0])
+            + np.array([counts.min(), counts.max()]) * row[SLOTS["rate"]]
+        )
         low = abs(c - r) + 1e-3 + stroke - min(ends.min(), stroke)
         high = c + r - 1e-3 + stroke - max(ends.max(), stroke)
         trials += list(np.linspace(low, high, 200) - stroke)

@@ -1,5 +1,6 @@
 """``heliotrope calibrate``: learn the heliostats' imperfections from measurements."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,13 +28,19 @@ def calibrate(
 ) -> None:
     """Fit each heliostat, test it on held-out measurements, and write a report with pictures."""
     result, left_out = _fit(folder, model, centroid, split, fraction, seed)
+    from heliotrope.calibration.report import write_beside
+
     page = show_report(result, report, quiet=as_json)
     if as_json:
         print_json({**as_document(result), "left_out": left_out, "report": str(page)})
         return
-    for line in left_out:
-        print(f"left out: {line}")
     print_result(result)
+    if left_out:
+        listing = report / "left_out.txt"
+        write_beside(listing, lambda p: p.write_text("\n".join(left_out) + "\n", encoding="utf-8"))
+        reasons = Counter(line.split(": ", 1)[1] for line in left_out)
+        for reason, count in reasons.most_common():
+            print(f"left out: {count} measurements: {reason} (named in {listing})")
     print(f"report: {page}")
 
 
@@ -74,7 +81,7 @@ def as_document(result: "Result") -> dict[str, Any]:
     """Return the figures of a calibration for JSON."""
     import numpy as np
 
-    heliostats = {}
+    heliostats: dict[str, dict[str, Any]] = {}
     for i, (name, before, after, held, outcome) in enumerate(result.rows()):
         if not before.count:
             continue

@@ -96,9 +96,7 @@ def _measure(plant: "Plant", truth: Any, seed: int) -> Any:
             )  # fmt: skip
     rows, counts, source, spots, seconds = (np.concatenate(p) for p in zip(*parts, strict=True))
     distance = np.linalg.norm(nominal.position[rows] - target.center, axis=-1)
-    return sightings(
-        rows, counts, source, spots, time=seconds, sigma=CENTROID_NOISE / distance
-    )
+    return sightings(rows, counts, source, spots, time=seconds, sigma=CENTROID_NOISE / distance)
 
 
 def _track_day(plant: "Plant", truth: Any) -> dict[str, Any]:

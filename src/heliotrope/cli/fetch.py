@@ -29,17 +29,26 @@ def fetch(
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.0f} of {task.total:.0f} files"),
+        TextColumn("{task.completed:.0f} of {task.total:.0f}"),
         TimeRemainingColumn(),
     )
+    fetched: list[fetching.Fetched] = []
     with Progress(*columns, disable=as_json) as bar:
-        task = bar.add_task("fetching", total=None)
+        task = bar.add_task("looking", total=1)
 
-        def show(done: int, total: int, _name: str) -> None:
-            bar.update(task, completed=done, total=total)
+        def show(state: fetching.FetchState) -> None:
+            bar.update(
+                task, description=state.stage, completed=state.done, total=max(state.total, 1)
+            )
 
-        files = fetching.fetch_heliostats(heliostats, into, base_url=address, progress=show)
+        fetched.append(fetching.fetch_tower(into, base_url=address, progress=show))
+        fetched.append(fetching.fetch_heliostats(heliostats, into, base_url=address, progress=show))
+    files = [str(file) for part in fetched for file in part.files]
+    new = sum(len(part.new) for part in fetched)
+    missing = [text for part in fetched for text in part.missing]
     if as_json:
-        print_json({"files": [str(file) for file in files]})
-    else:
-        print(f"{len(files)} files in {into}")
+        print_json({"files": files, "new": new, "missing": missing})
+        return
+    for text in missing:
+        print(f"missing: {text}")
+    print(f"{len(files)} files in {into}, {new} of them new")

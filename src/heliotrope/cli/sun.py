@@ -17,7 +17,8 @@ def sun(
     ] = None,
     temperature: Annotated[float, typer.Option(help="°C.")] = 12.0,
     every: Annotated[
-        str | None, typer.Option(help="A table of the day of TIME at this interval: 30s, 10min, 1h.")
+        str | None,
+        typer.Option(help="The whole day of TIME at this interval: 30s, 10min."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
@@ -73,7 +74,10 @@ def sun(
             for r in rows
         ],
     )
-    for name in ("sunrise", "culmination", "sunset"):
-        event = day[name]
-        shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({day['kind']})"
+    for name, event in (
+        ("sunrise", events.sunrise),
+        ("culmination", events.culmination),
+        ("sunset", events.sunset),
+    ):
+        shown = event.strftime("%Y-%m-%d %H:%M:%S UTC") if event else f"none ({events.kind})"
         print(f"{name:12}{shown}")

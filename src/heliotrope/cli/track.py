@@ -15,8 +15,6 @@ from heliotrope.cli._common import (
 )
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from heliotrope.field.plant import Plant
     from heliotrope.mechanism.tracking import Tracking
 
@@ -133,9 +131,7 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
     print(f"{heliostat} at {document['time'].isoformat()}, sun at "
           f"{document['sun_elevation_deg']:.2f}° of elevation")  # fmt: skip
     names = " and ".join(document["joints"])
-    print_table(
-        ["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows
-    )
+    print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     print("* the one to take")
 
 

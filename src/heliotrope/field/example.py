@@ -11,7 +11,7 @@ import numpy as np
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.geometry import FloatArray, direction
+from heliotrope.geometry import FloatArray, as_float, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
@@ -94,4 +94,5 @@ def _square(center: tuple[float, float, float], size: float) -> FloatArray:
     # Who looks north at it has west to the left.
     half = 0.5 * size
     shifts = np.array([(-half, half), (half, half), (half, -half), (-half, -half)])
-    return np.array(center) + np.stack([shifts[:, 0], 0 * shifts[:, 0], shifts[:, 1]], axis=-1)
+    plane = np.stack([shifts[:, 0], 0 * shifts[:, 0], shifts[:, 1]], axis=-1)
+    return as_float(np.array(center) + plane)

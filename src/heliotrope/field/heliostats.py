@@ -85,9 +85,7 @@ class Heliostats:
             wrong = ~(np.isfinite(values) & (values > 0))
             if wrong.any():
                 i = int(np.flatnonzero(wrong)[0])
-                raise InputError(
-                    f"heliostat {self.names[i]}: {what} {values[i]} m must be above 0"
-                )
+                raise InputError(f"heliostat {self.names[i]}: {what} {values[i]} m must be above 0")
             object.__setattr__(self, what, values)
         clean = {}
         for name, given in self.parameters.items():
@@ -152,9 +150,7 @@ class Heliostats:
             height=self.height[index],
             facets=None
             if facets is None
-            else Facets(
-                facets.center[index], facets.half_width[index], facets.half_height[index]
-            ),
+            else Facets(facets.center[index], facets.half_width[index], facets.half_height[index]),
             parameters={name: values[index] for name, values in self.parameters.items()},
             aim=None if self.aim is None else self.aim[index],
             cluster=tuple(self.cluster[i] for i in index) if self.cluster else (),

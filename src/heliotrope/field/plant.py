@@ -53,7 +53,7 @@ class Plant:
                         "names are unique in a plant"
                     )
                 seen[name] = group
-        surfaces = [s.name for s in (*self.targets, *self.receivers)]
+        surfaces = [t.name for t in self.targets] + [r.name for r in self.receivers]
         for name in surfaces:
             if surfaces.count(name) > 1:
                 raise InputError(f"target or receiver {name}: the name occurs twice")

@@ -51,12 +51,12 @@ class Target:
     def _across(self) -> FloatArray:
         """From the left edge to the right edge."""
         c = self.corners
-        return 0.5 * (c[1] + c[2] - c[0] - c[3])
+        return np.asarray(0.5 * (c[1] + c[2] - c[0] - c[3]))
 
     @property
     def _up(self) -> FloatArray:
         c = self.corners
-        return 0.5 * (c[0] + c[1] - c[2] - c[3])
+        return np.asarray(0.5 * (c[0] + c[1] - c[2] - c[3]))
 
     @property
     def width(self) -> float:
@@ -133,9 +133,7 @@ class Receiver:
     def __post_init__(self) -> None:
         kinds = ("planar", "convex_cylinder", "external_cylinder")
         if self.kind not in kinds:
-            raise InputError(
-                f"receiver {self.name}: kind {self.kind!r}; known: {', '.join(kinds)}"
-            )
+            raise InputError(f"receiver {self.name}: kind {self.kind!r}; known: {', '.join(kinds)}")
         for name in ("width", "height"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):

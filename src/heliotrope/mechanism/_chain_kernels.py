@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from heliotrope.mechanism._drive_kernels import angle_per_count, angle_per_slot, drive_angle
+from heliotrope.mechanism._jit import OPTIONS
 from heliotrope.mechanism._slots import (
     MOVES_ALONG_NORMAL,
     MOVES_DRIVE,
@@ -22,10 +23,8 @@ from heliotrope.mechanism._slots import (
     MOVES_VERTEX,
 )
 
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
 
-
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def turn(matrix, axis, angle, out):
     """out = matrix · Rot(axis, angle), with the axis in the frame of ``matrix``."""
     x, y, z = axis[0], axis[1], axis[2]
@@ -48,13 +47,13 @@ def turn(matrix, axis, angle, out):
         out[i, 2] = a * r02 + b * r12 + c * r22
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _place(matrix, vector, out):
     for i in range(3):
         out[i] = matrix[i, 0] * vector[0] + matrix[i, 1] * vector[1] + matrix[i, 2] * vector[2]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def chain_pose(
     position, orientation, axes, origins, angles, driven, joint_angles, vertex, normal,
     frames, screw_axes, screw_points, n, m,
@@ -89,7 +88,7 @@ def chain_pose(
         m[i] += frame[i, 0] * vertex[0] + frame[i, 1] * vertex[1] + frame[i, 2] * vertex[2]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _screw(axis, point, n, m, factor, dn, dm):
     dn[0] = factor * (axis[1] * n[2] - axis[2] * n[1])
     dn[1] = factor * (axis[2] * n[0] - axis[0] * n[2])
@@ -100,7 +99,7 @@ def _screw(axis, point, n, m, factor, dn, dm):
     dm[2] = factor * (axis[0] * y - axis[1] * x)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def chain_derivative(
     what, index, sub, drives, driven, counts, frames, screw_axes, screw_points, n, m, dn, dm
 ):
@@ -124,7 +123,7 @@ def chain_derivative(
             dm[:] = n
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def pose_block(
     position, orientation, axes, origins, angles, drives, driven, vertex, normal,
     counts, rows, n_out, m_out, start, stop,
@@ -144,7 +143,7 @@ def pose_block(
         )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def jacobian_block(
     position, orientation, axes, origins, angles, drives, driven, vertex, normal,
     counts, rows, codes, n_out, m_out, dn_out, dm_out, dn_counts, dm_counts, start, stop,
@@ -171,12 +170,10 @@ def jacobian_block(
         for k in range(driven.shape[0]):
             factor = angle_per_count(drives[r, k], counts[i, k])
             j = driven[k]
-            _screw(
-                screw_axes[j], screw_points[j], n, m, factor, dn_counts[i, k], dm_counts[i, k]
-            )
+            _screw(screw_axes[j], screw_points[j], n, m, factor, dn_counts[i, k], dm_counts[i, k])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def armature_block(
     position, orientation, axes, origins, angles, driven, vertex, normal, out, start, stop
 ):

@@ -4,6 +4,7 @@ import math
 
 from numba import njit
 
+from heliotrope.mechanism._jit import INLINED, OPTIONS
 from heliotrope.mechanism._slots import (
     BIAS,
     KIND,
@@ -22,10 +23,8 @@ from heliotrope.mechanism._slots import (
     ZERO,
 )
 
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
 
-
-@njit(**_OPTIONS, forceinline=True)
+@njit(**INLINED)
 def load_drive(table, i, k):
     """Drive ``k`` of row ``i`` as a tuple, which lives in registers."""
     r = (table[i, k, 0], table[i, k, 1], table[i, k, 2], table[i, k, 3], table[i, k, 4])
@@ -34,20 +33,20 @@ def load_drive(table, i, k):
     return r + s + t + (table[i, k, 15], table[i, k, 16], table[i, k, 17], table[i, k, 18])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def triangle_angle(length, offset, radius):
     """Angle at the joint of the triangle (offset, radius, length), clamped to [0, π]."""
     cosine = (offset * offset + radius * radius - length * length) / (2.0 * offset * radius)
     return math.acos(min(1.0, max(-1.0, cosine)))
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _triangle_slope(length, offset, radius):
     """dΦ/dL of the triangle; infinite where it is stretched flat."""
     return length / (offset * radius * math.sin(triangle_angle(length, offset, radius)))
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def ideal_angle(d, counts):
     """Angle φ of drive row ``d`` before bias, scale, worm and sag."""
     if d[KIND] == LINEAR:
@@ -59,14 +58,14 @@ def ideal_angle(d, counts):
     return d[ZERO] + d[RATE] * counts
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _worm_argument(d, counts, phi):
     if d[KIND] == LINEAR:
         return d[WORM_RATIO] * d[RATE] * counts
     return d[WORM_RATIO] * phi
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def drive_angle(d, counts):
     """Joint angle θ = bias + (1 + scale) φ + worm + sag of drive row ``d``."""
     phi = ideal_angle(d, counts)
@@ -79,7 +78,7 @@ def drive_angle(d, counts):
     return theta
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def angle_per_ideal(d, counts, phi):
     """Return (dθ/dφ with the worm's argument held, dθ/du of the worm)."""
     slope = 1.0 + d[SCALE] - d[SAG] * math.sin(phi + d[SAG_PHASE])
@@ -90,7 +89,7 @@ def angle_per_ideal(d, counts, phi):
     return slope, worm
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def angle_per_count(d, counts):
     """dθ/dcounts of drive row ``d``."""
     phi = ideal_angle(d, counts)
@@ -102,8 +101,8 @@ def angle_per_count(d, counts):
     return (slope + worm * d[WORM_RATIO]) * d[RATE]
 
 
-@njit(**_OPTIONS)
-def angle_per_slot(d, counts, slot):  # noqa: C901 - one branch a parameter of the table
+@njit(**OPTIONS)
+def angle_per_slot(d, counts, slot):
     """dθ/d(slot) of drive row ``d`` at constant counts."""
     phi = ideal_angle(d, counts)
     if slot == BIAS:
@@ -144,7 +143,7 @@ def angle_per_slot(d, counts, slot):  # noqa: C901 - one branch a parameter of t
     return slope * d[SENSE] * (second - first)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _counts_of_ideal(d, phi):
     """Counts at which the ideal angle is ``phi``; a jack's reach is clamped to its triangle."""
     if d[KIND] == LINEAR:
@@ -158,7 +157,7 @@ def _counts_of_ideal(d, phi):
     return (phi - d[ZERO]) / d[RATE]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def drive_counts(d, theta):
     """Counts at which drive row ``d`` stands at joint angle ``theta``.
 
@@ -188,7 +187,7 @@ def drive_counts(d, theta):
     return counts
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def angles_block(drives, counts, rows, out, start, stop):
     """θ of every drive: ``drives`` (N, D, S), ``counts`` (M, D), ``rows`` (M,)."""
     for i in range(start, stop):
@@ -196,7 +195,7 @@ def angles_block(drives, counts, rows, out, start, stop):
             out[i, k] = drive_angle(drives[rows[i], k], counts[i, k])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def counts_block(drives, angles, rows, out, start, stop):
     """Counts of every drive, the inverse of :func:`angles_block`."""
     for i in range(start, stop):
@@ -204,7 +203,7 @@ def counts_block(drives, angles, rows, out, start, stop):
             out[i, k] = drive_counts(drives[rows[i], k], angles[i, k])
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def slopes_block(drives, counts, rows, out, start, stop):
     """dθ/dcounts of every drive."""
     for i in range(start, stop):

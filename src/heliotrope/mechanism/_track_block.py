@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from heliotrope.mechanism._drive_kernels import drive_angle, drive_counts, load_drive
+from heliotrope.mechanism._jit import INLINED, OPTIONS
 from heliotrope.mechanism._slots import (
     BIAS,
     KIND,
@@ -44,14 +45,11 @@ from heliotrope.mechanism._track_kernels import (
 from heliotrope.mechanism._vectors import about, turn_between
 from heliotrope.mechanism._warm_kernels import LANES, STEPS, warm_start
 
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
-_INLINED = {**_OPTIONS, "forceinline": True}
-
 #: Angles this far (rad) beyond a stop count as on it.
 STOP_SLACK = 1e-9
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def stop_angles(d):
     """Lowest and highest joint angle that both kinds of stops of drive ``d`` allow."""
     if math.isfinite(d[MIN_COUNT]) or math.isfinite(d[MAX_COUNT]):
@@ -59,7 +57,7 @@ def stop_angles(d):
     return d[MIN_ANGLE], d[MAX_ANGLE]
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def _counts(d, theta):
     """Counts at a joint angle; the plain rotary drive without a call."""
     if d[KIND] == ROTARY and d[WORM_COS] == 0.0 and d[WORM_SIN] == 0.0 and d[SAG] == 0.0:
@@ -67,7 +65,7 @@ def _counts(d, theta):
     return drive_counts(d, theta)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _count_stops(d):
     low, high = d[MIN_ANGLE], d[MAX_ANGLE]
     lower, upper = d[MIN_COUNT], d[MAX_COUNT]
@@ -88,7 +86,7 @@ def _count_stops(d):
     return low, high
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def into_stops(theta, stops, near):
     """Return (angle, inside): theta + 2πk within the stops nearest to ``near``, or a stop."""
     turn = 2.0 * math.pi
@@ -108,12 +106,12 @@ def into_stops(theta, stops, near):
     return low, False
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _turn(theta_1, theta_2):
     return math.sin(theta_1), math.cos(theta_1), math.sin(theta_2), math.cos(theta_2)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _free_angle(g, axis, held, u, v, stops, near):
     """Best angle of the other joint while joint ``axis`` is held, within its stops."""
     if axis == 0:
@@ -125,7 +123,7 @@ def _free_angle(g, axis, held, u, v, stops, near):
     return into_stops(math.atan2(sine, cosine), stops, near)[0]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
     """Nearest pose with joint ``axis`` held at a stop; returns (residual, θ₁, θ₂)."""
     other = 1 - axis
@@ -146,7 +144,7 @@ def _along_stop(g, s, p, u, v, local, axis, held, stops, near):
     return residual_angle(g, t, u, v_here), one, two
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _nearest_at_stops(g, s, p, u, v, local, stops, near):
     """Nearest pose on the border of the stops' rectangle: (residual, θ₁, θ₂)."""
     best, one, two = np.inf, 0.0, 0.0
@@ -154,15 +152,13 @@ def _nearest_at_stops(g, s, p, u, v, local, stops, near):
         for side in range(2):
             held = stops[axis][side]
             if math.isfinite(held):
-                rest, first, second = _along_stop(
-                    g, s, p, u, v, local, axis, held, stops, near
-                )
+                rest, first, second = _along_stop(g, s, p, u, v, local, axis, held, stops, near)
                 if rest < best:
                     best, one, two = rest, first, second
     return best, one, two
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near):
     """Solve one branch within the stops: (status, iterations, residual, θ₁, θ₂, n, m)."""
     nothing = (np.nan, np.nan, np.nan)
@@ -176,9 +172,7 @@ def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near)
         reached, t = solve_direction(g, constants(g, u), u, v, sign)
         status, iterations, m = OK if reached else UNREACHABLE, 1, place_vertex(g, t)
     else:
-        status, iterations, t, m, v, rest = solve_aim(
-            g, s, p, m, sign, tolerance, limit, newton
-        )
+        status, iterations, t, m, v, rest = solve_aim(g, s, p, m, sign, tolerance, limit, newton)
         if status == DEGENERATE or s == (0.0, 0.0, 0.0):
             return DEGENERATE, iterations, np.nan, np.nan, np.nan, nothing, nothing
     one, inside_1 = into_stops(math.atan2(t[0], t[1]), stops[0], near[0])
@@ -194,14 +188,14 @@ def solve_branch(g, s, p, m, sign, local, tolerance, limit, newton, stops, near)
     return STOPPED, iterations, rest, one, two, turned(g, t, n), place_vertex(g, t)
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def _home(stops):
     if math.isfinite(stops[0]) and math.isfinite(stops[1]):
         return 0.5 * (stops[0] + stops[1])
     return 0.0
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _better(status, residual, seconds, radians):
     """Whether the second branch is to be preferred to the first."""
     if status[0] == OK and status[1] == OK:
@@ -211,7 +205,7 @@ def _better(status, residual, seconds, radians):
     return residual[1] < residual[0]
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def track_block(
     armatures, drives, suns, aims, current, index, local, branch, tolerance, limit, newton,
     angles, counts, normals, vertices, status, iterations, residual, best, start, stop,

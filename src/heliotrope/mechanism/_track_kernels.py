@@ -16,6 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
+from heliotrope.mechanism._jit import INLINED, OPTIONS
 from heliotrope.mechanism._vectors import (
     about,
     across,
@@ -28,10 +29,6 @@ from heliotrope.mechanism._vectors import (
     times,
     turn_between,
 )
-
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
-# Called in the innermost loop: a call through a pointer would cost more than their work.
-_INLINED = {**_OPTIONS, "forceinline": True}
 
 OK = 0
 UNREACHABLE = 1  # inside the dead cone around the primary axis
@@ -47,7 +44,7 @@ NEWTON_LIMIT, DAMPING_LIMIT = 60, 30
 DEGENERATE_LIMIT = 1e-9
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def load_armature(table, i):
     """Row ``i`` of armatures (N, 18) as a tuple."""
     r = (table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5])
@@ -57,25 +54,25 @@ def load_armature(table, i):
     )  # fmt: skip
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def axis_1(g):
     """Primary axis."""
     return g[0], g[1], g[2]
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def axis_2(g):
     """Secondary axis at zero primary angle; of zero length if there is none."""
     return g[6], g[7], g[8]
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def is_single(g):
     """Whether there is no secondary axis."""
     return g[6] == 0.0 and g[7] == 0.0 and g[8] == 0.0
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def constants(g, u):
     """What the solution for mirror vector ``u`` keeps from step to step.
 
@@ -93,7 +90,7 @@ def constants(g, u):
     return ab, ub, 1.0 / dot(c, c), dot(e, a), dot(e, c), dot(f, a), dot(f, c)
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def solve_direction(g, k, u, v, sign):
     """Turn both joints so that ``u`` (given at zero angles) comes to lie along v.
 
@@ -128,7 +125,7 @@ def solve_direction(g, k, u, v, sign):
     return reached, (sine_1 * size, cosine_1 * size, sine_2, cosine_2)
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def turned(g, t, u):
     """Vector ``u`` of the mirror (given at zero angles) at turn t."""
     if not is_single(g):
@@ -136,7 +133,7 @@ def turned(g, t, u):
     return about(axis_1(g), t[0], t[1], u)
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def place_vertex(g, t):
     """Vertex at turn t."""
     r = (g[12] - g[9], g[13] - g[10], g[14] - g[11])
@@ -146,7 +143,7 @@ def place_vertex(g, t):
     return add(r, (g[3], g[4], g[5]))
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def served(g, s):
     """The part of source direction s that the mechanism can serve: all, or that across its axis.
 
@@ -161,7 +158,7 @@ def served(g, s):
     return times(1.0 / size, flat)
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def wanted_normal(g, s, p, m):
     """(bisector of s and the way from m to p, that way, its length); length 0 if none.
 
@@ -182,7 +179,7 @@ def wanted_normal(g, s, p, m):
     return times(1.0 / size, v), way, distance
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def mirror_normal(g, t):
     """Normal at turn t; for a single axis its unit projection across the axis."""
     n = turned(g, t, (g[15], g[16], g[17]))
@@ -192,14 +189,14 @@ def mirror_normal(g, t):
     return n
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def beam_miss(s, way, distance, n):
     """Distance (m) by which the ray reflected with normal n passes the aim."""
     ray = minus(times(2.0 * dot(n, s), n), s)
     return distance * norm(cross(way, ray))
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def residual_angle(g, t, u, v):
     """Angle between the turned ``u`` and v; in the plane across the axis if single."""
     x = turned(g, t, u)
@@ -209,7 +206,7 @@ def residual_angle(g, t, u, v):
     return angle(x, v)
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _columns(g, t, n, m, k):
     """(dn, dm) by joint angle k: the screw formula."""
     if k == 0:
@@ -221,7 +218,7 @@ def _columns(g, t, n, m, k):
     return cross(w, n), cross(w, minus(m, o))
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _difference_column(g, t, n, m, v, way, distance, k):
     """d(n − v) by joint angle k; the bisector v moves with the vertex."""
     dn, dm = _columns(g, t, n, m, k)
@@ -232,7 +229,7 @@ def _difference_column(g, t, n, m, v, way, distance, k):
     return minus(dn, times(0.5 / dot(v, way), across(dway, v)))
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def _newton(g, s, p, t, tolerance):
     """Levenberg-damped Newton on |n − v|² from turn t; returns (status, iterations, t)."""
     theta_1, theta_2 = math.atan2(t[0], t[1]), math.atan2(t[2], t[3])
@@ -281,7 +278,7 @@ def _newton(g, s, p, t, tolerance):
     return NOT_CONVERGED, NEWTON_LIMIT, t
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
     """Bring the beam of armature ``g`` from direction s (served) to point p on one branch.
 
@@ -319,7 +316,7 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
     return NOT_CONVERGED, limit, t, m, v, np.nan
 
 
-@njit(**_INLINED)
+@njit(**INLINED)
 def local_direction(g, aim):
     """Where the source must stand, at zero angles, to light point ``aim`` fixed to the mirror.
 

@@ -4,16 +4,16 @@ import math
 
 from numba import njit
 
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy", "forceinline": True}
+from heliotrope.mechanism._jit import INLINED
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def dot(a, b):
     """a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def cross(a, b):
     """a × b."""
     return (
@@ -23,38 +23,38 @@ def cross(a, b):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def add(a, b):
     """a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def minus(a, b):
     """a − b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def times(factor, a):
     """factor · a."""
     return factor * a[0], factor * a[1], factor * a[2]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def norm(a):
     """|a|."""
     return math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def across(a, axis):
     """The part of a perpendicular to the unit axis."""
     along = dot(a, axis)
     return a[0] - along * axis[0], a[1] - along * axis[1], a[2] - along * axis[2]
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def about(axis, sine, cosine, u):
     """Turn u about the unit axis by the angle of known sine and cosine (Rodrigues)."""
     along = (1.0 - cosine) * dot(axis, u)
@@ -65,7 +65,7 @@ def about(axis, sine, cosine, u):
     )
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def turn_between(axis, u, v):
     """Sine and cosine of the turn about the axis that brings u as near to v as can be."""
     sine = dot(axis, cross(u, v))
@@ -76,7 +76,7 @@ def turn_between(axis, u, v):
     return sine / size, cosine / size
 
 
-@njit(**_OPTIONS)
+@njit(**INLINED)
 def angle(u, v):
     """Angle between unit vectors, exact near 0 and π."""
     apart = norm(minus(u, v))

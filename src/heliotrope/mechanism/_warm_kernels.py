@@ -12,10 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
+from heliotrope.mechanism._jit import INLINED, OPTIONS
 from heliotrope.mechanism._track_kernels import axis_1, axis_2, constants, load_armature
 from heliotrope.mechanism._vectors import across, add, cross, dot, minus, times
-
-_OPTIONS = {"nogil": True, "cache": True, "error_model": "numpy"}
 
 #: Heliostats side by side, and steps taken with them.
 LANES = 8
@@ -26,14 +25,14 @@ STEPS = 3
 ROWS = 37
 
 
-@njit(**_OPTIONS, forceinline=True)
+@njit(**INLINED)
 def _put(table, row, lane, vector):
     table[row, lane] = vector[0]
     table[row + 1, lane] = vector[1]
     table[row + 2, lane] = vector[2]
 
 
-@njit(**_OPTIONS, forceinline=True)
+@njit(**INLINED)
 def _gather(table, lane, g, s, p):
     """Fill one lane with what the step needs; the vertex starts at zero angles."""
     a, b = axis_1(g), axis_2(g)
@@ -59,7 +58,7 @@ def _gather(table, lane, g, s, p):
     table[_SUN_C, lane] = dot(s, c)
 
 
-@njit(**_OPTIONS, forceinline=True)
+@njit(**INLINED)
 def _step(w, sign):
     """One fixed-point step of every lane: see ``solve_direction`` for the formulae."""
     for i in range(LANES):
@@ -94,7 +93,7 @@ def _step(w, sign):
         w[_Y + 2, i] = cosine_1 * z + sine_1 * (a0 * y - a1 * x) + along * a2
 
 
-@njit(**_OPTIONS)
+@njit(**OPTIONS)
 def warm_start(armatures, suns, aims, index, first, stop, sign, vertices):
     """Vertices (LANES, 3) to start rows ``first`` … from, after STEPS steps.
 

@@ -71,7 +71,7 @@ class Armature:
         second = rotation(self.axis_2, theta[..., 1])
 
         def turned(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-            return np.einsum("...ij,...j->...i", matrix, vector)
+            return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
 
         normal = turned(first, turned(second, self.normal))
         arm = self.origin_2 - self.origin_1 + turned(second, self.vertex - self.origin_2)

@@ -177,7 +177,7 @@ class Mechanism:
         for name, value in values.items():
             delta = as_float(value)
             if not np.isfinite(delta).all():
-                raise InputError(f"parameter {name}: {value} is not finite")
+                raise InputError(f"parameter {name}: {value!r} is not finite")
             what, index, sub = self.parameter(name).code
             if what == slot.MOVES_JOINT:
                 angles[..., index] += delta
@@ -207,9 +207,7 @@ class Mechanism:
         flat, rows, shape = self._flatten(counts)
         normal, vertex = np.empty((len(rows), 3)), np.empty((len(rows), 3))
         arrays = self.kernel_arrays
-        run_blocks(
-            lambda a, b: pose_block(*arrays, flat, rows, normal, vertex, a, b), len(rows)
-        )
+        run_blocks(lambda a, b: pose_block(*arrays, flat, rows, normal, vertex, a, b), len(rows))
         return Pose(normal.reshape(*shape, 3), vertex.reshape(*shape, 3))
 
     def jacobian(self, counts: npt.ArrayLike, names: tuple[str, ...]) -> Jacobian:

@@ -238,8 +238,8 @@ def rotary(
     per_turn = as_float(steps_per_turn) * as_float(microsteps) * as_float(gear_ratio)
     if not (np.isfinite(per_turn) & (per_turn > 0)).all():
         raise InputError(
-            f"rotary drive: steps {steps_per_turn} × microsteps {microsteps} × gear ratio "
-            f"{gear_ratio} must be above 0 and finite"
+            f"rotary drive: steps {steps_per_turn!r} × microsteps {microsteps!r} × gear ratio "
+            f"{gear_ratio!r} must be above 0 and finite"
         )
     _check_sense(sense)
     rate = as_float(sense) * TAU / per_turn
@@ -275,7 +275,7 @@ def linear_paint(
     """
     counts_per_metre = as_float(increment)
     if not (np.isfinite(counts_per_metre) & (counts_per_metre != 0)).all():
-        raise InputError(f"linear drive: increment {increment} counts per metre must not be 0")
+        raise InputError(f"linear drive: increment {increment!r} counts per metre must not be 0")
     sense = np.where(as_float(clockwise) == 1, 1.0, -1.0)
     return _build(
         slot.LINEAR,
@@ -372,15 +372,13 @@ def linear_guo(
     a, b, included = as_float(side_a), as_float(side_b), as_float(included_at_zero)
     if not ((included > 0) & (included < np.pi)).all():
         raise InputError(
-            f"linear drive: included angle at zero {included_at_zero} rad must lie in (0, π)"
+            f"linear drive: included angle at zero {included_at_zero!r} rad must lie in (0, π)"
         )
     length = np.sqrt((a - b) ** 2 + 4.0 * a * b * np.sin(0.5 * included) ** 2)
     zero = as_float(angle_at_zero) - as_float(sense) * included
-    return linear_grigoriev(
-        a, b, length, metres_per_count, angle_zero=zero, sense=sense, **values
-    )
+    return linear_grigoriev(a, b, length, metres_per_count, angle_zero=zero, sense=sense, **values)
 
 
 def _check_sense(sense: npt.ArrayLike) -> None:
     if not np.isin(as_float(sense), (-1.0, 1.0)).all():
-        raise InputError(f"drive: sense {sense} must be +1 or −1")
+        raise InputError(f"drive: sense {sense!r} must be +1 or −1")

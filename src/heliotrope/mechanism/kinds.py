@@ -385,7 +385,7 @@ def single_axis(
         raise InputError("normal: it lies along the axis, which then cannot turn it")
     height = as_float(pivot_height)
     lean_names = _lean_names(a)
-    steps = [
+    steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
         (f"tilt_{lean_names[0]}", normalize(np.cross(a, _LEANS[lean_names[0]])),
          height[..., None] * UP),
         (f"tilt_{lean_names[1]}", normalize(np.cross(a, _LEANS[lean_names[1]])), 0.0),

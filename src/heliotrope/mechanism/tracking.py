@@ -91,7 +91,7 @@ class Tracking:
     @property
     def reachable(self) -> npt.NDArray[np.bool_]:
         """Whether the beam reaches its aim, (..., B)."""
-        return self.status == Status.OK
+        return np.asarray(self.status == Status.OK)
 
     def chosen(self, values: np.ndarray) -> np.ndarray:
         """Return the best branch's part of one of the arrays above, (..., rest)."""

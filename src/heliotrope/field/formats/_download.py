@@ -287,10 +287,9 @@ def _attempt(job: Job, channel: Channel) -> bool:
             raise _LaterError("the part that is there does not fit")
         _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
         start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
-        length = _length(response)
         said = Entry(
             response.headers.get("etag", ""), response.headers.get("last-modified", ""),
-            -1 if length is None else start + length, done=False,
+            _whole(response), done=False,
         )  # fmt: skip
         # A part would mean that the file that is there is older than what the entry says.
         same = entry is None or (entry.etag, entry.modified) == (said.etag, said.modified)
@@ -321,11 +320,15 @@ def _fits(response: "httpx.Response", start: int) -> bool:
     return response.status_code != HTTPStatus.PARTIAL_CONTENT or span.startswith(f"bytes {start}-")
 
 
-def _length(response: "httpx.Response") -> int | None:
+def _whole(response: "httpx.Response") -> int:
+    """Return the size of the whole file, −1 if the answer does not say."""
     if response.headers.get("content-encoding", "identity") != "identity":
-        return None
-    length = response.headers.get("content-length", "")
-    return int(length) if length.isdigit() else None
+        return -1
+    if response.status_code == HTTPStatus.PARTIAL_CONTENT:
+        size = response.headers.get("content-range", "").rpartition("/")[2]
+    else:
+        size = response.headers.get("content-length", "")
+    return int(size) if size.isdigit() else -1
 
 
 def _store(job: Job, channel: Channel, response: "httpx.Response", start: int, said: Entry) -> None:

@@ -45,10 +45,7 @@ def build_group(
     """
     reader = _Reader(path, name, group, table, rows)
     position = np.stack([table.numbers[c][rows] for c in _POSITION], axis=-1)
-    if group.chain is not None:
-        mechanism = reader.chain(position)
-    else:
-        mechanism = reader.built(position, site)
+    mechanism = reader.chain(position) if group.chain else reader.built(position, site)
     width = reader.number("mirror_width_m", group.mirror_width_m)
     height = reader.number("mirror_height_m", group.mirror_height_m)
     if width is None or height is None:
@@ -263,9 +260,7 @@ def _column(mechanism: Mechanism, name: str) -> str:
     return name if unit == "1" else f"{name}_{unit}"
 
 
-def group_document(
-    name: str, heliostats: Heliostats
-) -> tuple[dict[str, Any], dict[str, Any]]:
+def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return the TOML of a group, and the columns of what differs between its heliostats."""
     m = heliostats.mechanism
     columns: dict[str, Any] = {"name": list(heliostats.names), "group": [name] * len(heliostats)}

@@ -106,9 +106,8 @@ def _drive(name: str, kind: str, **own: Any) -> type[BaseModel]:
         "max_count": (Number | None, None),
         "speed_counts_per_s": (Positive | None, None),
     }
-    return create_model(
-        name, __base__=Strict, kind=(Literal[kind], ...), **own, **angles, **common
-    )
+    fields: dict[str, Any] = {"kind": (Literal[kind], ...), **own, **angles, **common}
+    return create_model(name, __base__=Strict, **fields)
 
 
 RotaryDrive = _drive(

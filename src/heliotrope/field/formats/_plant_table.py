@@ -145,21 +145,16 @@ def _numbers(
     empty = values.isna().to_numpy()
     wrong = np.isnan(read) & (~empty if column not in REQUIRED else True)
     for i in np.flatnonzero(wrong)[:MOST_PROBLEMS]:
-        given = values.iloc[i]
-        shown = "nothing" if pd.isna(given) else repr(given)
-        problems.append(
-            FormatError(
-                path, f"heliostat {names[i]}: {shown} is no number", f"line {i + 2}, column {column}"
-            )
-        )
+        shown = "nothing" if empty[i] else repr(values.iloc[i])
+        text = f"heliostat {names[i]}: {shown} is no number"
+        problems.append(FormatError(path, text, f"line {i + 2}, column {column}"))
     outside = ~np.isnan(read) & ~((read >= low) & (read <= high))
     for i in np.flatnonzero(outside)[:MOST_PROBLEMS]:
-        problems.append(
-            FormatError(
-                path, f"heliostat {names[i]}: {read[i]:g} is outside {low:g} to {high:g} {unit}; "
-                "is it in another unit?", f"line {i + 2}, column {column}",
-            )
-        )  # fmt: skip
+        text = (
+            f"heliostat {names[i]}: {read[i]:g} is outside {low:g} to {high:g} {unit}; "
+            "is it in another unit?"
+        )
+        problems.append(FormatError(path, text, f"line {i + 2}, column {column}"))
     return np.asarray(read, dtype=np.float64)
 
 

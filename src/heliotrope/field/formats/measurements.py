@@ -6,10 +6,9 @@ be used is left out and named.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.errors import FormatError
 from heliotrope.field.formats._textfile import check_file
@@ -78,15 +77,12 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
     place = Path(folder)
     origin = read_tower(find_tower(place)).origin
     table = place / "measurements.csv"
-    if table.exists():
-        frame = _read_table(table, centroid)
-    else:
-        frame = _read_files(place, centroid)
+    frame = _read_table(table, centroid) if table.exists() else _read_files(place, centroid)
     columns = ("lat", "lon", "alt")
     spots = frame[[f"{centroid}_{c}" for c in columns]].to_numpy(dtype=np.float64)
     enu = np.full((len(frame), 3), np.nan)
     known = np.isfinite(spots).all(axis=1)
-    enu[known] = geodetic_to_enu(*spots[known].T, origin)
+    enu[known] = geodetic_to_enu(spots[known, 0], spots[known, 1], spots[known, 2], origin)
     return _keep_good(frame, enu, centroid)
 
 
@@ -144,7 +140,7 @@ def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Me
     elevation = frame["sun_elevation_deg_apparent"].to_numpy(dtype=np.float64)
     counts = frame[["axis_1_motor_position", "axis_2_motor_position"]].to_numpy(dtype=np.float64)
     time = _seconds(frame["timestamp"].astype(str))
-    reasons: list[tuple[npt.NDArray[np.bool_], str]] = [
+    reasons: list[tuple[Any, str]] = [
         (frame["heliostat"].astype(str).to_numpy() == "", "no heliostat is named"),
         (~np.isfinite(counts).all(axis=1), "a motor position is missing or no number"),
         (~np.isfinite(azimuth) | ~np.isfinite(elevation), "the sun's angles are missing"),
@@ -155,8 +151,10 @@ def _keep_good(frame: "pd.DataFrame", enu: FloatArray, centroid: Centroid) -> Me
     good = np.ones(len(frame), dtype=np.bool_)
     left_out = []
     for wrong, reason in reasons:
-        for i in np.flatnonzero(wrong & good):
-            left_out.append(f"{frame['heliostat'][i]} {frame['id'][i]}: {reason}")
+        left_out += [
+            f"{frame['heliostat'][i]} {frame['id'][i]}: {reason}"
+            for i in np.flatnonzero(wrong & good)
+        ]
         good &= ~wrong
     rows = np.flatnonzero(good)
     # 0 is south and east is positive: the angle from north, clockwise, is 180° minus it.

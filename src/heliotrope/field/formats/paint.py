@@ -247,7 +247,7 @@ def find_properties(folder: str | Path) -> list[Path]:
     """Return the property files of a folder: ``properties/ID.json`` or PAINT's own layout."""
     root = Path(folder)
     flat = sorted((root / "properties").glob("*.json"))
-    nested = sorted(root.glob("*/Properties/*-heliostat-properties.json"))
+    nested = sorted(root.glob("*/Properties/*heliostat-properties*.json"))
     return flat or nested
 
 
@@ -259,9 +259,10 @@ def find_tower(folder: str | Path) -> Path:
     FormatError
         If there is none.
     """
-    for name in (TOWER_FILE, "WRI1030197-tower-measurements.json"):
-        if (Path(folder) / name).exists():
-            return Path(folder) / name
+    names = [Path(folder) / TOWER_FILE, *sorted(Path(folder).glob("**/*tower-measurements*.json"))]
+    for name in names:
+        if name.exists():
+            return name
     raise FormatError(folder, f"{TOWER_FILE} is missing in this folder; fetch it too")
 
 
@@ -280,7 +281,11 @@ def read_plant(folder: str | Path) -> Plant:
     files = find_properties(place)
     if not files:
         raise FormatError(place, "there are no heliostat properties (properties/ID.json)")
-    heliostats = to_heliostats([read_heliostat(file) for file in files], tower.origin)
+    listed = [
+        read_heliostat(file, file.parent.parent.name if file.parent.name == "Properties" else None)
+        for file in files
+    ]
+    heliostats = to_heliostats(listed, tower.origin)
     latitude, longitude, height = tower.origin
     return Plant(
         name="Jülich",
@@ -294,7 +299,8 @@ def read_plant(folder: str | Path) -> Plant:
 def to_heliostats(properties: Iterable[Properties], origin: Origin) -> Heliostats:
     """Return heliostats as arrays from their properties, about ``origin``."""
     listed = list(properties)
-    position = geodetic_to_enu(*np.array([p.geodetic for p in listed]).T, origin)
+    latitude, longitude, height = np.array([p.geodetic for p in listed]).T
+    position = geodetic_to_enu(latitude, longitude, height, origin)
     drives = (
         Drive(np.stack([p.drives[0].table for p in listed])),
         Drive(np.stack([p.drives[1].table for p in listed])),

@@ -260,7 +260,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def check_plant(path: str | Path) -> list[Finding]:
-    """Return everything that is wrong or strange in a plant file; raises nothing for its content."""
+    """Return everything that is wrong or strange in a plant file, as findings."""
     place = Path(path)
     try:
         document = _read_document(place)
@@ -306,8 +306,9 @@ def _crowding(plant: Plant) -> list[str]:
     if not close.any():
         return []
     i, j = pairs[close][int(np.argmin(apart[close]))]
-    return [
+    text = (
         f"{int(close.sum())} pairs of mirrors can touch: the nearest, {plant.names[i]} and "
         f"{plant.names[j]}, stand {apart[close].min():.2f} m apart with diagonals of "
         f"{size[i]:.2f} m"
-    ]
+    )
+    return [text]
