@@ -206,7 +206,7 @@ def _target_plot(ax: "Axes", groups: list[tuple[FloatArray, str, str]], title: s
     ax.set_xlabel("right, m")
     ax.set_ylabel("up, m")
     ax.grid(alpha=0.3)
-    if len(groups) > 1:
+    if sum(len(plane) > 0 for plane, _, _ in groups) > 1:
         ax.legend(frameon=False)
 
 

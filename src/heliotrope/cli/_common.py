@@ -105,5 +105,5 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str
     console = Console()
     if not console.is_terminal:
         # A file or a pipe has no width: never cut a number.
-        console = Console(width=200)
+        console = Console(width=1000)
     console.print(table)

@@ -51,12 +51,16 @@ def _fit(
     from heliotrope.calibration import estimator, evaluation
     from heliotrope.calibration.report import Result
     from heliotrope.calibration.sightings import of_measurements
+    from heliotrope.errors import FormatError
     from heliotrope.field.formats import measurements, paint
 
     plant = paint.read_plant(folder)
     (group,) = plant.groups.values()
     found = measurements.read_measurements(folder, centroid=centroid)
     seen, left_out = of_measurements(found, group)
+    if not len(seen):
+        reason = f"; the first: {found.left_out[0]}" if found.left_out else ""
+        raise FormatError(folder, f"no measurement can be used{reason}")
     training = evaluation.split(seen, split, fraction, seed)
     calibration = estimator.fit(group.mechanism, seen, model, keep=training)
     result = Result(group.names, group.mechanism, seen, calibration, training, model)

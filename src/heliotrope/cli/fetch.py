@@ -41,8 +41,8 @@ def fetch(
                 task, description=state.stage, completed=state.done, total=max(state.total, 1)
             )
 
-        fetched.append(fetching.fetch_tower(into, base_url=address, progress=show))
         fetched.append(fetching.fetch_heliostats(heliostats, into, base_url=address, progress=show))
+        fetched.append(fetching.fetch_tower(into, base_url=address, progress=show))
     files = [str(file) for part in fetched for file in part.files]
     new = sum(len(part.new) for part in fetched)
     missing = [text for part in fetched for text in part.missing]

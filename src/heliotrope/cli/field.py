@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from heliotrope.cli._common import print_json, print_table
+from heliotrope.cli._common import print_json
 
 app = typer.Typer(help="Check plant files.", no_args_is_help=True)
 
@@ -28,10 +28,8 @@ def check(
     if as_json:
         print_json({"file": str(file), "ok": not wrong, "findings": [vars(f) for f in findings]})
     else:
-        if findings:
-            print_table(
-                ["severity", "what"], [[f.severity, f.text] for f in findings], title=str(file)
-            )
+        for finding in findings:
+            print(f"{finding.severity}: {finding.text}")
         if not wrong:
             plant = plant_file.read_plant(file)
             print(f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "

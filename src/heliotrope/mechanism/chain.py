@@ -19,7 +19,7 @@ from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
 
 #: What a mechanism may be indexed with.
-Index = int | slice | EllipsisType | tuple[int | slice | EllipsisType, ...] | npt.NDArray[np.intp]
+Index = int | slice | EllipsisType | None | tuple[int | slice | EllipsisType, ...] | npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class Mechanism:
         return self.shape[0]
 
     def __getitem__(self, index: Index) -> "Mechanism":
-        """Return the mechanisms at ``index`` of the batch axes."""
-        if not self.shape:
+        """Return the mechanisms at ``index`` of the batch axes; None adds an axis."""
+        if not self.shape and index is not None:
             raise InputError("a single mechanism cannot be indexed")
         return replace(
             self,

@@ -179,7 +179,9 @@ class _Reader:
         for key in needed:
             if key not in values:
                 raise self.fail(f"{key} is missing, here and as a column {where}.{key}", where)
-        return drive_kinds.linear_paint(*(values.pop(key) for key in needed), **values)
+        # Taken out first: an unpacked generator would run only after **values.
+        constants = [values.pop(key) for key in needed]
+        return drive_kinds.linear_paint(*constants, **values)
 
     def raw_drive(self, joint: str, numbers: Mapping[str, float]) -> Drive:
         row = np.zeros((len(self.rows), slot.DRIVE_SLOTS))

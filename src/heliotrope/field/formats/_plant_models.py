@@ -47,6 +47,8 @@ class SiteTable(Strict):
     height_m: Annotated[float, Field(ge=-500, le=9000)] = 0.0
     pressure_pa: Annotated[float, Field(ge=30e3, le=120e3)] | None = None
     temperature_c: Annotated[float, Field(ge=-80, le=60)] = 12.0
+    name: str = ""
+    delta_t_s: Number | None = Field(None, description="TT - UT1; default from the date.")
 
 
 class TargetTable(Strict):

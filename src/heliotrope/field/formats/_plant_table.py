@@ -73,10 +73,8 @@ def read_table(path: Path) -> HeliostatTable:
         check_file(path, "the table of heliostats")
         texts = dict.fromkeys(TEXTS, str)
         try:
-            frame = pd.read_csv(
-                path, dtype=texts, keep_default_na=False, na_values=[""],
-                float_precision="round_trip",
-            )  # fmt: skip
+            # Since pandas 3.1 numbers are read to the last digit.
+            frame = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""])
         except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
             raise FormatError(path, f"no table in CSV: {str(error).strip()}") from None
     missing = [name for name in REQUIRED if name not in frame.columns]

@@ -114,7 +114,7 @@ def _assemble(
     site = Site(
         document.site.latitude_deg, document.site.longitude_deg, document.site.height_m,
         pressure=document.site.pressure_pa, temperature_c=document.site.temperature_c,
-        name=document.plant.name,
+        name=document.site.name, delta_t=document.site.delta_t_s,
     )  # fmt: skip
     groups, targets, receivers = {}, [], []
     for group in sorted(set(table.group) - set(document.groups)):
@@ -223,6 +223,8 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
             "height_m": plant.site.height,
             **({} if plant.site.pressure is None else {"pressure_pa": plant.site.pressure}),
             "temperature_c": plant.site.temperature_c,
+            **({} if plant.site.delta_t is None else {"delta_t_s": plant.site.delta_t}),
+            **({"name": plant.site.name} if plant.site.name else {}),
         },
         "targets": [
             {

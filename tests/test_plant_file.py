@@ -1,0 +1,215 @@
+"""The plant file: what is written is read again, digit for digit."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from data import juelich
+from heliotrope.errors import InputError
+from heliotrope.field.example import prototype
+from heliotrope.field.formats import paint, plant_file
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.sun import Site
+from machines import every_kind, imperfect
+
+ROOT = Path(__file__).parents[1]
+
+
+def _same(a: Plant, b: Plant) -> None:
+    assert (a.name, a.site) == (b.name, b.site)
+    assert list(a.groups) == list(b.groups)
+    for name, mine in a.groups.items():
+        other = b.groups[name]
+        assert mine.names == other.names
+        assert mine.cluster == other.cluster
+        assert (mine.width == other.width).all()
+        m, n = mine.mechanism, other.mechanism
+        assert (m.kind, m.joints, m.driven) == (n.kind, n.joints, n.driven)
+        for key in ("position", "orientation", "axes", "origins", "angles", "vertex", "normal"):
+            assert (getattr(m, key) == getattr(n, key)).all(), key
+        assert (m.drives.table == n.drives.table).all()
+        assert set(mine.parameters) == set(other.parameters)
+        for key, values in mine.parameters.items():
+            assert (values == other.parameters[key]).all()
+        if mine.facets is None:
+            assert other.facets is None
+        else:
+            assert other.facets is not None
+            assert (mine.facets.center == other.facets.center).all()
+            assert (mine.facets.half_width == other.facets.half_width).all()
+    for t, u in zip(a.targets, b.targets, strict=True):
+        assert t.name == u.name
+        assert (t.corners == u.corners).all()
+        assert (t.center == u.center).all()
+        assert {k: v.tolist() for k, v in t.markers.items()} == {
+            k: v.tolist() for k, v in u.markers.items()
+        }
+    for r, s in zip(a.receivers, b.receivers, strict=True):
+        assert (r.name, r.kind, r.width, r.radius) == (s.name, s.kind, s.width, s.radius)
+        assert (r.normal == s.normal).all()
+
+
+@pytest.mark.parametrize("table", ["csv", "parquet"])
+def test_every_kind_survives(table: str, tmp_path: Path) -> None:
+    groups = {}
+    for kind, one in every_kind().items():
+        if kind == "single_axis":
+            continue
+        field = imperfect(_spread(one, 3), seed=1)
+        rng = np.random.default_rng(2)
+        groups[kind] = Heliostats(
+            tuple(f"{kind}-{i}" for i in range(3)), field, np.full(3, 1.7), np.full(3, 1.1),
+            parameters={"tilt_north": rng.normal(0, 1e-3, 3)} if "tilt_north" in field.parameters
+            else {},
+        )  # fmt: skip
+    plant = Plant("mixed", Site(37.1, -2.3, 500.0), groups)
+    plant_file.write_plant(plant, tmp_path / "plant.toml", table)  # type: ignore[arg-type]
+    _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == [f"plant.{table}", "plant.toml"] or table
+
+
+def _spread(one: Mechanism, count: int) -> Mechanism:
+    return one[None][np.zeros(count, dtype=np.intp)]
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-900, 900)] * 3), min_size=1, max_size=5),
+    st.floats(-89, 89), st.floats(-0.2, 0.2), st.floats(-0.05, 0.05),
+)  # fmt: skip
+def test_any_field_survives(tmp_path_factory, places, latitude, tilt, offset) -> None:  # type: ignore[no-untyped-def]
+    folder = tmp_path_factory.mktemp("plant")
+    mechanism = kinds.azimuth_elevation(np.array(places), pivot_offset=offset)
+    mechanism = mechanism.with_parameters({"tilt_east": tilt / 7})
+    names = tuple(f"H{i}" for i in range(len(places)))
+    heliostats = Heliostats(
+        names, mechanism, np.full(len(names), 2.0), np.full(len(names), 1.0),
+        parameters={"canting": np.full(len(names), tilt / 3)},
+    )  # fmt: skip
+    plant = Plant("any", Site(latitude, 10.0, 12.5), {"g": heliostats})
+    plant_file.write_plant(plant, folder / "p.toml")
+    _same(plant, plant_file.read_plant(folder / "p.toml"))
+
+
+def test_prototype_and_juelich_survive(tmp_path: Path) -> None:
+    for plant in (prototype(), paint.read_plant(juelich())):
+        plant_file.write_plant(plant, tmp_path / "plant.toml")
+        _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
+        assert not [f for f in plant_file.check_plant(tmp_path / "plant.toml")
+                    if f.severity == "error"]  # fmt: skip
+
+
+def test_by_hand_is_as_built(tmp_path: Path) -> None:
+    (tmp_path / "plant.toml").write_text(
+        """
+format = "heliotrope-plant"
+version = 1
+heliostats = "field.csv"
+plant = {name = "hand"}
+site = {latitude_deg = 37.1, longitude_deg = -2.3, height_m = 500}
+[groups.jacks]
+kind = "two_jacks"
+mirror_width_m = 3.2
+mirror_height_m = 2.5
+concentrator_translation_m = [0, 0.175, 0]
+[groups.jacks.drives.elevation]
+kind = "linear"
+increment_per_m = 154166.6667
+offset_m = 0.335
+pivot_radius_m = 0.338
+initial_angle_deg = -87.8
+clockwise = 0
+[groups.jacks.drives.azimuth]
+kind = "linear"
+increment_per_m = 154166.6667
+initial_stroke_length_m = 0.0775
+offset_m = 0.34
+pivot_radius_m = 0.319
+initial_angle_rad = 0.94
+max_count = 75000
+""",
+        encoding="utf-8",
+    )
+    (tmp_path / "field.csv").write_text(
+        "name,group,east_m,north_m,up_m,drives.elevation.initial_stroke_length_m\n"
+        "A,jacks,1,2,3,0.0774\nB,jacks,4,5,6,0.0785\n",
+        encoding="utf-8",
+    )
+    plant = plant_file.read_plant(tmp_path / "plant.toml")
+    from heliotrope.mechanism.drives import SLOTS, linear_paint
+
+    table = plant.groups["jacks"].mechanism.drives.table
+    assert table[:, 0, SLOTS["stroke_offset"]].tolist() == [0.0774, 0.0785]
+    wanted = linear_paint(154166.6667, 0.0785, 0.335, 0.338, np.radians(-87.8), clockwise=0)
+    assert (table[1, 0] == wanted.table).all()
+    assert table[0, 1, SLOTS["max_count"]] == 75000
+
+
+def test_warnings_of_check(tmp_path: Path) -> None:
+    near = kinds.azimuth_elevation(np.array([[0.0, -30, 0], [0.5, -30, 0], [0, 40, 0]]))
+    heliostats = Heliostats(("A", "B", "C"), near, np.full(3, 2.0), np.full(3, 2.0))
+    target = prototype().targets
+    plant_file.write_plant(
+        Plant("w", Site(0.0, 0.0, 0.0), {"g": heliostats}, target), tmp_path / "p.toml"
+    )
+    texts = [f.text for f in plant_file.check_plant(tmp_path / "p.toml")]
+    assert any("no receiver" in t for t in texts)
+    assert any("1 pairs of mirrors can touch: the nearest, A and B" in t for t in texts)
+    assert any("1 heliostats stand behind its plane" in t for t in texts)
+
+
+def test_schema_in_the_docs_is_current() -> None:
+    stored = json.loads((ROOT / "docs/reference/plant.schema.json").read_text(encoding="utf-8"))
+    assert stored == plant_file.json_schema()
+
+
+def test_nothing_half_written(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        plant_file.write_plant(prototype(), tmp_path / "nowhere" / "plant.toml")
+    plant_file.write_plant(prototype(), tmp_path / "folder" / "plant.toml")
+    assert sorted(p.name for p in (tmp_path / "folder").iterdir()) == ["plant.csv", "plant.toml"]
+
+
+def test_prototype_is_the_thesis_s() -> None:
+    plant = prototype()
+    assert len(plant) == 18
+    assert len(set(plant.groups["azel"].cluster)) == 6
+    group, row = plant.find("P6A")
+    np.testing.assert_array_equal(group.position[row], [19.2, -30.8, 0.0])
+    assert plant.targets[0].normal == pytest.approx([0.0, -1.0, 0.0])
+
+
+# --- the arrays themselves ----------------------------------------------------------------
+
+ONE = kinds.azimuth_elevation(np.zeros((2, 3)))
+CORNERS = prototype().targets[0].corners
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Heliostats(("A",), ONE, np.ones(1), np.ones(1)), "1 names but mechanisms"),
+        (lambda: Heliostats(("A", "A"), ONE, np.ones(2), np.ones(2)), "the name occurs twice"),
+        (lambda: Heliostats(("A", ""), ONE, np.ones(2), np.ones(2)), "an empty name"),
+        (lambda: Heliostats(("A", "B"), ONE, np.zeros(2), np.ones(2)), "heliostat A: width 0.0"),
+        (lambda: Heliostats(("A", "B"), ONE, np.ones(2), np.ones(2),
+                            parameters={"canting": np.array([0, np.nan])}), "B: parameter canting"),
+        (lambda: Target("t", CORNERS[:3], CORNERS[0]), "must have shapes"),
+        (lambda: Target("t", CORNERS * [1, 0, 0], CORNERS[0]), "span no area"),
+        (lambda: Receiver("r", "flat", CORNERS[0], CORNERS[1], 1.0, 1.0), "kind 'flat'; known"),
+        (lambda: Receiver("r", "planar", CORNERS[0], CORNERS[1], -1.0, 1.0), "width -1.0 m"),
+        (lambda: prototype().heliostat("P9Z"), "there is no heliostat 'P9Z'"),
+        (lambda: prototype().target("tower"), "there is no target 'tower'"),
+    ],
+)  # fmt: skip
+def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InputError, match=text):
+        make()
