@@ -105,7 +105,7 @@ def test_far_zeros_are_found() -> None:
     found = fit(nominal, seen, "guo6", priors=dict.fromkeys(far, 0.05))
     assert (found.outcome == Outcome.CONVERGED).all()
     for name, value in far.items():
-        np.testing.assert_allclose(found.parameters[name], value, rtol=0, atol=0.2 * MRAD)
+        np.testing.assert_allclose(found.parameters[name], value, rtol=0, atol=0.5 * MRAD)
 
 
 def test_far_strokes_of_jacks_are_found() -> None:
