@@ -63,7 +63,9 @@ def _scipy(nominal: Any, seen: Any, sample: int) -> np.ndarray:
             plain = np.einsum("nij,njk,nk->ni", w, axes, pose.normal - b)
             return np.concatenate([plain.ravel(), y])
 
-        found.append(least_squares(residual, np.zeros(len(names)), method="lm").x * sigma)
+        start = np.zeros(len(names))
+        solved = least_squares(residual, start, method="lm", xtol=1e-10, ftol=1e-10)
+        found.append(solved.x * sigma)
     return np.array(found)
 
 
@@ -81,14 +83,17 @@ def run(quick: bool) -> dict[str, Any]:
             {"heliotrope": ours, "SciPy": lambda n=nominal, s=seen: _scipy(n, s, sample)},  # type: ignore[misc]
             1 if quick or size > 1000 else 3,
         )
-        apart = np.abs(ours().values[:sample] - _scipy(nominal, seen, sample)).max()
-        if apart > 1e-6:
-            raise RuntimeError(f"the contenders differ by {apart:.2g}; the times mean nothing")
+        found = ours()
+        gap = np.abs(found.values[:sample] - _scipy(nominal, seen, sample))
+        apart = float((gap / found.sigma[:sample]).max())
+        # In standard deviations; SciPy's differences leave about 1e-4 of one.
+        if apart > 1e-3:
+            raise RuntimeError(f"the contenders differ by {apart:.2g} σ; the times mean nothing")
         each = times["heliotrope"]["best_s"] / size
         theirs = times["SciPy"]["best_s"] / sample
         rows.append(
             {"heliostats": size, "ms_per_heliostat": 1e3 * each, "seconds": each * size,
              "scipy_ms_per_heliostat": 1e3 * theirs, "scipy_ratio": theirs / each,
-             "differs": float(apart)}
+             "differs_sigma": apart}
         )  # fmt: skip
     return {"rows": rows, "sightings": SIGHTINGS, "parameters": len(parameters.MODELS[MODEL])}

@@ -19,7 +19,14 @@ from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
 
 #: What a mechanism may be indexed with.
-Index = int | slice | EllipsisType | None | tuple[int | slice | EllipsisType, ...] | npt.NDArray[np.intp]
+Index = (
+    int
+    | slice
+    | EllipsisType
+    | None
+    | tuple[int | slice | EllipsisType, ...]
+    | npt.NDArray[np.intp]
+)
 
 
 @dataclass(frozen=True)
