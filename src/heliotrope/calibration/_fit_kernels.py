@@ -35,6 +35,8 @@ CAUCHY = 2
 #: Where Huber and Cauchy leave the square, in standard deviations; 95 % efficient
 #: for Gaussian noise in one dimension.
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.385
+#: Degrees of freedom that the sightings' stated sigma is worth when the scale is found.
+PRIOR_FREEDOM = 5.0
 
 
 @njit(**OPTIONS)
@@ -341,9 +343,11 @@ def fit_block(
                 )  # fmt: skip
                 total += steps
                 if turn < rounds:
-                    free = max(1.0, 2.0 * kept - size) / (2.0 * kept)
-                    new = _median_scale(squares, keep, rows) / math.sqrt(free)
-                    scale = max(new, lowest_scale)
+                    # Few sightings fit themselves: the stated sigma counts as some more.
+                    free = max(0.0, 2.0 * kept - size)
+                    new = _median_scale(squares, keep, rows)
+                    total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)
+                    scale = max(lowest_scale, math.sqrt(total_square / (PRIOR_FREEDOM + free)))
         for p in range(size):
             x[i, p] = y[p] * sigma[i, p]
         scales[i], costs[i], iterations[i] = scale, cost, total

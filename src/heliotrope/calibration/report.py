@@ -151,7 +151,7 @@ def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure
 
 def overview(result: Result) -> "Figure":
     """Return the picture of all heliostats: median beam error before, after and held out."""
-    table = result.rows()
+    table = [row for row in result.rows() if row[1].count]
     figure, axes = _figure(1, 1, (max(6.0, 0.32 * len(table) + 2.0), 4.2))
     ax: Axes = axes[0, 0]
     place = np.arange(len(table))
@@ -164,6 +164,7 @@ def overview(result: Result) -> "Figure":
         if np.isfinite(values).any():
             ax.plot(place, values, marker, color=colour, label=label, ms=5)
     ax.set_yscale("log")
+    ax.set_ylim(bottom=max(0.01, 0.7 * ax.get_ylim()[0]))
     ax.set_xticks(place, [row[0] for row in table], rotation=90)
     ax.set_ylabel("median beam error, mrad")
     ax.grid(axis="y", alpha=0.3)

@@ -69,11 +69,13 @@ def _fit(
 
 def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
     """Write the report behind a progress bar."""
+    import sys
+
     from rich.progress import track as bar
 
     from heliotrope.calibration.report import write_report
 
-    steps = iter(bar(range(len(result.names) + 1), "drawing", transient=True, disable=quiet))
+    steps = iter(bar(range(len(result.names) + 1), "drawing", transient=True, disable=quiet or not sys.stderr.isatty()))
 
     def advance(_done: int, _total: int) -> None:
         next(steps, None)
