@@ -1,5 +1,6 @@
 """``heliotrope calibrate``: learn the heliostats' imperfections from measurements."""
 
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -69,13 +70,12 @@ def _fit(
 
 def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
     """Write the report behind a progress bar."""
-    import sys
-
     from rich.progress import track as bar
 
     from heliotrope.calibration.report import write_report
 
-    steps = iter(bar(range(len(result.names) + 1), "drawing", transient=True, disable=quiet or not sys.stderr.isatty()))
+    hidden = quiet or not sys.stdout.isatty()
+    steps = iter(bar(range(len(result.names) + 1), "drawing", transient=True, disable=hidden))
 
     def advance(_done: int, _total: int) -> None:
         next(steps, None)

@@ -130,7 +130,7 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
         )
     print(f"{heliostat} at {document['time'].isoformat()}, sun at "
           f"{document['sun_elevation_deg']:.2f}° of elevation")  # fmt: skip
-    names = " and ".join(document["joints"])
+    names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     print("* the one to take")
 
