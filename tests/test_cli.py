@@ -1,0 +1,179 @@
+"""The command line: what each command prints, on the screen and as JSON."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from data import juelich
+from heliotrope import __version__, sun
+from heliotrope.cli import main
+from heliotrope.field.example import prototype
+from heliotrope.field.formats.plant_file import read_plant, write_plant
+from heliotrope.geometry import azimuth_elevation, reflect
+from paint_server import PLANT, serve
+
+
+def _call(arguments: list[str], capsys: Any, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setattr(sys, "argv", ["heliotrope", *map(str, arguments)])
+    with pytest.raises(SystemExit) as leaving:
+        main()
+    captured = capsys.readouterr()
+    assert leaving.value.code in (0, None), captured.err
+    return str(captured.out)
+
+
+@pytest.fixture
+def call(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run a command and return what it prints."""
+    return lambda *arguments: _call(list(arguments), capsys, monkeypatch)
+
+
+@pytest.fixture
+def plant_file(tmp_path: Path) -> Path:
+    """The example plant as a file."""
+    write_plant(prototype(), tmp_path / "plant.toml")
+    return tmp_path / "plant.toml"
+
+
+def test_help_and_version(call: Any) -> None:
+    text = call("--help")
+    for command in ("sun", "track", "field", "calibrate", "fetch", "demo"):
+        assert command in text
+    assert call("--version").strip() == f"heliotrope {__version__}"
+
+
+def test_sun(call: Any) -> None:
+    arguments = ("sun", "--latitude", "39.742476", "--longitude", "-105.1786", "--height",
+                 "1830.14", "--pressure", "820", "--temperature", "11",
+                 "--time", "2003-10-17T12:30:30-07:00", "--json")  # fmt: skip
+    found = json.loads(call(*arguments))
+    # Reda & Andreas 2004, table A5.1: azimuth 194.34024°, zenith 50.11162°.
+    assert found["azimuth_deg"] == pytest.approx(194.34024, abs=2e-4)
+    assert found["elevation_deg"] == pytest.approx(90 - 50.11162, abs=2e-4)
+    assert found["sunrise"] < found["culmination"] < found["sunset"]
+    table = call("sun", "--time", "2026-09-02T10:00Z", "--every", "1h")
+    assert table.count("2026-09-02T") >= 11
+    assert "sunset" in table
+
+
+def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
+    found = json.loads(
+        call("track", plant_file, "--heliostat", "P6A", "--aim", "0,0,13", "--time",
+             "2026-09-02T10:00:00Z", "--json")
+    )  # fmt: skip
+    assert len(found["branches"]) == 2
+    plant = prototype()
+    mechanism = plant.heliostat("P6A")
+    vector = sun.vector("2026-09-02T10:00:00Z", plant.site)
+    keys = {"azimuth_deg", "elevation_deg", "angles_rad", "counts", "reachable", "residual_mrad",
+            "iterations"}  # fmt: skip
+    for branch in found["branches"]:
+        assert keys <= set(branch)
+        pose = mechanism.pose(branch["counts"])
+        azimuth, elevation = azimuth_elevation(pose.normal)
+        assert branch["azimuth_deg"] == pytest.approx(np.degrees(azimuth), abs=1e-9)
+        assert branch["elevation_deg"] == pytest.approx(np.degrees(elevation), abs=1e-9)
+        if branch["reachable"]:
+            ray = reflect(vector, pose.normal)
+            way = np.array([0.0, 0.0, 13.0]) - pose.vertex
+            assert np.linalg.norm(np.cross(way, ray)) < 1e-8
+            assert branch["residual_mrad"] < 1e-6
+        else:
+            assert branch["residual_mrad"] > 1.0
+    assert found["branches"][found["best"]]["reachable"]
+
+
+def test_track_a_day(call: Any, plant_file: Path) -> None:
+    arguments = ("track", plant_file, "--heliostat", "P1A", "--time", "2026-09-02T10:00Z",
+                 "--every", "30min")  # fmt: skip
+    found = json.loads(call(*arguments, "--json"))
+    assert 20 < len(found["day"]) < 25
+    assert sum(row["reachable"] for row in found["day"]) > 18
+    assert "P1A" in call(*arguments)
+    shown = call("track", plant_file, "--heliostat", "P1A", "--sun", "0.2,0.5,0.8")
+    assert "the one to take" in shown
+
+
+def test_field_check(call: Any, plant_file: Path) -> None:
+    found = json.loads(call("field", "check", plant_file, "--json"))
+    assert found["ok"]
+    assert found["findings"] == []
+    assert "all is well" in call("field", "check", plant_file)
+
+
+def test_track_reads_heliok(call: Any) -> None:
+    scene = Path(__file__).parent / "files" / "heliok-scene.xml"
+    found = json.loads(call("track", scene, "--heliostat", "HeliostatA", "--aim", "0,0,20",
+                            "--sun", "0.6123724,-0.3535534,0.7071068", "--json"))  # fmt: skip
+    angles = np.degrees(found["branches"][0]["angles_rad"])
+    np.testing.assert_allclose(angles, [-36.8761, 40.6415], rtol=0, atol=2e-3)
+
+
+def test_track_reads_paint(call: Any) -> None:
+    arguments = ("--target", "multi_focus_tower", "--time", "2022-06-01T10:00Z", "--json")
+    found = json.loads(call("track", juelich(), "--heliostat", "AA39", *arguments))
+    assert found["branches"][found["best"]]["reachable"]
+
+
+def test_fetch(call: Any, tmp_path: Path) -> None:
+    with httpx.Client(timeout=5.0) as client, serve(client) as database:
+        href = f"{database.base}/{PLANT}-tower-measurements.json"
+        database.put(
+            f"{PLANT}-tower-measurements-item-stac.json",
+            {"assets": {"tower-measurements": {"href": href}}},
+        )
+        database.put(f"{PLANT}-tower-measurements.json", {"tower": 1})
+        arguments = ("fetch", "juelich", "AA39", "--into", tmp_path / "j", "--base-url",
+                     database.base)  # fmt: skip
+        found = json.loads(call(*arguments, "--json"))
+        assert len(found["files"]) == found["new"] == 4
+        assert all(Path(file).is_file() for file in found["files"])
+        assert "4 files in" in call(*arguments)
+        assert json.loads(call(*arguments, "--json"))["new"] == 0
+
+
+def test_calibrate(call: Any, tmp_path: Path) -> None:
+    found = json.loads(call("calibrate", juelich(), "--report", tmp_path / "out", "--json"))
+    assert found["median_of_medians_held_out_mrad_n20"] <= 1.10
+    assert found["heliostats"]["BF57"]["n"] == 145
+    assert len(found["left_out"]) == 549
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "BF41" in page
+    table = (tmp_path / "out" / "parameters.csv").read_text(encoding="utf-8").splitlines()
+    assert table[0].startswith("name,sightings,outcome,noise_scale,tilt_north_rad")
+    assert len(table) == 27
+    for name in ("overview", "BF57"):
+        assert (tmp_path / "out" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_demo(call: Any, tmp_path: Path) -> None:
+    found = json.loads(call("demo", "--into", tmp_path / "d", "--seed", "3", "--json"))
+    assert found["day_before_mrad"] > 5.0
+    assert found["day_after_mrad"] < 0.3
+    plant = read_plant(tmp_path / "d" / "plant.toml")
+    assert np.abs(plant.groups["azel"].parameters["tilt_north"]).max() > 1e-3
+
+
+def test_light_import() -> None:
+    """Help must not wait for the heavy libraries."""
+    code = (
+        "import sys; import heliotrope.cli; "
+        "print([m for m in ('numpy','numba','scipy','pandas','pvlib','matplotlib','pydantic') "
+        "if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_closed_pipe_is_no_error(plant_file: Path) -> None:
+    command = Path(sys.executable).with_name("heliotrope")
+    line = f"{command} track {plant_file} --heliostat P1A --every 30s | head -1"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr
+    assert "P1A" in done.stdout
