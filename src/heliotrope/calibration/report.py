@@ -214,7 +214,7 @@ def _target_plot(ax: "Axes", groups: list[tuple[FloatArray, str, str]], title: s
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem }
 table { border-collapse: collapse } td, th { padding: .15rem .8rem; text-align: right }
-td:first-child, th:first-child, td:last-child { text-align: left }
+td:first-child, th:first-child, td:last-child, th:last-child { text-align: left }
 tr:nth-child(even) { background: #8881 } img { max-width: 100% }
 """
 

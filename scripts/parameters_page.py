@@ -1,0 +1,44 @@
+"""Write docs/reference/parameters.md from the parameter table: ``python scripts/parameters_page.py``."""
+
+from pathlib import Path
+
+from heliotrope.mechanism.parameters import MODELS, table
+
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "parameters.md"
+KINDS = {
+    "Azimuth-elevation": (("tilt_north", "tilt_east", "azimuth", "non_orthogonality", "elevation",
+                           "canting", "canting_secondary"), (False, False)),
+    "Two jacks (Jülich)": (("tilt_up", "tilt_north", "elevation", "non_orthogonality", "azimuth",
+                            "canting", "canting_secondary"), (True, True)),
+}  # fmt: skip
+
+
+def page() -> str:
+    """Return the page's text."""
+    lines = [
+        "# Parameters of a mechanism", "",
+        "Each is a deviation from the nominal mechanism. This page is made from the table in the "
+        "program (`scripts/parameters_page.py`). Drives' parameters take the name of their joint; "
+        "other kinds have the same rows with their joints' names.",
+    ]  # fmt: skip
+    for kind, (joints, linear) in KINDS.items():
+        lines += ["", f"## {kind}", ""]
+        lines += ["| name | unit | cause | positive | prior σ | in the literature |"]
+        lines += ["|---|---|---|---|---|---|"]
+        for row in table(joints, (2, 4), linear).values():
+            prior = f"{1e3 * row.prior:g} mrad" if row.unit == "rad" else (
+                f"{1e3 * row.prior:g} mm" if row.unit == "m" else f"{row.prior:g}"
+            )
+            aliases = ", ".join(row.aliases)
+            lines.append(
+                f"| `{row.name}` | {row.unit} | {row.cause} | {row.positive} | {prior} | {aliases} |"
+            )
+    lines += ["", "## Models", "", "| model | parameters |", "|---|---|"]
+    for name, parameters in MODELS.items():
+        lines.append(f"| `{name}` | {', '.join(f'`{p}`' for p in parameters)} |")
+    lines.append("| `full` | all of a mechanism's but worm and pivot radius |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
