@@ -35,7 +35,7 @@ lint: $(STAMP)  ## check style, types and layers
 	@$(BIN)/lint-imports
 
 docs: $(STAMP)  ## build the documentation into site/
-	@$(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
 	@$(BIN)/python -m benchmarks all

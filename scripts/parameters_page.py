@@ -1,4 +1,4 @@
-"""Write docs/reference/parameters.md from the parameter table: ``python scripts/parameters_page.py``."""
+"""Write docs/reference/parameters.md from the parameter table."""
 
 from pathlib import Path
 
@@ -15,24 +15,24 @@ KINDS = {
 
 def page() -> str:
     """Return the page's text."""
-    lines = [
-        "# Parameters of a mechanism", "",
+    said = (
         "Each is a deviation from the nominal mechanism. This page is made from the table in the "
         "program (`scripts/parameters_page.py`). Drives' parameters take the name of their joint; "
-        "other kinds have the same rows with their joints' names.",
-    ]  # fmt: skip
+        "other kinds have the same rows with their joints' names."
+    )
+    lines = ["# Parameters of a mechanism", "", said]
     for kind, (joints, linear) in KINDS.items():
         lines += ["", f"## {kind}", ""]
         lines += ["| name | unit | cause | positive | prior σ | in the literature |"]
         lines += ["|---|---|---|---|---|---|"]
         for row in table(joints, (2, 4), linear).values():
-            prior = f"{1e3 * row.prior:g} mrad" if row.unit == "rad" else (
-                f"{1e3 * row.prior:g} mm" if row.unit == "m" else f"{row.prior:g}"
+            prior = (
+                f"{1e3 * row.prior:g} mrad"
+                if row.unit == "rad"
+                else (f"{1e3 * row.prior:g} mm" if row.unit == "m" else f"{row.prior:g}")
             )
-            aliases = ", ".join(row.aliases)
-            lines.append(
-                f"| `{row.name}` | {row.unit} | {row.cause} | {row.positive} | {prior} | {aliases} |"
-            )
+            cells = [f"`{row.name}`", row.unit, row.cause, row.positive, prior]
+            lines.append(f"| {' | '.join([*cells, ', '.join(row.aliases)])} |")
     lines += ["", "## Models", "", "| model | parameters |", "|---|---|"]
     for name, parameters in MODELS.items():
         lines.append(f"| `{name}` | {', '.join(f'`{p}`' for p in parameters)} |")
