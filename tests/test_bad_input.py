@@ -182,6 +182,37 @@ def test_the_unspoilt_plant_is_accepted(tmp_path, capsys, monkeypatch) -> None: 
     assert "2 heliostats" in capsys.readouterr().out
 
 
+TWO_AXIS = (
+    TOML.replace("drives.azimuth", "drives.primary")
+    .replace("drives.elevation", "drives.secondary")
+    .replace(
+        '"azimuth_elevation"',
+        '"two_axis"\naxis_1 = [0, 0, 1]\naxis_2 = [1, 0, 0]\nnormal = [0, 1, 0]',
+    )
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("axis_2 = [1, 0, 0]", "axis_2 = [0, 0, 3]", "so they are parallel"),
+        ("axis_2 = [1, 0, 0]", "axis_2 = [0, 0, 0]", "axis_2: a vector of length 0"),
+        ("axis_2 = [1, 0, 0]\n", "", "axis_2 is missing; kind two_axis needs it"),
+        ("normal = [0, 1, 0]", "normal = [2, 0, 0]", "along the secondary axis"),
+        ("normal = [0, 1, 0]", "normal = [0, nan, 0]", "normal.1: nan"),
+    ],
+)
+def test_axes(old, new, says, tmp_path, capsys, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    assert old in TWO_AXIS
+    (tmp_path / "plant.toml").write_text(TWO_AXIS.replace(old, new), encoding="utf-8")
+    (tmp_path / "field.csv").write_text(CSV, encoding="utf-8")
+    plant = str(tmp_path / "plant.toml")
+    assert _run(["track", plant, "--heliostat", "A1"], monkeypatch) == 2
+    captured = capsys.readouterr()
+    _one_line(captured.err)
+    assert says in captured.err
+
+
 # --- files that are none --------------------------------------------------------------
 
 

@@ -63,6 +63,7 @@ def test_gears() -> None:
     assert drive.angles(200 * 16 * 90) == pytest.approx(2 * np.pi, abs=1e-12)
     assert drives.rotary(200, 90, sense=-1).angles(200 * 90 / 4) == pytest.approx(-np.pi / 2)
     assert drives.direct().angles(0.3) == 0.3
+    assert drives.direct(min_angle=np.zeros(3)).shape == (3,)
     assert drives.direct().angles(np.empty(0)).shape == (0,)
 
 

@@ -77,10 +77,12 @@ class Drive:
         InputError
             If a name is not one of them.
         """
-        table = self.table.copy()
-        for name, value in values.items():
+        for name in values:
             if name not in SLOTS:
                 raise InputError(f"drive: there is no {name!r}; known: {', '.join(SLOTS)}")
+        shape = np.broadcast_shapes(self.shape, *(np.shape(v) for v in values.values()))
+        table = np.array(np.broadcast_to(self.table, (*shape, slot.DRIVE_SLOTS)))
+        for name, value in values.items():
             table[..., SLOTS[name]] = value
         return _checked(Drive(table))
 
