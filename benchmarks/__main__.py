@@ -1,42 +1,80 @@
-"""``python -m benchmarks NAME [--json] [--quick]``; NAME may be all."""
+"""``python -m benchmarks NAME [--json] [--quick]``; NAME may be all.
+
+``all`` keeps every result in benchmarks/results, unless it is a quick one.
+"""
 
 import argparse
 import importlib
 import json
 import sys
+import time
 from typing import Any
 
-from benchmarks._run import keep, machine
+from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 
+#: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
 NAMES = ("tracking", "calibration", "sun", "field", "startup")
+#: Columns of a table that goes to a file or a pipe.
+WIDTH = 150
 
 
-def _show(name: str, result: dict[str, Any]) -> None:
+def _measure(name: str, quick: bool) -> dict[str, Any]:
+    where = machine()
+    neighbours, start = Neighbours(), time.perf_counter()
+    result = importlib.import_module(f"benchmarks.{name}").run(quick)
+    return {
+        "name": name,
+        "headline": result.headline,
+        "within_budget": result.within_budget,
+        **result.figures,
+        "quick": quick,
+        "seconds": time.perf_counter() - start,
+        "others_cores": neighbours.cores(),
+        "machine": where,
+        "rows": result.rows,
+    }
+
+
+def _text(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
 
-    m = result["machine"]
-    table = Table(title=f"{name}: {m['cpu']}, {m['cores']} cores", box=SIMPLE_HEAD)
-    rows = result["rows"]
+    table = Table(title=title, box=SIMPLE_HEAD)
     for column in rows[0]:
-        table.add_column(column, justify="left" if isinstance(rows[0][column], str) else "right")
+        left = isinstance(rows[0][column], str)
+        table.add_column(column.replace("_", " "), justify="left" if left else "right")
     for row in rows:
-        table.add_row(
-            *(f"{v:,.4g}" if isinstance(v, float) else f"{v:,}" if isinstance(v, int) else str(v)
-              for v in row.values())
-        )  # fmt: skip
-    console = Console(width=None if sys.stdout.isatty() else 200)
-    console.print(table)
+        table.add_row(*map(_text, row.values()))
+    Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
+
+
+def _show(result: dict[str, Any]) -> None:
+    m = result["machine"]
+    title = f"{result['name']}: {m['cpu']}, {m['cores']} cores, commit {m['commit'] or 'unknown'}"
+    _print_table(title, result["rows"])
     for key, value in result.items():
-        if key not in ("rows", "machine", "name"):
-            print(f"{key}: {value}")
-    if m["load_average"] > 0.5 * m["cores"]:
-        print(f"the machine was busy (load {m['load_average']:.1f}): these times are too long")
+        if key not in {"name", "machine", "rows", "quick"} and value is not None:
+            print(f"{key.replace('_', ' ')}: {_text(value)}")
+    if result["others_cores"] > BUSY * m["cores"]:
+        print(
+            f"the machine was busy: others took {result['others_cores']:.1f} cores meanwhile "
+            f"(load average before: {m['load_average']:.1f}); these times are too long"
+        )
 
 
 def main() -> int:
-    """Run what is asked for."""
+    """Run what is asked for; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", nargs="?", help=f"all, {', '.join(NAMES)}")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -51,16 +89,20 @@ def main() -> int:
         return 2
     results = {}
     for name in NAMES if given.name == "all" else (given.name,):
-        before = machine()
-        result = {"name": name, "machine": before}
-        result |= importlib.import_module(f"benchmarks.{name}").run(given.quick)
-        results[name] = result
+        try:
+            results[name] = _measure(name, given.quick)
+        except BenchmarkError as error:
+            print(f"benchmarks: {name}: {error}", file=sys.stderr)
+            return 1
         if given.name == "all" and not given.quick:
-            keep(name, result)
+            keep(name, results[name])
         if not given.json:
-            _show(name, result)
+            _show(results[name])
     if given.json:
         print(json.dumps(results if given.name == "all" else results[given.name]))
+    elif given.name == "all":
+        kept = ("name", "headline", "within_budget", "others_cores", "seconds")
+        _print_table("all", [{key: result[key] for key in kept} for result in results.values()])
     return 0
 
 

@@ -1,48 +1,122 @@
-"""What the benchmarks share: timing, the machine, and keeping the results."""
+"""What the benchmarks share: timing, memory, the machine, and keeping the results."""
 
 import json
 import os
 import platform
 import statistics
+import subprocess
 import time
+import tracemalloc
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("heliotrope", "numpy", "numba", "scipy", "pvlib", "pandas")
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+PACKAGES = ("heliotrope", "numpy", "numba", "scipy", "pvlib", "pandas", "pyarrow")
+#: Others that take more than this part of the cores make a measurement doubtful.
+BUSY = 0.1
+
+Call = Callable[[], Any]
+Row = dict[str, str | int | float | None]
+
+
+class BenchmarkError(RuntimeError):
+    """A benchmark that cannot be run, or whose contenders do not do the same."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a benchmark found.
+
+    Attributes
+    ----------
+    rows
+        One a size and contender, all with the same keys; the keys name the units.
+    headline
+        The result in one line.
+    figures
+        What holds for all rows.
+    within_budget
+        Whether the budget of the design is kept; None if there is none at these sizes.
+    """
+
+    rows: list[Row]
+    headline: str
+    figures: dict[str, float | int | str] = field(default_factory=dict)
+    within_budget: bool | None = None
+
+
+@dataclass(frozen=True)
+class Times:
+    """Least and median wall time, and least processor time of the process, in seconds."""
+
+    best: float
+    median: float
+    processor: float
+
+
+class Neighbours:
+    """Counts what other programs take of the processors, from now on.
+
+    The load average cannot tell them from the benchmark itself, and lags by a minute.
+    """
+
+    def __init__(self) -> None:
+        self._start = self._now()
+
+    @staticmethod
+    def _now() -> tuple[float, float, float]:
+        with Path("/proc/stat").open(encoding="ascii") as lines:
+            user, nice, system, _, _, irq, softirq, steal = map(int, lines.readline().split()[1:9])
+        busy = (user + nice + system + irq + softirq + steal) / os.sysconf("SC_CLK_TCK")
+        return time.perf_counter(), busy, sum(os.times()[:4])
+
+    def cores(self) -> float:
+        """Return how many cores the others have kept busy since then."""
+        wall, busy, own = (b - a for a, b in zip(self._start, self._now(), strict=True))
+        return max(0.0, busy - own) / wall if wall > 0.0 else 0.0
+
+
+def _revision() -> str | None:
+    """Return the commit of the tree, with a + if files differ from it; None outside git."""
+    git = ("git", "-C", str(ROOT))
+    try:
+        commit = subprocess.run(
+            [*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True
+        ).stdout.strip()
+        # The results are left out: `all` writes them while it runs.
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--", ":/", f":(exclude){RESULTS}"],
+            capture_output=True, text=True, check=True,
+        ).stdout  # fmt: skip
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return commit + ("+" if changed else "")
 
 
 def machine() -> dict[str, Any]:
-    """Return what the figures were measured on."""
-    model = "unknown"
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        for line in cpuinfo.read_text(encoding="utf-8").splitlines():
-            if line.startswith("model name"):
-                model = line.split(":", 1)[1].strip()
-                break
-    pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    """Return what the figures are measured on, and when."""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    models = [line.split(":", 1)[1].strip() for line in cpuinfo if line.startswith("model name")]
     return {
-        "cpu": model,
+        "cpu": models[0] if models else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),
-        "memory_gib": round(pages / 2**30, 1),
+        "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30, 1),
         "system": platform.platform(terse=True),
         "python": platform.python_version(),
-        "load_average": os.getloadavg()[0],
         "versions": {name: version(name) for name in PACKAGES},
+        "commit": _revision(),
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "load_average": os.getloadavg()[0],
     }
 
 
-def best(contenders: dict[str, Callable[[], Any]], repeats: int) -> dict[str, dict[str, float]]:
-    """Time contenders in turn, so that a disturbance meets all of them.
-
-    Returns for each the least and the median wall time and the least processor time of
-    the process, in seconds.
-    """
+def timed(contenders: dict[str, Call], repeats: int) -> dict[str, Times]:
+    """Time contenders in turn, so that a disturbance meets all of them, after a round to warm up."""
     walls: dict[str, list[float]] = {name: [] for name in contenders}
     works: dict[str, list[float]] = {name: [] for name in contenders}
     for call in contenders.values():
@@ -54,13 +128,36 @@ def best(contenders: dict[str, Callable[[], Any]], repeats: int) -> dict[str, di
             walls[name].append(time.perf_counter() - wall)
             works[name].append(time.process_time() - work)
     return {
-        name: {
-            "best_s": min(walls[name]),
-            "median_s": statistics.median(walls[name]),
-            "processor_s": min(works[name]),
-        }
+        name: Times(min(walls[name]), statistics.median(walls[name]), min(works[name]))
         for name in contenders
     }
+
+
+def peak_bytes(call: Call) -> int:
+    """Return how much more memory Python and NumPy hold at the worst moment of a call."""
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        call()
+        return tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+
+
+def agree(what: str, apart: float, limit: float, unit: str) -> float:
+    """Return how far the contenders are apart.
+
+    Raises
+    ------
+    BenchmarkError
+        If that is not within the limit.
+    """
+    if not apart <= limit:
+        raise BenchmarkError(
+            f"{what}: the contenders differ by {apart:.2g} {unit}, limit {limit:g}; "
+            "they do not compute the same, so their times mean nothing"
+        )
+    return apart
 
 
 def keep(name: str, result: dict[str, Any]) -> Path:

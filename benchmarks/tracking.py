@@ -1,33 +1,55 @@
 """Tracking of 1 to 1,000,000 heliostats beside NumPy and SciPy's Rotation.
 
-The contenders run the same method to the same limit (the beam within 1e-9 m of its aim):
-the closed-form pair of angles inside a fixed point on the vertex. They are compared
-before they are timed.
+All run the same method to the same limit: the closed-form pair of angles inside a fixed
+point on the vertex, until the beam is within 1e-9 m of its aim. Heliotrope gives drive
+counts within the stops, pose, residual and status as well; its peers give angles alone.
 """
 
 import math
 import os
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from benchmarks._run import best
+from benchmarks._array_tracking import by_formula, by_rotation, track_arrays
+from benchmarks._run import Call, Result, Row, Times, agree, peak_bytes, timed
 from heliotrope.mechanism import kinds
-from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.tracking import track
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import Branch, track
 
 SUN = np.array([0.3, -0.6, 0.7]) / np.linalg.norm([0.3, -0.6, 0.7])
 AIM = np.array([0.0, 0.0, 120.0])
-BUDGET_NS = 250.0
-Turn = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+TOLERANCE = 1e-9
+#: On two threads, at 100,000 heliostats.
+BUDGET_NS, BUDGET_SIZE = 250.0, 100_000
+REPEATS = {1: 200, 1000: 100, 100_000: 25, 1_000_000: 5}
+AZEL, ARBITRARY = "azimuth-elevation", "arbitrary axes"
 
 
-def field(rows: int, arbitrary: bool = False) -> Any:
-    """Imperfect mechanisms 50 to 900 m from the tower."""
+@dataclass(frozen=True)
+class Contender:
+    """One way of tracking a field."""
+
+    name: str
+    branches: int
+    threads: int
+    iterations: int
+    call: Call
+
+    @property
+    def key(self) -> str:
+        """Name it among the others."""
+        return f"{self.name}/{self.branches}/{self.threads}"
+
+
+def field(rows: int, arbitrary: bool = False) -> Mechanism:
+    """Return imperfect mechanisms 100 to 900 m from the tower, in the half circle to the north."""
     rng = np.random.default_rng(0)
-    place = np.c_[rng.uniform(-600, 600, rows), rng.uniform(50, 900, rows), np.zeros(rows)]
+    distance = np.sqrt(rng.uniform(100.0**2, 900.0**2, rows))
+    bearing = rng.uniform(-0.5 * np.pi, 0.5 * np.pi, rows)
+    place = np.c_[distance * np.sin(bearing), distance * np.cos(bearing), np.zeros(rows)]
     if arbitrary:
         skew = rng.normal(0, 0.1, (rows, 3))
         return kinds.two_axis(
@@ -39,62 +61,8 @@ def field(rows: int, arbitrary: bool = False) -> Any:
     return perfect.with_parameters({n: rng.normal(0, s, rows) for n, s in sizes.items()})
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("...i,...i->...", a, b)
-
-
-def _rodrigues(axis: np.ndarray, angle: np.ndarray, u: np.ndarray) -> np.ndarray:
-    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
-    along = _dot(axis, u)[:, None]
-    return cosine * u + sine * np.cross(axis, u) + (1.0 - cosine) * along * axis
-
-
-def _rotation(axis: np.ndarray, angle: np.ndarray, u: np.ndarray) -> np.ndarray:
-    turned: np.ndarray = Rotation.from_rotvec(axis * angle[:, None]).apply(u)
-    return turned
-
-
-def by_arrays(g: Armature, turn: Turn, limit: int = 50) -> np.ndarray:
-    """Angles (N, 2) of branch 0, all heliostats in step until the last one is there."""
-    a, b, n = g.axis_1, g.axis_2, g.normal
-    arm, between = g.vertex - g.origin_2, g.origin_2 - g.origin_1
-    cross = np.cross(a, b)
-    size, ab, nb = _dot(cross, cross), _dot(a, b), _dot(n, b)
-    vertex = g.vertex
-    theta = np.zeros((len(vertex), 2))
-    for _ in range(limit):
-        way = AIM - vertex
-        way = way / np.linalg.norm(way, axis=1)[:, None]
-        v = SUN + way
-        v = v / np.linalg.norm(v, axis=1)[:, None]
-        va = _dot(v, a)
-        alpha, beta = (va - ab * nb) / size, (nb - ab * va) / size
-        rest = 1.0 - alpha**2 - beta**2 - 2.0 * alpha * beta * ab
-        gamma = -np.sqrt(np.maximum(rest, 0.0) / size)
-        z = alpha[:, None] * a + beta[:, None] * b + gamma[:, None] * cross
-        theta[:, 1] = np.arctan2(_dot(b, np.cross(n, z)), _dot(n, z) - nb * nb)
-        theta[:, 0] = np.arctan2(_dot(a, np.cross(z, v)), _dot(z, v) - va * va)
-        old = vertex
-        vertex = g.origin_1 + turn(a, theta[:, 0], between + turn(b, theta[:, 1], arm))
-        if np.linalg.norm(np.cross(vertex - old, way), axis=1).max() <= 1e-9:
-            break
-    return theta
-
-
-def _agree(mechanism: Any) -> float:
-    ours = track(mechanism, SUN, AIM, branch=0).angles[:, 0]
-    apart = 0.0
-    for turn in (_rodrigues, _rotation):
-        theirs = by_arrays(mechanism.armature, turn)
-        gap = np.abs(np.remainder(ours - theirs + np.pi, 2 * np.pi) - np.pi).max()
-        apart = max(apart, float(gap))
-    if apart > 1e-9:
-        raise RuntimeError(f"the contenders differ by {apart:.2g} rad; the times mean nothing")
-    return apart
-
-
-def _with_threads(count: int, call: Callable[[], Any]) -> Callable[[], Any]:
-    def run() -> Any:
+def _on_threads(count: int, call: Call) -> Call:
+    def run() -> object:
         before = os.environ.get("HELIOTROPE_THREADS")
         os.environ["HELIOTROPE_THREADS"] = str(count)
         try:
@@ -108,60 +76,91 @@ def _with_threads(count: int, call: Callable[[], Any]) -> Callable[[], Any]:
     return run
 
 
-def run(quick: bool) -> dict[str, Any]:
-    """Return the figures."""
-    sizes = (1, 1000) if quick else (1, 1000, 100_000, 1_000_000)
-    cores = len(os.sched_getaffinity(0))
-    rows = []
-    for size in sizes:
-        mechanism = field(size)
-        mechanism.armature  # noqa: B018 - reduced once, as a plant does
-        apart = _agree(mechanism) if size <= 100_000 else None
+def _contenders(mechanism: Mechanism) -> tuple[list[Contender], float]:
+    """Return the contenders, and by how much their angles differ, rad."""
+    table = mechanism.armature.table
+    found = []
+    one: Branch = 0
+    both: Branch = "both"
+    for branch, branches in ((one, 1), (both, 2)):
+        steps = int(track(mechanism, SUN, AIM, branch=branch).iterations.max())
 
-        def one(m: Any = mechanism) -> Any:
-            return track(m, SUN, AIM, branch=0)
+        def ours(b: Branch = branch) -> object:
+            return track(mechanism, SUN, AIM, branch=b, tolerance=TOLERANCE)
 
-        def both(m: Any = mechanism) -> Any:
-            return track(m, SUN, AIM)
+        found += [
+            Contender("Heliotrope", branches, n, steps, _on_threads(n, ours)) for n in (2, 1)
+        ]
+    angles = track(mechanism, SUN, AIM, branch=0, tolerance=TOLERANCE).angles[:, 0]
+    apart = 0.0
+    for name, turn in (("NumPy", by_formula), ("SciPy Rotation", by_rotation)):
+        theirs, steps = track_arrays(table, SUN, AIM, turn, TOLERANCE)
+        gap = np.remainder(angles - theirs + np.pi, 2.0 * np.pi) - np.pi
+        apart = max(apart, agree(f"{name}, angles", float(np.abs(gap).max()), 1e-9, "rad"))
 
-        contenders: dict[str, Callable[[], Any]] = {
-            "heliotrope, one branch": _with_threads(cores, one),
-            "heliotrope, one branch, 1 thread": _with_threads(1, one),
-            "heliotrope, both branches": _with_threads(cores, both),
-            "NumPy": lambda m=mechanism: by_arrays(m.armature, _rodrigues),  # type: ignore[misc]
-            "SciPy Rotation": lambda m=mechanism: by_arrays(m.armature, _rotation),  # type: ignore[misc]
+        def peer(t: object = turn) -> object:
+            return track_arrays(table, SUN, AIM, t, TOLERANCE)  # type: ignore[arg-type]
+
+        found.append(Contender(name, 1, 1, steps, peer))
+    return found, apart
+
+
+def _rows(kind: str, size: int) -> Iterable[tuple[Row, Times]]:
+    contenders, apart = _contenders(field(size, kind == ARBITRARY))
+    times = timed({c.key: c.call for c in contenders}, REPEATS[size])
+    reference = times[contenders[0].key].best
+    for c in contenders:
+        time = times[c.key]
+        row: Row = {
+            "mechanism": kind,
+            "heliostats": size,
+            "contender": c.name,
+            "branches": c.branches,
+            "threads": c.threads,
+            "iterations": c.iterations,
+            "best_ns_per_heliostat": 1e9 * time.best / size,
+            "median_ns_per_heliostat": 1e9 * time.median / size,
+            "processor_ns_per_heliostat": 1e9 * time.processor / size,
+            "ratio_to_first": time.best / reference,
+            "peak_bytes_per_heliostat": peak_bytes(c.call) / size,
+            "growth_exponent": None,
+            "apart_rad": apart,
         }
-        times = best(contenders, 3 if quick else {1_000_000: 3, 100_000: 9}.get(size, 50))
-        reference = times["heliotrope, one branch"]["best_s"]
-        for name, time in times.items():
-            rows.append(
-                {
-                    "heliostats": size,
-                    "contender": name,
-                    "ns_per_heliostat": 1e9 * time["best_s"] / size,
-                    "median_ns_per_heliostat": 1e9 * time["median_s"] / size,
-                    "processor_ns_per_heliostat": 1e9 * time["processor_s"] / size,
-                    "ratio_to_heliotrope": time["best_s"] / reference,
-                    "differs_rad": apart,
-                }
-            )
-    ours = [r for r in rows if r["contender"] == "heliotrope, one branch"]
-    large = [r for r in ours if r["heliostats"] >= 1000]
-    growth = None
-    if len(large) > 1:
-        first, last = large[0], large[-1]
-        growth = 1.0 + math.log(last["ns_per_heliostat"] / first["ns_per_heliostat"]) / math.log(
-            last["heliostats"] / first["heliostats"]
-        )
-    skewed = field(sizes[-2], arbitrary=True)
-    skewed.armature  # noqa: B018
-    time = best({"arbitrary": lambda: track(skewed, SUN, AIM, branch=0)}, 5)["arbitrary"]
-    found = {r["heliostats"]: r["ns_per_heliostat"] for r in ours}
-    return {
-        "rows": rows,
-        "arbitrary_axes_ns_per_heliostat": 1e9 * time["best_s"] / sizes[-2],
-        "exponent_of_growth": growth,
-        "tolerance_m": 1e-9,
-        "budget_ns_at_100000": BUDGET_NS,
-        "within_budget": None if quick else bool(found[100_000] <= BUDGET_NS),
-    }
+        yield row, time
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    sizes = (1, 1000) if quick else tuple(REPEATS)
+    rows: list[Row] = []
+    found: dict[tuple[str, int], list[Times]] = {}
+    for kind in (AZEL, ARBITRARY):
+        for size in sizes:
+            pairs = list(_rows(kind, size))
+            found[kind, size] = [time for _, time in pairs]
+            rows += [row for row, _ in pairs]
+    per_size = len(found[AZEL, 1])
+    for k, row in enumerate(rows):
+        # The rows of one size follow those of the size before, in the same order.
+        if row["heliostats"] != sizes[0]:
+            place = sizes.index(int(row["heliostats"] or 0))
+            small, large = sizes[place - 1], sizes[place]
+            times = [found[str(row["mechanism"]), s][k % per_size].best for s in (small, large)]
+            row["growth_exponent"] = math.log(times[1] / times[0]) / math.log(large / small)
+    shown = sizes[-1] if quick else BUDGET_SIZE
+    two, one, _, _, array, rotation = (t.best for t in found[AZEL, shown])
+    headline = (
+        f"{shown:,} heliostats: {1e9 * two / shown:.0f} ns each on two threads, "
+        f"{1e9 * one / shown:.0f} on one; NumPy on one {array / one:.1f} × that, "
+        f"SciPy's Rotation {rotation / one:.1f} ×"
+    )
+    within = None
+    if not quick:
+        worst = max(found[kind, BUDGET_SIZE][0].median for kind in (AZEL, ARBITRARY))
+        within = 1e9 * worst / BUDGET_SIZE <= BUDGET_NS
+    return Result(
+        rows,
+        headline,
+        {"tolerance_m": TOLERANCE, "budget_ns_per_heliostat": BUDGET_NS},
+        within,
+    )
