@@ -15,7 +15,7 @@ from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 #: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
 NAMES = ("tracking", "calibration", "sun", "field", "startup")
 #: Columns of a table that goes to a file or a pipe.
-WIDTH = 150
+WIDTH = 160
 
 
 def _measure(name: str, quick: bool) -> dict[str, Any]:
@@ -52,8 +52,11 @@ def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
 
     table = Table(title=title, box=SIMPLE_HEAD)
     for column in rows[0]:
-        left = isinstance(rows[0][column], str)
-        table.add_column(column.replace("_", " "), justify="left" if left else "right")
+        words, left = column.split("_"), isinstance(rows[0][column], str)
+        table.add_column(
+            " ".join(words), justify="left" if left else "right", no_wrap=left,
+            min_width=max(map(len, words)),
+        )  # fmt: skip
     for row in rows:
         table.add_row(*map(_text, row.values()))
     Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
@@ -99,10 +102,10 @@ def main() -> int:
         if not given.json:
             _show(results[name])
     if given.json:
-        print(json.dumps(results if given.name == "all" else results[given.name]))
+        print(json.dumps(results if given.name == "all" else results[given.name], allow_nan=False))
     elif given.name == "all":
         kept = ("name", "headline", "within_budget", "others_cores", "seconds")
-        _print_table("all", [{key: result[key] for key in kept} for result in results.values()])
+        _print_table("summary", [{key: result[key] for key in kept} for result in results.values()])
     return 0
 
 

@@ -11,12 +11,15 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks._run import BenchmarkError
+
 Array = np.ndarray
 #: Turn u (3, N) about unit axes (3, N) by angles of sine and cosine (N,).
 Turn = Callable[[Array, Array, Array, Array], Array]
 
 #: Rows of a block: the fastest of 2,000 to 64,000 for both peers.
 BLOCK = 16_000
+LIMIT = 50
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -48,7 +51,7 @@ def _block(g: Array, sun: Array, aim: Array, turn: Turn, tolerance: float) -> tu
     arm, between = vertex - origin_2, origin_2 - origin
     c = _cross(a, b)
     inverse, ab, nb = 1.0 / _dot(c, c), _dot(a, b), _dot(n, b)
-    for step in range(1, 51):
+    for step in range(1, LIMIT + 1):
         way = aim - vertex
         way /= np.sqrt(_dot(way, way))
         v = sun + way
@@ -67,8 +70,9 @@ def _block(g: Array, sun: Array, aim: Array, turn: Turn, tolerance: float) -> tu
         vertex = origin + turn(a, sine_1 * size_1, cosine_1 * size_1, inner)
         miss = _cross(vertex - old, way)
         if _dot(miss, miss).max() <= tolerance * tolerance:
-            break
-    return np.stack([np.arctan2(sine_1, cosine_1), np.arctan2(sine_2, cosine_2)], axis=-1), step
+            angles = np.arctan2(sine_1, cosine_1), np.arctan2(sine_2, cosine_2)
+            return np.stack(angles, axis=-1), step
+    raise BenchmarkError(f"arrays: a miss of {tolerance:g} m is not reached in {LIMIT} iterations")
 
 
 def track_arrays(
@@ -90,6 +94,11 @@ def track_arrays(
     Returns
     -------
     Joint angles of branch 0, (N, 2), and the largest number of iterations.
+
+    Raises
+    ------
+    BenchmarkError
+        If a row does not get there.
     """
     angles, most = np.empty((len(table), 2)), 0
     for first in range(0, len(table), BLOCK):

@@ -116,7 +116,7 @@ def machine() -> dict[str, Any]:
 
 
 def timed(contenders: dict[str, Call], repeats: int) -> dict[str, Times]:
-    """Time contenders in turn, so that a disturbance meets all of them, after a round to warm up."""
+    """Time contenders in turn, after a round to warm up: a disturbance meets all of them."""
     walls: dict[str, list[float]] = {name: [] for name in contenders}
     works: dict[str, list[float]] = {name: [] for name in contenders}
     for call in contenders.values():
@@ -165,6 +165,6 @@ def keep(name: str, result: dict[str, Any]) -> Path:
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     part.replace(path)
     return path

@@ -1,14 +1,36 @@
 """The benchmarks run and say on what; how long they take is nobody's business here."""
 
+import functools
+import importlib
 import json
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
-NAMES = ("tracking", "calibration", "sun", "field", "startup")
+TIMES = {"best_ms", "median_ms"}
+COLUMNS = {
+    "tracking": {
+        "mechanism", "heliostats", "contender", "branches", "threads", "iterations",
+        "best_ns_per_heliostat", "median_ns_per_heliostat", "processor_ns_per_heliostat",
+        "ratio_to_first", "growth_exponent", "peak_bytes_per_heliostat", "apart_rad",
+    },
+    "calibration": {"heliostats", "ms_per_heliostat", "scipy_ratio", "differs_sigma"},
+    "sun": {"times", "contender", "processor_ms", "ratio_to_first", "apart_rad"} | TIMES,
+    "field": {"heliostats", "table", "work", "ratio_to_pandas"} | TIMES,
+    "startup": {"command", "best_s", "median_s", "ratio_to_first"},
+}  # fmt: skip
+RESULT = {
+    "name", "headline", "within_budget", "quick", "seconds", "others_cores", "machine", "rows",
+}  # fmt: skip
+MACHINE = {
+    "cpu", "cores", "memory_gib", "system", "python", "versions", "commit", "date", "load_average",
+}  # fmt: skip
 
 
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -18,20 +40,158 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_quick_run_gives_json(name: str) -> None:
+def _module(monkeypatch: pytest.MonkeyPatch, name: str) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT))
+    return importlib.import_module(f"benchmarks.{name}")
+
+
+@functools.cache
+def _quick(name: str) -> Any:
     done = _run(name, "--json", "--quick")
     assert done.returncode == 0, done.stderr
-    result = json.loads(done.stdout)
+    return json.loads(done.stdout, parse_constant=_no_number)
+
+
+def _no_number(text: str) -> float:
+    raise AssertionError(f"{text} is no JSON")
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_quick_run_gives_json(name: str) -> None:
+    result = _quick(name)
+    assert set(result) >= RESULT
     assert result["name"] == name
+    assert result["quick"] is True
+    assert set(result["machine"]) == MACHINE
+    assert {"heliotrope", "numpy", "numba", "scipy"} <= set(result["machine"]["versions"])
     assert result["rows"]
-    assert {"cpu", "cores", "versions", "load_average", "date"} <= set(result["machine"])
-    assert result["machine"]["versions"]["numpy"]
+    for row in result["rows"]:
+        assert set(row) >= COLUMNS[name]
+
+
+def test_tracking_covers_what_is_claimed() -> None:
+    rows = _quick("tracking")["rows"]
+    seen = {(r["contender"], r["branches"], r["threads"]) for r in rows}
+    ours = {("Heliotrope", b, t) for b in (1, 2) for t in (1, 2)}
+    assert seen == ours | {("NumPy", 1, 1), ("SciPy Rotation", 1, 1)}
+    assert {r["mechanism"] for r in rows} == {"azimuth-elevation", "arbitrary axes"}
+    for row in rows:
+        assert row["apart_rad"] <= 1e-9
+        assert (row["growth_exponent"] is None) == (row["heliostats"] == 1)
+
+
+def test_table_names_machine_and_headline() -> None:
+    done = _run("startup", "--quick")
+    assert done.returncode == 0, done.stderr
+    assert "heliotrope --help" in done.stdout
+    assert "headline: " in done.stdout
+    assert "cores" in done.stdout.splitlines()[0]
 
 
 def test_names_and_unknown_name() -> None:
-    assert _run().stdout.split() == list(NAMES)
+    assert set(_run().stdout.split()) == set(COLUMNS)
     done = _run("flying")
     assert done.returncode == 2
+    assert done.stdout == ""
     assert done.stderr.count("\n") == 1
-    assert "there is no 'flying'" in done.stderr
+    assert "there is no 'flying'; known: all, tracking" in done.stderr
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_all_keeps_and_sums_up(
+    as_json: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    main, shared = _module(monkeypatch, "__main__"), _module(monkeypatch, "_run")
+
+    def stand_in(name: str) -> Any:
+        result = shared.Result([{"work": "nothing", "best_s": 1.5}], f"what {name} found")
+        return type("Benchmark", (), {"run": staticmethod(lambda _: result)})
+
+    monkeypatch.setattr(main.importlib, "import_module", stand_in)
+    monkeypatch.setattr(shared, "RESULTS", tmp_path / "results")
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "all", *(["--json"] if as_json else [])])
+    assert main.main() == 0
+    out = capsys.readouterr().out
+    kept = {p.name: json.loads(p.read_text()) for p in (tmp_path / "results").iterdir()}
+    assert set(kept) == {f"{name}.json" for name in COLUMNS}
+    if as_json:
+        assert json.loads(out) == {Path(name).stem: result for name, result in kept.items()}
+    else:
+        summary = out[out.rindex("summary") :]
+        assert all(f"what benchmarks.{name} found" in summary for name in COLUMNS)
+
+
+def test_a_failed_benchmark_says_why_in_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    main = _module(monkeypatch, "__main__")
+    startup = _module(monkeypatch, "startup")
+    monkeypatch.setattr(startup.sys, "executable", str(tmp_path / "python"))
+    monkeypatch.setattr(sys, "argv", ["benchmarks", "startup"])
+    assert main.main() == 1
+    assert capsys.readouterr().err == (
+        "benchmarks: startup: no command 'heliotrope' beside this Python; run `make setup`\n"
+    )
+
+
+def test_contenders_must_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = _module(monkeypatch, "_run")
+    assert shared.agree("angles", 1e-10, 1e-9, "rad") == 1e-10
+    with pytest.raises(shared.BenchmarkError, match=r"angles: .* differ by 2e-09 rad, limit 1e-09"):
+        shared.agree("angles", 2e-9, 1e-9, "rad")
+    with pytest.raises(shared.BenchmarkError, match="differ by nan"):
+        shared.agree("angles", float("nan"), 1e-9, "rad")
+
+
+def test_plant_file_must_come_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    field, shared = _module(monkeypatch, "field"), _module(monkeypatch, "_run")
+    plant, other = field._plant(3), field._plant(4)
+    monkeypatch.setattr(field, "read_plant", lambda _: other)
+    with pytest.raises(shared.BenchmarkError, match="csv: what is read is not what was written"):
+        field._contenders(plant, "csv", tmp_path)
+
+
+def test_arrays_must_converge(monkeypatch: pytest.MonkeyPatch) -> None:
+    arrays, shared = _module(monkeypatch, "_array_tracking"), _module(monkeypatch, "_run")
+    tracking = _module(monkeypatch, "tracking")
+    table = tracking.field(5).armature.table
+    angles, steps = arrays.track_arrays(table, tracking.SUN, tracking.AIM, arrays.by_formula, 1e-9)
+    assert np.isfinite(angles).all()
+    monkeypatch.setattr(arrays, "LIMIT", steps - 1)
+    with pytest.raises(shared.BenchmarkError, match=r"1e-09 m is not reached in \d iterations"):
+        arrays.track_arrays(table, tracking.SUN, tracking.AIM, arrays.by_formula, 1e-9)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
+def test_growth_is_the_exponent_of_time(exponent: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    tracking = _module(monkeypatch, "tracking")
+    small, large = (
+        {"heliostats": n, "best_ns_per_heliostat": 7.0 * n**exponent / n} for n in (1000, 100_000)
+    )
+    tracking._add_growth([small], [large])
+    assert large["growth_exponent"] == pytest.approx(exponent, abs=1e-12)
+
+
+def test_field_stands_where_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    place = _module(monkeypatch, "tracking").field(2000).position
+    distance = np.hypot(place[:, 0], place[:, 1])
+    assert distance.min() >= 100.0
+    assert distance.max() <= 900.0
+    assert (place[:, 1] >= 0.0).all()
+
+
+def test_peak_memory_is_seen_and_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    shared = _module(monkeypatch, "_run")
+    assert 8e6 <= shared.peak_bytes(lambda: np.zeros(1_000_000)) < 9e6
+
+
+def test_timing_takes_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[str] = []
+    times = _module(monkeypatch, "_run").timed(
+        {"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, 2
+    )
+    assert calls == ["a", "b"] * 3
+    assert all(0.0 <= t.best <= t.median for t in times.values())
