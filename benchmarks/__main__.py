@@ -15,7 +15,7 @@ from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 #: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
 NAMES = ("tracking", "calibration", "sun", "field", "startup")
 #: Columns of a table that goes to a file or a pipe.
-WIDTH = 160
+WIDTH = 180
 
 
 def _measure(name: str, quick: bool) -> dict[str, Any]:
