@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
@@ -33,6 +33,7 @@ def _miss(sun, aim, normal, vertex) -> np.ndarray:  # type: ignore[no-untyped-de
 
 
 @given(UNIT, UNIT, UNIT, UNIT, UNIT, st.floats(0, 0.5), st.floats(5, 1000))
+@example(*map(np.array, ((0, 1.0, 0), (0, 0, 1.0), (1.0, 0, 1), (0, 1.0, 0), (0, 1.0, 0))), 0.5, 10)
 def test_the_beam_reaches_its_aim(a, b, n, s, p, arm, distance) -> None:  # type: ignore[no-untyped-def]
     a, b, n, s, p = (normalize(v) for v in (a, b, n, s, p))
     if np.linalg.norm(np.cross(a, b)) < 0.05 or np.linalg.norm(np.cross(n, b)) < 0.05:
@@ -55,7 +56,7 @@ def test_the_beam_reaches_its_aim(a, b, n, s, p, arm, distance) -> None:  # type
             way = normalize(aim - found.vertex[branch])
             rest = angle_between(found.normal[branch], bisector(s, way))
             assert rest == pytest.approx(found.residual[branch], abs=1e-9)
-            assert rest > 1e-9
+            assert 2.0 * rest * distance > 1e-9  # a beam that strikes is not called unreachable
         else:
             assert status == Status.DEGENERATE or distance < 10
 

@@ -40,6 +40,8 @@ DEGENERATE = 4  # source opposite to aim, aim in the vertex, or a value not fini
 SLOW = 0.3
 #: Iterations of Newton, and trials of the damping in each.
 NEWTON_LIMIT, DAMPING_LIMIT = 60, 30
+#: Steps of Gauss-Newton before the curvature of the gap itself is looked at.
+PATIENCE = 8
 #: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
 DEGENERATE_LIMIT = 1e-9
 
@@ -230,6 +232,37 @@ def _difference_column(g, t, n, m, v, way, distance, k):
 
 
 @njit(**OPTIONS)
+def _gradient(g, s, p, one, two):
+    """Half the gradient of |n − v|² by the two joint angles."""
+    t = (math.sin(one), math.cos(one), math.sin(two), math.cos(two))
+    m = place_vertex(g, t)
+    v, way, distance = wanted_normal(g, s, p, m)
+    if distance == 0.0:
+        return np.nan, np.nan
+    n = mirror_normal(g, t)
+    gap = minus(n, v)
+    first = _difference_column(g, t, n, m, v, way, distance, 0)
+    second = _difference_column(g, t, n, m, v, way, distance, 1)
+    return dot(first, gap), dot(second, gap)
+
+
+@njit(**OPTIONS)
+def _curvature(g, s, p, one, two):
+    """Half the second derivatives of |n − v|², by differences of its gradient.
+
+    Where the gap cannot close, its own curvature counts as much as the squared first
+    derivatives, and Gauss-Newton creeps.
+    """
+    h = 1e-5
+    up_0, up_1 = _gradient(g, s, p, one + h, two)
+    down_0, down_1 = _gradient(g, s, p, one - h, two)
+    right_0, right_1 = _gradient(g, s, p, one, two + h)
+    left_0, left_1 = _gradient(g, s, p, one, two - h)
+    mixed = 0.25 * (up_1 - down_1 + right_0 - left_0) / h
+    return 0.5 * (up_0 - down_0) / h, mixed, 0.5 * (right_1 - left_1) / h
+
+
+@njit(**OPTIONS)
 def _newton(g, s, p, t, tolerance):
     """Levenberg-damped Newton on |n − v|² from turn t; returns (status, iterations, t)."""
     theta_1, theta_2 = math.atan2(t[0], t[1]), math.atan2(t[2], t[3])
@@ -246,6 +279,13 @@ def _newton(g, s, p, t, tolerance):
         second = _difference_column(g, t, n, m, v, way, distance, 1)
         h00, h01, h11 = dot(first, first), dot(first, second), dot(second, second)
         e0, e1 = dot(first, gap), dot(second, gap)
+        if iteration >= PATIENCE:
+            c00, c01, c11 = _curvature(g, s, p, theta_1, theta_2)
+            if math.isfinite(c00 + c01 + c11):
+                # On a saddle the lowest curvature is turned up: downhill on both axes.
+                lowest = 0.5 * (c00 + c11) - math.hypot(0.5 * (c00 - c11), c01)
+                lift = max(0.0, -2.0 * lowest)
+                h00, h01, h11 = c00 + lift, c01, c11 + lift
         improved = False
         for _ in range(DAMPING_LIMIT):
             d00, d11 = h00 + damping * (h00 + h11), h11 + damping * (h00 + h11)
@@ -272,7 +312,8 @@ def _newton(g, s, p, t, tolerance):
         v, way, distance, gap = v_new, way_new, distance_new, gap_new
         damping *= 0.1
         if settled:
-            return UNREACHABLE, iteration + 1, t
+            reached = beam_miss(s, way, distance, n) <= tolerance
+            return (OK if reached else UNREACHABLE), iteration + 1, t
     if beam_miss(s, way, distance, n) <= tolerance:
         return OK, NEWTON_LIMIT, t
     return NOT_CONVERGED, NEWTON_LIMIT, t
@@ -306,6 +347,10 @@ def solve_aim(g, s, p, m, sign, tolerance, limit, newton):
         if square <= tolerance * tolerance:
             # A miss turns the way by miss / distance and the bisector by that over |s + t|.
             residual = math.sqrt(square) / (distance * 2.0 * dot(v, way))
+            if not reached:
+                # On the very edge rounding alone may say so: the beam decides.
+                v, way, distance = wanted_normal(g, s, p, m)
+                reached = beam_miss(s, way, distance, mirror_normal(g, t)) <= tolerance
             return (OK if reached else UNREACHABLE), iteration, t, m, v, residual
         if newton and iteration >= 2 and not square < SLOW * SLOW * before:
             status, more, t = _newton(g, s, p, t, tolerance)
