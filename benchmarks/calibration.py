@@ -93,7 +93,8 @@ def run(quick: bool) -> Result:
         each = seconds / size
         theirs = times["SciPy"].best / sample
         rows.append(
-            {"heliostats": size, "ms_per_heliostat": 1e3 * each, "seconds": seconds, "median_seconds": times["heliotrope"].median,
+            {"heliostats": size, "ms_per_heliostat": 1e3 * each, "seconds": seconds,
+             "median_seconds": times["heliotrope"].median,
              "scipy_ms_per_heliostat": 1e3 * theirs, "scipy_ratio": theirs / each,
              "differs_sigma": apart}
         )  # fmt: skip
