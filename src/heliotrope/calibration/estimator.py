@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration import _fit_kernels as kernels
-from heliotrope.calibration.sightings import Sightings, ray_directions
+from heliotrope.calibration.sightings import Sightings, bisector_covariance, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import (
     FloatArray,
@@ -224,14 +224,8 @@ def _data(
         vertex = mechanism[s.heliostat].pose(s.counts).vertex
         source, way = ray_directions(s, vertex)
         total = source + way
-        size = np.linalg.norm(total, axis=-1, keepdims=True)
-        normal = total / size
-        axes = tangent_axes(normal)
-        # A turn of the ray t by ε moves the bisector by its part across the normal over
-        # |s + t|: the whole of it across the plane of incidence, cos i of it within.
-        spread = np.eye(3) - way[:, :, None] * way[:, None, :]
-        across = axes / size[:, :, None]
-        covariance = across @ spread @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
+        axes = tangent_axes(total / np.linalg.norm(total, axis=-1, keepdims=True))
+        covariance = bisector_covariance(s, vertex, axes)
         whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     return (
         s.counts, s.source, s.source_at_infinity, s.destination, s.destination_at_infinity, axes,

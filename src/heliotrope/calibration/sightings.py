@@ -6,6 +6,7 @@ the ray between them is known. A photograph of the beam on a target, a reflectio
 by a drone, a sun sensor and a camera in the field differ in nothing else.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -15,6 +16,9 @@ from heliotrope.errors import InputError
 from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, normalize
+
+#: Of a unit vector that was normalised: its length is off by a few roundings.
+_UNIT = 2e-15
 
 
 @dataclass(frozen=True)
@@ -36,6 +40,9 @@ class Sightings:
     sigma
         Standard deviation of the ray's direction (source and destination together) in
         each of two directions across it, rad of beam, (M,).
+    source_covariance, destination_covariance
+        What is known of each end beyond that, ENU, (M, 3, 3): of a point m², of a
+        direction rad². Of a direction only what lies across it counts. Added to sigma.
     """
 
     heliostat: npt.NDArray[np.intp]
@@ -46,6 +53,8 @@ class Sightings:
     source_at_infinity: npt.NDArray[np.bool_]
     destination_at_infinity: npt.NDArray[np.bool_]
     sigma: FloatArray
+    source_covariance: FloatArray
+    destination_covariance: FloatArray
 
     def __len__(self) -> int:
         return len(self.heliostat)
@@ -71,6 +80,8 @@ def sightings(
     source_at_infinity: npt.ArrayLike = True,
     destination_at_infinity: npt.ArrayLike = False,
     sigma: npt.ArrayLike = 5e-4,
+    source_covariance: npt.ArrayLike = 0.0,
+    destination_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
     """Return checked sightings; everything broadcasts to the M rows of ``counts``.
 
@@ -81,19 +92,23 @@ def sightings(
     counts
         Drive counts, (M, D).
     source, destination
-        Directions (any length) or points (m), ENU, (M, 3).
+        Directions (any length) or points (m), ENU, (M, 3). A direction of length 1 is
+        kept to the last bit.
     time
         Unix seconds, (M,).
     source_at_infinity, destination_at_infinity
         The sun is at infinity, the centroid on a target is not.
     sigma
         Standard deviation of the ray's direction, rad of beam, (M,).
+    source_covariance, destination_covariance
+        Of the ends, in addition to sigma, m² of a point and rad² of a direction: a
+        variance, the same in every direction, () or (M,), or matrices (3, 3) or (M, 3, 3).
 
     Raises
     ------
     InputError
-        If a value is not finite, a direction is zero, or sigma is not above 0; the text
-        names the row.
+        If a value is not finite, a direction is zero, sigma is not above 0, or a
+        covariance is not symmetric and positive semidefinite; the text names the row.
     """
     table = np.atleast_2d(as_float(counts))
     rows = len(table)
@@ -110,8 +125,9 @@ def sightings(
     ):
         points = np.array(np.broadcast_to(as_float(given), (rows, 3)))
         _finite(points, name)
-        if far.any():
-            points[far] = normalize(points[far], name)
+        loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
+        if loose.any():
+            points[loose] = normalize(points[loose], name)
         ends.append(points)
     _finite(table, "counts")
     spreads = spread(sigma, np.float64)
@@ -125,7 +141,45 @@ def sightings(
     return Sightings(
         index, spread(time, np.float64), table, ends[0], ends[1], far_source, far_destination,
         spreads,
+        _covariances(source_covariance, rows, "source_covariance"),
+        _covariances(destination_covariance, rows, "destination_covariance"),
     )  # fmt: skip
+
+
+def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
+    values = as_float(given)
+    if values.ndim < 2:
+        values = values[..., None, None] * np.eye(3)
+    try:
+        matrices = np.array(np.broadcast_to(values, (rows, 3, 3)))
+    except ValueError:
+        raise InputError(
+            f"sightings: {name} of shape {np.shape(given)}; give a variance, {rows} variances, "
+            f"or matrices (3, 3) or ({rows}, 3, 3)"
+        ) from None
+    wrong = ~is_covariance(matrices)
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
+        raise InputError(
+            f"sighting {i}: {name} {matrices[i].tolist()} is not symmetric and positive "
+            "semidefinite; give variances and covariances in m² of a point, rad² of a direction"
+        )
+    return np.asarray(0.5 * (matrices + np.swapaxes(matrices, -1, -2)))
+
+
+def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which matrices (M, 3, 3) are finite, symmetric and positive semidefinite.
+
+    Rounding is forgiven: 1e-9 of the largest entry.
+    """
+    largest = np.abs(matrices).max(axis=(-1, -2))
+    # Most are zero, and need no eigenvalues.
+    good = largest == 0.0
+    rows = np.flatnonzero(~good & np.isfinite(largest))
+    scaled = matrices[rows] / largest[rows, None, None]
+    even = np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(axis=(-1, -2)) <= 1e-9
+    good[rows] = even & (np.linalg.eigvalsh(scaled)[:, 0] >= -1e-9)
+    return np.asarray(good)
 
 
 def _finite(values: FloatArray, name: str) -> None:
@@ -146,6 +200,47 @@ def ray_directions(s: Sightings, vertex: npt.ArrayLike) -> tuple[FloatArray, Flo
         way = np.where(far[:, None], points, points - m)
         ends.append(way / np.linalg.norm(way, axis=-1, keepdims=True))
     return ends[0], ends[1]
+
+
+def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike) -> FloatArray:
+    r"""Return the covariance of the bisectors of source and destination, (M, 2, 2), rad².
+
+    With s and t the unit vectors to both ends and v their bisector, to first order
+
+    .. math:: δv = (I - v v^T)(δs + δt) / |s + t|
+
+    where a point at distance d that moves by δp turns its direction by
+    :math:`δs = (I - s s^T) δp / d`. Both ends are taken as independent.
+
+    Parameters
+    ----------
+    s
+        M sightings.
+    vertex
+        Of their mirrors, ENU metres, (M, 3).
+    axes
+        Two unit axes across each bisector, (M, 2, 3).
+    """
+    m = as_float(vertex)
+    ways = ray_directions(s, m)
+    size = np.linalg.norm(ways[0] + ways[1], axis=-1)
+    across = as_float(axes) / size[:, None, None]
+    # A turn of the ray t by ε moves the bisector by its part across the normal over
+    # |s + t|: the whole of it across the plane of incidence, cos i of it within.
+    turn = np.eye(3) - ways[1][:, :, None] * ways[1][:, None, :]
+    covariance = across @ turn @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
+    for way, points, far, given in (
+        (ways[0], s.source, s.source_at_infinity, s.source_covariance),
+        (ways[1], s.destination, s.destination_at_infinity, s.destination_covariance),
+    ):
+        rows = np.flatnonzero(given.any(axis=(-1, -2)))
+        if rows.size:
+            w = way[rows]
+            lever = np.where(far[rows], 1.0, np.linalg.norm(points[rows] - m[rows], axis=-1))
+            turn = (np.eye(3) - w[:, :, None] * w[:, None, :]) / lever[:, None, None]
+            part = across[rows] @ turn
+            covariance[rows] += part @ given[rows] @ np.swapaxes(part, -1, -2)
+    return as_float(covariance)
 
 
 def of_measurements(
@@ -176,3 +271,140 @@ def of_measurements(
         sigma=sigma,
     )
     return seen, left_out
+
+
+def camera_target(
+    heliostat: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    centroid: npt.ArrayLike,
+    *,
+    time: npt.ArrayLike = 0.0,
+    sigma: npt.ArrayLike = 5e-4,
+    sun_covariance: npt.ArrayLike = 0.0,
+    centroid_covariance: npt.ArrayLike = 0.0,
+) -> Sightings:
+    """Return sightings of the sun's image on a target (Malan): sun to centroid.
+
+    Parameters
+    ----------
+    heliostat, counts, time, sigma
+        As :func:`sightings`.
+    sun
+        Directions to the apparent sun, ENU, (M, 3).
+    centroid
+        Of the image on the target, ENU metres, (M, 3).
+    sun_covariance, centroid_covariance
+        rad² and m², as :func:`sightings`.
+    """
+    return sightings(
+        heliostat, counts, sun, centroid, time=time, sigma=sigma,
+        source_covariance=sun_covariance, destination_covariance=centroid_covariance,
+    )  # fmt: skip
+
+
+def drone(
+    heliostat: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    led: npt.ArrayLike,
+    camera: npt.ArrayLike,
+    *,
+    time: npt.ArrayLike = 0.0,
+    sigma: npt.ArrayLike = 5e-4,
+    led_covariance: npt.ArrayLike = 0.0,
+    camera_covariance: npt.ArrayLike = 0.0,
+) -> Sightings:
+    """Return sightings of a lamp's reflection from the air (HelioPoint): LED to camera.
+
+    Parameters
+    ----------
+    heliostat, counts, time, sigma
+        As :func:`sightings`.
+    led, camera
+        The lamp and the camera's centre of projection, ENU metres, (M, 3).
+    led_covariance, camera_covariance
+        m², as :func:`sightings`. Both are taken as independent. Where the lamp hangs beside
+        the camera, an error of the drone's position moves both: give it to one of them,
+        four-fold, and leave the other 0.
+    """
+    return sightings(
+        heliostat, counts, led, camera, time=time, sigma=sigma, source_at_infinity=False,
+        source_covariance=led_covariance, destination_covariance=camera_covariance,
+    )  # fmt: skip
+
+
+def sun_sensor(
+    heliostat: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    *,
+    time: npt.ArrayLike = 0.0,
+    normal_sigma: npt.ArrayLike = 2.5e-4,
+    normal_covariance: npt.ArrayLike = 0.0,
+) -> Sightings:
+    """Return sightings of a sensor that holds the mirror square to the sun: sun to sun.
+
+    Parameters
+    ----------
+    heliostat, counts, time
+        As :func:`sightings`.
+    sun
+        Directions to the apparent sun when the loop was closed, ENU, (M, 3).
+    normal_sigma
+        Standard deviation of the mirror's normal, rad, (M,); a ray turns by twice that.
+    normal_covariance
+        Of the normal, rad², as :func:`sightings`. Source and destination are the same
+        measurement, so all of it is the destination's, four-fold.
+    """
+    return sightings(
+        heliostat, counts, sun, sun, time=time, sigma=2.0 * as_float(normal_sigma),
+        destination_at_infinity=True, destination_covariance=4.0 * as_float(normal_covariance),
+    )  # fmt: skip
+
+
+def field_camera(
+    heliostat: npt.ArrayLike,
+    counts: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    camera: npt.ArrayLike,
+    *,
+    time: npt.ArrayLike = 0.0,
+    sigma: npt.ArrayLike = 5e-4,
+    sun_covariance: npt.ArrayLike = 0.0,
+    camera_covariance: npt.ArrayLike = 0.0,
+) -> Sightings:
+    """Return sightings of the sun in the mirror by a camera in the field (eSolar): sun to camera.
+
+    Parameters
+    ----------
+    heliostat, counts, time, sigma
+        As :func:`sightings`.
+    sun
+        Directions to the apparent sun, ENU, (M, 3).
+    camera
+        Its centre of projection, ENU metres, (M, 3).
+    sun_covariance, camera_covariance
+        rad² and m², as :func:`sightings`.
+    """
+    return sightings(
+        heliostat, counts, sun, camera, time=time, sigma=sigma,
+        source_covariance=sun_covariance, destination_covariance=camera_covariance,
+    )  # fmt: skip
+
+
+def join(parts: Sequence[Sightings]) -> Sightings:
+    """Return sightings of several kinds or campaigns as one, in the order given.
+
+    Raises
+    ------
+    InputError
+        If there are none, or they are of mechanisms with different numbers of drives.
+    """
+    drives = sorted({part.counts.shape[-1] for part in parts})
+    if len(drives) != 1:
+        raise InputError(
+            f"join: sightings of mechanisms with {drives or 'no'} drives; join those of one kind"
+        )
+    return Sightings(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Sightings)}
+    )
