@@ -85,6 +85,8 @@ class Calibration:
         Sightings used of each heliostat, (N,).
     iterations, outcome
         (N,); :class:`Outcome` as integers.
+    centre
+        Where the priors stand: zero, or a far start, (N, P).
     """
 
     names: tuple[str, ...]
@@ -96,6 +98,7 @@ class Calibration:
     count: npt.NDArray[np.int64]
     iterations: npt.NDArray[np.int64]
     outcome: npt.NDArray[np.int8]
+    centre: FloatArray
 
     @property
     def parameters(self) -> dict[str, FloatArray]:
@@ -172,6 +175,7 @@ def fit(
         count=np.bincount(sightings.heliostat[used], minlength=count),
         iterations=np.empty(count, dtype=np.int64),
         outcome=np.empty(count, dtype=np.int8),
+        centre=begin,
     )
     codes = mechanism.codes(names)
     started = mechanism.with_parameters({n: begin[:, p] for p, n in enumerate(names)})

@@ -1,0 +1,167 @@
+"""Compiled: covariances of sightings whose parameters wander in time, and what follows.
+
+The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant
+with a variance, plus an offset that lasts as long as a regime, plus Ornstein-Uhlenbeck
+processes of some amplitude and time; so two sightings share
+
+    K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + Σ_c a_c² exp(−|t_i − t_j| / τ_c)).
+
+A time that is not known (NaN) shares nothing with any other.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from heliotrope.mechanism._jit import OPTIONS
+
+
+@njit(**OPTIONS)
+def gram(
+    first, first_time, first_regime, second, second_time, second_regime, same,
+    static, regime, part, amplitude, tau,
+):  # fmt: skip
+    """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
+
+    ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) theirs;
+    ``same`` says that both are the same rows, so that i = j shares even an unknown time.
+    """
+    n, m, size = first.shape[0], second.shape[0], first.shape[2]
+    out = np.empty((2 * n, 2 * m))
+    weight = np.empty(size)
+    for i in range(n):
+        for j in range(m):
+            apart = abs(first_time[i] - second_time[j])
+            if same and i == j:
+                apart = 0.0
+            for p in range(size):
+                weight[p] = static[p]
+            if first_regime[i] == second_regime[j] and first_regime[i] != 0:
+                for p in range(size):
+                    weight[p] += regime[p]
+            if math.isfinite(apart):
+                for c in range(part.shape[0]):
+                    weight[part[c]] += amplitude[c] * amplitude[c] * math.exp(-apart / tau[c])
+            for a in range(2):
+                for b in range(2):
+                    total = 0.0
+                    for p in range(size):
+                        total += weight[p] * first[i, a, p] * second[j, b, p]
+                    out[2 * i + a, 2 * j + b] = total
+    return out
+
+
+@njit(**OPTIONS)
+def cost_and_gradient(
+    jacobian, time, label, residual, static, regime, part, group, amplitude, tau, noise
+):
+    """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
+
+    ``group`` (C,) says which of the G times a process has; ``tau`` is (G,).
+    """
+    n, parts, times = len(residual), part.shape[0], tau.shape[0]
+    each = np.empty(parts)
+    for c in range(parts):
+        each[c] = tau[group[c]]
+    matrix = gram(
+        jacobian, time, label, jacobian, time, label, True, static, regime, part, amplitude, each
+    )
+    for k in range(2 * n):
+        matrix[k, k] += noise * noise
+    gradient = np.zeros(1 + parts + times)
+    inverse = np.linalg.inv(matrix)
+    flat = np.ascontiguousarray(residual).reshape(2 * n)
+    alpha = inverse @ flat
+    cost = 0.5 * np.dot(flat, alpha) + np.sum(np.log(np.diag(np.linalg.cholesky(matrix))))
+    trace = 0.0
+    for k in range(2 * n):
+        trace += inverse[k, k] - alpha[k] * alpha[k]
+    gradient[0] = trace * noise * noise
+    for i in range(n):
+        for j in range(i + 1):
+            apart = abs(time[i] - time[j])
+            if i == j:
+                apart = 0.0
+            if not math.isfinite(apart):
+                continue
+            twice = 1.0 if i == j else 2.0
+            for c in range(parts):
+                p = part[c]
+                total = 0.0
+                for a in range(2):
+                    for b in range(2):
+                        w = inverse[2 * i + a, 2 * j + b] - alpha[2 * i + a] * alpha[2 * j + b]
+                        total += w * jacobian[i, a, p] * jacobian[j, b, p]
+                share = amplitude[c] * amplitude[c] * math.exp(-apart / each[c])
+                total *= 0.5 * twice * share
+                gradient[1 + c] += 2.0 * total
+                gradient[1 + parts + group[c]] += total * apart / each[c]
+    return cost, gradient
+
+
+@njit(**OPTIONS)
+def pooled_block(
+    jacobian, time, label, residual, offsets, static, regime, part, group, amplitude, tau, noise,
+    costs, gradients, start, stop,
+):  # fmt: skip
+    """Cost and gradient of heliostats ``start`` to ``stop``, one a row."""
+    for i in range(start, stop):
+        a, b = offsets[i], offsets[i + 1]
+        cost, gradient = cost_and_gradient(
+            jacobian[a:b], time[a:b], label[a:b], residual[a:b], static, regime, part, group,
+            amplitude, tau, noise,
+        )  # fmt: skip
+        costs[i] = cost
+        gradients[i] = gradient
+
+
+@njit(**OPTIONS)
+def left_out(inverse, alpha, n):
+    """Squared distance of each sighting from what all the others say, and its variance.
+
+    ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r. Returns (z² (n,), error (n, 2),
+    covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
+    Gaussian Processes for Machine Learning, (5.12), in blocks of two.)
+    """
+    square, error, spread = np.empty(n), np.empty((n, 2)), np.empty((n, 2, 2))
+    for i in range(n):
+        a, b, c = inverse[2 * i, 2 * i], inverse[2 * i, 2 * i + 1], inverse[2 * i + 1, 2 * i + 1]
+        determinant = a * c - b * b
+        spread[i, 0, 0], spread[i, 1, 1] = c / determinant, a / determinant
+        spread[i, 0, 1] = spread[i, 1, 0] = -b / determinant
+        x, y = alpha[2 * i], alpha[2 * i + 1]
+        error[i, 0] = spread[i, 0, 0] * x + spread[i, 0, 1] * y
+        error[i, 1] = spread[i, 1, 0] * x + spread[i, 1, 1] * y
+        square[i] = x * error[i, 0] + y * error[i, 1]
+    return square, error, spread
+
+
+@njit(**OPTIONS)
+def remove_farthest(inverse, residual, most):
+    """Take away the sighting farthest from the others, again and again.
+
+    Returns (which (most,), their z² (most,)) in the order of removal.
+    """
+    n = len(residual)
+    inverse = inverse.copy()
+    flat = np.ascontiguousarray(residual).reshape(2 * n)
+    which, squares = np.empty(most, dtype=np.int64), np.empty(most)
+    gone = np.zeros(n, dtype=np.bool_)
+    for step in range(most):
+        square, _, spread = left_out(inverse, inverse @ flat, n)
+        best = -1
+        for i in range(n):
+            if not gone[i] and (best < 0 or square[i] > square[best]):
+                best = i
+        which[step], squares[step] = best, square[best]
+        gone[best] = True
+        # Schur: the inverse without rows and columns of ``best``.
+        pair = inverse[:, 2 * best : 2 * best + 2].copy()
+        inverse -= pair @ spread[best] @ np.ascontiguousarray(pair.T)
+        for k in (2 * best, 2 * best + 1):
+            inverse[k, :] = 0.0
+            inverse[:, k] = 0.0
+            inverse[k, k] = 1.0
+            flat[k] = 0.0
+    return which, squares

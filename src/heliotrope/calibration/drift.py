@@ -1,0 +1,462 @@
+r"""Parameters that wander: how a zero creeps and a normal quivers, learnt from a field.
+
+The parameters of a heliostat at time t are
+
+.. math:: x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t)
+
+a population mean μ and a deviation s of variance τ², both of the field; an offset of the
+two zeros in each regime; and Ornstein-Uhlenbeck processes d: the zeros creep over months
+(*slow*) and wander over weeks (*weeks*), and the mirror's normal moves within hours
+(*hours*: warmth, wind, the direction of approach). Linear in x and Gaussian, so everything
+follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for Machine
+Learning, (2.23)-(2.24), (5.8)-(5.12)).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from heliotrope.calibration import _drift_kernels as kernels
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.parallel import run_blocks
+
+DAY = 86400.0
+#: Names of the times of the processes.
+GROUPS = ("slow", "weeks", "hours")
+#: Where the search for them starts, and how far (in the logarithm) they may stray from there.
+START_DAYS = {"slow": 300.0, "weeks": 5.0, "hours": 0.1}
+START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
+START_NOISE = 0.5
+STRAY = 0.7
+#: How far one heliostat's own may stray from the field's; its times only half as far.
+OWN_STRAY = 1.0
+#: Standard deviation of a zero after a re-reference or repair, rad.
+REGIME_RAD = 0.020
+
+
+@dataclass(frozen=True)
+class Process:
+    """One Ornstein-Uhlenbeck process: the parameter that it moves and the group of its time."""
+
+    parameter: str
+    group: str
+
+
+def zeros(mechanism: Mechanism) -> tuple[str, ...]:
+    """Return the names of the drives' zeros."""
+    joints = [mechanism.joints[k] for k in mechanism.driven]
+    known = mechanism.parameters
+    return tuple(
+        f"{j}_initial_angle" if f"{j}_initial_angle" in known else f"{j}_bias" for j in joints
+    )
+
+
+def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
+    """Return the processes of a kind of mechanism: both zeros twice, and the normal."""
+    found = [Process(name, group) for group in ("slow", "weeks") for name in zeros(mechanism)]
+    normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
+    return tuple(found + [Process(name, "hours") for name in normal])
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """What is common to a field (or, refined, one heliostat's own).
+
+    Attributes
+    ----------
+    names
+        The P parameters, those that only wander included.
+    processes
+        C of them.
+    mean, spread
+        Population mean and standard deviation of the constant part, in the parameters'
+        units, (P,).
+    regime
+        Standard deviation of a regime's offset, (P,).
+    amplitude
+        Standard deviation of each process, (C,).
+    tau
+        Days, one for each of the groups in use, (G,).
+    noise
+        Of a sighting, in units of its sigma.
+    heavy
+        By how much the noise's variance is larger than a Gaussian's for 90 of 100 to lie
+        within the 90 % ellipse: the tails.
+    """
+
+    names: tuple[str, ...]
+    processes: tuple[Process, ...]
+    mean: FloatArray
+    spread: FloatArray
+    regime: FloatArray
+    amplitude: FloatArray
+    tau: FloatArray
+    noise: float
+    heavy: float = 1.0
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """The groups in use, in the order of ``tau``."""
+        return tuple(g for g in GROUPS if any(p.group == g for p in self.processes))
+
+    @property
+    def part(self) -> npt.NDArray[np.int64]:
+        """Place of each process' parameter among the names, (C,)."""
+        return np.array([self.names.index(p.parameter) for p in self.processes], dtype=np.int64)
+
+    @property
+    def group(self) -> npt.NDArray[np.int64]:
+        """Place of each process' time in ``tau``, (C,)."""
+        groups = self.groups
+        return np.array([groups.index(p.group) for p in self.processes], dtype=np.int64)
+
+    @property
+    def vector(self) -> FloatArray:
+        """Logarithms of noise, amplitudes and times: what is searched."""
+        return np.log(np.concatenate([[self.noise], self.amplitude, self.tau]))
+
+    def with_vector(self, vector: FloatArray) -> "Hyperparameters":
+        """Return these with noise, amplitudes and times from their logarithms."""
+        values = np.exp(vector)
+        c = len(self.processes)
+        return replace(
+            self, noise=float(values[0]), amplitude=values[1 : 1 + c], tau=values[1 + c :]
+        )
+
+
+def start(
+    mechanism: Mechanism,
+    model: tuple[str, ...],
+    processes: tuple[Process, ...] | None = None,
+    priors: FloatArray | None = None,
+) -> Hyperparameters:
+    """Return what is believed before any measurement.
+
+    Parameters
+    ----------
+    mechanism
+        Any of the field.
+    model
+        Parameters that are constant but unknown.
+    processes
+        What wanders, by default :func:`default_processes`; ``()`` for nothing.
+    priors
+        Standard deviations of the model's parameters, by default the table's.
+    """
+    moving = default_processes(mechanism) if processes is None else processes
+    extra = [p.parameter for p in moving] + list(zeros(mechanism))
+    names = tuple(dict.fromkeys([*model, *extra]))
+    table = [mechanism.parameter(n).prior for n in model] if priors is None else priors
+    spread, regime = np.zeros(len(names)), np.zeros(len(names))
+    spread[: len(model)] = table
+    for name in zeros(mechanism):
+        regime[names.index(name)] = REGIME_RAD
+    groups = tuple(g for g in GROUPS if any(p.group == g for p in moving))
+    return Hyperparameters(
+        names=names,
+        processes=moving,
+        mean=np.zeros(len(names)),
+        spread=spread,
+        regime=regime,
+        amplitude=np.array([START_RAD[p.group] for p in moving]),
+        tau=np.array([START_DAYS[g] for g in groups]),
+        noise=START_NOISE,
+    )
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Sightings of one heliostat, linear in its parameters: y = J x(t) + noise.
+
+    Attributes
+    ----------
+    jacobian
+        (n, 2, P), whitened.
+    value
+        y, (n, 2): what the parameters' deviations from ``centre`` must explain.
+    time
+        Days, (n,).
+    regime
+        (n,).
+    centre
+        Where the prior stands, (P,).
+    own
+        Where the centre is a far start and no population mean holds, (P,).
+    """
+
+    jacobian: FloatArray
+    value: FloatArray
+    time: FloatArray
+    regime: npt.NDArray[np.int64]
+    centre: FloatArray
+    own: npt.NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def take(self, rows: npt.ArrayLike) -> "Linear":
+        """Return some of the rows."""
+        index = np.asarray(rows)
+        return replace(
+            self,
+            jacobian=self.jacobian[index],
+            value=self.value[index],
+            time=self.time[index],
+            regime=self.regime[index],
+        )
+
+    def mean(self, hyper: Hyperparameters) -> FloatArray:
+        """Population mean that holds here, (P,)."""
+        return np.where(self.own, 0.0, hyper.mean)
+
+    def rest(self, hyper: Hyperparameters) -> FloatArray:
+        """Value without what the population's mean explains, (n, 2)."""
+        return np.ascontiguousarray(self.value - self.jacobian @ self.mean(hyper))
+
+
+def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatArray:
+    other = a if b is None else b
+    found: FloatArray = kernels.gram(
+        a.jacobian, a.time, a.regime, other.jacobian, other.time, other.regime, b is None,
+        hyper.spread**2, hyper.regime**2, hyper.part, hyper.amplitude, hyper.tau[hyper.group],
+    )  # fmt: skip
+    return found
+
+
+def covariance(hyper: Hyperparameters, data: Linear) -> FloatArray:
+    """Return the covariance of the values, noise included, (2 n, 2 n)."""
+    return _gram(hyper, data) + hyper.noise**2 * np.eye(2 * len(data))
+
+
+def fit_hyperparameters(
+    hyper: Hyperparameters, field: Sequence[Linear], iterations: int = 25
+) -> tuple[Hyperparameters, float]:
+    """Return the field's most probable noise, amplitudes and times, and the negative log evidence.
+
+    Parameters
+    ----------
+    hyper
+        Where to start; its logarithms are the centre of a weak prior of standard
+        deviation ``STRAY``, so that what the data do not show stays as it is.
+    field
+        Heliostats to learn from.
+    iterations
+        Of L-BFGS.
+    """
+    centre = start_vector(hyper)
+    return _search(hyper, field, centre, np.full(len(centre), STRAY), iterations)
+
+
+def start_vector(hyper: Hyperparameters) -> FloatArray:
+    """Return the centre of the weak prior: the values that a search starts from."""
+    return np.log(
+        np.array(
+            [START_NOISE]
+            + [START_RAD[p.group] for p in hyper.processes]
+            + [START_DAYS[g] for g in hyper.groups]
+        )
+    )
+
+
+def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperparameters:
+    """Return one heliostat's own hyperparameters: near the field's unless its data say else."""
+    spread = np.full(len(hyper.vector), OWN_STRAY)
+    spread[1 + len(hyper.processes) :] = 0.5 * OWN_STRAY
+    return _search(hyper, [data], hyper.vector, spread, iterations)[0]
+
+
+def _search(
+    hyper: Hyperparameters, field: Sequence[Linear], centre: FloatArray, spread: FloatArray,
+    iterations: int,
+) -> tuple[Hyperparameters, float]:  # fmt: skip
+    rows = [d for d in field if len(d)]
+    if not rows:
+        return hyper, 0.0
+    offsets = np.concatenate([[0], np.cumsum([len(d) for d in rows])])
+    jacobian = np.concatenate([d.jacobian for d in rows])
+    time = np.concatenate([d.time for d in rows])
+    label = np.concatenate([d.regime for d in rows])
+    rest = np.concatenate([d.rest(hyper) for d in rows])
+    static, regime, part, group = hyper.spread**2, hyper.regime**2, hyper.part, hyper.group
+    costs, gradients = np.empty(len(rows)), np.empty((len(rows), len(centre)))
+
+    def cost(vector: FloatArray) -> tuple[float, FloatArray]:
+        h = hyper.with_vector(vector)
+        run_blocks(
+            lambda a, b: kernels.pooled_block(
+                jacobian, time, label, rest, offsets, static, regime, part, group,
+                h.amplitude, h.tau, h.noise, costs, gradients, a, b,
+            ),
+            len(rows),
+            minimum_rows=2,
+        )  # fmt: skip
+        stray = (vector - centre) / spread
+        total = float(costs.sum() + 0.5 * stray @ stray)
+        slope = gradients.sum(axis=0) + stray / spread
+        return total, slope
+
+    bounds = [(c - 4.0 * s, c + 4.0 * s) for c, s in zip(centre, spread, strict=True)]
+    begin = np.clip(hyper.vector, centre - 4.0 * spread, centre + 4.0 * spread)
+    found = minimize(
+        cost, begin, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": iterations}
+    )
+    return hyper.with_vector(found.x), float(found.fun)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What the sightings of one heliostat say about its parameters at any time.
+
+    Made by :func:`posterior`; ``inverse`` is that of the covariance of ``data``'s values
+    and ``alpha`` its product with them.
+    """
+
+    hyper: Hyperparameters
+    data: Linear
+    inverse: FloatArray
+    alpha: FloatArray
+
+    def at(
+        self, time: FloatArray, regime: npt.NDArray[np.int64], wander: bool = True
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return parameters (m, P) and their covariance (m, P, P).
+
+        Parameters
+        ----------
+        time
+            Days, (m,); NaN: no knowledge of when.
+        regime
+            (m,).
+        wander
+            Whether the processes are in; else the constant part and the regime alone.
+        """
+        h, data = self.hyper, self.data
+        m, size = len(time), len(h.names)
+        base = data.centre + data.mean(h)
+        own = np.where(regime[:, None] != 0, h.regime**2, 0.0) + h.spread**2
+        share = np.broadcast_to(h.spread**2, (m, len(data), size)).copy()
+        same = (regime[:, None] == data.regime) & (regime[:, None] != 0)
+        share += same[:, :, None] * h.regime**2
+        if wander:
+            apart = np.abs(time[:, None] - data.time)
+            for c, p in enumerate(h.part):
+                decay = np.exp(-apart / h.tau[h.group[c]])
+                share[:, :, p] += h.amplitude[c] ** 2 * np.nan_to_num(decay, nan=0.0)
+                own[:, p] += h.amplitude[c] ** 2
+        # Covariance of each parameter with each component of each sighting, (m, P, 2 n).
+        cross = np.einsum("mnp,nap->mpna", share, data.jacobian).reshape(m, size, -1)
+        values = base + cross @ self.alpha
+        found = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
+        found[:, np.arange(size), np.arange(size)] += own
+        return values, 0.5 * (found + np.swapaxes(found, -1, -2))
+
+    def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return (z² (n,), error (n, 2), covariance (n, 2, 2)) of each, seen from the others."""
+        found: tuple[FloatArray, FloatArray, FloatArray] = kernels.left_out(
+            self.inverse, self.alpha, len(self.data)
+        )
+        return found
+
+    def log_predictive(self) -> FloatArray:
+        """Return the logarithm of each sighting's probability density given the others, (n,)."""
+        square, _, spread = self.left_out()
+        half_log = 0.5 * np.log(np.linalg.det(spread)) if len(square) else np.empty(0)
+        return np.asarray(-0.5 * square - half_log - np.log(2.0 * np.pi))
+
+    def log_evidence(self) -> float:
+        """Return the logarithm of the probability density of all of them."""
+        value = self.data.rest(self.hyper).ravel()
+        _, log_inverse = np.linalg.slogdet(self.inverse)
+        fit = float(value @ self.alpha)
+        return float(-0.5 * fit + 0.5 * log_inverse - 0.5 * len(value) * np.log(2.0 * np.pi))
+
+
+def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
+    """Return what ``data`` say under ``hyper``."""
+    if not len(data):
+        return Posterior(hyper, data, np.zeros((0, 0)), np.zeros(0))
+    inverse = np.linalg.inv(covariance(hyper, data))
+    inverse = 0.5 * (inverse + inverse.T)
+    return Posterior(hyper, data, inverse, inverse @ data.rest(hyper).ravel())
+
+
+#: What the table's priors are worth, in heliostats, when the population is learnt.
+TABLE_WORTH = 2.0
+#: Degrees of freedom of the population: one heliostat set up wrongly does not widen it.
+POPULATION_FREEDOM = 4.0
+
+
+def fit_population(
+    hyper: Hyperparameters, table: FloatArray, members: Sequence[Posterior]
+) -> Hyperparameters:
+    """Return ``hyper`` with the population's mean and spread anew (a step of EM).
+
+    Parameters
+    ----------
+    hyper
+        With the mean and spread that the members were calculated with.
+    table
+        Standard deviations of the parameter table, (P,); 0 where a parameter only wanders.
+    members
+        Heliostats.
+    """
+    size = len(hyper.names)
+    still = np.flatnonzero(table > 0)
+    values, variances, used = [], [], []
+    for member in members:
+        x, c = member.at(np.array([np.nan]), np.zeros(1, dtype=np.int64), wander=False)
+        values.append((x[0] - member.data.centre)[still])
+        variances.append(np.diagonal(c[0])[still])
+        used.append(~member.data.own[still])
+    if not values:
+        return hyper
+    x, c, ok = np.array(values), np.maximum(np.array(variances), 0.0), np.array(used)
+    mean, spread = hyper.mean[still].copy(), np.maximum(hyper.spread[still], 1e-3 * table[still])
+    prior = table[still]
+    for _ in range(30):
+        square = ((x - mean) ** 2 + c) / spread**2
+        weight = ok * (POPULATION_FREEDOM + 1.0) / (POPULATION_FREEDOM + square)
+        precision = (weight / spread**2).sum(axis=0)
+        mean = (weight * x / spread**2).sum(axis=0) / (precision + 1.0 / prior**2)
+        scatter = (weight * ((x - mean) ** 2 + c)).sum(axis=0)
+        spread = np.sqrt((TABLE_WORTH * prior**2 + scatter) / (TABLE_WORTH + ok.sum(axis=0)))
+        spread = np.maximum(spread, 0.05 * prior)
+    all_mean, all_spread = np.zeros(size), np.zeros(size)
+    all_mean[still], all_spread[still] = mean, spread
+    return replace(hyper, mean=all_mean, spread=all_spread)
+
+
+#: The 90th percentile of χ² with two degrees of freedom.
+NINETY = 2.0 * np.log(10.0)
+
+
+def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
+    """Return the factor on the noise's variance that puts 90 of 100 left-out sightings in.
+
+    ``outliers`` more lie outside, however large it is. Never below 1.
+    """
+    parts = [m.left_out() for m in members if len(m.data) > 3]
+    if not parts:
+        return 1.0
+    error = np.concatenate([p[1] for p in parts])
+    spread = np.concatenate([p[2] for p in parts])
+    noise = np.concatenate(
+        [np.full(len(m.data), m.hyper.noise**2) for m in members if len(m.data) > 3]
+    )
+
+    def inside(factor: float) -> float:
+        wider = spread + ((factor - 1.0) * noise)[:, None, None] * np.eye(2)
+        square = np.einsum("na,nab,nb->n", error, np.linalg.inv(wider), error)
+        return float((square <= NINETY).sum()) / (len(square) + outliers)
+
+    low, high = 1.0, 25.0
+    if inside(low) >= 0.9:
+        return low
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if inside(middle) < 0.9 else (low, middle)
+    return high

@@ -1,0 +1,69 @@
+"""Outliers by the generalised extreme Studentized deviate test (Rosner 1983, Technometrics 25).
+
+The sighting farthest from what the others say is taken away, again and again; the
+outliers are all up to the last one that was farther than chance allows, so that two
+alike do not hide each other. What is measured is a squared distance in two components,
+χ² with two degrees of freedom: the largest of n exceeds 2 ln(n / α) with probability α.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration import _drift_kernels as kernels
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+
+#: Probability of calling one good sighting of a heliostat an outlier.
+ALPHA = 1e-3
+#: No more than this share of the sightings can be outliers.
+SHARE = 0.25
+
+
+def generalised_esd(
+    residual: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    *,
+    alpha: float = ALPHA,
+    share: float = SHARE,
+) -> npt.NDArray[np.bool_]:
+    """Return the mask of outliers among n two-component residuals.
+
+    Parameters
+    ----------
+    residual
+        (n, 2), of expectation zero.
+    covariance
+        Of all of them together, noise included, (2 n, 2 n).
+    alpha
+        Probability of a false alarm for the whole set.
+    share
+        Largest share of outliers.
+
+    Raises
+    ------
+    InputError
+        If alpha or share does not lie between 0 and 1, or the covariance is singular.
+    """
+    for name, value in (("alpha", alpha), ("share", share)):
+        if not 0.0 < value < 1.0:
+            raise InputError(f"{name} {value}: it must lie between 0 and 1")
+    rest = np.ascontiguousarray(residual, dtype=np.float64)
+    n = len(rest)
+    mask = np.zeros(n, dtype=np.bool_)
+    most = min(int(share * n), n - 3)
+    if most < 1:
+        return mask
+    try:
+        inverse = np.linalg.inv(np.asarray(covariance, dtype=np.float64))
+    except np.linalg.LinAlgError:
+        raise InputError("covariance of the residuals: singular; add the noise") from None
+    which, squares = kernels.remove_farthest(inverse, rest, most)
+    beyond = np.flatnonzero(squares > critical(n - np.arange(most), alpha))
+    if len(beyond):
+        mask[which[: beyond[-1] + 1]] = True
+    return mask
+
+
+def critical(count: npt.ArrayLike, alpha: float = ALPHA) -> FloatArray:
+    """Return the squared distance that the farthest of ``count`` exceeds with probability alpha."""
+    return np.asarray(2.0 * np.log(np.asarray(count, dtype=np.float64) / alpha))
