@@ -18,14 +18,14 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration import _fit_kernels as kernels
-from heliotrope.calibration.sightings import Sightings, bisector_covariance, ray_directions
+from heliotrope.calibration.residuals import whitening
+from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import (
     FloatArray,
     angle_between,
     as_float,
     bisector,
-    tangent_axes,
     wrap_signed,
 )
 from heliotrope.mechanism import parameters as parameter_table
@@ -225,12 +225,7 @@ def _data(
     """The sightings as the kernels read them; axes and whitening are those of the start."""
     axes, whiten = np.zeros((len(s), 2, 3)), np.zeros((len(s), 2, 2))
     if len(s):
-        vertex = mechanism[s.heliostat].pose(s.counts).vertex
-        source, way = ray_directions(s, vertex)
-        total = source + way
-        axes = tangent_axes(total / np.linalg.norm(total, axis=-1, keepdims=True))
-        covariance = bisector_covariance(s, vertex, axes)
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        axes, whiten = whitening(s, mechanism[s.heliostat].pose(s.counts).vertex)
     return (
         s.counts, s.source, s.source_at_infinity, s.destination, s.destination_at_infinity, axes,
         whiten, keep,

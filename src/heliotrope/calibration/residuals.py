@@ -1,0 +1,107 @@
+"""Whitened residuals of sightings and their derivatives, for every row at once."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.calibration.sightings import Sightings, bisector_covariance, ray_directions
+from heliotrope.geometry import FloatArray, tangent_axes
+from heliotrope.mechanism.chain import Mechanism
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """Residuals of M sightings at given mechanisms, and how they change.
+
+    Attributes
+    ----------
+    residual
+        Normal minus bisector in the tangent plane, whitened by the sightings'
+        covariance, (M, 2).
+    jacobian
+        By the named parameters, (M, 2, P).
+    beam
+        Turns a whitened residual into the beam's error to the right of and above the
+        destination, as seen from the mirror, rad, (M, 2, 2).
+    """
+
+    residual: FloatArray
+    jacobian: FloatArray
+    beam: FloatArray
+
+
+def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Linearised:
+    """Return residuals and derivatives of sightings ``s``.
+
+    Parameters
+    ----------
+    mechanism
+        One a sighting, batch shape (M,).
+    s
+        M sightings.
+    names
+        P parameters of the table.
+    """
+    found = mechanism.jacobian(s.counts, names)
+    n, m = found.pose.normal, found.pose.vertex
+    axes, whiten = whitening(s, m)
+    source, way = ray_directions(s, m)
+    total = source + way
+    size = np.linalg.norm(total, axis=-1, keepdims=True)
+    v = total / size
+    db = np.zeros_like(found.normal)
+    for ends, far, unit in (
+        (s.source, s.source_at_infinity, source),
+        (s.destination, s.destination_at_infinity, way),
+    ):
+        distance = np.where(far, np.inf, np.linalg.norm(ends - m, axis=-1))[:, None, None]
+        along = np.sum(found.vertex * unit[:, None], axis=-1, keepdims=True)
+        db -= (found.vertex - along * unit[:, None]) / distance
+    db -= np.sum(db * v[:, None], axis=-1, keepdims=True) * v[:, None]
+    db /= size[:, :, None]
+    gap = np.einsum("mak,mk->ma", axes, n - v)
+    slope = np.einsum("mak,mpk->map", axes, found.normal - db)
+    return Linearised(
+        residual=np.einsum("mab,mb->ma", whiten, gap),
+        jacobian=np.einsum("mab,mbp->map", whiten, slope),
+        beam=_beam_map(axes, v, source, way) @ np.linalg.inv(whiten),
+    )
+
+
+def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return axes of the tangent plane (M, 2, 3) and what whitens a residual along them.
+
+    Parameters
+    ----------
+    s
+        M sightings.
+    vertex
+        Where the mirrors are, (M, 3).
+
+    Returns
+    -------
+    Axes (M, 2, 3) across the bisector, and W (M, 2, 2) with W C Wᵀ = 1 for the
+    covariance C of the bisector along the axes.
+    """
+    source, way = ray_directions(s, vertex)
+    total = source + way
+    axes = tangent_axes(total / np.linalg.norm(total, axis=-1, keepdims=True))
+    whiten = np.linalg.inv(np.linalg.cholesky(bisector_covariance(s, vertex, axes)))
+    return axes, whiten
+
+
+def frame(way: FloatArray) -> FloatArray:
+    """Return unit vectors to the right of and above ways (M, 3), seen along them, (M, 2, 3)."""
+    right = np.stack([way[:, 1], -way[:, 0], np.zeros(len(way))], axis=-1)
+    right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
+    return np.stack([right, np.cross(right, way)], axis=1)
+
+
+def _beam_map(axes: FloatArray, v: FloatArray, source: FloatArray, way: FloatArray) -> FloatArray:
+    """Change of the reflected ray by a change of the normal along the tangent axes, (M, 2, 2)."""
+    # d(2 (n·s) n − s) = 2 ((dn·s) n + (n·s) dn)
+    seen = frame(way)
+    along = np.einsum("mak,mk->ma", axes, source)
+    cosine = np.sum(v * source, axis=-1)[:, None, None]
+    first = np.einsum("mck,mk->mc", seen, v)[:, :, None] * along[:, None, :]
+    return np.asarray(2.0 * (first + cosine * np.einsum("mck,mak->mca", seen, axes)))
