@@ -149,7 +149,7 @@ def sightings(
 def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
     values = as_float(given)
     if values.ndim < 2:
-        values = values[..., None, None] * np.eye(3)
+        values = np.where(np.eye(3) > 0.0, values[..., None, None], 0.0)
     try:
         matrices = np.array(np.broadcast_to(values, (rows, 3, 3)))
     except ValueError:

@@ -1,0 +1,324 @@
+"""Rows of a table, cell by cell: the bad ones are named and left out, one line each."""
+
+import csv
+import io
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal
+from fractions import Fraction
+from itertools import repeat
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._textfile import read_text
+from heliotrope.geometry import FloatArray
+
+#: A column as it was read: texts, or what Parquet holds.
+Cells: TypeAlias = list[Any] | FloatArray
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_TIME = re.compile(
+    r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d(?:[.,](\d+))?)?) ?(Z|[+-]\d\d(?::?\d\d)?)?", re.ASCII
+)
+_TRUE, _FALSE = ("true", "1"), ("false", "0")
+
+
+@dataclass
+class Rows:
+    """The M rows of a table.
+
+    Attributes
+    ----------
+    path
+        The file.
+    places
+        Where each row stands ("line 12"), (M,).
+    columns
+        Cells by column, (M,) each.
+    header
+        Where the names of the columns stand, "" if nowhere in particular.
+    heliostat
+        As each row names it, for the messages, (M,).
+    reasons
+        Why a row cannot be used, by its index.
+    """
+
+    path: Path
+    places: list[str]
+    columns: dict[str, Cells]
+    header: str = ""
+    heliostat: Sequence[str] = ()
+    reasons: dict[int, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    @property
+    def good(self) -> npt.NDArray[np.intp]:
+        """Indices of the rows that nothing was found wrong with."""
+        return np.array([i for i in range(len(self)) if i not in self.reasons], dtype=np.intp)
+
+    @property
+    def left_out(self) -> list[str]:
+        """One line for each row that cannot be used, in the order of the rows."""
+        lines = []
+        for i, reason in sorted(self.reasons.items()):
+            name = self.heliostat[i] if len(self.heliostat) else ""
+            whose = f", heliostat {name}" if name else ""
+            lines.append(f"{self.path.name}: {self.places[i]}{whose}, {reason}")
+        return lines
+
+    def need(self, names: Sequence[str]) -> None:
+        """Raise FormatError if one of the columns is not there."""
+        for name in names:
+            if name not in self.columns:
+                there = ", ".join(list(self.columns)[:12]) or "none"
+                raise FormatError(
+                    self.path, f"there is no column {name}; add it. There are {there}", self.header
+                )
+
+    def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
+        """Leave a row out; the first reason is the one that is told."""
+        self.reasons.setdefault(int(i), f"column {column}: {reason}")
+
+    def texts(self, column: str) -> list[str]:
+        """Return the cells as texts, "" where empty or where there is no such column."""
+        if column not in self.columns:
+            return [""] * len(self)
+        return ["" if _empty(cell) else str(cell) for cell in self.columns[column]]
+
+    def filled(self, column: str) -> npt.NDArray[np.bool_]:
+        """Return which cells are not empty, (M,)."""
+        return np.array([not _empty(cell) for cell in self.columns[column]], dtype=np.bool_)
+
+    def numbers(self, column: str, what: str, empty: float | None = None) -> FloatArray:
+        """Return the finite numbers of a column; other cells leave their rows out.
+
+        Parameters
+        ----------
+        column
+            That is there.
+        what
+            What to give instead, with its unit.
+        empty
+            What an empty cell stands for; None refuses it.
+        """
+        cells = self.columns[column]
+        values = cells if isinstance(cells, np.ndarray) else np.array([_number(c) for c in cells])
+        values = np.asarray(values, dtype=np.float64).copy()
+        for i in np.flatnonzero(~np.isfinite(values)):
+            if not _empty(cells[i]):
+                self.refuse(i, column, f"{_shown(cells[i])} is no finite number; give {what}")
+            elif empty is None:
+                self.refuse(i, column, f"the cell is empty; give {what}")
+            else:
+                values[i] = empty
+        return values
+
+    def check(self, column: str, wrong: npt.ArrayLike, values: FloatArray, reason: str) -> None:
+        """Leave out the rows that are ``wrong``, with their value and what stands behind it."""
+        for i in np.flatnonzero(wrong):
+            self.refuse(i, column, f"{values[i]:.10g}{reason}")
+
+    def flags(self, column: str) -> npt.NDArray[np.bool_]:
+        """Return truths; cells that are neither true nor false leave their rows out."""
+        flags = np.zeros(len(self), dtype=np.bool_)
+        for i, cell in enumerate(self.columns[column]):
+            text = str(int(cell) if isinstance(cell, float) and cell in (0.0, 1.0) else cell)
+            known = text.strip().casefold()
+            if known in _TRUE:
+                flags[i] = True
+            elif known not in _FALSE:
+                self.refuse(i, column, f"{_shown(cell)} is neither true nor false; give one")
+        return flags
+
+    def times(self, column: str, optional: bool) -> FloatArray:
+        """Return unix seconds; NaN where the cell is empty and may be."""
+        seconds = np.full(len(self), np.nan)
+        for i, cell in enumerate(self.columns[column]):
+            if _empty(cell):
+                if not optional:
+                    self.refuse(i, column, "the cell is empty; give a time in ISO 8601 with Z")
+                continue
+            try:
+                text = cell.isoformat() if isinstance(cell, datetime) else str(cell)
+                seconds[i] = parse_time(text)
+            except InputError as error:
+                self.refuse(i, column, str(error))
+        return seconds
+
+
+def read_rows(path: Path, what: str) -> Rows:
+    """Return the rows of a CSV file with a header, separated by comma, semicolon or tab.
+
+    Empty lines are skipped; lines with more or fewer cells than the header are bad rows.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read, or its header is unusable.
+    """
+    text = read_text(path, what)
+    header = text.lstrip("\r\n").split("\n", maxsplit=1)[0]
+    separator = max(",;\t", key=header.count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
+    table: list[list[str]] = []
+    places: list[str] = []
+    before = 0
+    try:
+        for cells in reader:
+            # A quoted cell may run over several lines; the row is named by its first.
+            if any(cell.strip() for cell in cells):
+                table.append(cells)
+                places.append(f"line {before + 1}")
+            before = reader.line_num
+    except csv.Error as error:
+        raise FormatError(path, f"no table in CSV ({error})", f"line {reader.line_num}") from None
+    if not table:
+        raise FormatError(path, f"there is nothing in it; it should be {what}")
+    names = [cell.strip() for cell in table.pop(0)]
+    place = places.pop(0)
+    while names and not names[-1]:
+        names.pop()
+    for k, name in enumerate(names):
+        if not name or name in names[:k]:
+            wrong = f"column {name} stands there twice" if name else f"column {k + 1} has no name"
+            raise FormatError(path, f"{wrong}; name each column once", place)
+    rows = Rows(path, places, {}, place)
+    for i, cells in enumerate(table):
+        while len(cells) > len(names) and not cells[-1].strip():
+            cells.pop()
+        if len(cells) != len(names):
+            rows.reasons[i] = f"{len(cells)} cells under {len(names)} columns; correct the line"
+        cells.extend(repeat("", len(names) - len(cells)))
+    rows.columns.update({name: [cells[k] for cells in table] for k, name in enumerate(names)})
+    return rows
+
+
+def read_parquet(path: Path, what: str) -> Rows:
+    """Return the rows of a Parquet file.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    if not path.is_file():
+        raise FormatError(path, f"there is no such file; give the path of {what}")
+    try:
+        with pq.ParquetFile(path) as file:
+            table = file.read()
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).split("\n", maxsplit=1)[0]
+        raise FormatError(path, f"no Parquet table ({reason}); it should be {what}") from None
+    names = list(table.column_names)
+    if len(set(names)) != len(names):
+        raise FormatError(path, "two columns have the same name; name each column once")
+    columns: dict[str, Cells] = {
+        name: column.to_numpy() if pa.types.is_float64(column.type) else column.to_pylist()
+        for name, column in zip(names, table.columns, strict=True)
+    }
+    return Rows(path, [f"row {i + 1}" for i in range(table.num_rows)], columns)
+
+
+def rows_of(names: Sequence[str]) -> dict[str, int]:
+    """Return the row of each heliostat by its name.
+
+    Raises
+    ------
+    InputError
+        If a name occurs twice.
+    """
+    index = {name: i for i, name in enumerate(names)}
+    if len(index) != len(names):
+        twice = next(name for i, name in enumerate(names) if index[name] != i)
+        raise InputError(f"heliostat {twice}: the name occurs twice; names are unique")
+    return index
+
+
+def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
+    """Return the row of each heliostat that the table names; strangers are left out."""
+    index = rows_of(names)
+    rows.heliostat = rows.texts(column)
+    found = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
+    for i in np.flatnonzero(found < 0):
+        name = rows.heliostat[i]
+        text = str(UnknownNameError("heliostat", name, names)) if name else "the cell is empty"
+        rows.refuse(i, column, text if name else f"{text}; name a heliostat")
+    return found
+
+
+def parse_time(text: str) -> float:
+    """Return unix seconds of an ISO 8601 text, the nearest double to all its digits.
+
+    Raises
+    ------
+    InputError
+        If it is no time, or one without a time zone.
+    """
+    found = _TIME.fullmatch(text.strip())
+    if found is None:
+        raise InputError(f"{_shown(text)} is no ISO 8601 time; write it like 2026-06-21T12:00:00Z")
+    day, clock, digits, zone = found.groups()
+    if zone is None:
+        raise InputError(
+            f"{text.strip()} has no time zone; append Z if it is UTC, or an offset such as +02:00"
+        )
+    try:
+        moment = datetime.fromisoformat(f"{day}T{clock[:8]}{zone}")
+        whole = (moment - _EPOCH) // timedelta(seconds=1)
+        return float(whole + (Fraction(int(digits), 10 ** len(digits)) if digits else 0))
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{_shown(text)} is no time ({error}); correct it") from None
+
+
+def format_time(seconds: float) -> str:
+    """Return unix seconds as ISO 8601 in UTC, with the digits that give the same double again.
+
+    Raises
+    ------
+    InputError
+        If they are infinite or lie outside the years 1 to 9999.
+    """
+    if math.isnan(seconds):
+        return ""
+    try:
+        whole = math.floor(seconds)
+        moment = (_EPOCH + timedelta(seconds=whole)).replace(tzinfo=None).isoformat()
+    except OverflowError:
+        raise InputError(f"time {seconds} s since 1970 lies outside the years 1 to 9999") from None
+    # repr is the shortest text that gives the same double; its decimals are kept exactly.
+    decimals = f"{Decimal(repr(float(seconds))):f}".partition(".")[2].rstrip("0")
+    if decimals and seconds < 0.0:
+        # Below the epoch the time of day still counts upwards.
+        decimals = f"{10 ** len(decimals) - int(decimals):0{len(decimals)}d}"
+    return f"{moment}.{decimals}Z" if decimals else f"{moment}Z"
+
+
+def _empty(cell: Any) -> bool:
+    # NaN and NaT, which Parquet may hold, are the values that differ from themselves.
+    return cell is None or cell != cell or (isinstance(cell, str) and not cell.strip())  # noqa: PLR0124
+
+
+def _number(cell: Any) -> float:
+    if isinstance(cell, bool) or (isinstance(cell, str) and "_" in cell):
+        return math.nan
+    try:
+        return float(cell)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _shown(cell: Any) -> str:
+    text = repr(cell if isinstance(cell, str) else str(cell))
+    return text if len(text) <= 60 else f"{text[:57]}…'"

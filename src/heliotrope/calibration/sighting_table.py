@@ -1,0 +1,383 @@
+"""Tables of sightings: every kind in one CSV or Parquet file, and Malan's own CSV.
+
+One row is one sighting. A row that cannot be used is left out and named in one line
+(file, line, heliostat, column, value, what to do); a file that cannot be used raises.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration._cells import (
+    Rows,
+    find_heliostats,
+    format_time,
+    read_parquet,
+    read_rows,
+    rows_of,
+)
+from heliotrope.calibration.sightings import Sightings, camera_target, is_covariance, sightings
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._textfile import LIMIT, write_file
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, direction
+
+#: Kinds of sightings; whether their source and their destination are at infinity.
+KINDS = {
+    "camera_target": (True, False),
+    "drone": (False, False),
+    "sun_sensor": (True, True),
+    "field_camera": (True, False),
+}
+_ENDS = ("source", "destination")
+_AXES = ("east", "north", "up")
+#: Upper triangle of a symmetric matrix, by the initials of the axes.
+_PAIRS = {"ee": (0, 0), "en": (0, 1), "eu": (0, 2), "nn": (1, 1), "nu": (1, 2), "uu": (2, 2)}
+#: Farther from the plant's reference than this no lamp, camera or target stands, m.
+_FARTHEST = 50e3
+_MALAN = (
+    "timestamp", "sun_azimuth_deg", "sun_elevation_deg", "horizontal_offset_m",
+    "vertical_offset_m", "azimuth_counts", "elevation_counts",
+)  # fmt: skip
+#: A centroid farther from the aim point than this is in another unit, m.
+_FARTHEST_OFFSET = 50.0
+
+
+def read_sightings(
+    path: str | Path, names: Sequence[str]
+) -> tuple[Sightings, tuple[str, ...], list[str]]:
+    """Return the sightings of a table, the kind of each, and what was left out and why.
+
+    Parameters
+    ----------
+    path
+        A file ``.csv`` (comma, semicolon or tab; with or without a byte-order mark) or
+        ``.parquet``, with the columns of :func:`write_sightings`. Columns ``time``,
+        ``kind`` and the covariances may be missing; ``sigma_mrad`` may stand for
+        ``sigma_rad``. A time that is not given is NaN. Further columns are not looked at.
+    names
+        Of the heliostats, (N,): the row of each is its place here.
+
+    Returns
+    -------
+    The M sightings in the order of the file, their kinds ("" where not given), and one
+    line for each row that could not be used.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read, or a column is missing or known by a name like it.
+    InputError
+        If a name occurs twice.
+    """
+    file = Path(path)
+    if _is_parquet(file):
+        rows = read_parquet(file, "a table of sightings")
+    else:
+        rows = read_rows(file, "a table of sightings in CSV (large ones are .parquet)")
+    drives = _check_columns(rows)
+    heliostat = find_heliostats(rows, "heliostat", names)
+    kinds = rows.texts("kind")
+    time = rows.times("time", optional=True) if "time" in rows.columns else None
+    counts = np.stack([rows.numbers(name, "drive counts") for name in drives], axis=-1)
+    far = {end: rows.flags(f"{end}_at_infinity") for end in _ENDS}
+    ends = {end: _points(rows, end, far[end]) for end in _ENDS}
+    _check_kinds(rows, kinds, far)
+    sigma = _sigma(rows)
+    spread = {end: _covariance(rows, end) for end in _ENDS}
+    good = rows.good
+    seen = sightings(
+        heliostat[good],
+        counts[good],
+        ends["source"][good],
+        ends["destination"][good],
+        time=np.nan if time is None else time[good],
+        source_at_infinity=far["source"][good],
+        destination_at_infinity=far["destination"][good],
+        sigma=sigma[good],
+        source_covariance=spread["source"][good],
+        destination_covariance=spread["destination"][good],
+    )
+    return seen, tuple(kinds[i] for i in good), rows.left_out
+
+
+def write_sightings(
+    path: str | Path,
+    sightings: Sightings,
+    names: Sequence[str],
+    kinds: Sequence[str] | None = None,
+) -> None:
+    """Write sightings so that :func:`read_sightings` gives the same doubles again.
+
+    Parameters
+    ----------
+    path
+        A file ``.csv`` or ``.parquet``; it is there whole or not at all.
+    sightings
+        M of them.
+    names
+        Of the heliostats, (N,).
+    kinds
+        Of each sighting: "camera_target", "drone", "sun_sensor", "field_camera" or "",
+        (M,).
+
+    Raises
+    ------
+    InputError
+        If a name, a kind or a time cannot be written, the suffix is another one, a CSV
+        would exceed the 64 MiB that are read again, or the folder cannot be written to.
+    """
+    file = Path(path)
+    columns = _columns(sightings, names, kinds)
+    if _is_parquet(file):
+        write_file(file, lambda stream: _write_parquet(columns, stream))
+    else:
+        write_file(file, lambda stream: _write_csv(file, columns, stream))
+
+
+def read_malan(
+    path: str | Path,
+    heliostat: str,
+    names: Sequence[str],
+    target: Target,
+    *,
+    aim: tuple[float, float] = (0.0, 0.0),
+    sigma: float = 5e-4,
+) -> tuple[Sightings, list[str]]:
+    """Return the camera-target sightings of one heliostat in Malan's form.
+
+    Parameters
+    ----------
+    path
+        CSV (comma, semicolon or tab; with or without a byte-order mark) with the columns
+        ``timestamp`` (ISO 8601 with a zone), ``sun_azimuth_deg`` (clockwise from north),
+        ``sun_elevation_deg`` (apparent), ``horizontal_offset_m`` and
+        ``vertical_offset_m`` (of the centroid from the aim point, to the right as seen
+        from the heliostats, and up), ``azimuth_counts`` and ``elevation_counts``.
+    heliostat
+        Name of the one that was measured.
+    names
+        Of all heliostats, (N,).
+    target
+        That the beam stood on.
+    aim
+        The aim point, m to the right of and above the target's center.
+    sigma
+        Standard deviation of a centroid as seen from the mirror, rad of beam.
+
+    Returns
+    -------
+    The sightings in the order of the file, and one line for each row left out.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read or lacks a column.
+    UnknownNameError
+        If there is no such heliostat.
+    """
+    index = rows_of(names)
+    if heliostat not in index:
+        raise UnknownNameError("heliostat", heliostat, names)
+    rows = read_rows(Path(path), "a table of Malan's measurements in CSV")
+    rows.need(_MALAN)
+    rows.heliostat = [heliostat] * len(rows)
+    time = rows.times("timestamp", optional=False)
+    azimuth = rows.numbers("sun_azimuth_deg", "degrees clockwise from north")
+    elevation = rows.numbers("sun_elevation_deg", "degrees above the horizon")
+    offsets = [
+        rows.numbers(name, "metres from the aim point")
+        for name in ("horizontal_offset_m", "vertical_offset_m")
+    ]
+    counts = [rows.numbers(name, "drive counts") for name in _MALAN[-2:]]
+    rows.check(
+        "sun_azimuth_deg", (azimuth < -180.0) | (azimuth > 360.0), azimuth,
+        "° is outside −180° to 360°; give degrees clockwise from north",
+    )  # fmt: skip
+    rows.check(
+        "sun_elevation_deg", (elevation <= -5.0) | (elevation > 90.0), elevation,
+        "° is outside −5° to 90°; give the sun's elevation in degrees",
+    )  # fmt: skip
+    for name, values in zip(_MALAN[3:5], offsets, strict=True):
+        rows.check(
+            name, np.abs(values) > _FARTHEST_OFFSET, values,
+            f" m is more than {_FARTHEST_OFFSET:g} m; is it in another unit?",
+        )  # fmt: skip
+    good = rows.good
+    seen = camera_target(
+        index[heliostat],
+        np.stack(counts, axis=-1)[good],
+        direction(np.radians(azimuth[good]), np.radians(elevation[good])),
+        target.point((np.stack(offsets, axis=-1) + aim)[good]),
+        time=time[good],
+        sigma=sigma,
+    )
+    return seen, rows.left_out
+
+
+def _is_parquet(path: Path) -> bool:
+    suffix = path.suffix.casefold()
+    if suffix not in (".csv", ".parquet"):
+        raise FormatError(path, f"the name ends in {suffix!r}; sightings are .csv or .parquet")
+    return suffix == ".parquet"
+
+
+def _check_columns(rows: Rows) -> list[str]:
+    """Return the columns of counts; all that are needed are there, none is mistyped."""
+    ends = [f"{end}_{axis}" for end in _ENDS for axis in (*_AXES, "at_infinity")]
+    rows.need(["heliostat", "count_1", *ends])
+    there = list(rows.columns)
+    drives = ["count_1"]
+    while f"count_{len(drives) + 1}" in rows.columns:
+        drives.append(f"count_{len(drives) + 1}")
+    covariances = [f"{end}_cov_{pair}" for end in _ENDS for pair in _PAIRS]
+    for end in _ENDS:
+        six = [name for name in covariances if name.startswith(end)]
+        if any(name in rows.columns for name in six):
+            rows.need(six)
+    sigmas = ("sigma_rad", "sigma_mrad")
+    if all(name in rows.columns for name in sigmas):
+        raise FormatError(rows.path, "sigma is given in rad and mrad; keep one column", rows.header)
+    if "sigma_mrad" not in rows.columns:
+        rows.need(["sigma_rad"])
+    known = ["heliostat", "time", "kind", *drives, *ends, *sigmas, *covariances]
+    likely = [n for n in (*known, f"count_{len(drives) + 1}") if n not in there]
+    for name in there:
+        if name not in known and name.startswith(("source_", "destination_", "count_", "sigma")):
+            close = get_close_matches(name, likely, n=1)
+            hint = f"did you mean {close[0]}?" if close else "give it another name or remove it"
+            raise FormatError(rows.path, f"column {name} is not known; {hint}", rows.header)
+    return drives
+
+
+def _points(rows: Rows, end: str, far: npt.NDArray[np.bool_]) -> FloatArray:
+    names = [f"{end}_{axis}" for axis in _AXES]
+    what = "metres in ENU, or a part of the direction"
+    points = np.stack([rows.numbers(name, what) for name in names], axis=-1)
+    for name, values in zip(names, points.T, strict=True):
+        rows.check(
+            name, ~far & (np.abs(values) > _FARTHEST), values,
+            f" m is more than {_FARTHEST / 1e3:g} km from the plant; give ENU metres about it",
+        )  # fmt: skip
+    for i in np.flatnonzero(far & ~points.any(axis=-1)):
+        rows.refuse(i, names[0], "0, 0, 0 has no direction; give one from the mirror")
+    return points
+
+
+def _check_kinds(rows: Rows, kinds: Sequence[str], far: dict[str, npt.NDArray[np.bool_]]) -> None:
+    for i, kind in enumerate(kinds):
+        if kind and kind not in KINDS:
+            rows.refuse(i, "kind", str(UnknownNameError("kind of sighting", kind, KINDS)))
+        for end, wanted in zip(_ENDS, KINDS.get(kind, ()), strict=False):
+            if far[end][i] != wanted:
+                rows.refuse(
+                    i, f"{end}_at_infinity",
+                    f"{str(bool(far[end][i])).lower()}, but of kind {kind} it is "
+                    f"{str(wanted).lower()}; correct one of them",
+                )  # fmt: skip
+
+
+def _sigma(rows: Rows) -> FloatArray:
+    name = "sigma_rad" if "sigma_rad" in rows.columns else "sigma_mrad"
+    unit = name.removeprefix("sigma_")
+    given = rows.numbers(name, f"the ray's standard deviation in {unit}")
+    # Dividing rounds once; 1e-3 is no double.
+    sigma = given if unit == "rad" else given / 1e3
+    rows.check(name, ~(sigma > 0.0) & np.isfinite(sigma), given, f" {unit} must be above 0")
+    return sigma
+
+
+def _covariance(rows: Rows, end: str) -> FloatArray:
+    matrices = np.zeros((len(rows), 3, 3))
+    if f"{end}_cov_ee" not in rows.columns:
+        return matrices
+    names = {pair: f"{end}_cov_{pair}" for pair in _PAIRS}
+    # All six empty are no covariance; a few of them are a mistake.
+    filled = np.array([rows.filled(name) for name in names.values()])
+    some = filled.any(axis=0)
+    what = "m² of a point or rad² of a direction, or leave all six empty"
+    for k, (pair, (a, b)) in enumerate(_PAIRS.items()):
+        values = rows.numbers(names[pair], what, empty=0.0)
+        matrices[:, a, b] = matrices[:, b, a] = values
+        for i in np.flatnonzero(some & ~filled[k]):
+            rows.refuse(i, names[pair], f"the cell is empty; give {what}")
+    for i in np.flatnonzero(~is_covariance(matrices)):
+        rows.refuse(
+            i, f"{end}_cov_ee to {end}_cov_uu",
+            f"{[float(matrices[i, a, b]) for a, b in _PAIRS.values()]} is no covariance (not "
+            "positive semidefinite); correct them or leave all six empty",
+        )  # fmt: skip
+    return matrices
+
+
+def _columns(
+    s: Sightings, names: Sequence[str], kinds: Sequence[str] | None
+) -> dict[str, list[Any]]:
+    rows_of(names)
+    if len(s) and int(s.heliostat.max()) >= len(names):
+        raise InputError(
+            f"sightings: heliostat row {int(s.heliostat.max())} of {len(names)} names; give the "
+            "names of all heliostats"
+        )
+    given = [""] * len(s) if kinds is None else list(kinds)
+    if len(given) != len(s):
+        raise InputError(f"sightings: {len(given)} kinds of {len(s)} sightings; give one of each")
+    for kind in given:
+        if kind and kind not in KINDS:
+            raise UnknownNameError("kind of sighting", kind, KINDS)
+    columns: dict[str, list[Any]] = {
+        "heliostat": [str(names[i]) for i in s.heliostat],
+        "time": [format_time(t) for t in s.time.tolist()],
+        "kind": given,
+    }
+    for d in range(s.counts.shape[-1]):
+        columns[f"count_{d + 1}"] = s.counts[:, d].tolist()
+    for end in _ENDS:
+        for axis, values in zip(_AXES, getattr(s, end).T, strict=True):
+            columns[f"{end}_{axis}"] = values.tolist()
+        columns[f"{end}_at_infinity"] = getattr(s, f"{end}_at_infinity").tolist()
+    columns["sigma_rad"] = s.sigma.tolist()
+    for end in _ENDS:
+        matrices = getattr(s, f"{end}_covariance")
+        if matrices.any():
+            for pair, (a, b) in _PAIRS.items():
+                columns[f"{end}_cov_{pair}"] = matrices[:, a, b].tolist()
+    return columns
+
+
+def _write_csv(path: Path, columns: dict[str, list[Any]], stream: BinaryIO) -> None:
+    text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    # repr of a float is the shortest text that reads back the same.
+    cells: Iterable[list[Any]] = (
+        ["true" if c else "false" for c in column] if name.endswith("_at_infinity") else column
+        for name, column in columns.items()
+    )
+    writer.writerows(zip(*cells, strict=True))
+    text.flush()
+    text.detach()
+    if stream.tell() > LIMIT:
+        raise InputError(
+            f"{path}: {stream.tell() / 2**20:.0f} MiB of CSV are more than the "
+            f"{LIMIT / 2**20:.0f} MiB that are read again; write .parquet"
+        )
+
+
+def _write_parquet(columns: dict[str, list[Any]], stream: BinaryIO) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    def kind(name: str) -> Any:
+        if name in ("heliostat", "time", "kind"):
+            return pa.string()
+        return pa.bool_() if name.endswith("_at_infinity") else pa.float64()
+
+    table = pa.table({name: pa.array(cells, kind(name)) for name, cells in columns.items()})
+    pq.write_table(table, stream)
