@@ -131,6 +131,7 @@ def test_covariances_broadcast() -> None:
         ([[0, 1.0, 0], [0, 0, 0], [0, 0, 0]], r"sighting 0: source_covariance .* not symmetric"),
         ([0.0, np.nan], r"sighting 1: source_covariance"),
         ([0.0, np.inf], r"sighting 1: source_covariance"),
+        ([0.0, 1e308], r"sighting 1: source_covariance"),
         ([1.0, 2.0, 3.0], r"source_covariance of shape \(3,\); give a variance, 2 variances"),
     ],
 )
@@ -329,6 +330,7 @@ GOOD = (
 BAD: list[tuple[str, int, str, str]] = [
     # what, column, value, what the line says
     ("stranger", 0, "AA40", "heliostat AA40, column heliostat: there is no heliostat 'AA40'; did"),
+    ("broken name", 0, '"AA\n39"', "heliostat AA 39, column heliostat: there is no heliostat"),
     ("nobody", 0, "", "line 3, column heliostat: the cell is empty; name a heliostat"),
     ("naive", 1, "2026-06-21T12:00:00", "column time: 2026-06-21T12:00:00 has no time zone; app"),
     ("no time", 1, "noon", "column time: 'noon' is no ISO 8601 time; write it like"),
@@ -384,7 +386,8 @@ def test_all_bad_rows_together(tmp_path: Path) -> None:
     seen, _, left_out = read_sightings(path, NAMES)
     assert len(seen) == 2
     assert len(left_out) == len(BAD) + 3
-    after = len(BAD) + 3
+    # One of the bad cells runs over two lines.
+    after = len(BAD) + 4
     nowhere = "column source_east: 0, 0, 0 has no direction; give one from the mirror"
     assert left_out[-3:] == [
         f"s.csv: line {after}, heliostat AA39, {nowhere}",
@@ -444,6 +447,7 @@ def test_parquet_rows_are_named_too(tmp_path: Path) -> None:
         ("kind", "sigma_rad", "sigma is given in rad and mrad; keep one column"),
         ("time", "kind", "column kind stands there twice; name each column once"),
         ("kind", "", "column 3 has no name"),
+        ("heliostat", '"a\nb"', "there is no column heliostat; add it. There are a b, time,"),
         ("AA39", '"AA39', "no table in CSV (unexpected end of data)"),
     ],
 )
@@ -480,6 +484,13 @@ def test_an_unreadable_file_is_refused(
         read_sightings(path, NAMES)
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_parquet_of_broken_texts_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "s.parquet"
+    pq.write_table(pa.table({"heliostat": pa.array([b"\xff"]).view(pa.string())}), path)
+    with pytest.raises(FormatError, match=r"no Parquet table \('utf-8' codec"):
+        read_sightings(path, NAMES)
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -72,7 +72,8 @@ class Rows:
         for i, reason in sorted(self.reasons.items()):
             name = self.heliostat[i] if len(self.heliostat) else ""
             whose = f", heliostat {name}" if name else ""
-            lines.append(f"{self.path.name}: {self.places[i]}{whose}, {reason}")
+            # A quoted cell may hold line breaks; a message is one line.
+            lines.append(" ".join(f"{self.path.name}: {self.places[i]}{whose}, {reason}".split()))
         return lines
 
     def need(self, names: Sequence[str]) -> None:
@@ -183,7 +184,7 @@ def read_rows(path: Path, what: str) -> Rows:
         raise FormatError(path, f"no table in CSV ({error})", f"line {reader.line_num}") from None
     if not table:
         raise FormatError(path, f"there is nothing in it; it should be {what}")
-    names = [cell.strip() for cell in table.pop(0)]
+    names = [_tidy(cell) for cell in table.pop(0)]
     place = places.pop(0)
     while names and not names[-1]:
         names.pop()
@@ -218,16 +219,17 @@ def read_parquet(path: Path, what: str) -> Rows:
     try:
         with pq.ParquetFile(path) as file:
             table = file.read()
-    except (pa.ArrowException, OSError) as error:
+        names = [_tidy(name) for name in table.column_names]
+        cells: list[Cells] = [
+            column.to_numpy() if pa.types.is_float64(column.type) else column.to_pylist()
+            for column in table.columns
+        ]
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
         raise FormatError(path, f"no Parquet table ({reason}); it should be {what}") from None
-    names = list(table.column_names)
     if len(set(names)) != len(names):
         raise FormatError(path, "two columns have the same name; name each column once")
-    columns: dict[str, Cells] = {
-        name: column.to_numpy() if pa.types.is_float64(column.type) else column.to_pylist()
-        for name, column in zip(names, table.columns, strict=True)
-    }
+    columns = dict(zip(names, cells, strict=True))
     return Rows(path, [f"row {i + 1}" for i in range(table.num_rows)], columns)
 
 
@@ -303,6 +305,11 @@ def format_time(seconds: float) -> str:
         # Below the epoch the time of day still counts upwards.
         decimals = f"{10 ** len(decimals) - int(decimals):0{len(decimals)}d}"
     return f"{moment}.{decimals}Z" if decimals else f"{moment}Z"
+
+
+def _tidy(name: str) -> str:
+    """Return the name of a column in one line that a message can show."""
+    return " ".join(name.split())[:60]
 
 
 def _empty(cell: Any) -> bool:

@@ -125,7 +125,8 @@ def sightings(
     ):
         points = np.array(np.broadcast_to(as_float(given), (rows, 3)))
         _finite(points, name)
-        loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
+        with np.errstate(over="ignore"):
+            loose = far & (np.abs(np.linalg.norm(points, axis=-1) - 1.0) > _UNIT)
         if loose.any():
             points[loose] = normalize(points[loose], name)
         ends.append(points)
@@ -170,12 +171,12 @@ def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
 def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which matrices (M, 3, 3) are finite, symmetric and positive semidefinite.
 
-    Rounding is forgiven: 1e-9 of the largest entry.
+    Rounding is forgiven: 1e-9 of the largest entry. Beyond 1e100 nothing is finite.
     """
     largest = np.abs(matrices).max(axis=(-1, -2))
     # Most are zero, and need no eigenvalues.
     good = largest == 0.0
-    rows = np.flatnonzero(~good & np.isfinite(largest))
+    rows = np.flatnonzero(~good & (largest < 1e100))
     scaled = matrices[rows] / largest[rows, None, None]
     even = np.abs(scaled - np.swapaxes(scaled, -1, -2)).max(axis=(-1, -2)) <= 1e-9
     good[rows] = even & (np.linalg.eigvalsh(scaled)[:, 0] >= -1e-9)
