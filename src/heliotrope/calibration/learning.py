@@ -1,0 +1,382 @@
+"""Learning a field: from sightings to parameters that predict, with their uncertainty.
+
+1. A robust maximum a posteriori fit of each heliostat (:mod:`.estimator`).
+2. Regimes in time (:mod:`.regimes`), and the fit again on the common one.
+3. From a sample of the field: the population of the parameters, the processes by which
+   they wander and the noise (:mod:`.drift`), without the outliers (:mod:`.outliers`).
+4. For each heliostat what its own sightings say under that.
+
+Steps 1, 2 and 4 treat every heliostat by itself; only step 3 looks at several.
+"""
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from threadpoolctl import threadpool_limits
+
+from heliotrope.calibration import drift
+from heliotrope.calibration.drift import DAY, Hyperparameters, Linear, Posterior
+from heliotrope.calibration.estimator import Calibration, Loss, fit
+from heliotrope.calibration.evaluation import Errors, errors
+from heliotrope.calibration.outliers import ALPHA, generalised_esd
+from heliotrope.calibration.regimes import find_regimes, regime_at
+from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.parallel import threads
+
+#: Heliostats with fewer sightings teach nothing about the field.
+FEWEST = 8
+#: No more heliostats than this are looked at for what is common to the field.
+SAMPLE = 60
+#: A start this many standard deviations of the prior away was a mistake in the plant's data.
+MISTAKE = 5.0
+#: Rounds of expectation and maximisation over the population.
+ROUNDS = 6
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Where M beams are expected, against where they were seen.
+
+    Attributes
+    ----------
+    errors
+        Of the predicted against the seen, (M,).
+    plane
+        Predicted minus seen, rad of beam to the right of and above the destination, (M, 2).
+    covariance
+        Of ``plane`` as predicted: parameters, wandering and noise, rad², (M, 2, 2).
+    inside
+        Whether the error lies in the 90 % ellipse, (M,).
+    """
+
+    errors: Errors
+    plane: FloatArray
+    covariance: FloatArray
+    inside: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What was learnt of N heliostats from M sightings.
+
+    Attributes
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        All that were given.
+    model
+        Parameters that are constant but unknown.
+    used
+        Sightings to learn from, as asked, (M,).
+    static
+        The robust fit of step 2.
+    hyper
+        What is common to the field.
+    members
+        What is known of each heliostat.
+    regime
+        Of each sighting; −1 if not used, (M,).
+    outlier
+        (M,); ``used`` ones only.
+    """
+
+    mechanism: Mechanism
+    sightings: Sightings
+    model: tuple[str, ...]
+    used: npt.NDArray[np.bool_]
+    static: Calibration
+    hyper: Hyperparameters
+    members: tuple[Posterior, ...]
+    regime: npt.NDArray[np.int64]
+    outlier: npt.NDArray[np.bool_]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The P parameters, those that only wander included."""
+        return self.hyper.names
+
+    def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
+        """Return the regime of a heliostat at Unix times ``when`` (m,)."""
+        rows = np.flatnonzero((self.sightings.heliostat == heliostat) & (self.regime >= 0))
+        return regime_at(self.sightings.time[rows], self.regime[rows], when)
+
+    def parameters_at(
+        self, heliostat: npt.ArrayLike, time: npt.ArrayLike
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return deviations (M, P) at Unix times (M,) and their covariance (M, P, P).
+
+        Parameters
+        ----------
+        heliostat
+            Rows, (M,).
+        time
+            Unix seconds, (M,); NaN: at no known time.
+        """
+        rows = np.asarray(heliostat, dtype=np.intp)
+        when = np.broadcast_to(np.asarray(time, dtype=np.float64), rows.shape)
+        size = len(self.names)
+        values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
+        with threadpool_limits(1, "blas"):
+            for i in np.unique(rows):
+                part = np.flatnonzero(rows == i)
+                # Many at once would need much memory: sightings × times × parameters.
+                for some in np.array_split(part, 1 + len(part) // 500):
+                    label = self.regimes(int(i), when[some])
+                    values[some], spread[some] = self.members[i].at(when[some] / DAY, label)
+        return values, spread
+
+    def mechanism_at(self, heliostat: npt.ArrayLike, time: npt.ArrayLike) -> Mechanism:
+        """Return the mechanisms of ``heliostat`` (M,) as they are expected at ``time`` (M,)."""
+        values, _ = self.parameters_at(heliostat, time)
+        nominal = self.mechanism[np.asarray(heliostat, dtype=np.intp)]
+        return nominal.with_parameters({n: values[:, p] for p, n in enumerate(self.names)})
+
+    def predict(self, sightings: Sightings) -> Prediction:
+        """Return what was to be expected of sightings, and how far off it was."""
+        rows = sightings.heliostat
+        values, spread = self.parameters_at(rows, sightings.time)
+        nominal = self.mechanism[rows]
+        moved = nominal.with_parameters({n: values[:, p] for p, n in enumerate(self.names)})
+        alone = replace(sightings, heliostat=np.arange(len(rows)))
+        found = errors(moved, alone)
+        line = linearise(moved, sightings, self.names)
+        noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in self.members])[rows]
+        white = line.jacobian @ spread @ np.swapaxes(line.jacobian, -1, -2)
+        white += noise[:, None, None] * np.eye(2)
+        covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
+        square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
+        return Prediction(found, found.offset, covariance, square <= drift.NINETY)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Steps 1 and 2 for some heliostats."""
+
+    static: Calibration
+    regime: npt.NDArray[np.int64]
+    field: tuple[Linear, ...]
+    rows: tuple[npt.NDArray[np.intp], ...]
+
+
+def prepare(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: tuple[str, ...],
+    names: tuple[str, ...],
+    used: npt.NDArray[np.bool_],
+    *,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    loss: Loss = "cauchy",
+) -> Prepared:
+    """Fit each heliostat, cut its time into regimes, and linearise its sightings."""
+    zeros = drift.zeros(mechanism)
+    regime = np.where(used, 0, -1)
+    offsets, order = _by_heliostat(sightings, used, len(mechanism))
+    static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
+    for turn in range(2):
+        moved = mechanism.with_parameters(static.parameters)
+        # No row of a single zero has a pair of them to be shifted.
+        if len(zeros) != 2:
+            break
+        line = linearise(moved[sightings.heliostat], sightings, zeros)
+        for i in range(len(mechanism)):
+            part = order[offsets[i] : offsets[i + 1]]
+            scale = max(float(static.scale[i]), 0.3)
+            regime[part] = find_regimes(
+                sightings.time[part], line.residual[part] / scale, line.jacobian[part] / scale
+            )
+        if turn == 1 or not (regime > 0).any():
+            break
+        static = fit(mechanism, sightings, model, keep=regime == 0, priors=priors, loss=loss)
+    moved = mechanism.with_parameters(static.parameters)
+    line = linearise(moved[sightings.heliostat], sightings, names)
+    at = np.zeros((len(mechanism), len(names)))
+    centre = np.zeros_like(at)
+    at[:, : len(model)], centre[:, : len(model)] = static.values, static.centre
+    # A start only a little off was a help to the search; the prior stays with the nominal.
+    centre[(np.abs(static.centre) < MISTAKE * static.prior).all(axis=1)] = 0.0
+    field, rows = [], []
+    for i in range(len(mechanism)):
+        part = order[offsets[i] : offsets[i + 1]]
+        jacobian = np.ascontiguousarray(line.jacobian[part])
+        field.append(
+            Linear(
+                jacobian=jacobian,
+                value=jacobian @ (at[i] - centre[i]) - line.residual[part],
+                time=sightings.time[part] / DAY,
+                regime=regime[part],
+                centre=centre[i],
+                own=centre[i] != 0.0,
+                steps=np.empty(0),
+            )
+        )
+        rows.append(part)
+    return Prepared(static, regime, tuple(field), tuple(rows))
+
+
+def _by_heliostat(
+    s: Sightings, used: npt.NDArray[np.bool_], count: int
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+    """Offsets (N + 1,) and the used rows, heliostat by heliostat, not depending on the rows' order."""
+    keys = (*s.destination.T, *s.source.T, *s.counts.T, s.time, s.heliostat)
+    order = np.lexsort(keys)
+    order = order[used[order]]
+    return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
+
+
+def learn_field(
+    hyper: Hyperparameters, prepared: Prepared, progress: Progress | None = None
+) -> Hyperparameters:
+    """Return what is common to the field, from prepared heliostats (step 3)."""
+    table = np.where(hyper.spread > 0, hyper.spread, 0.0)
+    teachers = [k for k, d in enumerate(prepared.field) if len(d) >= FEWEST]
+    if not teachers:
+        return hyper
+    everything = [prepared.field[k] for k in teachers]
+    # Of the field, not of each: a heliostat full of mistakes has a large noise of its own.
+    usual = max(float(np.median(prepared.static.scale[teachers])), hyper.noise)
+    clean = [_without_outliers(replace(hyper, noise=usual), d) for d in everything]
+    for turn in range(ROUNDS):
+        if turn in (0, 2, ROUNDS - 1):
+            hyper, _ = drift.fit_hyperparameters(hyper, drift.typical(hyper, clean))
+        if turn in (1, 3):
+            clean = [_without_outliers(hyper, d) for d in everything]
+        members = [drift.posterior(hyper, d) for d in clean]
+        hyper = drift.fit_population(hyper, table, members)
+        if progress:
+            progress(turn + 1, ROUNDS)
+    final = [finish(hyper, d)[0] for d in everything]
+    gone = sum(len(d) for d in everything) - sum(len(m.data) for m in final)
+    return replace(
+        hyper, rate=drift.step_rate(final), heavy=drift.heavy_tails(final, gone)
+    )
+
+
+def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
+    return data.take(~_outliers(hyper, data))
+
+
+def _outliers(hyper: Hyperparameters, data: Linear, alpha: float = ALPHA) -> npt.NDArray[np.bool_]:
+    if len(data) < 4:
+        return np.zeros(len(data), dtype=np.bool_)
+    return generalised_esd(data.rest(hyper), drift.covariance(hyper, data), alpha=alpha)
+
+
+def finish(
+    hyper: Hyperparameters, data: Linear, own: bool = True
+) -> tuple[Posterior, npt.NDArray[np.bool_]]:
+    """Return what one heliostat's sightings say under the field's ``hyper``, and its outliers.
+
+    ``own`` lets its noise and wandering differ from the field's.
+    """
+    outlier = _outliers(hyper, data)
+    if len(data) >= FEWEST and hyper.processes:
+        data = replace(data, steps=drift.find_steps(hyper, data.take(~outlier)))
+        if own:
+            hyper = drift.refine(hyper, data.take(~outlier))
+        outlier = _outliers(hyper, data)
+    return drift.posterior(hyper, data.take(~outlier)), outlier
+
+
+def learn(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: str | tuple[str, ...],
+    *,
+    used: npt.ArrayLike | None = None,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    processes: tuple[drift.Process, ...] | None = None,
+    hyper: Hyperparameters | None = None,
+    loss: Loss = "cauchy",
+    own: bool = True,
+    progress: Progress | None = None,
+) -> Learned:
+    """Learn parameters, regimes, wandering and noise of every heliostat.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        M of these heliostats, in any order.
+    model
+        Name of a model of the parameter table, or names of parameters.
+    used
+        Mask of the sightings to learn from, (M,).
+    priors
+        Standard deviations that replace the table's, by name.
+    processes
+        What wanders; ``()`` for nothing.
+    hyper
+        What is common to the field, if it is known already.
+    loss
+        Of the robust fit.
+    own
+        Whether each heliostat's noise and wandering may differ from the field's.
+    progress
+        Called with (done, all) heliostats.
+
+    Raises
+    ------
+    InputError
+        As of :func:`heliotrope.calibration.estimator.fit`.
+    """
+    constant = (
+        parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
+    )
+    keep = np.ones(len(sightings), dtype=np.bool_) if used is None else np.asarray(used, np.bool_)
+    with threadpool_limits(1, "blas"):
+        first = drift.start(mechanism, constant, processes, _prior_row(constant, mechanism, priors))
+        prepared = prepare(
+            mechanism, sightings, constant, first.names, keep, priors=priors, loss=loss
+        )
+        if hyper is None:
+            hyper = learn_field(first, sample(prepared))
+        members, outlier = _finish_all(hyper, prepared, len(sightings), own, progress)
+    return Learned(
+        mechanism, sightings, constant, keep, prepared.static, hyper, members, prepared.regime,
+        outlier,
+    )  # fmt: skip
+
+
+def _prior_row(
+    model: tuple[str, ...], mechanism: Mechanism, given: Mapping[str, npt.ArrayLike] | None
+) -> FloatArray:
+    """One standard deviation a parameter: the median where a field overrides them one by one."""
+    table = [np.median((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
+    return np.array(table, dtype=np.float64)
+
+
+def sample(prepared: Prepared, most: int = SAMPLE) -> Prepared:
+    """Return the heliostats to learn the field from: ``most`` of those with enough sightings."""
+    able = np.array([k for k, d in enumerate(prepared.field) if len(d) >= FEWEST], dtype=np.intp)
+    if len(able) > most:
+        able = able[np.linspace(0, len(able) - 1, most).round().astype(np.intp)]
+    chosen = replace(prepared.static, scale=prepared.static.scale[able])
+    field = tuple(prepared.field[k] for k in able)
+    return Prepared(chosen, prepared.regime, field, tuple(prepared.rows[k] for k in able))
+
+
+def _finish_all(
+    hyper: Hyperparameters, prepared: Prepared, rows: int, own: bool, progress: Progress | None
+) -> tuple[tuple[Posterior, ...], npt.NDArray[np.bool_]]:
+    outlier = np.zeros(rows, dtype=np.bool_)
+    members = []
+    with ThreadPoolExecutor(threads(), thread_name_prefix="heliotrope-learn") as pool:
+        found = pool.map(lambda data: finish(hyper, data, own), prepared.field)
+        for k, (member, mine) in enumerate(found):
+            members.append(member)
+            outlier[prepared.rows[k]] = mine
+            if progress:
+                progress(k + 1, len(prepared.field))
+    return tuple(members), outlier
