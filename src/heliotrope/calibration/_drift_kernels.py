@@ -4,9 +4,10 @@ The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p i
 with a variance, plus an offset that lasts as long as a regime, plus Ornstein-Uhlenbeck
 processes of some amplitude and time; so two sightings share
 
-    K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + Σ_c a_c² exp(−|t_i − t_j| / τ_c)).
+    K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + δ_p² min(e_i, e_j)
+                            + Σ_c a_c² exp(−|t_i − t_j| / τ_c))
 
-A time that is not known (NaN) shares nothing with any other.
+with e the number of steps that the zeros have taken before. A time that is not known (NaN) shares nothing with any other.
 """
 
 import math
@@ -19,8 +20,8 @@ from heliotrope.mechanism._jit import OPTIONS
 
 @njit(**OPTIONS)
 def gram(
-    first, first_time, first_regime, second, second_time, second_regime, same,
-    static, regime, part, amplitude, tau,
+    first, first_time, first_regime, first_epoch, second, second_time, second_regime,
+    second_epoch, same, static, regime, step, part, amplitude, tau,
 ):  # fmt: skip
     """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
 
@@ -40,6 +41,10 @@ def gram(
             if first_regime[i] == second_regime[j] and first_regime[i] != 0:
                 for p in range(size):
                     weight[p] += regime[p]
+            shared = min(first_epoch[i], second_epoch[j])
+            if shared > 0:
+                for p in range(size):
+                    weight[p] += shared * step[p]
             if math.isfinite(apart):
                 for c in range(part.shape[0]):
                     weight[part[c]] += amplitude[c] * amplitude[c] * math.exp(-apart / tau[c])
@@ -54,7 +59,8 @@ def gram(
 
 @njit(**OPTIONS)
 def cost_and_gradient(
-    jacobian, time, label, residual, static, regime, part, group, amplitude, tau, noise
+    jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau,
+    noise,
 ):
     """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
 
@@ -65,7 +71,8 @@ def cost_and_gradient(
     for c in range(parts):
         each[c] = tau[group[c]]
     matrix = gram(
-        jacobian, time, label, jacobian, time, label, True, static, regime, part, amplitude, each
+        jacobian, time, label, epoch, jacobian, time, label, epoch, True, static, regime, step,
+        part, amplitude, each,
     )
     for k in range(2 * n):
         matrix[k, k] += noise * noise
@@ -102,15 +109,15 @@ def cost_and_gradient(
 
 @njit(**OPTIONS)
 def pooled_block(
-    jacobian, time, label, residual, offsets, static, regime, part, group, amplitude, tau, noise,
-    costs, gradients, start, stop,
+    jacobian, time, label, epoch, residual, offsets, static, regime, step, part, group, amplitude,
+    tau, noise, costs, gradients, start, stop,
 ):  # fmt: skip
     """Cost and gradient of heliostats ``start`` to ``stop``, one a row."""
     for i in range(start, stop):
         a, b = offsets[i], offsets[i + 1]
         cost, gradient = cost_and_gradient(
-            jacobian[a:b], time[a:b], label[a:b], residual[a:b], static, regime, part, group,
-            amplitude, tau, noise,
+            jacobian[a:b], time[a:b], label[a:b], epoch[a:b], residual[a:b], static[i], regime,
+            step, part, group, amplitude, tau, noise,
         )  # fmt: skip
         costs[i] = cost
         gradients[i] = gradient
@@ -165,3 +172,39 @@ def remove_farthest(inverse, residual, most):
             inverse[k, k] = 1.0
             flat[k] = 0.0
     return which, squares
+
+
+@njit(**OPTIONS)
+def step_gains(inverse, alpha, slope, variance):
+    """Gain in log evidence by a step of the zeros before each sighting, in order of time, (n,).
+
+    ``slope`` (n, 2, Z) are the derivatives by the Z zeros, ``variance`` (Z,) of the step.
+    With U the derivatives of the rows from k on, the gain is
+    −½ log |1 + V UᵀK⁻¹U| + ½ bᵀ(V⁻¹ + UᵀK⁻¹U)⁻¹ b, b = UᵀK⁻¹r (matrix determinant lemma).
+    """
+    n, size = slope.shape[0], slope.shape[2]
+    gains = np.zeros(n)
+    total, right = np.zeros((size, size)), np.zeros(size)
+    for k in range(n - 1, 0, -1):
+        for z in range(size):
+            for a in range(2):
+                right[z] += slope[k, a, z] * alpha[2 * k + a]
+        for j in range(k, n):
+            twice = 1.0 if j == k else 2.0
+            for y in range(size):
+                for z in range(size):
+                    block = 0.0
+                    for a in range(2):
+                        for b in range(2):
+                            w = inverse[2 * k + a, 2 * j + b]
+                            block += (
+                                slope[k, a, y] * w * slope[j, b, z]
+                                + slope[k, a, z] * w * slope[j, b, y]
+                            )
+                    total[y, z] += 0.5 * twice * block
+        spread = total.copy()
+        for z in range(size):
+            spread[z, z] += 1.0 / variance[z]
+        log_size = np.log(np.linalg.det(spread)) + np.sum(np.log(variance))
+        gains[k] = 0.5 * np.dot(right, np.linalg.solve(spread, right)) - 0.5 * log_size
+    return gains

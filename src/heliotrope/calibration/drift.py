@@ -34,8 +34,19 @@ START_NOISE = 0.5
 STRAY = 0.7
 #: How far one heliostat's own may stray from the field's; its times only half as far.
 OWN_STRAY = 1.0
+#: Share of the heliostats that teach the field.
+TYPICAL = 0.85
+#: Where a far start had to be found, the prior is this many times the table's.
+WIDE = 10.0
 #: Standard deviation of a zero after a re-reference or repair, rad.
 REGIME_RAD = 0.020
+#: Standard deviation of a step, rad: a jack that slipped, a limit switch that moved.
+STEP_RAD = 0.001
+#: Gain in log evidence that a step must bring, beyond the logarithm of the places tried,
+#: and fewest sightings that must follow it.
+STEP_GAIN, AFTER_STEP = 4.0, 3
+#: No heliostat has more.
+MOST_STEPS = 12
 
 
 @dataclass(frozen=True)
@@ -77,12 +88,18 @@ class Hyperparameters:
         units, (P,).
     regime
         Standard deviation of a regime's offset, (P,).
+    step
+        Standard deviation of a step of the zeros, (P,).
+    wide
+        Standard deviation of a constant whose nominal value was a mistake, (P,).
     amplitude
         Standard deviation of each process, (C,).
     tau
         Days, one for each of the groups in use, (G,).
     noise
         Of a sighting, in units of its sigma.
+    rate
+        Steps a day.
     heavy
         By how much the noise's variance is larger than a Gaussian's for 90 of 100 to lie
         within the 90 % ellipse: the tails.
@@ -93,9 +110,12 @@ class Hyperparameters:
     mean: FloatArray
     spread: FloatArray
     regime: FloatArray
+    step: FloatArray
+    wide: FloatArray
     amplitude: FloatArray
     tau: FloatArray
     noise: float
+    rate: float = 0.0
     heavy: float = 1.0
 
     @property
@@ -151,10 +171,11 @@ def start(
     extra = [p.parameter for p in moving] + list(zeros(mechanism))
     names = tuple(dict.fromkeys([*model, *extra]))
     table = [mechanism.parameter(n).prior for n in model] if priors is None else priors
-    spread, regime = np.zeros(len(names)), np.zeros(len(names))
+    spread, regime, step = np.zeros(len(names)), np.zeros(len(names)), np.zeros(len(names))
     spread[: len(model)] = table
     for name in zeros(mechanism):
         regime[names.index(name)] = REGIME_RAD
+        step[names.index(name)] = STEP_RAD
     groups = tuple(g for g in GROUPS if any(p.group == g for p in moving))
     return Hyperparameters(
         names=names,
@@ -162,6 +183,8 @@ def start(
         mean=np.zeros(len(names)),
         spread=spread,
         regime=regime,
+        step=step,
+        wide=WIDE * spread,
         amplitude=np.array([START_RAD[p.group] for p in moving]),
         tau=np.array([START_DAYS[g] for g in groups]),
         noise=START_NOISE,
@@ -186,6 +209,8 @@ class Linear:
         Where the prior stands, (P,).
     own
         Where the centre is a far start and no population mean holds, (P,).
+    steps
+        When the zeros have taken a step, days, ascending, (K,).
     """
 
     jacobian: FloatArray
@@ -194,9 +219,27 @@ class Linear:
     regime: npt.NDArray[np.int64]
     centre: FloatArray
     own: npt.NDArray[np.bool_]
+    steps: FloatArray
+
+    @property
+    def epoch(self) -> npt.NDArray[np.int64]:
+        """Number of steps before each sighting, (n,)."""
+        return self.epoch_at(self.time)
+
+    def epoch_at(self, time: FloatArray) -> npt.NDArray[np.int64]:
+        """Return the number of steps before times (m,) in days; 0 where it is NaN."""
+        found = np.searchsorted(self.steps, time, side="right")
+        return np.where(np.isfinite(time), found, 0).astype(np.int64)
 
     def __len__(self) -> int:
         return len(self.time)
+
+    def gap(self, time: FloatArray) -> FloatArray:
+        """Return the days from times (m,) to the nearest sighting; 0 where unknown."""
+        known = self.time[np.isfinite(self.time)]
+        if not len(known):
+            return np.zeros(len(time))
+        return np.nan_to_num(np.abs(time[:, None] - known).min(axis=1), nan=0.0)
 
     def take(self, rows: npt.ArrayLike) -> "Linear":
         """Return some of the rows."""
@@ -213,6 +256,10 @@ class Linear:
         """Population mean that holds here, (P,)."""
         return np.where(self.own, 0.0, hyper.mean)
 
+    def spread(self, hyper: Hyperparameters) -> FloatArray:
+        """Standard deviation of the constants that holds here, (P,)."""
+        return np.where(self.own, hyper.wide, hyper.spread)
+
     def rest(self, hyper: Hyperparameters) -> FloatArray:
         """Value without what the population's mean explains, (n, 2)."""
         return np.ascontiguousarray(self.value - self.jacobian @ self.mean(hyper))
@@ -221,8 +268,8 @@ class Linear:
 def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatArray:
     other = a if b is None else b
     found: FloatArray = kernels.gram(
-        a.jacobian, a.time, a.regime, other.jacobian, other.time, other.regime, b is None,
-        hyper.spread**2, hyper.regime**2, hyper.part, hyper.amplitude, hyper.tau[hyper.group],
+        a.jacobian, a.time, a.regime, a.epoch, other.jacobian, other.time, other.regime,
+        other.epoch, b is None, a.spread(hyper) ** 2, hyper.regime**2, hyper.step**2, hyper.part, hyper.amplitude, hyper.tau[hyper.group],
     )  # fmt: skip
     return found
 
@@ -249,6 +296,21 @@ def fit_hyperparameters(
     """
     centre = start_vector(hyper)
     return _search(hyper, field, centre, np.full(len(centre), STRAY), iterations)
+
+
+def typical(
+    hyper: Hyperparameters, field: Sequence[Linear], share: float = TYPICAL
+) -> list[Linear]:
+    """Return the ``share`` of heliostats that ``hyper`` explains best, sighting by sighting.
+
+    Trimmed likelihood: one heliostat full of mistakes must not teach the field to wander.
+    """
+    rows = [d for d in field if len(d)]
+    if len(rows) < 4:
+        return rows
+    each = [-posterior(hyper, d).log_evidence() / len(d) for d in rows]
+    best = np.argsort(each, kind="stable")[: int(np.ceil(share * len(rows)))]
+    return [rows[k] for k in sorted(best)]
 
 
 def start_vector(hyper: Hyperparameters) -> FloatArray:
@@ -280,15 +342,18 @@ def _search(
     jacobian = np.concatenate([d.jacobian for d in rows])
     time = np.concatenate([d.time for d in rows])
     label = np.concatenate([d.regime for d in rows])
+    epoch = np.concatenate([d.epoch for d in rows])
     rest = np.concatenate([d.rest(hyper) for d in rows])
-    static, regime, part, group = hyper.spread**2, hyper.regime**2, hyper.part, hyper.group
+    static = np.stack([d.spread(hyper) ** 2 for d in rows])
+    regime, part, group = hyper.regime**2, hyper.part, hyper.group
     costs, gradients = np.empty(len(rows)), np.empty((len(rows), len(centre)))
 
     def cost(vector: FloatArray) -> tuple[float, FloatArray]:
         h = hyper.with_vector(vector)
         run_blocks(
             lambda a, b: kernels.pooled_block(
-                jacobian, time, label, rest, offsets, static, regime, part, group,
+                jacobian, time, label, epoch, rest, offsets, static, regime, hyper.step**2, part,
+                group,
                 h.amplitude, h.tau, h.noise, costs, gradients, a, b,
             ),
             len(rows),
@@ -337,8 +402,15 @@ class Posterior:
         h, data = self.hyper, self.data
         m, size = len(time), len(h.names)
         base = data.centre + data.mean(h)
-        own = np.where(regime[:, None] != 0, h.regime**2, 0.0) + h.spread**2
-        share = np.broadcast_to(h.spread**2, (m, len(data), size)).copy()
+        constant = data.spread(h) ** 2
+        own = np.where(regime[:, None] != 0, h.regime**2, 0.0) + constant
+        share = np.broadcast_to(constant, (m, len(data), size)).copy()
+        epoch = data.epoch_at(time)
+        if wander:
+            # Away from all sightings a step may have been taken that nobody saw.
+            own = own + (h.rate * data.gap(time))[:, None] * h.step**2
+        own = own + epoch[:, None] * h.step**2
+        share += np.minimum(epoch[:, None], data.epoch)[:, :, None] * h.step**2
         same = (regime[:, None] == data.regime) & (regime[:, None] != 0)
         share += same[:, :, None] * h.regime**2
         if wander:
@@ -382,6 +454,46 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
     inverse = np.linalg.inv(covariance(hyper, data))
     inverse = 0.5 * (inverse + inverse.T)
     return Posterior(hyper, data, inverse, inverse @ data.rest(hyper).ravel())
+
+
+def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
+    """Return the times (days) of steps of the zeros that the evidence asks for.
+
+    The best place is found in closed form, then the next one given it, as long as the
+    logarithm of the evidence gains enough.
+    """
+    moving = np.flatnonzero(hyper.step > 0)
+    order = np.argsort(data.time, kind="stable")
+    order = order[np.isfinite(data.time[order])]
+    n = len(order)
+    steps = np.empty(0)
+    if n < 2 * AFTER_STEP or not len(moving):
+        return steps
+    sorted_data = replace(data.take(order), steps=steps)
+    places = np.arange(AFTER_STEP, n - AFTER_STEP + 1)
+    places = places[sorted_data.time[places] > sorted_data.time[places - 1]]
+    limit = STEP_GAIN + np.log(max(len(places), 1))
+    for _ in range(MOST_STEPS):
+        now = posterior(hyper, replace(sorted_data, steps=steps))
+        slope = np.ascontiguousarray(sorted_data.jacobian[:, :, moving])
+        gains = kernels.step_gains(now.inverse, now.alpha, slope, hyper.step[moving] ** 2)
+        if not len(places) or gains[places].max() < limit:
+            break
+        k = int(places[np.argmax(gains[places])])
+        steps = np.sort(np.append(steps, 0.5 * (sorted_data.time[k - 1] + sorted_data.time[k])))
+        places = places[places != k]
+    return steps
+
+
+def step_rate(members: Sequence["Posterior"]) -> float:
+    """Return steps a day over the members' spans; as if one more had been seen in three years."""
+    days, steps = 1000.0, 1.0
+    for member in members:
+        known = member.data.time[np.isfinite(member.data.time)]
+        if len(known) >= 2 * AFTER_STEP:
+            days += float(np.ptp(known))
+            steps += len(member.data.steps)
+    return steps / days
 
 
 #: What the table's priors are worth, in heliostats, when the population is learnt.

@@ -38,7 +38,7 @@ Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
 #: A start is sought globally where the nominal mechanism misses by more than this, rad.
-FAR = 0.05
+FAR = 0.15
 
 
 class Outcome(IntEnum):

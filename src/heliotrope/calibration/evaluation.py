@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.residuals import frame
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
@@ -24,6 +25,9 @@ class Errors:
         Angle between the reflected ray and the way to the destination, rad, (M,).
     normal
         Angle between the normal and the bisector, rad, (M,).
+    offset
+        The beam's error to the right of and above the destination as seen from the
+        mirror, rad, (M, 2).
     plane
         Where the reflected ray passes the destination, m to the right of and above it
         as seen from the mirror, in the plane across the way, (M, 2); NaN at infinity.
@@ -31,6 +35,7 @@ class Errors:
 
     beam: FloatArray
     normal: FloatArray
+    offset: FloatArray
     plane: FloatArray
 
 
@@ -39,20 +44,21 @@ def errors(mechanism: Mechanism, sightings: Sightings) -> Errors:
     pose = mechanism[sightings.heliostat].pose(sightings.counts)
     source, way = ray_directions(sightings, pose.vertex)
     ray = reflect(source, pose.normal)
-    right = np.stack([way[:, 1], -way[:, 0], np.zeros(len(way))], axis=-1)
-    right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
-    up = np.cross(right, way)
     distance = np.where(
         sightings.destination_at_infinity,
         np.nan,
         np.linalg.norm(sightings.destination - pose.vertex, axis=-1),
     )
     forward = np.sum(ray * way, axis=-1)
-    offset = np.stack([np.sum(ray * right, axis=-1), np.sum(ray * up, axis=-1)], axis=-1)
-    plane = offset * (distance / np.where(forward > 0, forward, np.nan))[:, None]
+    across = np.einsum("mck,mk->mc", frame(way), ray)
+    plane = across * (distance / np.where(forward > 0, forward, np.nan))[:, None]
+    beam = angle_between(ray, way)
+    # The same direction, with the angle's length: sines fold back beyond a right angle.
+    size = np.maximum(np.linalg.norm(across, axis=-1), 1e-300)
     return Errors(
-        beam=angle_between(ray, way),
+        beam=beam,
         normal=angle_between(pose.normal, bisector(source, way)),
+        offset=across * (beam / size)[:, None],
         plane=plane,
     )
 

@@ -21,7 +21,7 @@ from heliotrope.mechanism._jit import OPTIONS
 #: does not make a regime.
 TRUNCATION = 16.0
 #: What new zeros must gain beyond the price of a cut (about 2 parameters in BIC, doubled).
-PRICE, CUT = 25.0, 12.0
+PRICE, CUT = 16.0, 8.0
 #: Fewest sightings of a regime: two could be two mistakes.
 FEWEST = 3
 #: Cuts are looked for at no more places than this: the longest gaps.
