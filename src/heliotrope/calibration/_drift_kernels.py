@@ -7,7 +7,8 @@ processes of some amplitude and time; so two sightings share
     K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + δ_p² min(e_i, e_j)
                             + Σ_c a_c² exp(−|t_i − t_j| / τ_c))
 
-with e the number of steps that the zeros have taken before. A time that is not known (NaN) shares nothing with any other.
+with e the number of steps that the zeros have taken before. A time that is not known
+(NaN) shares nothing with any other.
 """
 
 import math
@@ -59,7 +60,18 @@ def gram(
 
 @njit(**OPTIONS)
 def cost_and_gradient(
-    jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau,
+    jacobian,
+    time,
+    label,
+    epoch,
+    residual,
+    static,
+    regime,
+    step,
+    part,
+    group,
+    amplitude,
+    tau,
     noise,
 ):
     """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
@@ -71,8 +83,21 @@ def cost_and_gradient(
     for c in range(parts):
         each[c] = tau[group[c]]
     matrix = gram(
-        jacobian, time, label, epoch, jacobian, time, label, epoch, True, static, regime, step,
-        part, amplitude, each,
+        jacobian,
+        time,
+        label,
+        epoch,
+        jacobian,
+        time,
+        label,
+        epoch,
+        True,
+        static,
+        regime,
+        step,
+        part,
+        amplitude,
+        each,
     )
     for k in range(2 * n):
         matrix[k, k] += noise * noise

@@ -5,8 +5,8 @@ The parameters of a heliostat at time t are
 .. math:: x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t)
 
 a population mean μ and a deviation s of variance τ², both of the field; an offset of the
-two zeros in each regime; and Ornstein-Uhlenbeck processes d: the zeros creep over months
-(*slow*) and wander over weeks (*weeks*), and the mirror's normal moves within hours
+two zeros in each regime, and after each step; and Ornstein-Uhlenbeck processes d: the zeros
+creep over months (*slow*), if wanted over *weeks*, and the mirror's normal moves within hours
 (*hours*: warmth, wind, the direction of approach). Linear in x and Gaussian, so everything
 follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for Machine
 Learning, (2.23)-(2.24), (5.8)-(5.12)).
@@ -67,8 +67,12 @@ def zeros(mechanism: Mechanism) -> tuple[str, ...]:
 
 
 def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
-    """Return the processes of a kind of mechanism: both zeros twice, and the normal."""
-    found = [Process(name, group) for group in ("slow", "weeks") for name in zeros(mechanism)]
+    """Return the processes of a kind of mechanism: zeros that creep, a normal that quivers.
+
+    A further wandering over weeks can be asked for; on the measurements of Jülich it brings
+    nothing on top of the steps.
+    """
+    found = [Process(name, "slow") for name in zeros(mechanism)]
     normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
     return tuple(found + [Process(name, "hours") for name in normal])
 
@@ -137,7 +141,7 @@ class Hyperparameters:
     @property
     def vector(self) -> FloatArray:
         """Logarithms of noise, amplitudes and times: what is searched."""
-        return np.log(np.concatenate([[self.noise], self.amplitude, self.tau]))
+        return np.asarray(np.log(np.concatenate([[self.noise], self.amplitude, self.tau])))
 
     def with_vector(self, vector: FloatArray) -> "Hyperparameters":
         """Return these with noise, amplitudes and times from their logarithms."""
@@ -229,7 +233,7 @@ class Linear:
     def epoch_at(self, time: FloatArray) -> npt.NDArray[np.int64]:
         """Return the number of steps before times (m,) in days; 0 where it is NaN."""
         found = np.searchsorted(self.steps, time, side="right")
-        return np.where(np.isfinite(time), found, 0).astype(np.int64)
+        return np.asarray(np.where(np.isfinite(time), found, 0), dtype=np.int64)
 
     def __len__(self) -> int:
         return len(self.time)
@@ -239,7 +243,7 @@ class Linear:
         known = self.time[np.isfinite(self.time)]
         if not len(known):
             return np.zeros(len(time))
-        return np.nan_to_num(np.abs(time[:, None] - known).min(axis=1), nan=0.0)
+        return np.asarray(np.nan_to_num(np.abs(time[:, None] - known).min(axis=1), nan=0.0))
 
     def take(self, rows: npt.ArrayLike) -> "Linear":
         """Return some of the rows."""
@@ -267,9 +271,11 @@ class Linear:
 
 def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatArray:
     other = a if b is None else b
+    tau = hyper.tau[hyper.group]
     found: FloatArray = kernels.gram(
         a.jacobian, a.time, a.regime, a.epoch, other.jacobian, other.time, other.regime,
-        other.epoch, b is None, a.spread(hyper) ** 2, hyper.regime**2, hyper.step**2, hyper.part, hyper.amplitude, hyper.tau[hyper.group],
+        other.epoch, b is None, a.spread(hyper) ** 2, hyper.regime**2, hyper.step**2,
+        hyper.part, hyper.amplitude, tau,
     )  # fmt: skip
     return found
 
@@ -315,13 +321,9 @@ def typical(
 
 def start_vector(hyper: Hyperparameters) -> FloatArray:
     """Return the centre of the weak prior: the values that a search starts from."""
-    return np.log(
-        np.array(
-            [START_NOISE]
-            + [START_RAD[p.group] for p in hyper.processes]
-            + [START_DAYS[g] for g in hyper.groups]
-        )
-    )
+    amplitudes = [START_RAD[p.group] for p in hyper.processes]
+    times = [START_DAYS[g] for g in hyper.groups]
+    return np.asarray(np.log(np.array([START_NOISE, *amplitudes, *times])))
 
 
 def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperparameters:

@@ -12,7 +12,9 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
 
-Split = Literal["random", "chronological"]
+Split = Literal["random", "chronological", "neighbour"]
+#: A neighbourhood that is held out together: this share of the sightings, at least three.
+NEIGHBOURHOOD = 0.1
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,10 @@ def split(
     sightings
         Of any number of heliostats.
     kind
-        "random", or "chronological" (the earliest are for training).
+        "random"; "chronological" (the earliest are for training); or "neighbour": whole
+        neighbourhoods of source directions are held out, so that a held-out sighting's
+        nearest neighbours in the sky are held out with it. Time alone misleads: a random
+        choice leaves a sighting of ten minutes before in the training part.
     fraction
         Between 0 and 1.
     seed
@@ -86,17 +91,36 @@ def split(
     """
     if not 0.0 < fraction < 1.0:
         raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
-    if kind not in ("random", "chronological"):
-        raise InputError(f"split {kind!r}: give random or chronological")
+    if kind not in ("random", "chronological", "neighbour"):
+        raise InputError(f"split {kind!r}: give random, chronological or neighbour")
     chosen = np.zeros(len(sightings), dtype=np.bool_)
     for heliostat in np.unique(sightings.heliostat):
         rows = np.flatnonzero(sightings.heliostat == heliostat)
         if kind == "random":
             rows = np.random.default_rng((seed, int(heliostat))).permutation(rows)
+        elif kind == "neighbour":
+            rows = _by_neighbourhood(sightings, rows, fraction, seed)
         else:
             rows = rows[np.argsort(sightings.time[rows], kind="stable")]
         chosen[rows[: round(fraction * len(rows))]] = True
     return chosen
+
+
+def _by_neighbourhood(
+    sightings: Sightings, rows: npt.NDArray[np.intp], fraction: float, seed: int
+) -> npt.NDArray[np.intp]:
+    """Rows of one heliostat with whole neighbourhoods of the sky at the end."""
+    rng = np.random.default_rng((seed, int(sightings.heliostat[rows[0]])))
+    sky = sightings.source[rows]
+    many = max(3, round(NEIGHBOURHOOD * len(rows)))
+    free = np.ones(len(rows), dtype=np.bool_)
+    wanted = len(rows) - round(fraction * len(rows))
+    while (~free).sum() < wanted:
+        centre = rng.choice(np.flatnonzero(free))
+        apart = np.where(free, np.linalg.norm(sky - sky[centre], axis=1), np.inf)
+        left = min(many, wanted - int((~free).sum()))
+        free[np.argsort(apart, kind="stable")[:left]] = False
+    return np.concatenate([rows[free], rows[~free]])
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from heliotrope.calibration.outliers import ALPHA, generalised_esd
 from heliotrope.calibration.regimes import find_regimes, regime_at
 from heliotrope.calibration.residuals import linearise
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.parallel import threads
@@ -88,6 +88,9 @@ class Learned:
         Of each sighting; −1 if not used, (M,).
     outlier
         (M,); ``used`` ones only.
+    rows
+        For each heliostat the sightings it was learnt from, outliers among them, in the
+        order of its member's.
     """
 
     mechanism: Mechanism
@@ -99,6 +102,7 @@ class Learned:
     members: tuple[Posterior, ...]
     regime: npt.NDArray[np.int64]
     outlier: npt.NDArray[np.bool_]
+    rows: tuple[npt.NDArray[np.intp], ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -227,7 +231,7 @@ def prepare(
 def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Offsets (N + 1,) and the used rows, heliostat by heliostat, not depending on the rows' order."""
+    """Offsets (N + 1,) and the used rows by heliostat, in an order not that of the rows."""
     keys = (*s.destination.T, *s.source.T, *s.counts.T, s.time, s.heliostat)
     order = np.lexsort(keys)
     order = order[used[order]]
@@ -235,7 +239,7 @@ def _by_heliostat(
 
 
 def learn_field(
-    hyper: Hyperparameters, prepared: Prepared, progress: Progress | None = None
+    hyper: Hyperparameters, prepared: Prepared, rounds: int = ROUNDS
 ) -> Hyperparameters:
     """Return what is common to the field, from prepared heliostats (step 3)."""
     table = np.where(hyper.spread > 0, hyper.spread, 0.0)
@@ -246,20 +250,16 @@ def learn_field(
     # Of the field, not of each: a heliostat full of mistakes has a large noise of its own.
     usual = max(float(np.median(prepared.static.scale[teachers])), hyper.noise)
     clean = [_without_outliers(replace(hyper, noise=usual), d) for d in everything]
-    for turn in range(ROUNDS):
-        if turn in (0, 2, ROUNDS - 1):
+    for turn in range(rounds):
+        if turn in (0, 2, rounds - 1):
             hyper, _ = drift.fit_hyperparameters(hyper, drift.typical(hyper, clean))
         if turn in (1, 3):
             clean = [_without_outliers(hyper, d) for d in everything]
         members = [drift.posterior(hyper, d) for d in clean]
         hyper = drift.fit_population(hyper, table, members)
-        if progress:
-            progress(turn + 1, ROUNDS)
     final = [finish(hyper, d)[0] for d in everything]
     gone = sum(len(d) for d in everything) - sum(len(m.data) for m in final)
-    return replace(
-        hyper, rate=drift.step_rate(final), heavy=drift.heavy_tails(final, gone)
-    )
+    return replace(hyper, rate=drift.step_rate(final), heavy=drift.heavy_tails(final, gone))
 
 
 def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
@@ -299,6 +299,7 @@ def learn(
     hyper: Hyperparameters | None = None,
     loss: Loss = "cauchy",
     own: bool = True,
+    rounds: int = ROUNDS,
     progress: Progress | None = None,
 ) -> Learned:
     """Learn parameters, regimes, wandering and noise of every heliostat.
@@ -323,6 +324,8 @@ def learn(
         Of the robust fit.
     own
         Whether each heliostat's noise and wandering may differ from the field's.
+    rounds
+        Of expectation and maximisation over the population.
     progress
         Called with (done, all) heliostats.
 
@@ -341,11 +344,11 @@ def learn(
             mechanism, sightings, constant, first.names, keep, priors=priors, loss=loss
         )
         if hyper is None:
-            hyper = learn_field(first, sample(prepared))
+            hyper = learn_field(first, sample(prepared), rounds)
         members, outlier = _finish_all(hyper, prepared, len(sightings), own, progress)
     return Learned(
         mechanism, sightings, constant, keep, prepared.static, hyper, members, prepared.regime,
-        outlier,
+        outlier, prepared.rows,
     )  # fmt: skip
 
 
@@ -353,8 +356,8 @@ def _prior_row(
     model: tuple[str, ...], mechanism: Mechanism, given: Mapping[str, npt.ArrayLike] | None
 ) -> FloatArray:
     """One standard deviation a parameter: the median where a field overrides them one by one."""
-    table = [np.median((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
-    return np.array(table, dtype=np.float64)
+    table = [as_float((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
+    return np.array([np.median(t) for t in table], dtype=np.float64)
 
 
 def sample(prepared: Prepared, most: int = SAMPLE) -> Prepared:

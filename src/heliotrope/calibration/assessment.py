@@ -1,0 +1,187 @@
+"""How well a field was learnt: figures on the sightings that were held out."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.evaluation import Summary, summary
+from heliotrope.calibration.learning import Learned, Prediction
+from heliotrope.calibration.sightings import ray_directions
+from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
+from heliotrope.mechanism.azel import AxisAccuracy, axis_accuracy
+
+#: Heliostats with fewer sightings are shown but do not enter the overall figures.
+ENOUGH = 20
+
+
+@dataclass(frozen=True)
+class HeliostatFigures:
+    """Figures of one heliostat.
+
+    Attributes
+    ----------
+    name
+        Of the heliostat.
+    count
+        Sightings, learnt from and held out together.
+    beam, normal
+        Errors of the held-out ones, rad.
+    mean
+        Of the held-out beam errors, rad.
+    coverage
+        Share of the held-out ones within their 90 % ellipse.
+    axes
+        Zeros and scatter of azimuth and elevation of the normal (Guo (43)-(47)); None
+        with fewer than two held out.
+    outliers, regimes, steps
+        Number of them in the training part.
+    """
+
+    name: str
+    count: int
+    beam: Summary
+    normal: Summary
+    mean: float
+    coverage: float
+    axes: AxisAccuracy | None
+    outliers: int
+    regimes: int
+    steps: int
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures for JSON, in mrad."""
+        found: dict[str, Any] = {
+            "n": self.count,
+            "n_held_out": self.beam.count,
+            "median_beam_mrad": 1e3 * self.beam.median,
+            "mean_beam_mrad": 1e3 * self.mean,
+            "rms_beam_mrad": 1e3 * self.beam.rms,
+            "p95_beam_mrad": 1e3 * self.beam.p95,
+            "median_normal_mrad": 1e3 * self.normal.median,
+            "rms_normal_mrad": 1e3 * self.normal.rms,
+            "p95_normal_mrad": 1e3 * self.normal.p95,
+            "coverage_90": self.coverage,
+            "outliers": self.outliers,
+            "regimes": self.regimes,
+            "steps": self.steps,
+        }
+        if self.axes is not None:
+            found["gamma_0_mrad"] = 1e3 * float(self.axes.gamma_0)
+            found["sigma_gamma_mrad"] = 1e3 * float(self.axes.sigma_gamma)
+            found["alpha_0_mrad"] = 1e3 * float(self.axes.alpha_0)
+            found["sigma_alpha_mrad"] = 1e3 * float(self.axes.sigma_alpha)
+        return found
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Figures of a field.
+
+    Attributes
+    ----------
+    heliostats
+        Those with sightings.
+    median_of_medians, mean_of_means
+        Beam errors over the heliostats with :data:`ENOUGH` sightings, rad.
+    coverage
+        Of all their held-out sightings.
+    beam
+        Of all their held-out sightings together, rad.
+    blunders
+        Held-out sightings more than ``BLUNDER`` standard deviations away, whatever the
+        cause: they enter every figure.
+    """
+
+    heliostats: tuple[HeliostatFigures, ...]
+    median_of_medians: float
+    mean_of_means: float
+    coverage: float
+    beam: Summary
+    blunders: int
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures for JSON, in mrad."""
+        return {
+            "heliostats": {h.name: h.document() for h in self.heliostats},
+            "median_of_medians_mrad": 1e3 * self.median_of_medians,
+            "mean_of_means_mrad": 1e3 * self.mean_of_means,
+            "coverage_90": self.coverage,
+            "median_beam_mrad": 1e3 * self.beam.median,
+            "rms_beam_mrad": 1e3 * self.beam.rms,
+            "p95_beam_mrad": 1e3 * self.beam.p95,
+            "blunders_held_out": self.blunders,
+            "enough": ENOUGH,
+        }
+
+
+#: Standard deviations beyond which no Gaussian goes in a million sightings, as a distance.
+BLUNDER = 5.3
+
+
+def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
+    """Return the figures of what was not learnt from.
+
+    Parameters
+    ----------
+    names
+        Of the N heliostats.
+    learned
+        With some of its sightings not used.
+    """
+    rows = np.flatnonzero(~learned.used)
+    seen = learned.sightings.take(rows)
+    found = learned.predict(seen)
+    counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
+    figures = [
+        _one(names[i], int(i), int(counts[i]), learned, found, np.flatnonzero(seen.heliostat == i))
+        for i in np.flatnonzero(counts)
+    ]
+    enough = [h for h in figures if h.count >= ENOUGH and h.beam.count] or [
+        h for h in figures if h.beam.count
+    ]
+    inside = np.isin(seen.heliostat, [names.index(h.name) for h in enough])
+    far = np.sum(
+        found.plane * np.linalg.solve(found.covariance, found.plane[:, :, None])[..., 0], axis=-1
+    )
+    return Assessment(
+        tuple(figures),
+        float(np.median([h.beam.median for h in enough])) if enough else np.nan,
+        float(np.mean([h.mean for h in enough])) if enough else np.nan,
+        float(found.inside[inside].mean()) if inside.any() else np.nan,
+        summary(found.errors.beam[inside]),
+        int((far[inside] > BLUNDER**2).sum()),
+    )
+
+
+def _one(
+    name: str, i: int, count: int, learned: Learned, found: Prediction,
+    rows: npt.NDArray[np.intp],
+) -> HeliostatFigures:  # fmt: skip
+    mine = learned.sightings.heliostat == i
+    beam = found.errors.beam[rows]
+    return HeliostatFigures(
+        name=name,
+        count=count,
+        beam=summary(beam),
+        normal=summary(found.errors.normal[rows]),
+        mean=float(beam.mean()) if len(rows) else np.nan,
+        coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
+        axes=_axes(learned, np.flatnonzero(~learned.used)[rows]) if len(rows) > 1 else None,
+        outliers=int(learned.outlier[mine].sum()),
+        regimes=len(np.unique(learned.regime[mine & (learned.regime >= 0)])),
+        steps=len(learned.members[i].data.steps),
+    )
+
+
+def _axes(learned: Learned, rows: npt.NDArray[np.intp]) -> AxisAccuracy | None:
+    seen = learned.sightings.take(rows)
+    pose = learned.mechanism_at(seen.heliostat, seen.time).pose(seen.counts)
+    azimuth, elevation = azimuth_elevation(pose.normal)
+    source, way = ray_directions(seen, pose.vertex)
+    wanted_azimuth, wanted_elevation = azimuth_elevation(bisector(source, way))
+    weight: FloatArray = np.cos(wanted_elevation) ** 2
+    return axis_accuracy(
+        elevation, azimuth, wanted_elevation, wanted_azimuth, azimuth_weight=weight
+    )

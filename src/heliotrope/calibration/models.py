@@ -1,0 +1,161 @@
+"""Which parameters a field needs: models compared by what they predict and by their evidence.
+
+Every candidate is learnt on a sample of the field. What counts is the logarithm of the
+probability of each sighting given the heliostat's others (leave-one-out
+cross-validation, in closed form: Rasmussen & Williams 2006, (5.10)-(5.12)); the simplest
+candidate that is within one standard error of the best is chosen (Breiman et al. 1984).
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration import learning
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS
+
+#: Heliostats that models are compared on: those with the most sightings.
+HELIOSTATS = 16
+#: A model must gain this much a sighting (in the logarithm: one per cent) to be worth it.
+WORTH = 0.01
+#: A left-out sighting cannot count worse than this: outliers do not choose the model.
+WORST = -25.0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model with its score.
+
+    Attributes
+    ----------
+    name, parameters
+        Of the model.
+    log_predictive
+        Mean over the sightings of the log probability density given the others.
+    behind
+        How far that is below the best candidate's, and the standard error of this
+        difference.
+    log_evidence
+        Of all sightings under the learnt hyperparameters.
+    """
+
+    name: str
+    parameters: tuple[str, ...]
+    log_predictive: float
+    behind: float
+    behind_error: float
+    log_evidence: float
+
+
+def candidates(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
+    """Return the models that this kind of mechanism can have, by name, the simplest first."""
+    known = mechanism.parameters
+    found: dict[str, tuple[str, ...]] = {}
+    for name in ("guo6", "jacks", "khalsa8", "malan8"):
+        if all(p in known for p in parameter_table.MODELS[name]):
+            found[name] = parameter_table.MODELS[name]
+    if "jacks" in found:
+        found = {"jacks": found["jacks"]}
+        found["jacks8"] = tuple(p for p in found["jacks"] if not p.endswith("_offset")) + tuple(
+            p for p in found["jacks"] if p.endswith("stroke_offset")
+        )
+    for name in [n for n in found if n != "jacks8"]:
+        for extra in _extras(mechanism):
+            label = f"{name}+{extra[0]}"
+            if all(p in known and p not in found[name] for p in extra[1]):
+                found[label] = found[name] + extra[1]
+    found["full"] = parameter_table.model("full", known)
+    return dict(sorted(found.items(), key=lambda item: len(item[1])))
+
+
+def _extras(mechanism: Mechanism) -> list[tuple[str, tuple[str, ...]]]:
+    joints = [mechanism.joints[k] for k in mechanism.driven]
+    extras = [("sag", ("sag",)), ("position", parameter_table.MODELS["malan8"][:3])]
+    extras.append(("radii", tuple(f"{j}_pivot_radius" for j in joints)))
+    extras.append(("scales", tuple(f"{j}_scale" for j in joints)))
+    ratio = mechanism.drives.table[..., SLOTS["worm_ratio"]]
+    if bool(np.all(ratio != 0.0)):
+        extras.append(
+            ("worm", tuple(f"{j}_worm_{part}" for j in joints for part in ("cos", "sin")))
+        )
+    return extras
+
+
+def compare(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    models: Mapping[str, tuple[str, ...]] | None = None,
+    *,
+    used: npt.ArrayLike | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Candidate, ...]:
+    """Return the candidates with their scores, the simplest first.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        M of these heliostats.
+    models
+        Parameters by name, by default :func:`candidates`.
+    used
+        Mask of the sightings to learn from, (M,).
+    progress
+        Called with the name of each model before it is tried.
+
+    Raises
+    ------
+    InputError
+        If no heliostat has enough sightings, or there are no models.
+    """
+    trials = candidates(mechanism) if models is None else dict(models)
+    keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
+    counts = np.bincount(sightings.heliostat[keep], minlength=len(mechanism))
+    chosen = np.argsort(-counts, kind="stable")[:HELIOSTATS]
+    chosen = np.sort(chosen[counts[chosen] >= learning.FEWEST])
+    if not len(chosen) or not trials:
+        raise InputError(
+            f"models: no heliostat has {learning.FEWEST} sightings; name the model instead of auto"
+        )
+    place = np.full(len(mechanism), -1)
+    place[chosen] = np.arange(len(chosen))
+    part = sightings.take(np.flatnonzero(keep & (place[sightings.heliostat] >= 0)))
+    part = replace(part, heliostat=place[part.heliostat].astype(np.intp))
+    scores, evidence, good = {}, {}, np.ones(len(part), dtype=np.bool_)
+    for name, names in trials.items():
+        if progress:
+            progress(name)
+        found = learning.learn(mechanism[chosen], part, names, own=False, rounds=2)
+        score, mask = _scores(found)
+        scores[name], good = score, good & ~mask
+        evidence[name] = float(sum(m.log_evidence() for m in found.members))
+    means = {name: float(score[good].mean()) for name, score in scores.items()}
+    best = max(means, key=lambda name: means[name])
+    result = []
+    for name, names in trials.items():
+        gap = scores[best][good] - scores[name][good]
+        error = float(gap.std() / np.sqrt(max(len(gap), 1)))
+        result.append(Candidate(name, names, means[name], float(gap.mean()), error, evidence[name]))
+    return tuple(result)
+
+
+def choose(scored: tuple[Candidate, ...]) -> Candidate:
+    """Return the simplest candidate within one standard error of the best, or within ``WORTH``."""
+    able = [c for c in scored if c.behind <= max(c.behind_error, WORTH)]
+    return min(able, key=lambda c: len(c.parameters))
+
+
+def _scores(found: learning.Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Log predictive density of each sighting, and those that are outliers."""
+    score = np.full(len(found.sightings), WORST)
+    for i, member in enumerate(found.members):
+        rows = found.rows[i][~found.outlier[found.rows[i]]]
+        score[rows] = np.maximum(member.log_predictive(), WORST)
+    return score, found.outlier
