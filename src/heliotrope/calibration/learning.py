@@ -11,7 +11,7 @@ Steps 1, 2 and 4 treat every heliostat by itself; only step 3 looks at several.
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -300,6 +300,8 @@ def learn(
     loss: Loss = "cauchy",
     own: bool = True,
     rounds: int = ROUNDS,
+    runner: "Runner | None" = None,
+    chunk: int = 100,
     progress: Progress | None = None,
 ) -> Learned:
     """Learn parameters, regimes, wandering and noise of every heliostat.
@@ -326,6 +328,10 @@ def learn(
         Whether each heliostat's noise and wandering may differ from the field's.
     rounds
         Of expectation and maximisation over the population.
+    runner, chunk
+        Who learns chunks of so many heliostats, for example
+        :func:`heliotrope.calibration.cluster.runner`; by default this process, with the
+        same results bit for bit.
     progress
         Called with (done, all) heliostats.
 
@@ -338,18 +344,134 @@ def learn(
         parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
     )
     keep = np.ones(len(sightings), dtype=np.bool_) if used is None else np.asarray(used, np.bool_)
+    task = Task(constant, dict(priors or {}), loss, own)
     with threadpool_limits(1, "blas"):
-        first = drift.start(mechanism, constant, processes, _prior_row(constant, mechanism, priors))
-        prepared = prepare(
-            mechanism, sightings, constant, first.names, keep, priors=priors, loss=loss
-        )
         if hyper is None:
-            hyper = learn_field(first, sample(prepared), rounds)
-        members, outlier = _finish_all(hyper, prepared, len(sightings), own, progress)
+            hyper = field_of(mechanism, sightings, keep, task, processes, rounds)
+    whole = np.arange(len(mechanism))
+    if runner is None:
+        parts = [learn_part(mechanism, sightings, keep, task, hyper, progress)]
+        pieces = [whole]
+    else:
+        pieces = np.array_split(whole, max(1, -(-len(whole) // chunk)))
+        cut = [_cut(mechanism, sightings, keep, task, piece) for piece in pieces]
+        parts = runner([(*c[:4], hyper) for c in cut], progress)
+    return _join(mechanism, sightings, keep, constant, hyper, pieces, parts)
+
+
+@dataclass(frozen=True)
+class Task:
+    """What to learn and how, the same for every heliostat."""
+
+    model: tuple[str, ...]
+    priors: dict[str, npt.ArrayLike]
+    loss: Loss = "cauchy"
+    own: bool = True
+
+    def of(self, rows: npt.NDArray[np.intp], count: int) -> "Task":
+        """Return the task of some heliostats: priors given one by one are cut with them."""
+        cut = {
+            n: as_float(v)[rows] if as_float(v).shape == (count,) else v
+            for n, v in self.priors.items()
+        }
+        return replace(self, priors=cut)
+
+
+@dataclass(frozen=True)
+class Part:
+    """What was learnt of some heliostats; rows count within their sightings."""
+
+    prepared: Prepared
+    members: tuple[Posterior, ...]
+    outlier: npt.NDArray[np.bool_]
+
+
+#: Learns a list of (mechanism, sightings, used, task, hyper), on whatever machines.
+Runner = Callable[
+    [list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
+     Progress | None],
+    list[Part],
+]  # fmt: skip
+
+
+def learn_part(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    used: npt.NDArray[np.bool_],
+    task: Task,
+    hyper: Hyperparameters,
+    progress: Progress | None = None,
+) -> Part:
+    """Return what some heliostats' sightings say under the field's ``hyper``: steps 1, 2 and 4."""
+    with threadpool_limits(1, "blas"):
+        prepared = prepare(
+            mechanism, sightings, task.model, hyper.names, used, priors=task.priors, loss=task.loss
+        )
+        members, outlier = _finish_all(hyper, prepared, len(sightings), task.own, progress)
+    return Part(prepared, members, outlier)
+
+
+def _cut(
+    mechanism: Mechanism, sightings: Sightings, used: npt.NDArray[np.bool_], task: Task,
+    rows: npt.NDArray[np.intp],
+) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:  # fmt: skip
+    """The part of a field with heliostats ``rows``, renumbered, and its sightings' places."""
+    place = np.full(len(mechanism), -1)
+    place[rows] = np.arange(len(rows))
+    mine = np.flatnonzero(place[sightings.heliostat] >= 0)
+    part = sightings.take(mine)
+    part = replace(part, heliostat=place[part.heliostat].astype(np.intp))
+    return mechanism[rows], part, used[mine], task.of(rows, len(mechanism)), mine
+
+
+def _join(
+    mechanism: Mechanism, sightings: Sightings, used: npt.NDArray[np.bool_],
+    model: tuple[str, ...], hyper: Hyperparameters,
+    pieces: list[npt.NDArray[np.intp]], parts: list[Part],
+) -> Learned:  # fmt: skip
+    regime = np.full(len(sightings), -1)
+    outlier = np.zeros(len(sightings), dtype=np.bool_)
+    lengths = np.full(len(sightings), np.nan)
+    rows: list[npt.NDArray[np.intp]] = []
+    for piece, part in zip(pieces, parts, strict=True):
+        mine = np.flatnonzero(np.isin(sightings.heliostat, piece))
+        regime[mine], outlier[mine] = part.prepared.regime, part.outlier
+        lengths[mine] = part.prepared.static.lengths
+        rows += [mine[r] for r in part.prepared.rows]
+    fits = [part.prepared.static for part in parts]
+    whole = {
+        f.name: np.concatenate([getattr(fit, f.name) for fit in fits])
+        for f in fields(Calibration)
+        if f.name not in ("names", "lengths")
+    }
+    static = Calibration(names=model, lengths=lengths, **whole)
+    members = tuple(m for part in parts for m in part.members)
     return Learned(
-        mechanism, sightings, constant, keep, prepared.static, hyper, members, prepared.regime,
-        outlier, prepared.rows,
-    )  # fmt: skip
+        mechanism, sightings, model, used, static, hyper, members, regime, outlier, tuple(rows)
+    )
+
+
+def field_of(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    used: npt.NDArray[np.bool_],
+    task: Task,
+    processes: tuple[drift.Process, ...] | None = None,
+    rounds: int = ROUNDS,
+) -> Hyperparameters:
+    """Return what is common to a field, from at most ``SAMPLE`` of its heliostats."""
+    counts = np.bincount(sightings.heliostat[used], minlength=len(mechanism))
+    able = np.flatnonzero(counts >= FEWEST)
+    if len(able) > SAMPLE:
+        able = able[np.linspace(0, len(able) - 1, SAMPLE).round().astype(np.intp)]
+    first = drift.start(
+        mechanism, task.model, processes, _prior_row(task.model, mechanism, task.priors)
+    )
+    machines, part, keep, mine, _ = _cut(mechanism, sightings, used, task, able)
+    prepared = prepare(
+        machines, part, task.model, first.names, keep, priors=mine.priors, loss=task.loss
+    )
+    return learn_field(first, prepared, rounds)
 
 
 def _prior_row(
@@ -358,16 +480,6 @@ def _prior_row(
     """One standard deviation a parameter: the median where a field overrides them one by one."""
     table = [as_float((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
     return np.array([np.median(t) for t in table], dtype=np.float64)
-
-
-def sample(prepared: Prepared, most: int = SAMPLE) -> Prepared:
-    """Return the heliostats to learn the field from: ``most`` of those with enough sightings."""
-    able = np.array([k for k, d in enumerate(prepared.field) if len(d) >= FEWEST], dtype=np.intp)
-    if len(able) > most:
-        able = able[np.linspace(0, len(able) - 1, most).round().astype(np.intp)]
-    chosen = replace(prepared.static, scale=prepared.static.scale[able])
-    field = tuple(prepared.field[k] for k in able)
-    return Prepared(chosen, prepared.regime, field, tuple(prepared.rows[k] for k in able))
 
 
 def _finish_all(

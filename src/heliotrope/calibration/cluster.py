@@ -1,0 +1,65 @@
+"""Learning on many machines: chunks of heliostats on dask.distributed."""
+
+from typing import TYPE_CHECKING, Any
+
+from heliotrope.calibration.learning import Part, Progress, Runner, learn_part
+from heliotrope.errors import InputError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+
+def connect(scheduler: str) -> "Client":
+    """Return a client of ``scheduler``.
+
+    Parameters
+    ----------
+    scheduler
+        Address of a scheduler as ``tcp://10.0.0.1:8786``; or ``local`` or ``local:N`` for
+        N processes on this machine.
+
+    Raises
+    ------
+    InputError
+        If dask.distributed is not installed, or no scheduler answers there.
+    """
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise InputError(
+            "--scheduler needs dask.distributed; install it: pip install 'heliotrope[cluster]'"
+        ) from None
+    if scheduler == "local" or scheduler.startswith("local:"):
+        number = scheduler.removeprefix("local").removeprefix(":")
+        if number and not (number.isdigit() and int(number) > 0):
+            raise InputError(f"scheduler {scheduler!r}: write local:4 for four processes")
+        workers = int(number) if number else None
+        machines = LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=workers, threads_per_worker=1, dashboard_address=None, host="127.0.0.1"
+        )
+        return Client(machines)  # type: ignore[no-untyped-call]
+    try:
+        return Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError(
+            f"scheduler {scheduler!r}: nobody answers there ({str(error).splitlines()[0]}); give "
+            "tcp://HOST:PORT of a running dask scheduler, or local:N"
+        ) from None
+
+
+def runner(client: "Client") -> Runner:
+    """Return what learns chunks on the workers of ``client``, as many at once as there are."""
+
+    def run(tasks: list[Any], progress: Progress | None) -> list[Part]:
+        from distributed import as_completed
+
+        futures = [client.submit(learn_part, *task, pure=False) for task in tasks]
+        done = 0
+        for future in as_completed(futures):  # type: ignore[no-untyped-call]
+            done += len(tasks[futures.index(future)][0])
+            if progress:
+                progress(done, sum(len(task[0]) for task in tasks))
+        found: list[Part] = client.gather(futures)  # type: ignore[no-untyped-call]
+        return found
+
+    return run

@@ -1,0 +1,252 @@
+"""Results of a calibration in files: JSON with everything, Parquet for tables, a plant.
+
+The JSON holds for each heliostat its parameters with their covariance at one moment, its
+regimes, steps and outliers, and what is common to the field. The Parquet table holds one
+heliostat a row. The plant is the field's own with the parameters in it, and is read like
+any other.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import __version__
+from heliotrope.calibration.drift import DAY
+from heliotrope.calibration.estimator import Outcome
+from heliotrope.calibration.learning import Learned
+from heliotrope.field.formats import _json
+from heliotrope.field.formats._textfile import write_file, write_text
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+
+KIND = "heliotrope calibration"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Results:
+    """Parameters of N heliostats at one moment.
+
+    Attributes
+    ----------
+    model
+        Names of the constant parameters.
+    names
+        The P parameters, those that only wander included.
+    heliostats
+        Names, (N,).
+    time
+        The moment, Unix seconds; NaN: at no known time.
+    values, covariance
+        Deviations (N, P) and their covariance (N, P, P), rad, m or 1.
+    noise
+        Of a sighting, in units of its sigma, (N,).
+    used
+        Sightings of each, (N,).
+    """
+
+    model: tuple[str, ...]
+    names: tuple[str, ...]
+    heliostats: tuple[str, ...]
+    time: float
+    values: FloatArray
+    covariance: FloatArray
+    noise: FloatArray
+    used: npt.NDArray[np.int64]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the values, (N, P)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+
+    def apply(self, heliostats: Heliostats) -> Heliostats:
+        """Return heliostats with these parameters; those that are not here keep theirs.
+
+        Raises
+        ------
+        UnknownNameError
+            If the mechanisms lack a parameter.
+        """
+        place = {name: i for i, name in enumerate(self.heliostats)}
+        rows = np.array([place.get(name, -1) for name in heliostats.names])
+        merged = dict(heliostats.parameters)
+        for p, name in enumerate(self.names):
+            old = merged.get(name, np.zeros(len(heliostats)))
+            merged[name] = np.where(rows >= 0, self.values[rows, p], old)
+        return heliostats.with_parameters(merged)
+
+
+def at_moment(names: tuple[str, ...], learned: Learned, time: float | None = None) -> Results:
+    """Return the parameters at Unix ``time``, by default that of the last sighting used."""
+    known = learned.sightings.time[learned.used & np.isfinite(learned.sightings.time)]
+    when = float(known.max()) if time is None and len(known) else np.nan
+    if time is not None:
+        when = time
+    rows = np.arange(len(names))
+    values, spread = learned.parameters_at(rows, np.full(len(names), when))
+    return Results(
+        learned.model, learned.names, names, when, values, spread,
+        np.array([m.hyper.noise for m in learned.members]),
+        np.array([len(m.data) for m in learned.members]),
+    )  # fmt: skip
+
+
+def write_json(
+    path: Path, names: tuple[str, ...], learned: Learned, results: Results, ids: tuple[str, ...]
+) -> None:
+    """Write everything as JSON.
+
+    Parameters
+    ----------
+    path
+        The file.
+    names
+        Of the N heliostats.
+    learned
+        The calibration.
+    results
+        Its parameters at one moment.
+    ids
+        Name of each of the M sightings, for the list of outliers.
+    """
+    h = learned.hyper
+    document = {
+        "kind": KIND,
+        "version": VERSION,
+        "program": f"heliotrope {__version__}",
+        "time": _moment(results.time),
+        "model": list(learned.model),
+        "parameters": list(learned.names),
+        "units": [learned.mechanism.parameter(n).unit for n in learned.names],
+        "field": {
+            "mean": h.mean.tolist(),
+            "spread": h.spread.tolist(),
+            "processes": [
+                {
+                    "parameter": p.parameter,
+                    "group": p.group,
+                    "amplitude": float(a),
+                    "days": float(h.tau[g]),
+                }
+                for p, a, g in zip(h.processes, h.amplitude, h.group, strict=True)
+            ],
+            "noise": h.noise,
+            "heavy_tails": h.heavy,
+            "steps_per_day": h.rate,
+        },
+        "heliostats": {name: _heliostat(i, learned, results, ids) for i, name in enumerate(names)},
+    }
+    write_text(path, json.dumps(document, ensure_ascii=False, indent=1) + "\n")
+
+
+def _heliostat(i: int, learned: Learned, results: Results, ids: tuple[str, ...]) -> dict[str, Any]:
+    rows = learned.rows[i]
+    member = learned.members[i]
+    label = learned.regime[rows]
+    time = learned.sightings.time
+    regimes = [
+        {
+            "first": _moment(float(np.nanmin(time[rows[label == k]]))),
+            "last": _moment(float(np.nanmax(time[rows[label == k]]))),
+            "sightings": int((label == k).sum()),
+        }
+        for k in np.unique(label)
+        if k > 0
+    ]
+    return {
+        "values": results.values[i].tolist(),
+        "covariance": results.covariance[i].tolist(),
+        "sightings": int(results.used[i]),
+        "outcome": Outcome(int(learned.static.outcome[i])).name.lower(),
+        "noise": float(results.noise[i]),
+        "regimes": regimes,
+        "steps": [_moment(float(day) * DAY) for day in member.data.steps],
+        "outliers": [ids[k] for k in rows[learned.outlier[rows]]],
+    }
+
+
+def _moment(seconds: float) -> str | None:
+    if not np.isfinite(seconds):
+        return None
+    return datetime.fromtimestamp(seconds, UTC).isoformat()
+
+
+def read_json(path: str | Path) -> Results:
+    """Return the parameters of a file of :func:`write_json`.
+
+    Raises
+    ------
+    FormatError
+        If it is no such file; the text says what is wrong and where.
+    """
+    root = _json.read_json(path, "a calibration")
+    if not root.has("kind") or root["kind"].text() != KIND:
+        raise root.fail(
+            f"no calibration: kind must be {KIND!r}; give a file of heliotrope calibrate"
+        )
+    root["version"].number(VERSION, VERSION)
+    names = tuple(node.text() for node in root["parameters"].elements())
+    members = root["heliostats"].items()
+    size = len(names)
+    values, spread = np.empty((len(members), size)), np.empty((len(members), size, size))
+    for i, (_, node) in enumerate(members):
+        values[i] = _numbers(node["values"], size)
+        rows = node["covariance"].elements()
+        if len(rows) != size:
+            raise node["covariance"].fail(f"{len(rows)} rows for {size} parameters")
+        spread[i] = [_numbers(row, size) for row in rows]
+    return Results(
+        tuple(node.text() for node in root["model"].elements()),
+        names,
+        tuple(name for name, _ in members),
+        _seconds(root["time"]),
+        values,
+        spread,
+        np.array([node["noise"].number(0.0) for _, node in members]),
+        np.array([node["sightings"].number(0.0) for _, node in members], dtype=np.int64),
+    )
+
+
+def _numbers(node: _json.Node, size: int) -> list[float]:
+    found = [part.number() for part in node.elements()]
+    if len(found) != size:
+        raise node.fail(f"{len(found)} numbers for {size} parameters")
+    return found
+
+
+def _seconds(node: _json.Node) -> float:
+    if node.value is None:
+        return float("nan")
+    try:
+        return datetime.fromisoformat(node.text()).timestamp()
+    except ValueError:
+        raise node.fail(f"{node.value!r} is no ISO 8601 time") from None
+
+
+def write_parquet(path: Path, mechanism_units: dict[str, str], results: Results) -> None:
+    """Write one heliostat a row: parameters and standard deviations with their unit."""
+    import pandas as pd
+
+    columns: dict[str, Any] = {"name": results.heliostats, "sightings": results.used}
+    sigma = results.sigma
+    for p, name in enumerate(results.names):
+        unit = mechanism_units[name]
+        suffix = "" if unit == "1" else f"_{unit}"
+        columns[f"{name}{suffix}"] = results.values[:, p]
+        columns[f"{name}_sigma{suffix}"] = sigma[:, p]
+    columns["noise"] = results.noise
+    frame = pd.DataFrame(columns)
+    write_file(path, lambda part: frame.to_parquet(part, index=False))
+
+
+def calibrated_plant(plant: Plant, group: str, results: Results) -> Plant:
+    """Return ``plant`` with the parameters in the heliostats of ``group``."""
+    groups = dict(plant.groups)
+    groups[group] = results.apply(groups[group])
+    return replace(plant, groups=groups)
