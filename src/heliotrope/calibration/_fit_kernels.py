@@ -3,6 +3,7 @@
 Levenberg-Marquardt in parameters scaled by their priors, y = x / σ, so that the prior
 is the unit matrix and the damping means the same for a metre and a milliradian:
 minimise Σ ρ(|r|²) + |y|², r the two whitened components of normal minus bisector.
+A trial is evaluated with its derivatives, because nearly every one is taken.
 """
 
 import math
@@ -10,17 +11,13 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._chain_kernels import chain_derivative, chain_pose
-from heliotrope.mechanism._drive_kernels import drive_angle
-from heliotrope.mechanism._jit import OPTIONS
-from heliotrope.mechanism._slots import (
-    MOVES_ALONG_NORMAL,
-    MOVES_DRIVE,
-    MOVES_JOINT,
-    MOVES_ORIGIN,
-    MOVES_POSITION,
-    MOVES_VERTEX,
+from heliotrope.calibration._residual_kernels import (
+    place_mechanism,
+    residual_jacobian,
+    scratch_mechanism,
+    sighting_residual,
 )
+from heliotrope.mechanism._jit import OPTIONS
 
 CONVERGED = 0
 NOT_CONVERGED = 1
@@ -37,114 +34,36 @@ CAUCHY = 2
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.385
 #: Degrees of freedom that the sightings' stated sigma is worth when the scale is found.
 PRIOR_FREEDOM = 5.0
+#: Distance to the minimum, as the quadratic model sees it, that is not walked any more: no
+#: parameter is farther off than this many of its standard deviations.
+NEAR = 1e-7
+#: The same while the scale is still to be found.
+ROUGHLY = 1e-6
+#: A step that promises to gain less is taken unseen: the cost's rounding hides its gain.
+UNSEEN = 1e-9
+#: Damping after a first refusal, its growth, and how often it grows.
+DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 
 
 @njit(**OPTIONS)
-def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal):
-    """Move the arrays of one mechanism by x (P,), in place."""
-    for p in range(codes.shape[0]):
-        what, index, sub = codes[p, 0], codes[p, 1], codes[p, 2]
-        if what == MOVES_JOINT:
-            angles[index] += x[p]
-        elif what == MOVES_DRIVE:
-            drives[index, sub] += x[p]
-        elif what == MOVES_POSITION:
-            position[sub] += x[p]
-        elif what == MOVES_ORIGIN:
-            origins[index, sub] += x[p]
-        elif what == MOVES_VERTEX:
-            vertex[sub] += x[p]
-        elif what == MOVES_ALONG_NORMAL:
-            for k in range(3):
-                vertex[k] += x[p] * normal[k]
+def loss_and_weights(square, loss):
+    """Loss ρ(s), its derivative ρ', and what the curvature 2 ρ'' adds along the residual.
 
-
-@njit(**OPTIONS)
-def _unit_way(end, far, m, way):
-    """Unit vector from m to ``end``; returns its distance, infinite for a direction."""
-    if far:
-        way[:] = end
-        return np.inf
-    size = 0.0
-    for k in range(3):
-        way[k] = end[k] - m[k]
-        size += way[k] * way[k]
-    size = math.sqrt(size)
-    for k in range(3):
-        way[k] /= size
-    return size
-
-
-@njit(**OPTIONS)
-def _bisector_shift(s, s_distance, t, t_distance, v, size, dm, db):
-    """Change of the bisector v when the vertex moves by dm."""
-    s_along = s[0] * dm[0] + s[1] * dm[1] + s[2] * dm[2]
-    t_along = t[0] * dm[0] + t[1] * dm[1] + t[2] * dm[2]
-    along = 0.0
-    for k in range(3):
-        db[k] = -(dm[k] - s_along * s[k]) / s_distance - (dm[k] - t_along * t[k]) / t_distance
-        along += db[k] * v[k]
-    for k in range(3):
-        db[k] = (db[k] - along * v[k]) / size
-
-
-@njit(**OPTIONS)
-def sighting_residual(
-    mechanism, codes, counts, source, far_source, destination, far_destination, axes, whiten,
-    work, residual, jacobian, derivatives,
-):  # fmt: skip
-    """Whitened residual (2,) of one sighting and, if wanted, its derivative (2, P)."""
-    position, orientation, joint_axes, origins, angles, drives, driven, vertex, normal = mechanism
-    frames, screw_axes, screw_points, joint_angles, vectors = work
-    n, m, s, t, v = vectors[0], vectors[1], vectors[2], vectors[3], vectors[4]
-    dn, dm, db = vectors[5], vectors[6], vectors[7]
-    for k in range(driven.shape[0]):
-        joint_angles[k] = drive_angle(drives[k], counts[k])
-    chain_pose(
-        position, orientation, joint_axes, origins, angles, driven, joint_angles, vertex, normal,
-        frames, screw_axes, screw_points, n, m,
-    )  # fmt: skip
-    s_distance = _unit_way(source, far_source, m, s)
-    t_distance = _unit_way(destination, far_destination, m, t)
-    size = 0.0
-    for k in range(3):
-        v[k] = s[k] + t[k]
-        size += v[k] * v[k]
-    size = math.sqrt(size)
-    for k in range(3):
-        v[k] /= size
-    _project(axes, whiten, n, v, residual)
-    if derivatives:
-        for p in range(codes.shape[0]):
-            chain_derivative(
-                codes[p, 0], codes[p, 1], codes[p, 2], drives, driven, counts,
-                frames, screw_axes, screw_points, n, m, dn, dm,
-            )  # fmt: skip
-            _bisector_shift(s, s_distance, t, t_distance, v, size, dm, db)
-            _project(axes, whiten, dn, db, jacobian[:, p])
-
-
-@njit(**OPTIONS)
-def _project(axes, whiten, a, b, out):
-    x, y = 0.0, 0.0
-    for k in range(3):
-        x += axes[0, k] * (a[k] - b[k])
-        y += axes[1, k] * (a[k] - b[k])
-    out[0] = whiten[0, 0] * x + whiten[0, 1] * y
-    out[1] = whiten[1, 0] * x + whiten[1, 1] * y
-
-
-@njit(**OPTIONS)
-def loss_and_weight(square, loss, scale):
-    """(ρ, dρ/d|r|²) of a squared residual, |r| measured in ``scale``."""
-    square = square / (scale * scale)
+    A far outlier's loss is concave along the residual; there the curvature is taken as 0,
+    which keeps the step's matrix positive definite.
+    """
     if loss == HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
         size = math.sqrt(square)
-        return 2.0 * HUBER_WIDTH * size - HUBER_WIDTH * HUBER_WIDTH, HUBER_WIDTH / size
+        weight = HUBER_WIDTH / size
+        return 2.0 * HUBER_WIDTH * size - HUBER_WIDTH * HUBER_WIDTH, weight, -weight / square
     if loss == CAUCHY:
         ratio = square / (CAUCHY_WIDTH * CAUCHY_WIDTH)
-        return CAUCHY_WIDTH * CAUCHY_WIDTH * math.log1p(ratio), 1.0 / (1.0 + ratio)
-    return square, 1.0
+        weight = 1.0 / (1.0 + ratio)
+        bend = -2.0 * weight * weight / (CAUCHY_WIDTH * CAUCHY_WIDTH)
+        if ratio > 1.0:
+            bend = -weight / square
+        return CAUCHY_WIDTH * CAUCHY_WIDTH * math.log1p(ratio), weight, bend
+    return square, 1.0, 0.0
 
 
 @njit(**OPTIONS)
@@ -197,95 +116,93 @@ def inverse_from(factor, out):
 
 
 @njit(**OPTIONS)
-def _moved(base, codes, x):
-    """Copies of one mechanism's arrays, moved by x."""
-    position, orientation, axes, origins, angles, drives, driven, vertex, normal = base
-    position, origins, angles = position.copy(), origins.copy(), angles.copy()
-    drives, vertex = drives.copy(), vertex.copy()
-    apply_parameters(codes, x, position, origins, angles, drives, vertex, normal)
-    return position, orientation, axes, origins, angles, drives, driven, vertex, normal
+def _normal_equations(problem, y, loss, scale, curved, hessian, gradient):
+    """Cost at y with gradient (P,) and hessian (P, P), lower half, by y.
 
-
-@njit(**OPTIONS)
-def _normal_equations(
-    base, codes, sigma, y, rows, loss, scale, data, work, hessian, gradient, squares, derivatives
-):
-    """Cost at y; with ``derivatives`` also hessian (P, P) and gradient (P,) by y."""
-    counts, source, far_source, destination, far_destination, axes, whiten, keep = data
+    The hessian is Gauss-Newton's with the weights of the loss, which the covariance is
+    made of; ``curved`` adds the curvature of the loss, which is the better step.
+    """
+    base, codes, sigma, rows, data, squares, scratch, wrenches, jacobian = problem
     size = codes.shape[0]
-    moved = _moved(base, codes, y * sigma)
-    residual, jacobian = np.empty(2), np.zeros((2, size))
+    g = place_mechanism(base, codes, sigma, y, scratch)
+    drives, keep = scratch[0][3], data[7]
+    inverse = 1.0 / scale
     cost = 0.0
-    if derivatives:
-        hessian[:] = 0.0
-        gradient[:] = 0.0
     for p in range(size):
         cost += y[p] * y[p]
-        if derivatives:
-            hessian[p, p] = 1.0
-            gradient[p] = y[p]
+        gradient[p] = y[p]
+        for q in range(size):
+            hessian[p, q] = 0.0
+        hessian[p, p] = 1.0
     for i in range(rows[0], rows[1]):
-        sighting_residual(
-            moved, codes, counts[i], source[i], far_source[i], destination[i],
-            far_destination[i], axes[i], whiten[i], work, residual, jacobian, derivatives,
-        )  # fmt: skip
-        square = residual[0] * residual[0] + residual[1] * residual[1]
-        squares[i] = square
+        a, b = sighting_residual(g, drives, data, i, inverse, wrenches)
+        square = a * a + b * b
+        squares[i] = square * scale * scale
         if not keep[i]:
             continue
-        value, weight = loss_and_weight(square, loss, scale)
+        value, weight, bend = loss_and_weights(square, loss)
         cost += value
-        if derivatives:
-            weight /= scale * scale
-            for p in range(size):
-                a, b = jacobian[0, p] * sigma[p], jacobian[1, p] * sigma[p]
-                gradient[p] += weight * (a * residual[0] + b * residual[1])
-                for q in range(p + 1):
-                    hessian[p, q] += weight * sigma[q] * (a * jacobian[0, q] + b * jacobian[1, q])
+        if not curved:
+            bend = 0.0
+        residual_jacobian(drives, data[0], i, scratch, wrenches, jacobian)
+        w_aa, w_ab, w_bb = weight + bend * a * a, bend * a * b, weight + bend * b * b
+        for p in range(size):
+            x, z = jacobian[0, p], jacobian[1, p]
+            gradient[p] += weight * (a * x + b * z)
+            one, two = w_aa * x + w_ab * z, w_ab * x + w_bb * z
+            for q in range(p + 1):
+                hessian[p, q] += one * jacobian[0, q] + two * jacobian[1, q]
     return cost
 
 
 @njit(**OPTIONS)
-def _minimise(base, codes, sigma, y, rows, loss, scale, data, work, arrays, limit):
-    """Levenberg-Marquardt from y, in place; returns (cost, iterations, converged)."""
-    hessian, gradient, damped, factor, step, trial, squares = arrays
-    size = codes.shape[0]
-    damping = 1e-4
-    cost = _normal_equations(
-        base, codes, sigma, y, rows, loss, scale, data, work, hessian, gradient, squares, True
-    )
+def _minimise(problem, y, loss, scale, near, arrays, limit):
+    """Levenberg-Marquardt from y, in place; returns (cost, iterations, converged).
+
+    The prior keeps the matrix well-posed, so that damping begins only with a refusal.
+    """
+    hessians, gradients, damped, factor, step, trial = arrays
+    size = y.shape[0]
+    damping, side = 0.0, 0
+    cost = _normal_equations(problem, y, loss, scale, True, hessians[0], gradients[0])
     if not math.isfinite(cost):
         return cost, 0, False
-    for iteration in range(1, limit + 1):
-        improved, new = False, cost
-        for _ in range(25):
+    for iteration in range(limit):
+        hessian, gradient = hessians[side], gradients[side]
+        solved = cholesky_solve(hessian, gradient, factor, step)
+        distance = np.inf
+        if solved:
+            distance = 0.0
             for p in range(size):
-                for q in range(p + 1):
-                    damped[p, q] = hessian[p, q]
-                damped[p, p] += damping * hessian[p, p]
-            if cholesky_solve(damped, gradient, factor, step):
+                distance += gradient[p] * step[p]
+            if distance <= near * near:
+                return cost, iteration, True
+        new = np.nan
+        for _ in range(REFUSALS):
+            if damping > 0.0:
+                for p in range(size):
+                    for q in range(p + 1):
+                        damped[p, q] = hessian[p, q]
+                    damped[p, p] += damping * hessian[p, p]
+                solved = cholesky_solve(damped, gradient, factor, step)
+            if solved:
                 for p in range(size):
                     trial[p] = y[p] - step[p]
                 new = _normal_equations(
-                    base, codes, sigma, trial, rows, loss, scale, data, work, hessian, gradient,
-                    squares, False,
-                )  # fmt: skip
-                if new <= cost:
-                    improved = True
+                    problem, trial, loss, scale, True, hessians[1 - side], gradients[1 - side]
+                )
+                if new <= cost or (distance <= UNSEEN and math.isfinite(new)):
                     break
-            damping = max(damping, 1e-10) * 8.0
-        if not improved:
+            damping = max(HARDER * damping, DAMPING)
+            new = np.nan
+        if math.isnan(new):
             # Rounding is all that is left to gain.
-            return cost, iteration, True
-        gained = cost - new
+            _normal_equations(problem, y, loss, scale, True, hessian, gradient)
+            return cost, iteration + 1, True
         for p in range(size):
             y[p] = trial[p]
-        cost = _normal_equations(
-            base, codes, sigma, y, rows, loss, scale, data, work, hessian, gradient, squares, True
-        )
-        damping *= 0.1
-        if gained <= 1e-12 * (1.0 + cost):
-            return cost, iteration, True
+        cost, side = new, 1 - side
+        damping = 0.1 * damping if damping > DAMPING else 0.0
     return cost, limit, False
 
 
@@ -305,6 +222,16 @@ def _median_scale(squares, keep, rows):
 
 
 @njit(**OPTIONS)
+def _covariance(hessian, sigma, gradient, factor, step, out):
+    """Covariance of x = y σ (P, P); ``out`` stays as it is where there is none."""
+    if cholesky_solve(hessian, gradient, factor, step):
+        inverse_from(factor, out)
+        for p in range(sigma.shape[0]):
+            for q in range(sigma.shape[0]):
+                out[p, q] *= sigma[p] * sigma[q]
+
+
+@njit(**OPTIONS)
 def fit_block(
     arrays, codes, sigma, offsets, data, loss, rounds, limit, lowest_scale,
     x, covariance, scales, squares, costs, iterations, status, start, stop,
@@ -316,12 +243,14 @@ def fit_block(
     """
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]
-    work = (
-        np.empty((joints + 1, 3, 3)), np.empty((joints, 3)), np.empty((joints, 3)),
-        np.empty(drives), np.empty((8, 3)),
+    scratch = scratch_mechanism(joints, drives, arrays[5].shape[2], size)
+    wrenches, jacobian = np.zeros((3, 2, 6)), np.empty((2, size))
+    # The matrices of the last step and of its trial change places when the trial is taken.
+    solver = (
+        np.empty((2, size, size)), np.empty((2, size)), np.empty((size, size)),
+        np.zeros((size, size)), np.empty(size), np.empty(size),
     )  # fmt: skip
-    hessian, damped, factor = np.empty((size, size)), np.empty((size, size)), np.zeros((size, size))
-    gradient, step, trial, y = np.empty(size), np.empty(size), np.empty(size), np.empty(size)
+    hessian, gradient, y = solver[0][0], solver[1][0], np.empty(size)
     keep = data[7]
     for i in range(start, stop):
         base = (
@@ -334,13 +263,13 @@ def fit_block(
             kept += keep[k]
         y[:] = 0.0
         scale, total, converged, cost = 1.0, 0, False, np.nan
-        scratch = (hessian, gradient, damped, factor, step, trial, squares)
+        problem = (base, codes, sigma[i], rows, data, squares, scratch, wrenches, jacobian)
+        kind = loss
         if kept > 0:
             for turn in range(rounds + 1):
-                cost, steps, converged = _minimise(
-                    base, codes, sigma[i], y, rows, loss if turn > 0 or rounds == 0 else CAUCHY,
-                    scale, data, work, scratch, limit,
-                )  # fmt: skip
+                kind = loss if turn > 0 or rounds == 0 else CAUCHY
+                near = NEAR if turn == rounds else ROUGHLY
+                cost, steps, converged = _minimise(problem, y, kind, scale, near, solver, limit)
                 total += steps
                 if turn < rounds:
                     # Few sightings fit themselves: the stated sigma counts as some more.
@@ -348,21 +277,16 @@ def fit_block(
                     new = _median_scale(squares, keep, rows)
                     total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)
                     scale = max(lowest_scale, math.sqrt(total_square / (PRIOR_FREEDOM + free)))
+            _normal_equations(problem, y, kind, scale, False, hessian, gradient)
         for p in range(size):
             x[i, p] = y[p] * sigma[i, p]
         scales[i], costs[i], iterations[i] = scale, cost, total
         status[i] = CONVERGED if converged else NOT_CONVERGED
         if kept == 0:
             status[i] = TOO_FEW
-            hessian[:] = 0.0
-            for p in range(size):
-                hessian[p, p] = 1.0
+            hessian[:] = np.eye(size)
         elif not math.isfinite(cost):
             status[i] = FAILED
-        if status[i] != FAILED and cholesky_solve(hessian, gradient, factor, step):
-            inverse_from(factor, covariance[i])
-            for p in range(size):
-                for q in range(size):
-                    covariance[i, p, q] *= sigma[i, p] * sigma[i, q]
-        else:
-            covariance[i] = np.nan
+        covariance[i] = np.nan
+        if status[i] != FAILED:
+            _covariance(hessian, sigma[i], gradient, solver[3], solver[4], covariance[i])
