@@ -63,3 +63,11 @@ def runner(client: "Client") -> Runner:
         return found
 
     return run
+
+
+def disconnect(client: "Client") -> None:
+    """Leave the scheduler; one that :func:`connect` started here ends with it."""
+    machines = client.cluster
+    client.close()  # type: ignore[no-untyped-call]
+    if machines is not None:
+        machines.close()

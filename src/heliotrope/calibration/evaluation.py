@@ -89,8 +89,7 @@ def split(
     InputError
         If the fraction or the kind is none.
     """
-    if not 0.0 < fraction < 1.0:
-        raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
+    check_fraction(fraction)
     if kind not in ("random", "chronological", "neighbour"):
         raise InputError(f"split {kind!r}: give random, chronological or neighbour")
     chosen = np.zeros(len(sightings), dtype=np.bool_)
@@ -104,6 +103,18 @@ def split(
             rows = rows[np.argsort(sightings.time[rows], kind="stable")]
         chosen[rows[: round(fraction * len(rows))]] = True
     return chosen
+
+
+def check_fraction(fraction: float) -> None:
+    """Refuse a share of the sightings that leaves nothing to learn from or to test.
+
+    Raises
+    ------
+    InputError
+        If it does not lie between 0 and 1.
+    """
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"fraction {fraction}: it must lie between 0 and 1")
 
 
 def _by_neighbourhood(

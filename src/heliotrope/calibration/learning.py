@@ -109,6 +109,11 @@ class Learned:
         """The P parameters, those that only wander included."""
         return self.hyper.names
 
+    @property
+    def zeros(self) -> tuple[str, ...]:
+        """The drives' zeros."""
+        return drift.zeros(self.mechanism)
+
     def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
         """Return the regime of a heliostat at Unix times ``when`` (m,)."""
         rows = np.flatnonzero((self.sightings.heliostat == heliostat) & (self.regime >= 0))
@@ -160,6 +165,26 @@ class Learned:
         covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
         square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
         return Prediction(found, found.offset, covariance, square <= drift.NINETY)
+
+
+def left_out_errors(learned: Learned) -> FloatArray:
+    """Return each sighting's beam error as seen from all the others of its heliostat, rad, (M, 2).
+
+    To the right of and above the destination, predicted minus seen. Outliers and what was
+    not used are seen from all that was.
+    """
+    found = learned.predict(learned.sightings).plane
+    rows = learned.sightings.heliostat
+    values, _ = learned.parameters_at(rows, learned.sightings.time)
+    moved = learned.mechanism[rows].with_parameters(
+        {n: values[:, p] for p, n in enumerate(learned.names)}
+    )
+    beam = linearise(moved, learned.sightings, learned.zeros).beam
+    for i, member in enumerate(learned.members):
+        part = learned.rows[i][~learned.outlier[learned.rows[i]]]
+        if len(part):
+            found[part] = -np.einsum("mab,mb->ma", beam[part], member.left_out()[1])
+    return found
 
 
 @dataclass(frozen=True)

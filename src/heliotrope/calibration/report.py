@@ -1,26 +1,51 @@
-"""The report of a calibration: one page, its pictures, and tables for other programs."""
+"""The report of a calibration: one self-contained page, and files for other programs."""
 
+import base64
 import html
+import io
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliotrope.calibration.estimator import Calibration, Outcome
+from heliotrope.calibration import pictures
+from heliotrope.calibration.assessment import ENOUGH, Assessment
+from heliotrope.calibration.estimator import Outcome
 from heliotrope.calibration.evaluation import Errors, Summary, errors, summary
-from heliotrope.calibration.sightings import Sightings
-from heliotrope.geometry import FloatArray, azimuth_elevation
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.calibration.learning import Learned, left_out_errors
+from heliotrope.calibration.results import (
+    Results,
+    at_moment,
+    calibrated_plant,
+    write_json,
+    write_parquet,
+)
+from heliotrope.calibration.uncertainty import Blind, unobservable
+from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Blue and orange of Okabe and Ito, told apart by the colour-blind too.
-BEFORE, AFTER, TESTED = "#999999", "#0072b2", "#d55e00"
+#: No more heliostats than this get a section with pictures: those with the largest errors.
+MOST_SECTIONS = 60
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of one heliostat: errors of the beam, rad."""
+
+    index: int
+    name: str
+    before: Summary
+    after: Summary
+    held: Summary
+    outcome: Outcome
 
 
 @dataclass(frozen=True)
@@ -31,46 +56,88 @@ class Result:
     ----------
     names
         Of the N heliostats.
-    mechanism
-        Nominal, (N,).
-    sightings
-        All of them.
-    calibration
-        Fitted on the training part.
-    training
-        Mask of it, (M,).
-    model
-        Name of the model.
+    learned
+        From all sightings.
+    plant, group
+        The plant, and the group whose heliostats these are.
+    assessment
+        Of a second learning with a part held out, or None.
+    ids
+        A name for each sighting, for the list of outliers.
+    left_out
+        A line for each sighting that could not be used.
+    note
+        How the held-out part was chosen.
     """
 
     names: tuple[str, ...]
-    mechanism: Mechanism
-    sightings: Sightings
-    calibration: Calibration
-    training: "np.ndarray[Any, np.dtype[np.bool_]]"
-    model: str
+    learned: Learned
+    plant: Plant
+    group: str
+    assessment: Assessment | None = None
+    ids: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    note: str = ""
+    comparison: tuple[str, ...] = field(default=())
 
-    def errors(self) -> tuple[Errors, Errors]:
-        """Return the errors of all sightings before and after."""
-        moved = self.mechanism.with_parameters(self.calibration.parameters)
-        return errors(self.mechanism, self.sightings), errors(moved, self.sightings)
+    @cached_property
+    def results(self) -> Results:
+        """The parameters at the moment of the last sighting."""
+        return at_moment(self.names, self.learned)
 
-    def rows(self) -> list[tuple[str, Summary, Summary, Summary, Outcome]]:
-        """Return for each heliostat: name, before, after (training), held out, outcome."""
-        before, after = self.errors()
+    @cached_property
+    def before(self) -> Errors:
+        """Errors under the nominal mechanisms."""
+        return errors(self.learned.mechanism, self.learned.sightings)
+
+    @cached_property
+    def after(self) -> FloatArray:
+        """Beam errors, each sighting seen from the others, rad right and up, (M, 2)."""
+        return left_out_errors(self.learned)
+
+    @cached_property
+    def distance(self) -> FloatArray:
+        """From mirror to destination, m; 1 where that is at infinity, (M,)."""
+        s = self.learned.sightings
+        way = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
+        return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(way, axis=-1))
+
+    @property
+    def targets(self) -> FloatArray:
+        """Centres of the targets, (K, 3)."""
+        return np.array([t.center for t in self.plant.targets]).reshape(-1, 3)
+
+    @property
+    def aim(self) -> FloatArray:
+        """Where a heliostat aims in the map of its year: the first target, or the sightings'."""
+        if len(self.targets):
+            return np.asarray(self.targets[0])
+        s = self.learned.sightings
+        return np.asarray(np.mean(s.destination[~s.destination_at_infinity], axis=0))
+
+    @property
+    def latitude_deg(self) -> float:
+        """Of the site."""
+        return self.plant.site.latitude_deg
+
+    @cached_property
+    def _rows(self) -> tuple[Row, ...]:
+        held = {h.name: h.beam for h in self.assessment.heliostats} if self.assessment else {}
+        size = np.linalg.norm(self.after, axis=-1)
+        nothing = summary(np.empty(0))
         found = []
         for i, name in enumerate(self.names):
-            mine = self.sightings.heliostat == i
-            found.append(
-                (
-                    name,
-                    summary(before.beam[mine]),
-                    summary(after.beam[mine & self.training]),
-                    summary(after.beam[mine & ~self.training]),
-                    Outcome(int(self.calibration.outcome[i])),
-                )
-            )
-        return found
+            mine = self.learned.sightings.heliostat == i
+            if mine.any():
+                outcome = Outcome(int(self.learned.static.outcome[i]))
+                before = summary(self.before.beam[mine])
+                after = summary(size[mine])
+                found.append(Row(i, name, before, after, held.get(name, nothing), outcome))
+        return tuple(found)
+
+    def rows(self) -> tuple[Row, ...]:
+        """Return the figures of the heliostats that have sightings."""
+        return self._rows
 
 
 def write_parameters(result: Result, path: Path) -> None:
@@ -78,18 +145,19 @@ def write_parameters(result: Result, path: Path) -> None:
 
     Columns carry the unit: ``tilt_north_rad``, ``tilt_north_sigma_rad``.
     """
-    c = result.calibration
+    r, c = result.results, result.learned.static
     header = ["name", "sightings", "outcome", "noise_scale"]
-    for name in c.names:
-        unit = {"1": ""}.get(result.mechanism.parameter(name).unit)
-        unit = f"_{result.mechanism.parameter(name).unit}" if unit is None else unit
-        header += [f"{name}{unit}", f"{name}_sigma{unit}"]
+    for name in r.names:
+        unit = result.learned.mechanism.parameter(name).unit
+        suffix = "" if unit == "1" else f"_{unit}"
+        header += [f"{name}{suffix}", f"{name}_sigma{suffix}"]
     lines = [",".join(header)]
+    sigma = r.sigma
     for i, heliostat in enumerate(result.names):
         cells = [heliostat, str(int(c.count[i])), Outcome(int(c.outcome[i])).name.lower()]
-        cells.append(f"{c.scale[i]:.17g}")
-        for p in range(len(c.names)):
-            cells += [f"{c.values[i, p]:.17g}", f"{c.sigma[i, p]:.17g}"]
+        cells.append(f"{r.noise[i]:.17g}")
+        for p in range(len(r.names)):
+            cells += [f"{r.values[i, p]:.17g}", f"{sigma[i, p]:.17g}"]
         lines.append(",".join(cells))
     write_beside(path, lambda place: place.write_text("\n".join(lines) + "\n", encoding="utf-8"))
 
@@ -108,7 +176,10 @@ def write_beside(path: Path, write: Callable[[Path], object]) -> None:
 def write_report(
     result: Result, folder: Path, progress: Callable[[int, int], None] | None = None
 ) -> Path:
-    """Write the page, its pictures and ``parameters.csv``; returns the page's path.
+    """Write the page and the files beside it; returns the page's path.
+
+    ``index.html`` (all pictures inside it), ``parameters.csv``, ``calibration.json``,
+    ``calibration.parquet``, and ``plant.toml`` with the calibrated heliostats.
 
     Parameters
     ----------
@@ -119,134 +190,160 @@ def write_report(
     progress
         Called with (done, all) after each picture.
     """
-    before, after = result.errors()
     folder.mkdir(parents=True, exist_ok=True)
+    r = result.results
     write_parameters(result, folder / "parameters.csv")
-    total = len(result.names) + 1
-    _save(overview(result), folder / "overview.png")
-    for i, name in enumerate(result.names):
+    ids = result.ids or tuple(str(k) for k in range(len(result.learned.sightings)))
+    write_json(folder / "calibration.json", result.names, result.learned, r, ids)
+    units = {n: result.learned.mechanism.parameter(n).unit for n in r.names}
+    write_parquet(folder / "calibration.parquet", units, r)
+    write_plant(calibrated_plant(result.plant, result.group, r), folder / "plant.toml")
+    rows = sorted(result.rows(), key=lambda row: -_finite(row.after.median))[:MOST_SECTIONS]
+    rows = sorted(rows, key=lambda row: row.name)
+    sections = []
+    for k, row in enumerate(rows):
+        sections.append(_section(result, row))
         if progress:
-            progress(i + 1, total)
-        if (result.sightings.heliostat == i).any():
-            _save(heliostat_figure(result, i, before, after), folder / f"{name}.png")
+            progress(k + 1, len(rows) + 1)
     page = folder / "index.html"
-    write_beside(page, lambda place: place.write_text(_page(result), encoding="utf-8"))
+    text = _page(result, sections)
+    write_beside(page, lambda place: place.write_text(text, encoding="utf-8"))
     if progress:
-        progress(total, total)
+        progress(len(rows) + 1, len(rows) + 1)
     return page
 
 
-def _save(figure: "Figure", path: Path) -> None:
-    write_beside(path, lambda place: figure.savefig(place, dpi=110, format="png"))
+def _finite(value: float) -> float:
+    return value if np.isfinite(value) else 0.0
 
 
-def _figure(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=size, layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
+def _picture(figure: "Figure", alt: str, dpi: int = 80) -> str:
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format="png")
+    code = base64.b64encode(data.getvalue()).decode("ascii")
+    return f'<img loading="lazy" src="data:image/png;base64,{code}" alt="{html.escape(alt)}">'
 
 
-def overview(result: Result) -> "Figure":
-    """Return the picture of all heliostats: median beam error before, after and held out."""
-    table = [row for row in result.rows() if row[1].count]
-    figure, axes = _figure(1, 1, (max(6.0, 0.32 * len(table) + 2.0), 4.2))
-    ax: Axes = axes[0, 0]
-    place = np.arange(len(table))
-    for column, label, colour, marker in (
-        (1, "before", BEFORE, "o"),
-        (2, "after, training", AFTER, "s"),
-        (3, "after, held out", TESTED, "D"),
-    ):
-        values = [1e3 * row[column].median for row in table]  # type: ignore[union-attr]
-        if np.isfinite(values).any():
-            ax.plot(place, values, marker, color=colour, label=label, ms=5)
-    ax.set_yscale("log")
-    ax.set_ylim(bottom=max(0.01, 0.7 * ax.get_ylim()[0]))
-    ax.set_xticks(place, [row[0] for row in table], rotation=90)
-    ax.set_ylabel("median beam error, mrad")
-    ax.grid(axis="y", alpha=0.3)
-    ax.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
-    return figure
+def blind_spots(result: Result, i: int) -> tuple[Blind, ...]:
+    """Return what the sightings of heliostat ``i`` say nothing about."""
+    r = result.results
+    count = len(result.learned.model)
+    line = result.aim - result.learned.mechanism.position[i]
+    return unobservable(
+        r.names[:count], r.covariance[i][:count, :count], result.learned.hyper.spread[:count], line
+    )
 
 
-def heliostat_figure(result: Result, i: int, before: Errors, after: Errors) -> "Figure":
-    """Return the picture of one heliostat: errors on the target, residuals against the sun."""
-    mine = result.sightings.heliostat == i
-    train, test = mine & result.training, mine & ~result.training
-    figure, axes = _figure(2, 2, (10.0, 8.0))
-    figure.suptitle(f"{result.names[i]}: {int(mine.sum())} sightings, model {result.model}")
-    _target_plot(axes[0, 0], [(before.plane[mine], BEFORE, "before")], "before")
-    groups = [(after.plane[train], AFTER, "training"), (after.plane[test], TESTED, "held out")]
-    _target_plot(axes[0, 1], groups, "after")
-    source = result.sightings.source
-    azimuth, elevation = azimuth_elevation(source)
-    for ax, values, label in (
-        (axes[1, 0], np.degrees(azimuth), "sun azimuth from north, °"),
-        (axes[1, 1], np.degrees(elevation), "sun elevation, °"),
-    ):
-        for rows, colour in ((train, AFTER), (test, TESTED)):
-            ax.plot(values[rows], 1e3 * after.beam[rows], ".", color=colour)
-        ax.set_xlabel(label)
-        ax.set_ylabel("beam error after, mrad")
-        ax.set_ylim(bottom=0)
-        ax.grid(alpha=0.3)
-    return figure
+def _section(result: Result, row: Row) -> str:
+    name = html.escape(row.name)
+    learned, i = result.learned, row.index
+    notes = []
+    steps = learned.members[i].data.steps
+    if len(steps):
+        days = ", ".join(str(np.datetime64(int(d), "D")) for d in steps)
+        notes.append(f"The zeros took a step about {days}.")
+    mine = np.flatnonzero(learned.sightings.heliostat == i)
+    labels = learned.regime[mine]
+    for k in np.unique(labels[labels > 0]):
+        time = learned.sightings.time[mine[labels == k]] / 86400.0
+        first, last = (np.datetime64(int(t), "D") for t in (np.nanmin(time), np.nanmax(time)))
+        notes.append(f"Regime {k}: {int((labels == k).sum())} sightings, {first} to {last}.")
+    out = mine[learned.outlier[mine]]
+    if len(out):
+        listed = ", ".join(html.escape(result.ids[k]) if result.ids else str(k) for k in out)
+        notes.append(f"Outliers, left out: {listed}.")
+    notes += [b.text[0].upper() + b.text[1:] + "." for b in blind_spots(result, i)[:4]]
+    figure = _picture(pictures.heliostat_figure(result, i), f"Errors of {row.name}", 70)
+    body = "".join(f"<li>{note}</li>" for note in notes)
+    return (
+        f'<section id="{name}"><h2>{name}</h2>{figure}<ul>{body}</ul>'
+        f"{_parameter_table(result, i)}</section>"
+    )
 
 
-def _target_plot(ax: "Axes", groups: list[tuple[FloatArray, str, str]], title: str) -> None:
-    for plane, colour, label in groups:
-        if len(plane):
-            ax.plot(plane[:, 0], plane[:, 1], ".", color=colour, label=label)
-    ax.axhline(0, color="k", lw=0.5)
-    ax.axvline(0, color="k", lw=0.5)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title(f"predicted minus measured, {title}")
-    ax.set_xlabel("right, m")
-    ax.set_ylabel("up, m")
-    ax.grid(alpha=0.3)
-    if sum(len(plane) > 0 for plane, _, _ in groups) > 1:
-        ax.legend(frameon=False)
+def _parameter_table(result: Result, i: int) -> str:
+    r = result.results
+    lines = []
+    for p, name in enumerate(r.names):
+        row = result.learned.mechanism.parameter(name)
+        factor, unit = (1e3, {"rad": "mrad", "m": "mm"}.get(row.unit, "‰"))
+        lines.append(
+            f"<tr><td>{name}</td><td>{factor * r.values[i, p]:.3f}</td>"
+            f"<td>{factor * r.sigma[i, p]:.3f}</td><td>{factor * row.prior:.1f}</td>"
+            f"<td>{unit}</td><td>{html.escape(row.cause)}</td></tr>"
+        )
+    head = "<tr><th>parameter</th><th>value</th><th>σ</th><th>prior σ</th><th></th><th>cause</th>"
+    table = f"<table>{head}</tr>{''.join(lines)}</table>"
+    return f"<details><summary>parameters</summary>{table}</details>"
 
 
 _STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 72rem; padding: 0 1rem }
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1rem }
 table { border-collapse: collapse } td, th { padding: .15rem .8rem; text-align: right }
 td:first-child, th:first-child, td:last-child, th:last-child { text-align: left }
-tr:nth-child(even) { background: #8881 } img { max-width: 100% }
+tr:nth-child(even) { background: #8881 } img { max-width: 100%; background: #fff }
+section { border-top: 1px solid #8886; margin-top: 2rem } :root { color-scheme: light dark }
 """
 
 
-def _page(result: Result) -> str:
+def _page(result: Result, sections: list[str]) -> str:
     body = []
-    for name, before, after, held, outcome in result.rows():
-        numbers = [before.median, after.median, after.rms, held.median, held.p95]
+    linked = "".join(sections)
+    for row in result.rows():
+        numbers = [
+            row.before.median, row.after.median, row.after.rms, row.after.p95, row.held.median,
+            row.held.p95,
+        ]  # fmt: skip
         cells = "".join(
             f"<td>{1e3 * v:.2f}</td>" if np.isfinite(v) else "<td>–</td>" for v in numbers
         )
-        link = html.escape(name)
-        shown = f'<a href="#{link}">{link}</a>' if before.count else link
+        name = html.escape(row.name)
+        shown = f'<a href="#{name}">{name}</a>' if f'id="{name}"' in linked else name
+        out = int(result.learned.outlier[result.learned.sightings.heliostat == row.index].sum())
         body.append(
-            f"<tr><td>{shown}</td><td>{before.count}</td>{cells}<td>{outcome.text}</td></tr>"
+            f"<tr><td>{shown}</td><td>{row.before.count}</td><td>{out}</td>{cells}"
+            f"<td>{row.outcome.text}</td></tr>"
         )
-    pictures = [
-        f'<h2 id="{html.escape(name)}">{html.escape(name)}</h2>'
-        f'<img loading="lazy" src="{html.escape(name)}.png" alt="Errors of {html.escape(name)}">'
-        for i, name in enumerate(result.names)
-        if (result.sightings.heliostat == i).any()
-    ]
     head = (
-        "<tr><th>heliostat</th><th>sightings</th><th>median before</th><th>median after</th>"
-        "<th>RMS after</th><th>held out, median</th><th>held out, 95 %</th><th>fit</th></tr>"
+        "<tr><th>heliostat</th><th>sightings</th><th>outliers</th><th>before, median</th>"
+        "<th>after, median</th><th>RMS</th><th>95 %</th><th>held out, median</th><th>95 %</th>"
+        "<th>fit</th></tr>"
     )
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
         f"<title>Calibration</title><style>{_STYLE}</style><h1>Calibration</h1>"
-        f"<p>{len(result.names)} heliostats, {len(result.sightings)} sightings, model "
-        f"{html.escape(result.model)}. Beam errors in mrad (about twice the mirror's).</p>"
-        '<img src="overview.png" alt="Median beam error of each heliostat">'
-        f"<table>{head}{''.join(body)}</table>{''.join(pictures)}</html>"
+        f"{_summary(result)}{_picture(pictures.overview(result), 'Median beam error')}"
+        f"{_picture(pictures.field_map(result), 'Map of the field')}"
+        f"<table>{head}{''.join(body)}</table>{linked}</html>"
     )
+
+
+def _summary(result: Result) -> str:
+    learned = result.learned
+    unused = len(result.left_out)
+    first = f"{len(result.rows())} heliostats with {len(learned.sightings)} sightings; "
+    first += f"{int(learned.outlier.sum())} outliers and {unused} unusable ones left out."
+    second = "Errors are of the beam, in mrad (about twice the mirror's). <em>After</em>: each "
+    second += "sighting as predicted from all others of its heliostat."
+    parts = [first, f"Model: {', '.join(learned.model)}.", second]
+    a = result.assessment
+    if a is not None and np.isfinite(a.median_of_medians):
+        parts.append(
+            f"<em>Held out</em> ({html.escape(result.note)}): median of the medians "
+            f"{1e3 * a.median_of_medians:.2f} mrad over the heliostats with {ENOUGH} sightings or "
+            f"more; {100 * a.coverage:.0f} % lie within their 90 % ellipse."
+        )
+    h = learned.hyper
+    moving = "; ".join(
+        f"{p.parameter} by {1e3 * a:.2f} mrad within {_span(float(h.tau[g]))}"
+        for p, a, g in zip(h.processes, h.amplitude, h.group, strict=True)
+    )
+    if moving:
+        parts.append(f"What wanders: {moving}. Noise of a sighting: {h.noise:.2f} of its sigma.")
+    parts += [html.escape(line) for line in result.comparison]
+    return "".join(f"<p>{part}</p>" for part in parts)
+
+
+def _span(days: float) -> str:
+    return f"{24 * days:.1f} h" if days < 2.0 else f"{days:.0f} days"

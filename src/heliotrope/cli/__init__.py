@@ -11,8 +11,10 @@ import typer
 from heliotrope import __version__
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.demo import demo
+from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
+from heliotrope.cli.plan import plan
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
 from heliotrope.errors import HeliotropeError
@@ -47,6 +49,8 @@ app.command()(sun)
 app.command()(track)
 app.add_typer(field_app, name="field")
 app.command()(calibrate)
+app.command()(plan)
+app.command()(evaluate)
 app.command()(fetch)
 app.command()(demo)
 

@@ -25,7 +25,7 @@ def demo(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Make an example plant, measure it, calibrate it, track a day, and write a report."""
-    from heliotrope.calibration import estimator, evaluation
+    from heliotrope.calibration import assessment, evaluation, learning
     from heliotrope.calibration.report import Result, write_beside
     from heliotrope.cli.calibrate import show_report
     from heliotrope.field.example import prototype, roughly_installed
@@ -44,9 +44,13 @@ def demo(
         "canting", "position_east", "position_north", "position_up",
     )  # fmt: skip
     training = evaluation.split(seen, "random", 0.7, seed)
-    fitted = estimator.fit(group.mechanism, seen, model, keep=training)
-    result = Result(group.names, group.mechanism, seen, fitted, training, "rough installation")
-    calibrated = plant.with_groups({"azel": group.with_parameters(fitted.parameters)})
+    tested = learning.learn(group.mechanism, seen, model, used=training)
+    learned = learning.learn(group.mechanism, seen, model)
+    result = Result(
+        group.names, learned, plant, "azel", assessment.assess(group.names, tested),
+        note="random split, 70 % to learn from",
+    )  # fmt: skip
+    calibrated = plant.with_groups({"azel": result.results.apply(group)})
     write_plant(calibrated, into / "plant.toml")
     day = _track_day(calibrated, truth)
     picture = _day_picture(day)
@@ -133,9 +137,9 @@ def _figures(result: "Result", day: dict[str, Any]) -> dict[str, Any]:
     rows = result.rows()
     return {
         "heliostats": len(result.names),
-        "sightings": len(result.sightings),
-        "before_mrad": 1e3 * float(np.median([row[1].median for row in rows])),
-        "held_out_mrad": 1e3 * float(np.median([row[3].median for row in rows])),
+        "sightings": len(result.learned.sightings),
+        "before_mrad": 1e3 * float(np.median([row.before.median for row in rows])),
+        "held_out_mrad": 1e3 * float(np.median([row.held.median for row in rows])),
         "date": str(DAY.date()),
         "positions": len(day["times"]),
         "day_before_mrad": 1e3 * float(np.sqrt(np.mean(day["before"] ** 2))),
