@@ -62,6 +62,9 @@ def plan(
     settle: Annotated[str, typer.Option(help="Time to come to rest on the target.")] = "5s",
     exposure: Annotated[str, typer.Option(help="Time of the camera.")] = "2s",
     clear: Annotated[str, typer.Option(help="Time to leave the target.")] = "5s",
+    worth: Annotated[
+        float, typer.Option(help="Of a campaign: least share of its error that each must take.")
+    ] = 0.2,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table.")] = None,
     picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
@@ -69,9 +72,13 @@ def plan(
     """Plan the measurements that tell most: times, targets, and the beam error to expect."""
     from heliotrope.calibration.campaign import Timing
     from heliotrope.calibration.planning_report import check_picture
+    from heliotrope.errors import InputError
 
     if picture is not None:
         check_picture(picture)
+    for file in (csv, picture):
+        if file is not None and not file.parent.is_dir():
+            raise InputError(f"{file}: there is no folder {file.parent}; make it first")
     plant = open_plant(field)
     order = _Order(
         span=_span(begin, end, days),
@@ -80,6 +87,7 @@ def plan(
         sigma=1e-3 * _above(sigma_mrad, "--sigma-mrad"),
         every=parse_duration(every).total_seconds(),
         timing=Timing(*(parse_duration(t).total_seconds() for t in (settle, exposure, clear))),
+        worth=worth,
         count=count,
         csv=csv,
         picture=picture,
@@ -99,6 +107,7 @@ class _Order:
     sigma: float
     every: float
     timing: Any
+    worth: float
     count: int | None
     csv: Path | None
     picture: Path | None
@@ -385,7 +394,7 @@ def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
     with _bar(order.as_json, "scheduling") as step:
         found = planner.campaign(
             fleets, plant.site, order.targets, start, stop, timing=order.timing,
-            every=order.every, count=order.count, progress=step,
+            every=order.every, worth=order.worth, count=order.count, progress=step,
         )  # fmt: skip
     labels = [name for p in parts for name in p.labels]
     targets = [t.name for t in order.targets]

@@ -1,0 +1,472 @@
+r"""Planning of sightings: which sun and target tell most about a heliostat.
+
+A camera-target sighting adds JᵀJ to the information on the parameters, J being the
+whitened derivative of normal minus bisector. *D-optimal* choice makes the determinant
+of the information largest; *V-optimal* choice makes the expected squared error of the
+beam over the year smallest (Atkinson, Donev & Tobias 2007, chapters 10 and 12: greedy
+choice and Fedorov's exchange).
+"""
+
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun as solar
+from heliotrope.calibration import _gain
+from heliotrope.calibration.information import CHUNK, LOWEST
+from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.sightings import sightings
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, angle_between, as_float
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+from heliotrope.sun import Site
+
+Criterion = Literal["d", "v"]
+#: Rounds of exchange at most; two or three are usual.
+SWEEPS = 50
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a sighting must keep to.
+
+    Attributes
+    ----------
+    min_elevation
+        Lowest apparent elevation of the sun, rad.
+    max_incidence
+        Largest angle between the sun and the mirror's normal, rad.
+    max_obliquity
+        Largest angle between the beam and the target's normal, rad.
+    """
+
+    min_elevation: float = LOWEST
+    max_incidence: float = float(np.radians(75.0))
+    max_obliquity: float = float(np.radians(70.0))
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not 0.0 <= value < 0.5 * np.pi:
+                raise InputError(f"{field.name}: {np.degrees(value):g}° must lie in 0° to 90°")
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """M possible camera-target sightings.
+
+    Attributes
+    ----------
+    names
+        P parameters.
+    targets
+        Names of the targets.
+    heliostat, target
+        Rows of heliostat and target, (M,).
+    time
+        Unix seconds (UTC), (M,).
+    sun
+        Unit vectors to the apparent sun, ENU, (M, 3).
+    counts
+        Of the drives, (M, D).
+    normal
+        Of the mirror, ENU, (M, 3).
+    incidence, obliquity
+        Angles of the sun from the mirror's normal and of the beam from the target's,
+        rad, (M,).
+    jacobian
+        Whitened derivative of normal minus bisector by the parameters, (M, 2, P).
+    """
+
+    names: tuple[str, ...]
+    targets: tuple[str, ...]
+    heliostat: npt.NDArray[np.intp]
+    target: npt.NDArray[np.intp]
+    time: FloatArray
+    sun: FloatArray
+    counts: FloatArray
+    normal: FloatArray
+    incidence: FloatArray
+    obliquity: FloatArray
+    jacobian: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def take(self, rows: npt.ArrayLike) -> "Candidates":
+        """Return those at ``rows`` (indices or a mask), in that order."""
+        index = np.asarray(rows)
+        if not index.size:
+            index = index.astype(np.intp)
+        whole = ("names", "targets")
+        return replace(
+            self, **{f.name: getattr(self, f.name)[index] for f in fields(self)
+                     if f.name not in whole},
+        )  # fmt: skip
+
+    def of(self, heliostat: int) -> "Candidates":
+        """Return those of one heliostat."""
+        return self.take(np.flatnonzero(self.heliostat == heliostat))
+
+
+@dataclass(frozen=True)
+class Aimed:
+    """Mirrors sent to a target; batch shape (...).
+
+    Attributes
+    ----------
+    counts, normal
+        Of the drives and of the mirror, (..., D) and (..., 3).
+    incidence, obliquity
+        rad, (...).
+    able
+        Within the stops and the limits, (...).
+    """
+
+    counts: FloatArray
+    normal: FloatArray
+    incidence: FloatArray
+    obliquity: FloatArray
+    able: npt.NDArray[np.bool_]
+
+
+def aim_at(
+    mechanism: Mechanism,
+    sun: FloatArray,
+    target: Target,
+    limits: Limits,
+    current: FloatArray | None = None,
+) -> Aimed:
+    """Return the poses that send the sun to the centre of a target.
+
+    Parameters
+    ----------
+    mechanism, sun
+        Their batch shapes broadcast, (..., 3) unit vectors ENU. The sun's elevation is
+        not looked at.
+    target, limits
+        Where to, and what is allowed.
+    current
+        Counts where the drives stand, (..., D), to choose the nearer branch.
+    """
+    solved = track(mechanism, sun, target.center, current=current)
+    normal, vertex = solved.chosen(solved.normal), solved.chosen(solved.vertex)
+    with np.errstate(invalid="ignore"):
+        incidence = angle_between(np.broadcast_to(sun, normal.shape), normal)
+        back = vertex - target.center
+        back = back / np.linalg.norm(back, axis=-1, keepdims=True)
+        obliquity = angle_between(back, np.broadcast_to(target.normal, back.shape))
+        able = (
+            solved.chosen(solved.reachable)
+            & (incidence <= limits.max_incidence)
+            & (obliquity <= limits.max_obliquity)
+        )
+    return Aimed(solved.chosen(solved.counts), normal, incidence, obliquity, able)
+
+
+def candidates(
+    mechanism: Mechanism,
+    site: Site,
+    targets: tuple[Target, ...],
+    times: npt.ArrayLike,
+    names: tuple[str, ...],
+    *,
+    sigma: npt.ArrayLike = 5e-4,
+    limits: Limits | None = None,
+) -> Candidates:
+    """Return the sightings that sun, targets and stops allow, heliostat by heliostat.
+
+    Parameters
+    ----------
+    mechanism
+        Best estimates, batch shape (N,).
+    site
+        Place and air.
+    targets
+        With a camera on each; beams are sent to their centres.
+    times
+        Unix seconds (UTC), (T,); see :func:`grid`.
+    names
+        P parameters of the table.
+    sigma
+        Standard deviation of the beam's direction as the camera finds it, rad, () or (N,).
+    limits
+        By default :class:`Limits`.
+
+    Returns
+    -------
+    In order of heliostat, then target, then time; there may be none.
+
+    Raises
+    ------
+    InputError
+        If there is no target, the mechanisms have not one batch axis, or a time or
+        sigma cannot be used.
+    """
+    if not targets:
+        raise InputError("planning: there is no target; a camera-target sighting needs one")
+    if len(mechanism.shape) != 1:
+        raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+    bounds = limits or Limits()
+    moments = np.atleast_1d(as_float(times))
+    above = solar.position(moments, site)
+    up = above.elevation >= bounds.min_elevation
+    moments, suns = moments[up], above.vector[up]
+    spread = np.broadcast_to(as_float(sigma), (len(mechanism),))
+    step = max(1, CHUNK // max(1, len(moments)))
+    parts = [
+        _part(mechanism, first, min(first + step, len(mechanism)), k, target, moments, suns,
+              names, spread, bounds)
+        for first in range(0, len(mechanism), step)
+        for k, target in enumerate(targets)
+    ]  # fmt: skip
+    joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+    order = np.lexsort((joined[2], joined[1], joined[0]))
+    labels = tuple(t.name for t in targets)
+    return Candidates(names, labels, *(array[order] for array in joined))
+
+
+def _part(
+    mechanism: Mechanism, first: int, last: int, k: int, target: Target, moments: FloatArray,
+    suns: FloatArray, names: tuple[str, ...], sigma: FloatArray, limits: Limits,
+) -> tuple[np.ndarray, ...]:  # fmt: skip
+    """The arrays of :class:`Candidates` for some heliostats and one target."""
+    some = mechanism[first:last]
+    aimed = aim_at(some, suns[:, None], target, limits)
+    row, which = np.nonzero(aimed.able.T)
+    counts = aimed.counts[which, row]
+    slope = sighting_jacobian(some[row], counts, suns[which], target, names, sigma[first + row])
+    return (
+        (first + row).astype(np.intp), np.full(len(row), k, dtype=np.intp), moments[which],
+        suns[which], counts, aimed.normal[which, row], aimed.incidence[which, row],
+        aimed.obliquity[which, row], slope,
+    )  # fmt: skip
+
+
+def sighting_jacobian(
+    mechanism: Mechanism,
+    counts: FloatArray,
+    sun: FloatArray,
+    target: Target,
+    names: tuple[str, ...],
+    sigma: npt.ArrayLike,
+) -> FloatArray:
+    """Return the whitened derivative of normal minus bisector, (M, 2, P).
+
+    Parameters
+    ----------
+    mechanism
+        One a sighting, batch shape (M,).
+    counts, sun
+        (M, D) and unit vectors (M, 3).
+    target
+        The beam is seen at its centre.
+    names
+        P parameters.
+    sigma
+        rad of beam, () or (M,).
+    """
+    rows = len(counts)
+    if not rows:
+        return np.empty((0, 2, len(names)))
+    seen = sightings(np.arange(rows), counts, sun, target.center, sigma=sigma)
+    return linearise(mechanism, seen, names).jacobian
+
+
+def grid(start: float, stop: float, every: float) -> FloatArray:
+    """Return the multiples of ``every`` s from ``start`` to ``stop``, unix seconds, (T,).
+
+    Raises
+    ------
+    InputError
+        If the span is empty or holds more than 200,000 steps.
+    """
+    if not (np.isfinite([start, stop, every]).all() and every > 0.0 and stop > start):
+        raise InputError(
+            f"times from {start:.0f} to {stop:.0f} s every {every:g} s: the end must be after "
+            "the start"
+        )
+    if (stop - start) / every > 200_000:
+        raise InputError(
+            f"{(stop - start) / every:.0f} times in the span are more than 200,000; take a "
+            "longer step or a shorter span"
+        )
+    return np.arange(np.ceil(start / every), np.floor(stop / every) + 1.0) * every
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The K sightings to make of one heliostat, in order of time.
+
+    Attributes
+    ----------
+    chosen
+        The sightings.
+    rank
+        Place of each if only the most telling could be made, 1 … K, (K,).
+    gain
+        Growth of the log determinant of the information by each, nats, (K,).
+    before
+        Expected RMS of the beam's error over the year before the first, rad.
+    error
+        And after each, rad, (K,).
+    best_first
+        The same in order of rank, rad, (K,).
+    covariance
+        Of the parameters after all, (P, P).
+    """
+
+    chosen: Candidates
+    rank: npt.NDArray[np.intp]
+    gain: FloatArray
+    before: float
+    error: FloatArray
+    best_first: FloatArray
+    covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    @property
+    def log_det(self) -> float:
+        """Growth of the log determinant by all, nats."""
+        return float(self.gain.sum())
+
+
+def plan(
+    found: Candidates,
+    count: int,
+    information: npt.ArrayLike,
+    form: npt.ArrayLike,
+    *,
+    criterion: Criterion = "d",
+    exchange: bool = True,
+    gap: float = 0.0,
+) -> Plan:
+    """Return the sightings of one heliostat that tell most together.
+
+    Parameters
+    ----------
+    found
+        Its candidates, (M,).
+    count
+        How many to choose; fewer are chosen where there are no more.
+    information
+        What is known before, (P, P), see :func:`~heliotrope.calibration.information.precision`.
+    form
+        What the beam's error is made of, (P, P), see
+        :func:`~heliotrope.calibration.information.expectation`.
+    criterion
+        "d": largest determinant of the information; "v": smallest expected squared
+        error of the beam.
+    exchange
+        Whether the greedy choice is improved by exchanging one sighting at a time.
+    gap
+        Two sightings are further apart than this, s; at 0 they are at different times.
+
+    Raises
+    ------
+    InputError
+        If there is no candidate, count is below 1 or the criterion is none.
+
+    Notes
+    -----
+    Greedy choice reaches 63 % of the largest growth of log det at least (Nemhauser et
+    al. 1978: it is submodular); with exchange 98 % or more of exhaustive search in the
+    tests.
+    """
+    if criterion not in ("d", "v"):
+        raise InputError(f"criterion {criterion!r}: give d (determinant) or v (beam variance)")
+    if count < 1:
+        raise InputError(f"count {count}: give 1 or more sightings")
+    if not len(found):
+        raise InputError(
+            "planning: no candidate; the sun, the stops or the limits allow no sighting then"
+        )
+    matrix = as_float(information)
+    scale = 1.0 / np.sqrt(np.diagonal(matrix))
+    slope = found.jacobian * scale
+    # Scaled, metres and radians weigh alike, and the prior is near the unit matrix.
+    known = matrix * scale[:, None] * scale
+    weights = as_float(form) * scale[:, None] * scale
+    choice = _Choice(slope, found.time, known, weights, criterion, gap)
+    rows = choice.greedy(count, np.arange(len(found)))
+    if exchange:
+        rows = choice.exchange(rows)
+    rows = sorted(rows, key=lambda r: (found.time[r], r))
+    best = choice.greedy(len(rows), np.array(rows), apart=False)
+    gain, error, covariance = choice.walk(rows)
+    return Plan(
+        chosen=found.take(rows),
+        rank=np.array([best.index(r) + 1 for r in rows], dtype=np.intp),
+        gain=gain,
+        before=float(np.sqrt(max(0.0, np.trace(weights @ np.linalg.inv(known))))),
+        error=error,
+        best_first=choice.walk(best)[1],
+        covariance=covariance * scale[:, None] * scale,
+    )
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The search, in scaled parameters."""
+
+    slope: FloatArray
+    time: FloatArray
+    known: FloatArray
+    weights: FloatArray
+    criterion: Criterion
+    gap: float
+
+    def scores(self, covariance: FloatArray, rows: npt.NDArray[np.intp]) -> FloatArray:
+        if self.criterion == "d":
+            return _gain.information_gain(covariance, self.slope[rows])
+        return _gain.variance_gain(covariance, self.slope[rows], self.weights)
+
+    def greedy(self, count: int, rows: npt.NDArray[np.intp], apart: bool = True) -> list[int]:
+        """Best first."""
+        covariance, chosen = as_float(np.linalg.inv(self.known)), list[int]()
+        free = np.ones(len(rows), dtype=np.bool_)
+        while len(chosen) < count and free.any():
+            score = np.where(free, self.scores(covariance, rows), -np.inf)
+            place = int(np.argmax(score))
+            row = int(rows[place])
+            chosen.append(row)
+            covariance = _gain.updated(covariance, self.slope[row])
+            free[place] = False
+            if apart:
+                free &= np.abs(self.time[rows] - self.time[row]) > self.gap
+        return chosen
+
+    def exchange(self, chosen: list[int]) -> list[int]:
+        """Replace one at a time by a better one until none is better."""
+        rows, everything = list(chosen), np.arange(len(self.time))
+        total = self.known + sum(self.slope[r].T @ self.slope[r] for r in rows)
+        for _ in range(SWEEPS):
+            improved = False
+            for k, row in enumerate(rows):
+                rest = total - self.slope[row].T @ self.slope[row]
+                others = self.time[[r for i, r in enumerate(rows) if i != k]]
+                apart = np.abs(self.time[:, None] - others) > self.gap
+                score = self.scores(as_float(np.linalg.inv(rest)), everything)
+                best = int(np.argmax(np.where(apart.all(axis=1), score, -np.inf)))
+                if score[best] > score[row] * (1.0 + 1e-9):
+                    rows[k], improved = best, True
+                    total = rest + self.slope[best].T @ self.slope[best]
+            if not improved:
+                break
+        return rows
+
+    def walk(self, rows: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gain and expected error after each of ``rows``, and the last covariance."""
+        covariance = as_float(np.linalg.inv(self.known))
+        gain, error = np.empty(len(rows)), np.empty(len(rows))
+        for k, row in enumerate(rows):
+            gain[k] = _gain.information_gain(covariance, self.slope[row])
+            covariance = _gain.updated(covariance, self.slope[row])
+            error[k] = np.sqrt(max(0.0, float(np.trace(self.weights @ covariance))))
+        return gain, error, covariance

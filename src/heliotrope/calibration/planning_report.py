@@ -1,0 +1,247 @@
+"""Plans for people and other programs: tables as CSV, and pictures."""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+import numpy as np
+
+from heliotrope.calibration.campaign import Campaign
+from heliotrope.calibration.planning import Candidates, Plan
+from heliotrope.errors import InputError
+from heliotrope.field.formats._textfile import write_file, write_text
+from heliotrope.geometry import FloatArray, azimuth_elevation
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Okabe and Ito's colours, told apart by the colour-blind too.
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_PICTURES = (".png", ".svg", ".pdf")
+
+
+def plan_rows(heliostat: str, plan: Plan) -> list[dict[str, Any]]:
+    """Return one record a sighting, in order of time, for tables and JSON."""
+    c = plan.chosen
+    azimuth, elevation = np.degrees(azimuth_elevation(c.sun))
+    normal_azimuth, normal_elevation = np.degrees(azimuth_elevation(c.normal))
+    return [
+        {
+            "heliostat": heliostat,
+            "time": iso(c.time[k]),
+            "target": c.targets[c.target[k]],
+            "sun_azimuth_deg": float(azimuth[k]),
+            "sun_elevation_deg": float(elevation[k]),
+            "normal_azimuth_deg": float(normal_azimuth[k]),
+            "normal_elevation_deg": float(normal_elevation[k]),
+            "incidence_deg": float(np.degrees(c.incidence[k])),
+            "obliquity_deg": float(np.degrees(c.obliquity[k])),
+            **_counts(c.counts[k]),
+            "rank": int(plan.rank[k]),
+            "log_det_gain": float(plan.gain[k]),
+            "expected_beam_rms_mrad": float(1e3 * plan.error[k]),
+        }
+        for k in range(len(plan))
+    ]
+
+
+def campaign_rows(
+    found: Campaign, heliostats: Sequence[str], targets: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Return one record a measurement, in order of time, for tables and JSON."""
+    return [
+        {
+            "time": iso(found.time[k]),
+            "target": targets[found.target[k]],
+            "heliostat": heliostats[found.heliostat[k]],
+            "leave": iso(found.leave[k]),
+            "arrive": iso(found.arrive[k]),
+            "done": iso(found.done[k]),
+            "back": iso(found.back[k]),
+            **_counts(found.counts[k]),
+            "heliostat_expected_beam_rms_mrad": float(1e3 * found.heliostat_error[k]),
+            "field_expected_beam_rms_mrad": float(1e3 * found.error[k]),
+        }
+        for k in range(len(found))
+    ]
+
+
+def _counts(counts: FloatArray) -> dict[str, float]:
+    return {f"count_{d + 1}": float(value) for d, value in enumerate(counts)}
+
+
+def iso(seconds: float) -> str:
+    """Return unix seconds as ISO 8601 in UTC, to the second or, if need be, the millisecond."""
+    time = datetime.fromtimestamp(round(float(seconds), 3), UTC)
+    unit = "milliseconds" if time.microsecond else "seconds"
+    return time.isoformat(timespec=unit).replace("+00:00", "Z")
+
+
+def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write records as CSV, whole or not at all; their keys are the header.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be written to.
+    """
+    text = io.StringIO(newline="")
+    if rows:
+        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def write_picture(path: str | Path, figure: "Figure") -> None:
+    """Write a picture as PNG, SVG or PDF by its suffix, whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or the folder cannot be written to.
+    """
+    suffix = check_picture(path)
+
+    def draw(stream: BinaryIO) -> None:
+        figure.savefig(stream, dpi=110, format=suffix.removeprefix("."))
+
+    write_file(path, draw)
+
+
+def check_picture(path: str | Path) -> str:
+    """Return the suffix of a picture's name.
+
+    Raises
+    ------
+    InputError
+        If it is none of .png, .svg and .pdf.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _PICTURES:
+        raise InputError(
+            f"picture {path}: the name ends in {suffix!r}; give one of {', '.join(_PICTURES)}"
+        )
+    return suffix
+
+
+def plan_picture(plans: Mapping[str, Plan], possible: Candidates) -> "Figure":
+    """Return the sun's path with the chosen sightings, and the expected error after each.
+
+    Parameters
+    ----------
+    plans
+        By name of the heliostat.
+    possible
+        What could have been chosen; its suns are drawn as small dots.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    centre = _centre(possible.sun)
+    _sun_paths(left, possible, centre)
+    for n, (name, plan) in enumerate(plans.items()):
+        colour = _COLOURS[n % len(_COLOURS)]
+        azimuth, elevation = _place(plan.chosen.sun, centre)
+        left.plot(azimuth, elevation, "o", ms=5, color=colour, label=name)
+        if len(plans) == 1:
+            _ranks(left, azimuth, elevation, plan)
+        steps = np.arange(len(plan) + 1)
+        right.plot(steps, 1e3 * np.append(plan.before, plan.error), "o-", ms=4, color=colour,
+                   label=f"{name}, in order of time")  # fmt: skip
+        right.plot(steps, 1e3 * np.append(plan.before, plan.best_first), ":", color=colour,
+                   label=f"{name}, best first")  # fmt: skip
+    left.set_xlabel("azimuth of the sun, ° clockwise from north")
+    left.set_ylabel("elevation, °")
+    right.set_xlabel("measurements made")
+    right.set_ylabel("expected beam error over the year, mrad RMS")
+    right.set_yscale("log")
+    left.xaxis.set_major_formatter(lambda x, _: f"{x % 360.0:g}")
+    _finish((left, right), legend=len(plans) <= len(_COLOURS))
+    return figure
+
+
+def _sun_paths(ax: "Axes", possible: Candidates, centre: float) -> None:
+    order = np.argsort(possible.time, kind="stable")
+    time, sun = possible.time[order], possible.sun[order]
+    # Nights part the days.
+    for n, run in enumerate(
+        np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 3e4) + 1)
+    ):
+        azimuth, elevation = _place(sun[run], centre)
+        ax.plot(azimuth, elevation, ".-", ms=2, lw=0.5, color="#bbbbbb",
+                label="" if n else "possible")  # fmt: skip
+
+
+def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Plan) -> None:
+    """Ranks beside the points; those of points close together stand in one text."""
+    left = list(range(len(plan)))
+    while left:
+        first = left[0]
+        near = [
+            k
+            for k in left
+            if np.hypot(azimuth[k] - azimuth[first], elevation[k] - elevation[first]) < 4.0
+        ]
+        text = ", ".join(str(r) for r in sorted(plan.rank[near]))
+        ax.annotate(text, (azimuth[first], elevation[first]), xytext=(5, 5),
+                    textcoords="offset points", fontsize=8)  # fmt: skip
+        left = [k for k in left if k not in near]
+
+
+def campaign_picture(found: Campaign, position: FloatArray, targets: Sequence[str]) -> "Figure":
+    """Return the field coloured by what is to be expected after it, and the fall of the error.
+
+    Parameters
+    ----------
+    found
+        The campaign.
+    position
+        Of its heliostats, ENU metres, (N, 3).
+    targets
+        Names.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    order = np.argsort(-found.expected, kind="stable")
+    dots = left.scatter(
+        position[order, 0], position[order, 1], c=1e3 * found.expected[order], s=8, cmap="viridis_r"
+    )
+    figure.colorbar(dots, ax=left, label="expected beam error after, mrad RMS")
+    left.set_aspect("equal", adjustable="datalim")
+    left.set_xlabel("east, m")
+    left.set_ylabel("north, m")
+    hours = (found.time - found.time[0]) / 3600.0 if len(found) else np.empty(0)
+    right.plot(hours, 1e3 * found.error, color=_COLOURS[0],
+               label=f"{len(found)} measurements on {', '.join(targets)}")  # fmt: skip
+    right.set_xlabel("hours since the first measurement")
+    right.set_ylabel("expected beam error of the field, mrad RMS")
+    right.set_yscale("log")
+    _finish((left, right), legend=False)
+    right.legend(frameon=False, fontsize=8)
+    return figure
+
+
+def _finish(axes: "Sequence[Axes]", legend: bool) -> None:
+    for ax in axes:
+        ax.grid(alpha=0.3, which="both")
+        if legend:
+            ax.legend(frameon=False, fontsize=8)
+
+
+def _centre(suns: FloatArray) -> float:
+    """Azimuth of the mean sun, degrees."""
+    return float(np.degrees(azimuth_elevation(suns.sum(axis=0))[0]))
+
+
+def _place(suns: FloatArray, centre: float) -> tuple[FloatArray, FloatArray]:
+    """Azimuth within half a turn of ``centre``, so that a path across north is one line."""
+    azimuth, elevation = np.degrees(azimuth_elevation(suns))
+    return np.asarray((azimuth - centre + 180.0) % 360.0 - 180.0 + centre), elevation
