@@ -1,15 +1,19 @@
-"""The estimator beside SciPy's least squares, one heliostat after another.
+"""The estimator beside SciPy's least squares and Nelder-Mead, and ARTIST where it is at hand.
 
-The full comparison at field scale belongs to the field-scale estimator; this one keeps
-an eye on the kernel.
+All but ARTIST minimise the same cost, square loss and prior, from the same start. SciPy
+takes one heliostat after another, with Heliotrope's kinematics and its own differences.
+Heliotrope gives covariances as well.
 """
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
-from benchmarks._run import Result, Row, agree, timed
+from benchmarks import _artist
+from benchmarks._run import BenchmarkError, Result, Row, agree, peak_bytes, timed
 from heliotrope.calibration.estimator import fit
 from heliotrope.calibration.sightings import ray_directions, sightings
 from heliotrope.geometry import direction, reflect, tangent_axes
@@ -17,9 +21,14 @@ from heliotrope.mechanism import kinds, parameters
 
 SIGHTINGS = 30
 NOISE = 3e-4
-MODEL = "malan8"
-#: For 10,000 heliostats.
-BUDGET_S = 3.0
+NAMES = (*parameters.MODELS["malan8"], "canting", "azimuth_scale", "elevation_scale")
+#: For 10,000 heliostats, square loss.
+BUDGET_S, BUDGET_SIZE = 3.0, 10_000
+#: How often each size is timed.
+REPEATS = {10: 20, 100: 20, 1000: 10, 10_000: 7, 100_000: 1}
+SQUARE: dict[str, Any] = {"loss": "square", "adapt_scale": False}
+#: Evaluations of the cost that Nelder-Mead is given for one heliostat.
+EVALUATIONS = 20_000
 
 
 def _case(rows: int) -> tuple[Any, Any]:
@@ -27,7 +36,7 @@ def _case(rows: int) -> tuple[Any, Any]:
     place = np.c_[rng.uniform(-300, 300, rows), rng.uniform(50, 600, rows), np.zeros(rows)]
     nominal = kinds.azimuth_elevation(place, pivot_height=2.0, pivot_offset=0.2)
     truth = nominal.with_parameters(
-        {n: rng.normal(0, 5e-3, rows) for n in parameters.MODELS[MODEL]}
+        {n: rng.normal(0, 0.5 * nominal.parameter(n).prior, rows) for n in NAMES}
     )
     index = np.repeat(np.arange(rows), SIGHTINGS)
     counts = rng.uniform((-0.7, 0.3), (0.7, 1.3), (len(index), 2)) + [np.pi, 0.0]
@@ -38,75 +47,142 @@ def _case(rows: int) -> tuple[Any, Any]:
     return nominal, sightings(index, counts, sun, pose.vertex + 300.0 * ray, sigma=NOISE)
 
 
-def _scipy(nominal: Any, seen: Any, sample: int) -> np.ndarray:
-    names = parameters.MODELS[MODEL]
-    sigma = np.array([nominal.parameter(n).prior for n in names])
+def _residuals(nominal: Any, seen: Any, i: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the residuals of heliostat i, and its prior's, by parameters over their priors."""
+    sigma = np.array([nominal.parameter(n).prior for n in NAMES])
+    mine, one = seen.of(i), nominal[i : i + 1]
+    vertex = one[mine.heliostat].pose(mine.counts).vertex
+    source, way = ray_directions(mine, vertex)
+    total = source + way
+    size = np.linalg.norm(total, axis=-1, keepdims=True)
+    axes = tangent_axes(total / size)
+    across = axes / size[:, :, None]
+    spread = np.eye(3) - way[:, :, None] * way[:, None, :]
+    covariance = across @ spread @ np.swapaxes(across, -1, -2) * NOISE**2
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+
+    def residual(y: np.ndarray) -> np.ndarray:
+        moved = one.with_parameters(dict(zip(NAMES, y * sigma, strict=True)))
+        pose = moved[mine.heliostat].pose(mine.counts)
+        s, t = ray_directions(mine, pose.vertex)
+        b = (s + t) / np.linalg.norm(s + t, axis=-1, keepdims=True)
+        plain = np.einsum("nij,njk,nk->ni", whiten, axes, pose.normal - b)
+        return np.concatenate([plain.ravel(), y])
+
+    return residual
+
+
+def _least_squares(nominal: Any, seen: Any, sample: int) -> np.ndarray:
+    """Return parameters over their priors, (sample, P)."""
+    start = np.zeros(len(NAMES))
+    found = [
+        least_squares(_residuals(nominal, seen, i), start, method="lm", xtol=1e-10, ftol=1e-10)
+        for i in range(sample)
+    ]
+    return np.array([solved.x for solved in found])
+
+
+def _nelder_mead(nominal: Any, seen: Any, sample: int, evaluations: int) -> np.ndarray:
+    """Return parameters over their priors, (sample, P), after so many evaluations at most."""
+    options = {"maxfev": evaluations, "maxiter": evaluations, "adaptive": True,
+               "xatol": 1e-6, "fatol": 1e-9}  # fmt: skip
     found = []
     for i in range(sample):
-        mine = seen.of(i)
-        one = nominal[i : i + 1]
-        vertex = one[mine.heliostat].pose(mine.counts).vertex
-        source, way = ray_directions(mine, vertex)
-        total = source + way
-        size = np.linalg.norm(total, axis=-1, keepdims=True)
-        axes = tangent_axes(total / size)
-        across = axes / size[:, :, None]
-        spread = np.eye(3) - way[:, :, None] * way[:, None, :]
-        covariance = across @ spread @ np.swapaxes(across, -1, -2) * NOISE**2
-        whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+        residual = _residuals(nominal, seen, i)
 
-        def residual(
-            y: np.ndarray, one: Any = one, mine: Any = mine, axes: Any = axes, w: Any = whiten
-        ) -> np.ndarray:
-            moved = one.with_parameters(dict(zip(names, y * sigma, strict=True)))
-            pose = moved[mine.heliostat].pose(mine.counts)
-            s, t = ray_directions(mine, pose.vertex)
-            b = (s + t) / np.linalg.norm(s + t, axis=-1, keepdims=True)
-            plain = np.einsum("nij,njk,nk->ni", w, axes, pose.normal - b)
-            return np.concatenate([plain.ravel(), y])
+        def cost(y: np.ndarray, residual: Any = residual) -> float:
+            return float(np.sum(residual(y) ** 2))
 
-        start = np.zeros(len(names))
-        solved = least_squares(residual, start, method="lm", xtol=1e-10, ftol=1e-10)
-        found.append(solved.x * sigma)
+        start = np.zeros(len(NAMES))
+        found.append(minimize(cost, start, method="Nelder-Mead", options=options).x)
     return np.array(found)
+
+
+def _row(contender: str, size: int, best: float, median: float) -> dict[str, Any]:
+    return {
+        "contender": contender, "heliostats": size, "seconds": best, "median_seconds": median,
+        "ms_per_heliostat": 1e3 * best / size, "scipy_ratio": None, "nelder_mead_ratio": None,
+        "growth_exponent": None, "peak_bytes_per_heliostat": None, "differs_sigma": None,
+    }  # fmt: skip
+
+
+def _peers(quick: bool, size: int) -> list[dict[str, Any]]:
+    """SciPy's solvers, timed on a sample of the field, and checked against ours."""
+    sample, few, evaluations = (3, 1, 500) if quick else (20, 2, EVALUATIONS)
+    nominal, seen = _case(size)
+    found = fit(nominal, seen, NAMES, **SQUARE)
+    rows = []
+    for name, count, solve in (
+        ("SciPy least_squares", sample, lambda: _least_squares(nominal, seen, sample)),
+        ("SciPy Nelder-Mead", few, lambda: _nelder_mead(nominal, seen, few, evaluations)),
+    ):
+        once = timed({name: solve}, 1 if quick or count == few else 3)[name]
+        row = _row(name, count, once.best, once.median)
+        gap = np.abs(found.values[:count] - solve() * found.prior[:count])
+        row["differs_sigma"] = float((gap / found.sigma[:count]).max())
+        rows.append(row)
+    # SciPy's differences leave about 1e-4 of a standard deviation. Nelder-Mead stops where
+    # it has got to; its row says how far off that is.
+    agree("parameters", rows[0]["differs_sigma"], 1e-3, "σ")
+    return rows
+
+
+def _ours(quick: bool) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for size in (10, 30) if quick else tuple(REPEATS):
+        nominal, seen = _case(size)
+        cases = {"Heliotrope, square": SQUARE}
+        if quick or size == BUDGET_SIZE:
+            cases["Heliotrope, Cauchy, scale found"] = {}
+        calls = {
+            name: lambda n=nominal, s=seen, o=options: fit(n, s, NAMES, **o)
+            for name, options in cases.items()
+        }
+        times = timed(calls, 1 if quick else REPEATS[size])  # type: ignore[arg-type]
+        for name, call in calls.items():
+            row = _row(name, size, times[name].best, times[name].median)
+            row["peak_bytes_per_heliostat"] = peak_bytes(call) / size  # type: ignore[arg-type]
+            before = [r for r in rows if r["contender"] == name]
+            if before:
+                ratio = row["seconds"] / before[-1]["seconds"]
+                row["growth_exponent"] = math.log(ratio) / math.log(size / before[-1]["heliostats"])
+            rows.append(row)
+    return rows
 
 
 def run(quick: bool) -> Result:
     """Return the figures."""
-    sample = 3 if quick else 20
-    rows: list[Row] = []
-    for size in (30,) if quick else (100, 1000, 10_000):
-        nominal, seen = _case(size)
-
-        def ours(n: Any = nominal, s: Any = seen) -> Any:
-            return fit(n, s, MODEL, loss="square", adapt_scale=False)
-
-        times = timed(
-            {"heliotrope": ours, "SciPy": lambda n=nominal, s=seen: _scipy(n, s, sample)},  # type: ignore[misc]
-            1 if quick else 3,
-        )
-        found = ours()
-        gap = np.abs(found.values[:sample] - _scipy(nominal, seen, sample))
-        # SciPy's differences leave about 1e-4 of a standard deviation.
-        apart = agree("parameters", float((gap / found.sigma[:sample]).max()), 1e-3, "σ")
-        seconds = times["heliotrope"].best
-        each = seconds / size
-        theirs = times["SciPy"].best / sample
-        rows.append(
-            {"heliostats": size, "ms_per_heliostat": 1e3 * each, "seconds": seconds,
-             "median_seconds": times["heliotrope"].median,
-             "scipy_ms_per_heliostat": 1e3 * theirs, "scipy_ratio": theirs / each,
-             "differs_sigma": apart}
-        )  # fmt: skip
-    last = rows[-1]
+    rows = _ours(quick)
+    size = 30 if quick else BUDGET_SIZE
+    rows += _peers(quick, size)
+    squares, simplex = (row["ms_per_heliostat"] for row in rows[-2:])
+    skipped = _artist.why_skipped()
+    if skipped is None:
+        try:
+            each = _artist.seconds_per_heliostat()
+        except Exception as error:
+            raise BenchmarkError(f"ARTIST: {error!r}; see benchmarks/README.md") from error
+        rows.append(_row("ARTIST", 1, each, each))
+    for row in rows:
+        row["scipy_ratio"] = squares / row["ms_per_heliostat"]
+        row["nelder_mead_ratio"] = simplex / row["ms_per_heliostat"]
+    shown, robust = (
+        row for row in rows if row["heliostats"] == size and "Helio" in row["contender"]
+    )
+    kept: list[Row] = list(rows)
     return Result(
-        rows,
-        f"{last['heliostats']:,} heliostats × {SIGHTINGS} sightings in {last['seconds']:.2f} s, "
-        f"covariance included; SciPy takes {last['scipy_ratio']:.0f} × as long",
+        kept,
+        f"{size:,} heliostats × {SIGHTINGS} sightings × {len(NAMES)} parameters with covariance in "
+        f"{shown['seconds']:.2f} s ({robust['seconds']:.2f} s with Cauchy loss and scale found); "
+        f"SciPy's least squares takes {shown['scipy_ratio']:.0f} × as long, "
+        f"Nelder-Mead {shown['nelder_mead_ratio']:,.0f} ×",
         {
             "sightings": SIGHTINGS,
-            "parameters": len(parameters.MODELS[MODEL]),
+            "parameters": len(NAMES),
             "budget_median_s": BUDGET_S,
+            "budget_of": "Heliotrope, square",
+            "nelder_mead_evaluations": 500 if quick else EVALUATIONS,
+            "artist": f"skipped: {skipped}" if skipped else "run on its own data",
         },
-        None if quick else times["heliotrope"].median <= BUDGET_S,
+        None if quick else shown["median_seconds"] <= BUDGET_S,
     )
