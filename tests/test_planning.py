@@ -692,3 +692,12 @@ def test_a_plant_without_targets(run: Any, tmp_path: Path) -> None:
     code, _, err = run(tmp_path / "plant.toml")
     assert code == 2
     assert "this plant has no target" in err
+
+
+def test_no_input_is_overwritten(run: Any, plant_file: Path, tmp_path: Path) -> None:
+    table = next(tmp_path.glob("*.csv"))
+    before = table.read_bytes()
+    code, _, err = run(plant_file, "--heliostat", "P6A", *WEEK, "--csv", table)
+    assert code == 2
+    assert "this file is read from" in err
+    assert table.read_bytes() == before

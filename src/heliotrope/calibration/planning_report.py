@@ -220,10 +220,11 @@ def campaign_picture(found: Campaign, position: FloatArray, targets: Sequence[st
     left.set_ylabel("north, m")
     hours = (found.time - found.time[0]) / 3600.0 if len(found) else np.empty(0)
     right.plot(hours, 1e3 * found.error, color=_COLOURS[0],
-               label=f"{len(found)} measurements on {', '.join(targets)}")  # fmt: skip
+               label=f"{len(found):,} measurements on {', '.join(targets)}")  # fmt: skip
     right.set_xlabel("hours since the first measurement")
     right.set_ylabel("expected beam error of the field, mrad RMS")
-    right.set_yscale("log")
+    if len(found) and found.before > 10.0 * found.error[-1]:
+        right.set_yscale("log")
     _finish((left, right), legend=False)
     right.legend(frameon=False, fontsize=8)
     return figure

@@ -72,14 +72,11 @@ def plan(
     """Plan the measurements that tell most: times, targets, and the beam error to expect."""
     from heliotrope.calibration.campaign import Timing
     from heliotrope.calibration.planning_report import check_picture
-    from heliotrope.errors import InputError
 
     if picture is not None:
         check_picture(picture)
-    for file in (csv, picture):
-        if file is not None and not file.parent.is_dir():
-            raise InputError(f"{file}: there is no folder {file.parent}; make it first")
     plant = open_plant(field)
+    _check_outputs((csv, picture), field, sightings)
     order = _Order(
         span=_span(begin, end, days),
         targets=_targets(plant, target),
@@ -124,6 +121,25 @@ class _Part:
     information: "FloatArray"
     form: "FloatArray"
     aim: "FloatArray"
+
+
+def _check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path | None) -> None:
+    """Refuse what could not be written, or would replace what is read."""
+    import tomllib
+
+    from heliotrope.errors import InputError
+
+    read = {path.resolve() for path in (field, sightings) if path is not None}
+    if field.suffix.lower() == ".toml" and field.is_file():
+        table = tomllib.loads(field.read_text(encoding="utf-8-sig")).get("heliostats")
+        if isinstance(table, str):
+            read.add((field.parent / table).resolve())
+    for file in (path for path in outputs if path is not None):
+        if not file.parent.is_dir():
+            raise InputError(f"{file}: there is no folder {file.parent}; make it first")
+        inside = field.is_dir() and field.resolve() in file.resolve().parents and file.exists()
+        if file.resolve() in read or inside:
+            raise InputError(f"{file}: this file is read from; give another name to write to")
 
 
 def _span(begin: str, end: str | None, days: float | None) -> tuple[datetime, datetime]:
@@ -343,7 +359,7 @@ def _all_plans(
 
 def _print_plan(name: str, one: "Plan", rows: list[dict[str, Any]]) -> None:
     print_table(
-        ["time", "target", "sun azimuth", "elevation", "rank", "expected beam error"],
+        ["time", "target", "sun azimuth", "elevation", "rank", "error"],
         [
             [
                 r["time"],
@@ -351,11 +367,12 @@ def _print_plan(name: str, one: "Plan", rows: list[dict[str, Any]]) -> None:
                 f"{r['sun_azimuth_deg']:.1f}°",
                 f"{r['sun_elevation_deg']:.1f}°",
                 str(r["rank"]),
-                f"{r['expected_beam_rms_mrad']:.2f} mrad",
+                f"{r['expected_beam_rms_mrad']:.2f}",
             ]
             for r in rows
         ],
-        title=f"{name}: {1e3 * one.before:.2f} mrad before, {1e3 * one.error[-1]:.2f} mrad after",
+        title=f"{name}: expected beam error {1e3 * one.before:.2f} mrad before, "
+        f"{1e3 * one.error[-1]:.2f} mrad after",
     )
 
 
@@ -427,18 +444,19 @@ def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
 
 def _print_campaign(rows: list[dict[str, Any]]) -> None:
     print_table(
-        ["time", "target", "heliostat", "leaves", "its beam error after", "the field's"],
+        ["time", "target", "heliostat", "leaves", "its error", "the field's"],
         [
             [
                 r["time"],
                 r["target"],
                 r["heliostat"],
                 r["leave"][11:19],
-                f"{r['heliostat_expected_beam_rms_mrad']:.2f} mrad",
-                f"{r['field_expected_beam_rms_mrad']:.2f} mrad",
+                f"{r['heliostat_expected_beam_rms_mrad']:.2f}",
+                f"{r['field_expected_beam_rms_mrad']:.2f}",
             ]
             for r in rows[:SHOWN]
         ],
+        title="expected beam error after each, mrad",
     )
     if len(rows) > SHOWN:
         print(f"and {len(rows) - SHOWN:,} more; --csv FILE writes them all")
