@@ -177,7 +177,7 @@ def remove_farthest(inverse, residual, most):
     """
     n = len(residual)
     inverse = inverse.copy()
-    flat = np.ascontiguousarray(residual).reshape(2 * n)
+    flat = residual.copy().reshape(2 * n)
     which, squares = np.empty(most, dtype=np.int64), np.empty(most)
     gone = np.zeros(n, dtype=np.bool_)
     for step in range(most):

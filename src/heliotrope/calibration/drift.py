@@ -458,6 +458,26 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
     return Posterior(hyper, data, inverse, inverse @ data.rest(hyper).ravel())
 
 
+def permissive(hyper: Hyperparameters) -> Hyperparameters:
+    """Return ``hyper`` with zeros that may be anywhere a step could bring them, day by day.
+
+    What is an outlier even then is no sign of a step.
+    """
+    moving = [n for n, size in zip(hyper.names, hyper.step, strict=True) if size > 0]
+    if not moving or "weeks" in hyper.groups:
+        return hyper
+    more = tuple(Process(name, "weeks") for name in moving)
+    tau = dict(zip(hyper.groups, hyper.tau, strict=True))
+    tau["weeks"] = START_DAYS["weeks"]
+    sizes = [hyper.step[hyper.names.index(name)] for name in moving]
+    return replace(
+        hyper,
+        processes=hyper.processes + more,
+        amplitude=np.concatenate([hyper.amplitude, sizes]),
+        tau=np.array([tau[g] for g in GROUPS if g in tau]),
+    )
+
+
 def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
     """Return the times (days) of steps of the zeros that the evidence asks for.
 

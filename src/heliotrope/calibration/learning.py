@@ -304,12 +304,12 @@ def finish(
 
     ``own`` lets its noise and wandering differ from the field's.
     """
-    outlier = _outliers(hyper, data)
     if len(data) >= FEWEST and hyper.processes:
+        outlier = _outliers(drift.permissive(hyper), data)
         data = replace(data, steps=drift.find_steps(hyper, data.take(~outlier)))
         if own:
-            hyper = drift.refine(hyper, data.take(~outlier))
-        outlier = _outliers(hyper, data)
+            hyper = drift.refine(hyper, data.take(~_outliers(hyper, data)))
+    outlier = _outliers(hyper, data)
     return drift.posterior(hyper, data.take(~outlier)), outlier
 
 

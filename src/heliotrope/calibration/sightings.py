@@ -62,6 +62,8 @@ class Sightings:
     def take(self, rows: npt.ArrayLike) -> "Sightings":
         """Return the sightings at ``rows`` (indices or a mask), in that order."""
         index = np.asarray(rows)
+        # An empty list is an array of floats to NumPy.
+        index = index if index.size else index.astype(np.intp)
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def of(self, heliostat: int) -> "Sightings":
