@@ -1,21 +1,23 @@
 """A campaign: which heliostat goes to which target when, for a whole field.
 
 A target shows one beam at a time. Its time is cut into slots of equal length (settle,
-expose, clear), and each slot is given to the heliostat whose sighting then makes the
-field's expected squared beam error fall most. Mirrors travel while others are seen;
-each comes from its aim and goes back to it.
+expose, clear). Either a day is looked at as a whole, and every heliostat gets the hours
+that tell most about it as far as there is room; or each slot is given to the heliostat
+whose sighting then makes the field's expected squared beam error fall most. Mirrors
+travel while others are seen; each comes from its aim and goes back to it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from heapq import heapify, heappop, heappush
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration import _gain
+from heliotrope.calibration import _allocation, _gain
 from heliotrope.calibration.information import CHUNK
 from heliotrope.calibration.planning import Limits, aim_at, sighting_jacobian
 from heliotrope.errors import InputError
@@ -26,6 +28,9 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site
+
+#: For the derivatives of a day that is looked at as a whole, bytes.
+MEMORY = 1e9
 
 
 @dataclass(frozen=True)
@@ -160,7 +165,8 @@ def campaign(
     timing: Timing | None = None,
     limits: Limits | None = None,
     every: float = 1800.0,
-    worth: float = 0.2,
+    ahead: bool = True,
+    worth: float = 0.05,
     count: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Campaign:
@@ -181,6 +187,9 @@ def campaign(
     every
         Gains are found anew for the whole field at this interval, s; what is chosen is
         computed for its own time.
+    ahead
+        Look at each day as a whole, so that the error is smallest at its end; otherwise
+        each slot by itself, so that the error falls fastest.
     worth
         A measurement must lower the heliostat's own expected squared error by this share;
         a slot in which none does stays empty.
@@ -212,17 +221,18 @@ def campaign(
     if len(drives) != 1:
         raise InputError("campaign: mechanisms with different numbers of drives; plan each alone")
     work = _Work(
-        tuple(fleets), site, tuple(targets), timing or Timing(), limits or Limits(), worth, count
-    )
+        tuple(fleets), site, tuple(targets), timing or Timing(), limits or Limits(),
+        ahead, worth, count,
+    )  # fmt: skip
     cells, slots = _cells(work, start, stop, every)
     done = 0
-    for begin, arrivals in cells:
-        if count is not None and len(work.rows) >= count:
+    for begin, day in groupby(cells, key=lambda cell: cell[0]):
+        for arrivals in work.day(begin, [cell[1] for cell in day]):
+            done += len(arrivals)
+            if progress:
+                progress(done, slots)
+        if work.full:
             break
-        work.cell(begin, arrivals)
-        done += len(arrivals)
-        if progress:
-            progress(done, slots)
     if progress:
         progress(slots, slots)
     return work.result(slots * len(targets), drives.pop())
@@ -272,11 +282,11 @@ class _Work:
 
     def __init__(
         self, fleets: tuple[Fleet, ...], site: Site, targets: tuple[Target, ...],
-        timing: Timing, limits: Limits, worth: float, count: int | None,
+        timing: Timing, limits: Limits, ahead: bool, worth: float, count: int | None,
     ) -> None:  # fmt: skip
         self.fleets, self.site, self.targets = fleets, site, targets
         self.timing, self.limits = timing, limits
-        self.worth, self.limit = worth, count
+        self.ahead, self.worth, self.limit = ahead, worth, count
         sizes = [len(f) for f in fleets]
         self.offsets = np.concatenate([[0], np.cumsum(sizes)])
         total, most = int(self.offsets[-1]), max(len(f.names) for f in fleets)
@@ -331,15 +341,52 @@ class _Work:
             *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_View))
         )
 
-    def cell(self, begin: float, arrivals: FloatArray) -> None:
-        """Fill the slots that begin at ``arrivals`` in a window that opened at ``begin``."""
-        shift = self.timing.settle + 0.5 * self.timing.exposure
-        suns = solar.vector(arrivals + shift, self.site)
-        middle = suns[len(suns) // 2]
-        queues = [_Queue(self, self.field_view(middle, t)) for t in self.targets]
+    @property
+    def full(self) -> bool:
+        """Whether all measurements that were asked for are there."""
+        return self.limit is not None and len(self.rows) >= self.limit
+
+    def day(self, begin: float, cells: list[FloatArray]) -> Iterator[FloatArray]:
+        """Fill the intervals of a window that opened at ``begin``; yields each when it is done."""
+        size = self.covariance[:, :2].nbytes * len(self.targets)
+        look = max(1, int(MEMORY // size)) if self.ahead else 1
+        for first in range(0, len(cells), look):
+            some = cells[first : first + look]
+            suns = [solar.vector(c + self._shift, self.site) for c in some]
+            views = [[self.field_view(s[len(s) // 2], t) for t in self.targets] for s in suns]
+            options = [self._option(v, len(c)) for c, row in zip(some, views, strict=True)
+                       for v in row]  # fmt: skip
+            wanted: list[list[int] | None] = [None] * len(options)
+            if self.ahead:
+                left = None if self.limit is None else self.limit - len(self.rows)
+                known, form = self.covariance, self.form
+                first_choice = _allocation.allocate(known, form, options, self.worth, left)
+                wanted[:] = _allocation.exchanged(known, form, options, first_choice)
+            for n, arrivals in enumerate(some):
+                places = range(n * len(self.targets), (n + 1) * len(self.targets))
+                queues = [_Queue(self, views[n][o - places[0]], options[o], wanted[o])
+                          for o in places]  # fmt: skip
+                self._cell(begin, arrivals, suns[n], queues)
+                yield arrivals
+
+    @property
+    def _shift(self) -> float:
+        """From a beam's arrival to the middle of the exposure, s."""
+        return self.timing.settle + 0.5 * self.timing.exposure
+
+    def _option(self, view: _View, room: int) -> _allocation.Option:
+        rows = np.flatnonzero(view.able)
+        # A heliostat is back at its aim before it comes again.
+        again = self.timing.slot + 2.0 * view.seconds[rows]
+        most = np.floor((room * self.timing.slot + 2.0 * view.seconds[rows]) / again)
+        return _allocation.Option(rows, view.slope[rows], room, most.astype(np.intp))
+
+    def _cell(
+        self, begin: float, arrivals: FloatArray, suns: FloatArray, queues: "list[_Queue]"
+    ) -> None:
         for arrive, sun in zip(arrivals, suns, strict=True):
             for j, queue in enumerate(queues):
-                if self.limit is not None and len(self.rows) >= self.limit:
+                if self.full:
                     return
                 self._fill(j, queue, begin, float(arrive), sun)
 
@@ -349,7 +396,7 @@ class _Work:
         while queue.heap:
             entry = heappop(queue.heap)
             i = entry[2]
-            if entry[1] != self.version[i]:
+            if not queue.settled and entry[1] != self.version[i]:
                 queue.push(i)
                 continue
             ready = max(self.free[i], begin)
@@ -377,7 +424,7 @@ class _Work:
         self.square[i] = max(0.0, float(np.sum(self.form[i] * self.covariance[i])))
         self.version[i] += 1
         self.free[i] = done + way
-        time = arrive + self.timing.settle + 0.5 * self.timing.exposure
+        time = arrive + self._shift
         self.rows.append((arrive - way, arrive, time, done, done + way, i, j, own.counts[0],
                           float(np.sqrt(self.square[i])),
                           float(np.sqrt(self.square.sum() / self.counted))))  # fmt: skip
@@ -401,22 +448,23 @@ class _Work:
 class _Queue:
     """Heliostats for one target during an interval, the greatest gain first.
 
-    A gain is that of the middle of the interval. An entry whose heliostat has been
-    measured since is found stale by its version when it comes up, and only then renewed.
+    Either ``wanted`` are settled, in that order; or all that can be there are in it with
+    the gain of the middle of the interval, and an entry whose heliostat has been measured
+    since is found stale by its version when it comes up, and only then renewed.
     """
 
-    def __init__(self, work: _Work, view: _View) -> None:
-        self.work, self.view = work, view
-        rows = np.flatnonzero(view.able)
-        gains = np.empty(len(rows))
-        for a in range(0, len(rows), CHUNK):
-            part = rows[a : a + CHUNK]
-            gains[a : a + CHUNK] = _gain.variance_gain(
-                work.covariance[part], view.slope[part], work.form[part]
-            )
+    def __init__(
+        self, work: _Work, view: _View, option: _allocation.Option, wanted: list[int] | None
+    ) -> None:
+        self.work, self.view, self.settled = work, view, wanted is not None
+        self.heap: list[tuple[float, int, int]]
+        if wanted is not None:
+            self.heap = [(float(n), 0, i) for n, i in enumerate(wanted)]
+            return
+        found = _allocation.gains(work.covariance, work.form, option)
         self.heap = [
             (-float(g), int(work.version[i]), int(i))
-            for g, i in zip(gains, rows, strict=True)
+            for g, i in zip(found, option.rows, strict=True)
             if g > work.worth * work.square[i]
         ]
         heapify(self.heap)
@@ -424,6 +472,8 @@ class _Queue:
     def push(self, i: int) -> None:
         """Enter heliostat ``i`` with the gain that it has now."""
         work = self.work
+        if self.settled:
+            return
         gain = float(_gain.variance_gain(work.covariance[i], self.view.slope[i], work.form[i]))
         if gain > work.worth * work.square[i]:
             heappush(self.heap, (-gain, int(work.version[i]), i))

@@ -62,9 +62,13 @@ def plan(
     settle: Annotated[str, typer.Option(help="Time to come to rest on the target.")] = "5s",
     exposure: Annotated[str, typer.Option(help="Time of the camera.")] = "2s",
     clear: Annotated[str, typer.Option(help="Time to leave the target.")] = "5s",
+    by_slot: Annotated[
+        bool,
+        typer.Option("--by-slot", help="Of a campaign: fill each slot as if it were the last."),
+    ] = False,
     worth: Annotated[
         float, typer.Option(help="Of a campaign: least share of its error that each must take.")
-    ] = 0.2,
+    ] = 0.05,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
     csv: Annotated[Path | None, typer.Option("--csv", help="File for the table.")] = None,
     picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
@@ -84,6 +88,7 @@ def plan(
         sigma=1e-3 * _above(sigma_mrad, "--sigma-mrad"),
         every=parse_duration(every).total_seconds(),
         timing=Timing(*(parse_duration(t).total_seconds() for t in (settle, exposure, clear))),
+        ahead=not by_slot,
         worth=worth,
         count=count,
         csv=csv,
@@ -104,6 +109,7 @@ class _Order:
     sigma: float
     every: float
     timing: Any
+    ahead: bool
     worth: float
     count: int | None
     csv: Path | None
@@ -411,7 +417,8 @@ def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
     with _bar(order.as_json, "scheduling") as step:
         found = planner.campaign(
             fleets, plant.site, order.targets, start, stop, timing=order.timing,
-            every=order.every, worth=order.worth, count=order.count, progress=step,
+            every=order.every, ahead=order.ahead, worth=order.worth, count=order.count,
+            progress=step,
         )  # fmt: skip
     labels = [name for p in parts for name in p.labels]
     targets = [t.name for t in order.targets]

@@ -1,0 +1,219 @@
+"""Which heliostat is seen when and where, if a whole day is looked at together.
+
+Options are (interval, target) pairs with room for some beams. The greatest gain of all
+is taken again and again (greedy choice under capacities, Fisher, Nemhauser & Wolsey
+1978); gains only fall as heliostats become known, so a gain that has grown old is found
+anew only when it comes up (Minoux 1978). Then beams are moved and exchanged between
+options as long as the sum falls: the first choice does not know what comes after it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from heapq import heapify, heappop, heappush
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration import _gain
+from heliotrope.calibration.information import CHUNK
+from heliotrope.geometry import FloatArray, as_float
+
+#: Beams that are looked at for moves and exchanges, at most; some seconds' worth.
+TRIES = 4_000
+#: Sweeps over all beams, options tried for each, and partners tried in each.
+SWEEPS, DEPTH, PARTNERS = 8, 4, 64
+
+
+@dataclass(frozen=True)
+class Option:
+    """A target during an interval.
+
+    Attributes
+    ----------
+    rows
+        Heliostats that can be there, (n,).
+    slope
+        Their derivatives in scaled parameters, (n, 2, P).
+    room
+        Beams that it can take.
+    most
+        How often each heliostat can be there, (n,).
+    """
+
+    rows: npt.NDArray[np.intp]
+    slope: FloatArray
+    room: int
+    most: npt.NDArray[np.intp]
+
+
+def gains(covariance: FloatArray, form: FloatArray, option: Option) -> FloatArray:
+    """Fall of the expected squared error by one sighting of each, rad², (n,)."""
+    found = np.empty(len(option.rows))
+    for a in range(0, len(found), CHUNK):
+        part = option.rows[a : a + CHUNK]
+        slope = option.slope[a : a + CHUNK]
+        found[a : a + CHUNK] = _gain.variance_gain(covariance[part], slope, form[part])
+    return found
+
+
+def allocate(
+    covariance: FloatArray,
+    form: FloatArray,
+    options: Sequence[Option],
+    worth: float,
+    count: int | None,
+) -> list[list[int]]:
+    """Return for each option the heliostats that it shows, the most telling first.
+
+    Parameters
+    ----------
+    covariance, form
+        (N, P, P); they stay as they are.
+    options
+        In any order.
+    worth
+        A sighting must lower the heliostat's expected squared error by this share.
+    count
+        At most so many sightings, if given.
+    """
+    known = covariance.copy()
+    square = np.einsum("npq,nqp->n", form, known)
+    version = np.zeros(len(known), dtype=np.int64)
+    heap: list[tuple[float, int, int, int]] = []
+    for o, option in enumerate(options):
+        found = gains(known, form, option)
+        able = (found > worth * square[option.rows]) & (option.most > 0)
+        heap += [(-float(found[k]), 0, o, int(k)) for k in np.flatnonzero(able)]
+    heapify(heap)
+    chosen: list[list[int]] = [[] for _ in options]
+    often: dict[tuple[int, int], int] = {}
+    total = 0
+    while heap and (count is None or total < count):
+        _, age, o, k = heappop(heap)
+        option = options[o]
+        i = int(option.rows[k])
+        if len(chosen[o]) >= option.room or often.get((o, k), 0) >= option.most[k]:
+            continue
+        if age == version[i]:
+            chosen[o].append(i)
+            total += 1
+            often[o, k] = often.get((o, k), 0) + 1
+            known[i] = _gain.updated(known[i], option.slope[k])
+            square[i] = float(np.sum(form[i] * known[i]))
+            version[i] += 1
+        gain = float(_gain.variance_gain(known[i], option.slope[k], form[i]))
+        if gain > worth * square[i]:
+            heappush(heap, (-gain, int(version[i]), o, k))
+    return chosen
+
+
+class _Exchange:
+    """The chosen beams, and what each heliostat's are worth together."""
+
+    def __init__(
+        self, covariance: FloatArray, form: FloatArray, options: Sequence[Option],
+        chosen: Sequence[Sequence[int]],
+    ) -> None:  # fmt: skip
+        self.form, self.options = form, options
+        self.chosen = [list(rows) for rows in chosen]
+        self.information = np.linalg.inv(covariance)
+        self.place = np.full((len(options), len(covariance)), -1, dtype=np.int64)
+        for o, option in enumerate(options):
+            self.place[o, option.rows] = np.arange(len(option.rows))
+            for i in self.chosen[o]:
+                self.information[i] += self.square(o, i)
+
+    def slope(self, o: int, rows: int | list[int]) -> FloatArray:
+        """Derivatives of heliostats in an option."""
+        return np.asarray(self.options[o].slope[self.place[o, rows]])
+
+    def square(self, o: int, i: int) -> FloatArray:
+        """Information of one sighting."""
+        slope = self.slope(o, i)
+        return np.asarray(slope.T @ slope)
+
+    def able(self, o: int, i: int) -> bool:
+        """Whether heliostat ``i`` may come to option ``o`` once more."""
+        k = self.place[o, i]
+        return bool(k >= 0 and self.chosen[o].count(i) < self.options[o].most[k])
+
+    def better(self, o: int, i: int) -> bool:
+        """Move one beam of ``i`` from option ``o``, alone or against another's, if it pays."""
+        rest = as_float(np.linalg.inv(self.information[i] - self.square(o, i)))
+        others = np.array([p for p in range(len(self.options)) if p != o and self.able(p, i)])
+        if not others.size:
+            return self._replace(o, i, rest)
+        slopes = np.stack([self.slope(p, i) for p in (o, *others)])
+        gain = _gain.variance_gain(rest, slopes, self.form[i])
+        gain = gain[1:] - gain[0]
+        for n in np.argsort(-gain, kind="stable")[:DEPTH]:
+            p = int(others[n])
+            if gain[n] <= 0.0:
+                break
+            if len(self.chosen[p]) < self.options[p].room:
+                self._move(o, p, i)
+                return True
+            partner = self._partner(o, p, i, float(gain[n]))
+            if partner is not None:
+                self._move(o, p, i)
+                self._move(p, o, partner)
+                return True
+        return self._replace(o, i, rest)
+
+    def _replace(self, o: int, i: int, rest: FloatArray) -> bool:
+        """Give a beam's place to another heliostat that gains more by it."""
+        rows = self.options[o].rows
+        rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
+        new = [int(b) for b in rows if b != i and self.able(o, int(b))]
+        if not new:
+            return False
+        known = as_float(np.linalg.inv(self.information[new]))
+        gain = _gain.variance_gain(known, self.slope(o, new), self.form[new])
+        best = int(np.argmax(gain))
+        if gain[best] <= float(_gain.variance_gain(rest, self.slope(o, i), self.form[i])):
+            return False
+        self.chosen[o][self.chosen[o].index(i)] = new[best]
+        self.information[i] -= self.square(o, i)
+        self.information[new[best]] += self.square(o, new[best])
+        return True
+
+    def _partner(self, o: int, p: int, i: int, gain: float) -> int | None:
+        """Who of option ``p`` loses least by going to ``o``, if it loses less than ``gain``."""
+        rows = [b for b in dict.fromkeys(self.chosen[p]) if b != i and self.able(o, b)]
+        rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
+        if not rows:
+            return None
+        here, there = self.slope(p, rows), self.slope(o, rows)
+        rest = as_float(np.linalg.inv(self.information[rows] - np.swapaxes(here, 1, 2) @ here))
+        form = self.form[rows]
+        change = _gain.variance_gain(rest, there, form) - _gain.variance_gain(rest, here, form)
+        best = int(np.argmax(change))
+        # Rounding must not keep two beams changing places.
+        return rows[best] if change[best] > -gain * (1.0 - 1e-6) else None
+
+    def _move(self, o: int, p: int, i: int) -> None:
+        self.chosen[o].remove(i)
+        self.chosen[p].append(i)
+        self.information[i] += self.square(p, i) - self.square(o, i)
+
+
+def exchanged(
+    covariance: FloatArray,
+    form: FloatArray,
+    options: Sequence[Option],
+    chosen: Sequence[Sequence[int]],
+) -> list[list[int]]:
+    """Return the choice of :func:`allocate` after moves and exchanges that pay."""
+    work = _Exchange(covariance, form, options, chosen)
+    tries = 0
+    for _ in range(SWEEPS):
+        changes = 0
+        for o in range(len(options)):
+            for i in list(work.chosen[o]):
+                tries += 1
+                if tries > TRIES:
+                    return work.chosen
+                changes += i in work.chosen[o] and work.better(o, i)
+        if not changes:
+            break
+    return work.chosen
