@@ -20,6 +20,7 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from heliotrope.calibration import _drift_kernels as kernels
+from heliotrope.calibration.outliers import ALPHA, critical, generalised_esd
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.parallel import run_blocks
@@ -34,6 +35,8 @@ START_NOISE = 0.5
 STRAY = 0.7
 #: How far one heliostat's own may stray from the field's; its times only half as far.
 OWN_STRAY = 1.0
+#: With fewer sightings there is no telling which of them is wrong.
+FEWEST = 4
 #: Share of the heliostats that teach the field.
 TYPICAL = 0.85
 #: Where a far start had to be found, the prior is this many times the table's.
@@ -45,6 +48,9 @@ STEP_RAD = 0.001
 #: Gain in log evidence that a step must bring, beyond the logarithm of the places tried,
 #: and fewest sightings that must follow it.
 STEP_GAIN, AFTER_STEP = 4.0, 3
+#: A step is looked for between sightings so far apart, days: a mirror that is being measured
+#: all the while does not step.
+STEP_GAP = 1.0 / 24.0
 #: No heliostat has more.
 MOST_STEPS = 12
 
@@ -215,6 +221,8 @@ class Linear:
         Where the centre is a far start and no population mean holds, (P,).
     steps
         When the zeros have taken a step, days, ascending, (K,).
+    suspect
+        Far from the robust fit: believed only if the others agree, (n,).
     """
 
     jacobian: FloatArray
@@ -224,6 +232,7 @@ class Linear:
     centre: FloatArray
     own: npt.NDArray[np.bool_]
     steps: FloatArray
+    suspect: npt.NDArray[np.bool_]
 
     @property
     def epoch(self) -> npt.NDArray[np.int64]:
@@ -254,6 +263,7 @@ class Linear:
             value=self.value[index],
             time=self.time[index],
             regime=self.regime[index],
+            suspect=self.suspect[index],
         )
 
     def mean(self, hyper: Hyperparameters) -> FloatArray:
@@ -449,6 +459,32 @@ class Posterior:
         return float(-0.5 * fit + 0.5 * log_inverse - 0.5 * len(value) * np.log(2.0 * np.pi))
 
 
+def find_outliers(
+    hyper: Hyperparameters, data: Linear, alpha: float = ALPHA
+) -> npt.NDArray[np.bool_]:
+    """Return the mask of outliers: suspects that the others contradict, then generalised ESD.
+
+    Taken alone, the test takes away one sighting after the other from a fit that the bad
+    ones have bent; with a third of them bad it goes for good ones.
+    """
+    mask = np.zeros(len(data), dtype=np.bool_)
+    if len(data) < FEWEST:
+        return mask
+    if data.suspect.any() and (~data.suspect).sum() >= FEWEST:
+        others = posterior(hyper, data.take(~data.suspect))
+        asked = data.take(data.suspect)
+        values, spread = others.at(asked.time, asked.regime)
+        gap = asked.value - np.einsum("nap,np->na", asked.jacobian, values - data.centre)
+        cov = asked.jacobian @ spread @ np.swapaxes(asked.jacobian, -1, -2)
+        cov += hyper.noise**2 * np.eye(2)
+        square = np.einsum("na,nab,nb->n", gap, np.linalg.inv(cov), gap)
+        mask[data.suspect] = square > critical(len(data), alpha)
+    rest = np.flatnonzero(~mask)
+    part = data.take(rest)
+    mask[rest] = generalised_esd(part.rest(hyper), covariance(hyper, part), alpha=alpha)
+    return mask
+
+
 def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
     """Return what ``data`` say under ``hyper``."""
     if not len(data):
@@ -493,7 +529,7 @@ def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
         return steps
     sorted_data = replace(data.take(order), steps=steps)
     places = np.arange(AFTER_STEP, n - AFTER_STEP + 1)
-    places = places[sorted_data.time[places] > sorted_data.time[places - 1]]
+    places = places[sorted_data.time[places] - sorted_data.time[places - 1] > STEP_GAP]
     limit = STEP_GAIN + np.log(max(len(places), 1))
     for _ in range(MOST_STEPS):
         now = posterior(hyper, replace(sorted_data, steps=steps))

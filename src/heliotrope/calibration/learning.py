@@ -21,7 +21,6 @@ from heliotrope.calibration import drift
 from heliotrope.calibration.drift import DAY, Hyperparameters, Linear, Posterior
 from heliotrope.calibration.estimator import Calibration, Loss, fit
 from heliotrope.calibration.evaluation import Errors, errors
-from heliotrope.calibration.outliers import ALPHA, generalised_esd
 from heliotrope.calibration.regimes import find_regimes, regime_at
 from heliotrope.calibration.residuals import linearise
 from heliotrope.calibration.sightings import Sightings
@@ -36,6 +35,12 @@ FEWEST = 8
 SAMPLE = 60
 #: A start this many standard deviations of the prior away was a mistake in the plant's data.
 MISTAKE = 5.0
+#: Residuals of the robust fit longer than this, in units of its scale, are suspect.
+SUSPECT = 8.0
+#: Times that regimes and the fit on the common one are found anew.
+TURNS = 4
+#: What a model leaves is about so many times what repeats within a day.
+REPEATS = 3.0
 #: Rounds of expectation and maximisation over the population.
 ROUNDS = 6
 
@@ -212,19 +217,22 @@ def prepare(
     regime = np.where(used, 0, -1)
     offsets, order = _by_heliostat(sightings, used, len(mechanism))
     static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
-    for turn in range(2):
+    for turn in range(TURNS):
         moved = mechanism.with_parameters(static.parameters)
         # No row of a single zero has a pair of them to be shifted.
         if len(zeros) != 2:
             break
+        new = regime.copy()
         line = linearise(moved[sightings.heliostat], sightings, zeros)
         for i in range(len(mechanism)):
             part = order[offsets[i] : offsets[i + 1]]
-            scale = max(float(static.scale[i]), 0.3)
-            regime[part] = find_regimes(
-                sightings.time[part], line.residual[part] / scale, line.jacobian[part] / scale
+            rest = line.residual[part]
+            scale = max(min(float(static.scale[i]), repeatability(sightings.time[part], rest)), 0.3)
+            new[part] = find_regimes(
+                sightings.time[part], rest / scale, line.jacobian[part] / scale
             )
-        if turn == 1 or not (regime > 0).any():
+        settled, regime = np.array_equal(new, regime), new
+        if turn == TURNS - 1 or settled:
             break
         static = fit(mechanism, sightings, model, keep=regime == 0, priors=priors, loss=loss)
     moved = mechanism.with_parameters(static.parameters)
@@ -247,10 +255,26 @@ def prepare(
                 centre=centre[i],
                 own=centre[i] != 0.0,
                 steps=np.empty(0),
+                suspect=(regime[part] == 0) & (static.lengths[part] > SUSPECT),
             )
         )
         rows.append(part)
     return Prepared(static, regime, tuple(field), tuple(rows))
+
+
+def repeatability(time: FloatArray, residual: FloatArray) -> float:
+    """Return how well one heliostat's residuals repeat within a day, thrice; inf if unknown.
+
+    Where regimes are mixed the scale of the whole says nothing; neighbours in time still do.
+    """
+    order = np.argsort(time, kind="stable")
+    order = order[np.isfinite(time[order])]
+    near = np.diff(time[order]) < DAY
+    if near.sum() < FEWEST:
+        return float("inf")
+    steps = np.linalg.norm(np.diff(residual[order], axis=0)[near], axis=1)
+    # Differences of two Rayleigh lengths: the median is 1.1774 √2 σ.
+    return float(REPEATS * np.median(steps) / (1.1774 * np.sqrt(2.0)))
 
 
 def _by_heliostat(
@@ -288,13 +312,7 @@ def learn_field(
 
 
 def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
-    return data.take(~_outliers(hyper, data))
-
-
-def _outliers(hyper: Hyperparameters, data: Linear, alpha: float = ALPHA) -> npt.NDArray[np.bool_]:
-    if len(data) < 4:
-        return np.zeros(len(data), dtype=np.bool_)
-    return generalised_esd(data.rest(hyper), drift.covariance(hyper, data), alpha=alpha)
+    return data.take(~drift.find_outliers(hyper, data))
 
 
 def finish(
@@ -305,11 +323,11 @@ def finish(
     ``own`` lets its noise and wandering differ from the field's.
     """
     if len(data) >= FEWEST and hyper.processes:
-        outlier = _outliers(drift.permissive(hyper), data)
+        outlier = drift.find_outliers(drift.permissive(hyper), data)
         data = replace(data, steps=drift.find_steps(hyper, data.take(~outlier)))
         if own:
-            hyper = drift.refine(hyper, data.take(~_outliers(hyper, data)))
-    outlier = _outliers(hyper, data)
+            hyper = drift.refine(hyper, data.take(~drift.find_outliers(hyper, data)))
+    outlier = drift.find_outliers(hyper, data)
     return drift.posterior(hyper, data.take(~outlier)), outlier
 
 

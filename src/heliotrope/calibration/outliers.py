@@ -16,7 +16,7 @@ from heliotrope.geometry import FloatArray
 #: Probability of calling one good sighting of a heliostat an outlier.
 ALPHA = 1e-3
 #: No more than this share of the sightings can be outliers.
-SHARE = 0.4
+SHARE = 0.25
 
 
 def generalised_esd(
