@@ -435,7 +435,10 @@ class Posterior:
         cross = np.einsum("mnp,nap->mpna", share, data.jacobian).reshape(m, size, -1)
         values = base + cross @ self.alpha
         found = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
-        found[:, np.arange(size), np.arange(size)] += own
+        diagonal = np.arange(size)
+        found[:, diagonal, diagonal] += own
+        # What the data know almost exactly is a difference of equals: no less than nothing.
+        found[:, diagonal, diagonal] = np.maximum(found[:, diagonal, diagonal], 1e-12 * own)
         return values, 0.5 * (found + np.swapaxes(found, -1, -2))
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
