@@ -384,6 +384,20 @@ def _search(
     return hyper.with_vector(found.x), float(found.fun)
 
 
+def _no_less_than_nothing(found: FloatArray, before: FloatArray) -> FloatArray:
+    """Covariances (m, P, P) without what rounding made negative.
+
+    What the data know almost exactly is a difference of equals; in units of the standard
+    deviations before (variances (m, P)) no direction is known better than to 1e-6.
+    """
+    scale = np.sqrt(before)
+    both = scale[:, :, None] * scale[:, None, :]
+    ratio = np.divide(found, both, out=np.zeros_like(found), where=both > 0)
+    values, vectors = np.linalg.eigh(0.5 * (ratio + np.swapaxes(ratio, -1, -2)))
+    better = (vectors * np.maximum(values, 1e-12)[:, None, :]) @ np.swapaxes(vectors, -1, -2)
+    return np.asarray(both * better)
+
+
 @dataclass(frozen=True)
 class Posterior:
     """What the sightings of one heliostat say about its parameters at any time.
@@ -437,9 +451,7 @@ class Posterior:
         found = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
         diagonal = np.arange(size)
         found[:, diagonal, diagonal] += own
-        # What the data know almost exactly is a difference of equals: no less than nothing.
-        found[:, diagonal, diagonal] = np.maximum(found[:, diagonal, diagonal], 1e-12 * own)
-        return values, 0.5 * (found + np.swapaxes(found, -1, -2))
+        return values, _no_less_than_nothing(found, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return (z² (n,), error (n, 2), covariance (n, 2, 2)) of each, seen from the others."""

@@ -74,8 +74,9 @@ def field_map(result: "Result") -> "Figure":
         figure.colorbar(dots, label="median beam error after, mrad", extend="max")
         if known.sum() <= 60:
             for i in np.flatnonzero(known):
+                where = (float(places[i, 0]), float(places[i, 1]))
                 ax.annotate(
-                    result.names[i], (places[i, 0], places[i, 1]), xytext=(3, 3), textcoords="offset points",
+                    result.names[i], where, xytext=(3, 3), textcoords="offset points",
                     fontsize=6,
                 )  # fmt: skip
     for target in result.targets:
