@@ -29,7 +29,7 @@ from heliotrope.geometry import (
     wrap_signed,
 )
 from heliotrope.mechanism import parameters as parameter_table
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.chain import Mechanism, Pose
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.tracking import track
 from heliotrope.parallel import run_blocks
@@ -161,9 +161,10 @@ def fit(
     names = parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
     sigma = _priors(mechanism, names, priors or {})
     used = np.ones(rows, dtype=np.bool_) if keep is None else np.asarray(keep, dtype=np.bool_)
-    order = _canonical_order(sightings)
+    order = canonical_order(sightings)
     ordered = sightings.take(order)
-    begin = _far_starts(mechanism, ordered, names)
+    pose = mechanism[ordered.heliostat].pose(ordered.counts)
+    begin = _far_starts(mechanism, ordered, used[order], pose, names)
     shape = (count, len(names))
     result = Calibration(
         names=names,
@@ -179,7 +180,9 @@ def fit(
     )
     codes = mechanism.codes(names)
     started = mechanism.with_parameters({n: begin[:, p] for p, n in enumerate(names)})
-    data = _data(started, ordered, used[order])
+    if begin.any():
+        pose = started[ordered.heliostat].pose(ordered.counts)
+    data = _data(ordered, pose.vertex, used[order])
     offsets = np.searchsorted(ordered.heliostat, np.arange(count + 1))
     squares, costs = np.full(rows, np.nan), np.empty(count)
     arrays = started.kernel_arrays
@@ -213,26 +216,36 @@ def _priors(
     return np.stack(columns, axis=-1) if columns else np.empty((len(mechanism), 0))
 
 
-def _canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
-    """Heliostat by heliostat, and within one an order that does not depend on the rows'."""
-    keys = (*s.destination.T, *s.source.T, *s.counts.T, s.time, s.heliostat)
-    return np.lexsort(keys)
+def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
+    """Return the rows heliostat by heliostat, within one in an order that is not the rows'."""
+    first = (s.counts[:, -1], s.time, s.heliostat)
+    order = np.lexsort(first)
+    alike = np.ones(max(len(order) - 1, 0), dtype=np.bool_)
+    for key in first:
+        # Unknown times are alike.
+        alike &= ~(key[order[1:]] != key[order[:-1]]) | np.isnan(key[order[1:]].astype(float))
+    if alike.any():
+        more = (*s.source_covariance.reshape(len(s), -1).T,
+                *s.destination_covariance.reshape(len(s), -1).T, s.sigma)  # fmt: skip
+        order = np.lexsort((*more, *s.destination.T, *s.source.T, *s.counts.T, *first[1:]))
+    return order
 
 
-def _data(
-    mechanism: Mechanism, s: Sightings, keep: npt.NDArray[np.bool_]
-) -> tuple[np.ndarray, ...]:
+def _data(s: Sightings, vertex: FloatArray, keep: npt.NDArray[np.bool_]) -> tuple[np.ndarray, ...]:
     """The sightings as the kernels read them; axes and whitening are those of the start."""
     axes, whiten = np.zeros((len(s), 2, 3)), np.zeros((len(s), 2, 2))
     if len(s):
-        axes, whiten = whitening(s, mechanism[s.heliostat].pose(s.counts).vertex)
+        axes, whiten = whitening(s, vertex)
     return (
         s.counts, s.source, s.source_at_infinity, s.destination, s.destination_at_infinity, axes,
         whiten, keep,
     )  # fmt: skip
 
 
-def _far_starts(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> FloatArray:
+def _far_starts(
+    mechanism: Mechanism, s: Sightings, used: npt.NDArray[np.bool_], pose: Pose,
+    names: tuple[str, ...],
+) -> FloatArray:  # fmt: skip
     """Starting values: zero, but zeros and strokes where the nominal ones are far off.
 
     Each sighting says at which joint angles the nominal axes would produce it. Against
@@ -244,13 +257,11 @@ def _far_starts(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> F
     places = [_start_parameters(mechanism, names, d) for d in range(len(mechanism.driven))]
     if len(places) != 2 or any(zero is None for zero, _ in places) or not len(s):
         return begin
-    pose = mechanism[s.heliostat].pose(s.counts)
     source, way = ray_directions(s, pose.vertex)
     miss = angle_between(pose.normal, bisector(source, way))
-    offsets = np.searchsorted(s.heliostat, np.arange(len(mechanism) + 1))
-    for i in range(len(mechanism)):
-        part = slice(int(offsets[i]), int(offsets[i + 1]))
-        if part.stop - part.start < 3 or np.median(miss[part]) < FAR:
+    for i in np.unique(s.heliostat[used & (miss > FAR)]):
+        part = np.flatnonzero(used & (s.heliostat == i))
+        if len(part) < 3 or np.median(miss[part]) < FAR:
             continue
         far = s.destination_at_infinity[part, None]
         aim = np.where(far, pose.vertex[part] + 1e6 * s.destination[part], s.destination[part])

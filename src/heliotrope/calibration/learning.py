@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from heliotrope.calibration import drift
 from heliotrope.calibration.drift import DAY, Hyperparameters, Linear, Posterior
-from heliotrope.calibration.estimator import Calibration, Loss, fit
+from heliotrope.calibration.estimator import Calibration, Loss, canonical_order, fit
 from heliotrope.calibration.evaluation import Errors, errors
 from heliotrope.calibration.regimes import find_regimes, regime_at
 from heliotrope.calibration.residuals import linearise
@@ -281,8 +281,7 @@ def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Offsets (N + 1,) and the used rows by heliostat, in an order not that of the rows."""
-    keys = (*s.destination.T, *s.source.T, *s.counts.T, s.time, s.heliostat)
-    order = np.lexsort(keys)
+    order = canonical_order(s)
     order = order[used[order]]
     return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
 
