@@ -201,6 +201,15 @@ def test_calibrate_a_plant_with_a_table(call: Any, plant_file: Path, tmp_path: P
     )  # fmt: skip
     values = [h["parameters"]["tilt_north"] for h in found["heliostats"].values()]
     np.testing.assert_allclose(np.median(values), 5e-3, atol=2e-4)
+    # The field takes it back: as a plant, and as a calibration beside the old one.
+    question = ("--heliostat", "P6A", "--time", "2026-09-02T10:00Z", "--json")
+    plain = json.loads(call("track", plant_file, *question))
+    whole = json.loads(call("track", tmp_path / "out" / "plant.toml", *question))
+    beside = json.loads(
+        call("track", plant_file, "--calibration", tmp_path / "out" / "calibration.json", *question)
+    )
+    assert beside["branches"] == whole["branches"]
+    assert beside["branches"] != plain["branches"]
 
 
 def test_demo(call: Any, tmp_path: Path) -> None:

@@ -89,6 +89,9 @@ class Assessment:
         Of all their held-out sightings.
     beam
         Of all their held-out sightings together, rad.
+    fewest
+        Sightings that a heliostat needed to enter the figures over all: :data:`ENOUGH`,
+        or 0 if none has so many.
     blunders
         Held-out sightings more than ``BLUNDER`` standard deviations away, whatever the
         cause: they enter every figure.
@@ -99,6 +102,7 @@ class Assessment:
     mean_of_means: float
     coverage: float
     beam: Summary
+    fewest: int
     blunders: int
 
     def document(self) -> dict[str, Any]:
@@ -112,7 +116,7 @@ class Assessment:
             "rms_beam_mrad": 1e3 * self.beam.rms,
             "p95_beam_mrad": 1e3 * self.beam.p95,
             "blunders_held_out": self.blunders,
-            "enough": ENOUGH,
+            "enough": self.fewest,
         }
 
 
@@ -138,9 +142,9 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
         _one(names[i], int(i), int(counts[i]), learned, found, np.flatnonzero(seen.heliostat == i))
         for i in np.flatnonzero(counts)
     ]
-    enough = [h for h in figures if h.count >= ENOUGH and h.beam.count] or [
-        h for h in figures if h.beam.count
-    ]
+    tested = [h for h in figures if h.beam.count]
+    fewest = ENOUGH if any(h.count >= ENOUGH for h in tested) else 0
+    enough = [h for h in tested if h.count >= fewest]
     inside = np.isin(seen.heliostat, [names.index(h.name) for h in enough])
     far = np.sum(
         found.plane * np.linalg.solve(found.covariance, found.plane[:, :, None])[..., 0], axis=-1
@@ -151,6 +155,7 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
         float(np.mean([h.mean for h in enough])) if enough else np.nan,
         float(found.inside[inside].mean()) if inside.any() else np.nan,
         summary(found.errors.beam[inside]),
+        fewest,
         int((far[inside] > BLUNDER**2).sum()),
     )
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from heliotrope.calibration import pictures
-from heliotrope.calibration.assessment import ENOUGH, Assessment
+from heliotrope.calibration.assessment import Assessment
 from heliotrope.calibration.estimator import Outcome
 from heliotrope.calibration.evaluation import Errors, Summary, errors, summary
 from heliotrope.calibration.learning import Learned, left_out_errors
@@ -331,8 +331,8 @@ def _summary(result: Result) -> str:
     if a is not None and np.isfinite(a.median_of_medians):
         parts.append(
             f"<em>Held out</em> ({html.escape(result.note)}): median of the medians "
-            f"{1e3 * a.median_of_medians:.2f} mrad over the heliostats with {ENOUGH} sightings or "
-            f"more; {100 * a.coverage:.0f} % lie within their 90 % ellipse."
+            f"{1e3 * a.median_of_medians:.2f} mrad over the heliostats with {a.fewest} sightings "
+            f"or more; {100 * a.coverage:.0f} % lie within their 90 % ellipse."
         )
     h = learned.hyper
     moving = "; ".join(

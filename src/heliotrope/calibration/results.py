@@ -19,6 +19,7 @@ from heliotrope import __version__
 from heliotrope.calibration.drift import DAY
 from heliotrope.calibration.estimator import Outcome
 from heliotrope.calibration.learning import Learned
+from heliotrope.errors import InputError
 from heliotrope.field.formats import _json
 from heliotrope.field.formats._textfile import write_file, write_text
 from heliotrope.field.heliostats import Heliostats
@@ -250,3 +251,25 @@ def calibrated_plant(plant: Plant, group: str, results: Results) -> Plant:
     groups = dict(plant.groups)
     groups[group] = results.apply(groups[group])
     return replace(plant, groups=groups)
+
+
+def apply_to_plant(plant: Plant, results: Results) -> Plant:
+    """Return ``plant`` with the parameters in every group that has heliostats of these names.
+
+    Raises
+    ------
+    InputError
+        If no heliostat of the plant is among them.
+    UnknownNameError
+        If a mechanism lacks a parameter.
+    """
+    known = set(results.heliostats)
+    mine = [name for name, group in plant.groups.items() if known & set(group.names)]
+    if not mine:
+        raise InputError(
+            f"calibration of {', '.join(results.heliostats[:3])}…: the plant has none of these "
+            "heliostats; give the calibration of this plant"
+        )
+    for name in mine:
+        plant = calibrated_plant(plant, name, results)
+    return plant

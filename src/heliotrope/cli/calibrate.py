@@ -130,8 +130,6 @@ def print_result(result: "Result") -> None:
     """Print the table of a calibration and its overall figures."""
     import numpy as np
 
-    from heliotrope.calibration.assessment import ENOUGH
-
     def shown(value: float) -> str:
         return f"{1e3 * value:.2f}" if np.isfinite(value) else "–"
 
@@ -152,7 +150,7 @@ def print_result(result: "Result") -> None:
     a = result.assessment
     if a is not None and np.isfinite(a.median_of_medians):
         print(
-            f"median of the held-out medians (heliostats with {ENOUGH} or more): "
+            f"median of the held-out medians (heliostats with {a.fewest} or more): "
             f"{1e3 * a.median_of_medians:.2f} mrad of beam; {100 * a.coverage:.0f} % within the "
             "90 % ellipse"
         )

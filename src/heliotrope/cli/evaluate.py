@@ -97,8 +97,11 @@ def _print(document: dict[str, Any]) -> None:
         rows,
         title=f"beam error of held-out sightings, mrad ({document['split']} split)",
     )  # fmt: skip
+    whose = f"heliostats with {document['enough']} or more"
+    if not document["enough"]:
+        whose = "all heliostats (none has 20 sightings)"
     print(
-        f"heliostats with {document['enough']} or more: median of medians "
+        f"{whose}: median of medians "
         f"{shown(document['median_of_medians_mrad'])} mrad, mean of means "
         f"{shown(document['mean_of_means_mrad'])} mrad, "
         f"{shown(100 * document['coverage_90'], 1)} % within the 90 % ellipse"

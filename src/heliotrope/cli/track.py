@@ -33,6 +33,9 @@ def track(
     every: Annotated[
         str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
     ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="calibration.json of heliotrope calibrate, to apply.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Print normal, joint angles and drive counts of both branches, or of a day."""
@@ -43,6 +46,10 @@ def track(
     from heliotrope.mechanism import tracking
 
     plant = open_plant(field)
+    if calibration is not None:
+        from heliotrope.calibration.results import apply_to_plant, read_json
+
+        plant = apply_to_plant(plant, read_json(calibration))
     mechanism = plant.heliostat(heliostat)
     goal = np.array(_aim(plant, aim, target))
     moment = parse_time(time)
