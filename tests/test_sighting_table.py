@@ -12,7 +12,8 @@ import pytest
 
 from heliotrope.calibration import sighting_table
 from heliotrope.calibration._cells import format_time, parse_time
-from heliotrope.calibration.estimator import Outcome, _data, fit
+from heliotrope.calibration.estimator import Outcome, fit
+from heliotrope.calibration.residuals import whitening
 from heliotrope.calibration.sighting_table import read_malan, read_sightings, write_sightings
 from heliotrope.calibration.sightings import (
     Sightings,
@@ -166,7 +167,7 @@ def test_without_covariances_nothing_changes() -> None:
     spread = np.eye(3) - way[:, :, None] * way[:, None, :]
     across = axes / size[:, :, None]
     covariance = across @ spread @ np.swapaxes(across, -1, -2) * seen.sigma[:, None, None] ** 2
-    *_, axes_used, whiten, _ = _data(plant, seen, np.ones(len(seen), dtype=bool))
+    axes_used, whiten = whitening(seen, plant[seen.heliostat].pose(seen.counts).vertex)
     assert (axes_used == axes).all()
     assert (whiten == np.linalg.inv(np.linalg.cholesky(covariance))).all()
 
@@ -205,7 +206,7 @@ def test_whitening_is_that_of_finite_differences() -> None:
     found = bisector_covariance(seen, vertex, axes)
     largest = np.abs(expected).max(axis=(-1, -2), keepdims=True)
     assert (np.abs(found - expected) / largest).max() < 1e-5
-    *_, whiten, _ = _data(plant, seen, np.ones(len(seen), dtype=bool))
+    _, whiten = whitening(seen, plant[seen.heliostat].pose(seen.counts).vertex)
     unit = whiten @ found @ np.swapaxes(whiten, -1, -2)
     np.testing.assert_allclose(unit, np.broadcast_to(np.eye(2), unit.shape), atol=1e-6)
 
