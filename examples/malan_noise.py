@@ -158,6 +158,8 @@ def main(folder: Path) -> Path:
             print(f"{1e3 * noise:5.0f} mm  {label:16} actual {1e3 * s.actual[label]:6.3f} mrad, "
                   f"predicted {1e3 * s.predicted[label]:6.3f} mrad")  # fmt: skip
     ax.set_xscale("log")
+    ax.set_xticks(1e3 * noises, [f"{1e3 * n:.0f}" for n in noises])
+    ax.set_xticks([], minor=True)
     ax.set_ylim(bottom=0)
     ax.set_xlabel("noise of a centroid, mm")
     ax.set_ylabel("RMS of the beam on the target / noise")

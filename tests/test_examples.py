@@ -30,6 +30,12 @@ def test_malan_figures(tmp_path: Path) -> None:
         assert picture[..., :3].std() > 0.02
 
 
+def test_malan_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    picture = imread(_load("malan_noise").main(tmp_path))
+    assert picture[..., :3].std() > 0.02
+    assert "21 December" in capsys.readouterr().out
+
+
 def test_malan_sizing(capsys: pytest.CaptureFixture[str]) -> None:
     found = _load("malan_sizing").main()
     # The thesis: 5 MWe from about 10,000 heliostats of 5 m².
