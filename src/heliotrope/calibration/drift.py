@@ -34,7 +34,7 @@ START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
 START_NOISE = 0.5
 STRAY = 0.7
 #: How far one heliostat's own may stray from the field's; its times only half as far.
-OWN_STRAY = 1.0
+OWN_STRAY = 0.4
 #: With fewer sightings there is no telling which of them is wrong.
 FEWEST = 4
 #: Share of the heliostats that teach the field.
@@ -446,7 +446,7 @@ class Posterior:
                 share[:, :, p] += h.amplitude[c] ** 2 * np.nan_to_num(decay, nan=0.0)
                 own[:, p] += h.amplitude[c] ** 2
         # Covariance of each parameter with each component of each sighting, (m, P, 2 n).
-        cross = np.einsum("mnp,nap->mpna", share, data.jacobian).reshape(m, size, -1)
+        cross = np.einsum("mnp,nap->mpna", share, data.jacobian).reshape(m, size, 2 * len(data))
         values = base + cross @ self.alpha
         found = -(cross @ self.inverse) @ np.swapaxes(cross, -1, -2)
         diagonal = np.arange(size)

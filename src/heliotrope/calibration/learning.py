@@ -9,7 +9,7 @@
 Steps 1, 2 and 4 treat every heliostat by itself; only step 3 looks at several.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 
@@ -37,6 +37,8 @@ SAMPLE = 60
 MISTAKE = 5.0
 #: Residuals of the robust fit longer than this, in units of its scale, are suspect.
 SUSPECT = 8.0
+#: Times that the sightings are linearised anew; at Jülich a second time changes nothing.
+LINEARISED = 1
 #: Times that regimes and the fit on the common one are found anew.
 TURNS = 4
 #: What a model leaves is about so many times what repeats within a day.
@@ -262,6 +264,36 @@ def prepare(
     return Prepared(static, regime, tuple(field), tuple(rows))
 
 
+def relinearise(
+    mechanism: Mechanism, sightings: Sightings, prepared: Prepared, members: Sequence[Posterior]
+) -> Prepared:
+    """Linearise each sighting anew about what is believed of its heliostat at its time.
+
+    Gauss-Newton on the whole history: the robust fit may lie far from where population,
+    regimes and wandering bring a mirror, and a jack's law is not straight.
+    """
+    names = members[0].hyper.names
+    rows = np.concatenate(prepared.rows)
+    if not len(rows):
+        return prepared
+    values = np.concatenate(
+        [m.at(d.time, d.regime)[0] for m, d in zip(members, prepared.field, strict=True)]
+    )
+    seen = sightings.take(rows)
+    moved = mechanism[seen.heliostat].with_parameters(
+        {n: values[:, p] for p, n in enumerate(names)}
+    )
+    line = linearise(moved, seen, names)
+    offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
+    field = []
+    for k, d in enumerate(prepared.field):
+        part = slice(int(offsets[k]), int(offsets[k + 1]))
+        jacobian = np.ascontiguousarray(line.jacobian[part])
+        value = np.einsum("nap,np->na", jacobian, values[part] - d.centre) - line.residual[part]
+        field.append(replace(d, jacobian=jacobian, value=value))
+    return replace(prepared, field=tuple(field))
+
+
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
     """Return how well one heliostat's residuals repeat within a day, thrice; inf if unknown.
 
@@ -287,16 +319,23 @@ def _by_heliostat(
 
 
 def learn_field(
-    hyper: Hyperparameters, prepared: Prepared, rounds: int = ROUNDS
+    hyper: Hyperparameters,
+    mechanism: Mechanism,
+    sightings: Sightings,
+    prepared: Prepared,
+    rounds: int = ROUNDS,
 ) -> Hyperparameters:
     """Return what is common to the field, from prepared heliostats (step 3)."""
     table = np.where(hyper.spread > 0, hyper.spread, 0.0)
     teachers = [k for k, d in enumerate(prepared.field) if len(d) >= FEWEST]
     if not teachers:
         return hyper
-    everything = [prepared.field[k] for k in teachers]
     # Of the field, not of each: a heliostat full of mistakes has a large noise of its own.
     usual = max(float(np.median(prepared.static.scale[teachers])), hyper.noise)
+    for _ in range(LINEARISED):
+        known = [finish(replace(hyper, noise=usual), d, own=False)[0] for d in prepared.field]
+        prepared = relinearise(mechanism, sightings, prepared, known)
+    everything = [prepared.field[k] for k in teachers]
     clean = [_without_outliers(replace(hyper, noise=usual), d) for d in everything]
     for turn in range(rounds):
         if turn in (0, 2, rounds - 1):
@@ -449,6 +488,9 @@ def learn_part(
         prepared = prepare(
             mechanism, sightings, task.model, hyper.names, used, priors=task.priors, loss=task.loss
         )
+        for _ in range(LINEARISED):
+            known, _ = _finish_all(hyper, prepared, len(sightings), False, None)
+            prepared = relinearise(mechanism, sightings, prepared, known)
         members, outlier = _finish_all(hyper, prepared, len(sightings), task.own, progress)
     return Part(prepared, members, outlier)
 
@@ -513,7 +555,7 @@ def field_of(
     prepared = prepare(
         machines, part, task.model, first.names, keep, priors=mine.priors, loss=task.loss
     )
-    return learn_field(first, prepared, rounds)
+    return learn_field(first, machines, part, prepared, rounds)
 
 
 def _prior_row(
