@@ -8,11 +8,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from heliotrope.calibration.drift import NINETY
 from heliotrope.calibration.estimator import fit
 from heliotrope.calibration.learning import learn
 from heliotrope.calibration.residuals import linearise
 from heliotrope.calibration.sightings import Sightings, sightings
-from heliotrope.calibration.uncertainty import NINETY, expected, unobservable, year_map
+from heliotrope.calibration.uncertainty import expected, unobservable, year_map
 from heliotrope.geometry import FloatArray, direction, reflect
 from heliotrope.mechanism import kinds, parameters
 from heliotrope.mechanism.chain import Mechanism

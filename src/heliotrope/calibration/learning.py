@@ -63,12 +63,15 @@ class Prediction:
         Of ``plane`` as predicted: parameters, wandering and noise, rad², (M, 2, 2).
     inside
         Whether the error lies in the 90 % ellipse, (M,).
+    beam
+        Turns a whitened residual into ``plane``, (M, 2, 2).
     """
 
     errors: Errors
     plane: FloatArray
     covariance: FloatArray
     inside: npt.NDArray[np.bool_]
+    beam: FloatArray
 
 
 @dataclass(frozen=True)
@@ -116,14 +119,9 @@ class Learned:
         """The P parameters, those that only wander included."""
         return self.hyper.names
 
-    @property
-    def zeros(self) -> tuple[str, ...]:
-        """The drives' zeros."""
-        return drift.zeros(self.mechanism)
-
     def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
         """Return the regime of a heliostat at Unix times ``when`` (m,)."""
-        rows = np.flatnonzero((self.sightings.heliostat == heliostat) & (self.regime >= 0))
+        rows = self.rows[heliostat]
         return regime_at(self.sightings.time[rows], self.regime[rows], when)
 
     def parameters_at(
@@ -143,8 +141,9 @@ class Learned:
         size = len(self.names)
         values, spread = np.empty((len(rows), size)), np.empty((len(rows), size, size))
         with threadpool_limits(1, "blas"):
-            for i in np.unique(rows):
-                part = np.flatnonzero(rows == i)
+            order = np.argsort(rows, kind="stable")
+            each, first = np.unique(rows[order], return_index=True)
+            for i, part in zip(each, np.split(order, first[1:]), strict=True):
                 # Many at once would need much memory: sightings × times × parameters.
                 for some in np.array_split(part, 1 + len(part) // 500):
                     label = self.regimes(int(i), when[some])
@@ -154,15 +153,13 @@ class Learned:
     def mechanism_at(self, heliostat: npt.ArrayLike, time: npt.ArrayLike) -> Mechanism:
         """Return the mechanisms of ``heliostat`` (M,) as they are expected at ``time`` (M,)."""
         values, _ = self.parameters_at(heliostat, time)
-        nominal = self.mechanism[np.asarray(heliostat, dtype=np.intp)]
-        return nominal.with_parameters({n: values[:, p] for p, n in enumerate(self.names)})
+        return _moved(self.mechanism, heliostat, self.names, values)
 
     def predict(self, sightings: Sightings) -> Prediction:
         """Return what was to be expected of sightings, and how far off it was."""
         rows = sightings.heliostat
         values, spread = self.parameters_at(rows, sightings.time)
-        nominal = self.mechanism[rows]
-        moved = nominal.with_parameters({n: values[:, p] for p, n in enumerate(self.names)})
+        moved = _moved(self.mechanism, rows, self.names, values)
         alone = replace(sightings, heliostat=np.arange(len(rows)))
         found = errors(moved, alone)
         line = linearise(moved, sightings, self.names)
@@ -171,7 +168,16 @@ class Learned:
         white += noise[:, None, None] * np.eye(2)
         covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
         square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
-        return Prediction(found, found.offset, covariance, square <= drift.NINETY)
+        inside = square <= drift.NINETY
+        return Prediction(found, found.offset, covariance, inside, line.beam)
+
+
+def _moved(
+    mechanism: Mechanism, heliostat: npt.ArrayLike, names: tuple[str, ...], values: FloatArray
+) -> Mechanism:
+    """Mechanisms of rows ``heliostat`` (M,) with deviations ``values`` (M, P)."""
+    nominal = mechanism[np.asarray(heliostat, dtype=np.intp)]
+    return nominal.with_parameters({n: values[:, p] for p, n in enumerate(names)})
 
 
 def left_out_errors(learned: Learned) -> FloatArray:
@@ -180,17 +186,12 @@ def left_out_errors(learned: Learned) -> FloatArray:
     To the right of and above the destination, predicted minus seen. Outliers and what was
     not used are seen from all that was.
     """
-    found = learned.predict(learned.sightings).plane
-    rows = learned.sightings.heliostat
-    values, _ = learned.parameters_at(rows, learned.sightings.time)
-    moved = learned.mechanism[rows].with_parameters(
-        {n: values[:, p] for p, n in enumerate(learned.names)}
-    )
-    beam = linearise(moved, learned.sightings, learned.zeros).beam
+    known = learned.predict(learned.sightings)
+    found = known.plane.copy()
     for i, member in enumerate(learned.members):
         part = learned.rows[i][~learned.outlier[learned.rows[i]]]
         if len(part):
-            found[part] = -np.einsum("mab,mb->ma", beam[part], member.left_out()[1])
+            found[part] = -np.einsum("mab,mb->ma", known.beam[part], member.left_out()[1])
     return found
 
 
@@ -280,10 +281,7 @@ def relinearise(
         [m.at(d.time, d.regime)[0] for m, d in zip(members, prepared.field, strict=True)]
     )
     seen = sightings.take(rows)
-    moved = mechanism[seen.heliostat].with_parameters(
-        {n: values[:, p] for p, n in enumerate(names)}
-    )
-    line = linearise(moved, seen, names)
+    line = linearise(_moved(mechanism, seen.heliostat, names, values), seen, names)
     offsets = np.concatenate([[0], np.cumsum([len(d) for d in prepared.field])])
     field = []
     for k, d in enumerate(prepared.field):

@@ -389,9 +389,10 @@ def field_camera(
     sun_covariance, camera_covariance
         rad² and m², as :func:`sightings`.
     """
-    return sightings(
-        heliostat, counts, sun, camera, time=time, sigma=sigma,
-        source_covariance=sun_covariance, destination_covariance=camera_covariance,
+    # To the law a camera is a target: the sun's light came to this point.
+    return camera_target(
+        heliostat, counts, sun, camera, time=time, sigma=sigma, sun_covariance=sun_covariance,
+        centroid_covariance=camera_covariance,
     )  # fmt: skip
 
 

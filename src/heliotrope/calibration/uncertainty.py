@@ -10,14 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.drift import NINETY
 from heliotrope.calibration.residuals import linearise
 from heliotrope.calibration.sightings import sightings
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 
-#: Of a χ² with two degrees of freedom: the ellipse that holds nine of ten.
-NINETY = 2.0 * np.log(10.0)
 #: A combination of parameters whose variance the data have reduced by less than this is
 #: known by the prior only.
 PRIOR_ONLY = 0.9
@@ -85,10 +84,8 @@ def expected(
     each = mechanism if mechanism.shape else mechanism[None]
     each = each[np.zeros(count, dtype=np.intp)] if len(each) == 1 else each
     found = track(each, suns, aims)
-    best = np.asarray(found.best)[:, None]
-    counts = np.take_along_axis(found.counts, best[:, :, None], axis=1)[:, 0]
-    reachable = np.take_along_axis(found.reachable, best, axis=1)[:, 0]
-    safe = np.where(reachable[:, None], counts, 0.0)
+    reachable = found.chosen(found.reachable)
+    safe = np.where(reachable[:, None], found.chosen(found.counts), 0.0)
     seen = sightings(np.arange(count), safe, suns, aims)
     line = linearise(each, seen, names)
     slope = line.beam @ line.jacobian

@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
 
 from heliotrope.cli._common import open_plant
 
@@ -16,6 +18,29 @@ if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
 
 Centroid = Literal["utis", "helios"]
+
+# Options that mean the same in every command of calibration.
+Place = Annotated[
+    Path, typer.Argument(help="Folder with measurements, properties, tower; or a plant file.")
+]
+ModelOption = Annotated[
+    str, typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameters: a,b,c.")
+]
+TableOption = Annotated[
+    Path | None, typer.Option(help="Table of sightings (CSV, Parquet) for a plant file.")
+]
+CentroidOption = Annotated[Centroid, typer.Option(help="Which published centroid to believe.")]
+PriorOption = Annotated[
+    list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
+]
+SplitOption = Annotated[
+    Literal["random", "chronological", "neighbour"],
+    typer.Option(help="What is held out: any, the latest, or neighbourhoods of the sun."),
+]
+SeedOption = Annotated[int, typer.Option(help="Of the random choice.")]
+SchedulerOption = Annotated[
+    str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
+]
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
@@ -13,40 +14,23 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    place: Annotated[
-        Path, typer.Argument(help="Folder with measurements, properties, tower; or a plant file.")
-    ],
-    model: Annotated[
-        str,
-        typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameters: a,b,c."),
-    ] = "auto",
-    sightings: Annotated[
-        Path | None, typer.Option(help="Table of sightings (CSV, Parquet) for a plant file.")
-    ] = None,
-    centroid: Annotated[
-        Literal["utis", "helios"], typer.Option(help="Which published centroid to believe.")
-    ] = "utis",
-    prior: Annotated[
-        list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
-    ] = None,
-    split: Annotated[
-        Literal["random", "chronological", "neighbour"],
-        typer.Option(help="How sightings are held out to test."),
-    ] = "random",
+    place: shared.Place,
+    model: shared.ModelOption = "auto",
+    sightings: shared.TableOption = None,
+    centroid: shared.CentroidOption = "utis",
+    prior: shared.PriorOption = None,
+    split: shared.SplitOption = "random",
     fraction: Annotated[
         float, typer.Option(help="Share to learn from when testing; 1: no test.")
     ] = 0.7,
-    seed: Annotated[int, typer.Option(help="Of the random choice.")] = 0,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
-    ] = None,
+    seed: shared.SeedOption = 0,
+    scheduler: shared.SchedulerOption = None,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("out/calibration"),
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn every heliostat from all its sightings, test on held-out ones, write a report."""
     from heliotrope.calibration import assessment, evaluation
     from heliotrope.calibration.report import Result
-    from heliotrope.cli import _calibration as shared
 
     priors = shared.parse_priors(prior or [])
     if fraction != 1.0:
@@ -91,9 +75,8 @@ def _show(result: "Result", report: Path, as_json: bool) -> None:
 def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
     """Write the report behind a progress bar."""
     from heliotrope.calibration.report import write_report
-    from heliotrope.cli._calibration import progress
 
-    with progress("drawing", quiet) as advance:
+    with shared.progress("drawing", quiet) as advance:
         return write_report(result, folder, advance)
 
 

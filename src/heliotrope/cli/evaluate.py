@@ -1,38 +1,23 @@
 """``heliotrope evaluate``: how well a field is learnt, on sightings that were held out."""
 
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
+from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import print_json, print_table
 
 
 def evaluate(
-    place: Annotated[
-        Path, typer.Argument(help="Folder with measurements, properties, tower; or a plant file.")
-    ],
-    split: Annotated[
-        Literal["random", "chronological", "neighbour"],
-        typer.Option(help="What is held out: any, the latest, or neighbourhoods of the sun."),
-    ] = "random",
+    place: shared.Place,
+    split: shared.SplitOption = "random",
     fraction: Annotated[float, typer.Option(help="Share of the sightings to learn from.")] = 0.7,
-    seed: Annotated[int, typer.Option(help="Of the random choice.")] = 0,
-    model: Annotated[
-        str, typer.Option(help="auto; jacks, full, malan8, guo6, khalsa8; or parameters: a,b,c.")
-    ] = "auto",
-    sightings: Annotated[
-        Path | None, typer.Option(help="Table of sightings (CSV, Parquet) for a plant file.")
-    ] = None,
-    centroid: Annotated[
-        Literal["utis", "helios"], typer.Option(help="Which published centroid to believe.")
-    ] = "utis",
-    prior: Annotated[
-        list[str] | None, typer.Option(help="NAME=SIGMA in rad, m or 1; may be repeated.")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Address of a dask scheduler, or local:N.")
-    ] = None,
+    seed: shared.SeedOption = 0,
+    model: shared.ModelOption = "auto",
+    sightings: shared.TableOption = None,
+    centroid: shared.CentroidOption = "utis",
+    prior: shared.PriorOption = None,
+    scheduler: shared.SchedulerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn from a part of each heliostat's sightings and print the errors of the rest.
@@ -41,7 +26,6 @@ def evaluate(
     training part alone.
     """
     from heliotrope.calibration import assessment, evaluation
-    from heliotrope.cli import _calibration as shared
 
     evaluation.check_fraction(fraction)
     priors = shared.parse_priors(prior or [])
