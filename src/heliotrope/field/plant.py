@@ -8,6 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.camera import Camera
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray
@@ -16,7 +17,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.sun import Site
 
-Surface = TypeVar("Surface", Target, Receiver)
+Surface = TypeVar("Surface", Target, Receiver, Camera)
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Plant:
         unique over all groups.
     targets, receivers
         Surfaces that beams are sent to.
+    cameras
+        That look at the targets.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Plant:
     targets: tuple[Target, ...] = ()
     receivers: tuple[Receiver, ...] = ()
     notes: Mapping[str, str] = field(default_factory=dict)
+    cameras: tuple[Camera, ...] = ()
 
     def __post_init__(self) -> None:
         seen: dict[str, str] = {}
@@ -57,6 +61,12 @@ class Plant:
         for name in surfaces:
             if surfaces.count(name) > 1:
                 raise InputError(f"target or receiver {name}: the name occurs twice")
+        names = [camera.name for camera in self.cameras]
+        for camera in self.cameras:
+            if names.count(camera.name) > 1:
+                raise InputError(f"camera {camera.name}: the name occurs twice")
+            for target in camera.targets:
+                self.target(target)
 
     def __len__(self) -> int:
         return sum(len(group) for group in self.groups.values())
@@ -100,6 +110,10 @@ class Plant:
     def receiver(self, name: str) -> Receiver:
         """Return a receiver by name."""
         return _named("receiver", name, self.receivers)
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera by name."""
+        return _named("camera", name, self.cameras)
 
     @cached_property
     def position(self) -> FloatArray:

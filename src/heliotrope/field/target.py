@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
+from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, as_vectors, normalize
 
 
@@ -25,12 +26,15 @@ class Target:
         Where heliostats are aimed, ENU metres, (3,).
     markers
         Further known points by name, ENU metres.
+    marks
+        What is painted on it for cameras to find it by.
     """
 
     name: str
     corners: FloatArray
     center: FloatArray
     markers: Mapping[str, FloatArray] = field(default_factory=dict)
+    marks: tuple[Mark, ...] = ()
 
     def __post_init__(self) -> None:
         corners = as_vectors(self.corners, f"target {self.name}: corners")
@@ -42,6 +46,10 @@ class Target:
             )
         object.__setattr__(self, "corners", corners)
         object.__setattr__(self, "center", center)
+        names = [mark.name for mark in self.marks]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"target {self.name}: mark {name}: the name occurs twice")
         if np.linalg.norm(np.cross(self._across, self._up)) < 1e-6:
             raise InputError(
                 f"target {self.name}: its corners span no area; give four corners of a rectangle"

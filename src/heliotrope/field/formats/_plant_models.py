@@ -51,6 +51,18 @@ class SiteTable(Strict):
     delta_t_s: Number | None = Field(None, description="TT - UT1; default from the date.")
 
 
+class MarkTable(Strict):
+    """A mark on a target: L, T, square, disc, tag or taught picture."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["corner", "tee", "square", "disc", "tag", "picture"]
+    at_m: Vector = Field(description="ENU of its vertex, middle of bar, or centre.")
+    size_m: Positive
+    stroke_m: Positive | None = Field(None, description="Of a corner or tee; default a fifth.")
+    turn_deg: Number = Field(0.0, description="Counterclockwise, as seen from the front.")
+    code: str = Field("", description="Of a tag 4X4_50:7 or APRILTAG_36h11:7; of a picture a file.")
+
+
 class TargetTable(Strict):
     """``[[targets]]``: four corners from the upper left as seen from the front, or a size."""
 
@@ -61,6 +73,7 @@ class TargetTable(Strict):
     height_m: Positive | None = None
     facing_deg: Number | None = Field(None, description="Azimuth that the front looks to.")
     markers_m: dict[str, Vector] = Field(default_factory=dict)
+    marks: list[MarkTable] = Field(default_factory=list)
 
 
 class ReceiverTable(Strict):
@@ -75,6 +88,26 @@ class ReceiverTable(Strict):
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
     radius_m: Annotated[float, Field(ge=0)] = 0.0
     opening_angle_rad: Annotated[float, Field(ge=0)] = 0.0
+
+
+class CameraTable(Strict):
+    """``[[cameras]]``: a pinhole with distortion, in the convention of OpenCV."""
+
+    name: str = Field(min_length=1)
+    size_px: Annotated[list[Annotated[int, Field(ge=1)]], Field(min_length=2, max_length=2)]
+    focal_px: Annotated[list[Positive], Field(min_length=2, max_length=2)]
+    center_px: Annotated[list[Number], Field(min_length=2, max_length=2)]
+    skew_px: Number = 0.0
+    distortion: Annotated[list[Number], Field(min_length=5, max_length=5)] = Field(
+        default_factory=lambda: [0.0] * 5, description="k1, k2, p1, p2, k3."
+    )
+    position_m: Vector | None = None
+    rotation: Annotated[list[Vector], Field(min_length=3, max_length=3)] | None = Field(
+        None, description="Rows: the camera's right, down and forward in ENU."
+    )
+    targets: list[str] = Field(default_factory=list)
+    source: str = ""
+    deviation_px: Annotated[float, Field(ge=0)] = 0.0
 
 
 class ChainTable(Strict):
@@ -171,3 +204,4 @@ class PlantDocument(Strict):
     groups: dict[str, GroupTable] = Field(min_length=1)
     targets: list[TargetTable] = Field(default_factory=list)
     receivers: list[ReceiverTable] = Field(default_factory=list)
+    cameras: list[CameraTable] = Field(default_factory=list)

@@ -17,6 +17,12 @@ import numpy as np
 from pydantic import ValidationError
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._plant_cameras import (
+    build_camera,
+    build_mark,
+    camera_document,
+    mark_document,
+)
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
@@ -99,7 +105,7 @@ def _models() -> list[Any]:
 
     return [
         models.PlantDocument, models.PlantTable, models.SiteTable, models.TargetTable,
-        models.ReceiverTable, models.GroupTable, models.ChainTable, models.RotaryDrive,
+        models.MarkTable, models.ReceiverTable, models.CameraTable, models.GroupTable, models.ChainTable, models.RotaryDrive,
         models.LinearDrive,
     ]  # fmt: skip
 
@@ -116,7 +122,7 @@ def _assemble(
         pressure=document.site.pressure_pa, temperature_c=document.site.temperature_c,
         name=document.site.name, delta_t=document.site.delta_t_s,
     )  # fmt: skip
-    groups, targets, receivers = {}, [], []
+    groups, targets, receivers, cameras = {}, [], [], []
     for group in sorted(set(table.group) - set(document.groups)):
         known = ", ".join(document.groups)
         problems.append(
@@ -145,10 +151,16 @@ def _assemble(
             )  # fmt: skip
         except InputError as error:
             problems.append(FormatError(path, str(error), f"receivers[{k}]"))
+    for k, camera in enumerate(document.cameras):
+        try:
+            cameras.append(build_camera(camera))
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"cameras[{k}]"))
     if problems:
         return None
     try:
-        return Plant(document.plant.name, site, groups, tuple(targets), tuple(receivers))
+        return Plant(document.plant.name, site, groups, tuple(targets), tuple(receivers),
+                     cameras=tuple(cameras))  # fmt: skip
     except InputError as error:
         problems.append(FormatError(path, str(error)))
         return None
@@ -156,10 +168,11 @@ def _assemble(
 
 def _target(table: TargetTable) -> Target:
     markers = {name: np.array(point) for name, point in table.markers_m.items()}
+    marks = tuple(build_mark(mark) for mark in table.marks)
     if table.corners_m is not None:
         corners = np.array(table.corners_m)
         center = corners.mean(axis=0) if table.center_m is None else np.array(table.center_m)
-        return Target(table.name, corners, center, markers)
+        return Target(table.name, corners, center, markers, marks)
     size = (table.center_m, table.width_m, table.height_m, table.facing_deg)
     if any(value is None for value in size):
         raise InputError(
@@ -167,7 +180,7 @@ def _target(table: TargetTable) -> Target:
         )
     center = np.array(table.center_m)
     corners = rectangle(center, size[1] or 0.0, size[2] or 0.0, np.radians(size[3] or 0.0))
-    return Target(table.name, corners, center, markers)
+    return Target(table.name, corners, center, markers, marks)
 
 
 def rectangle(center: FloatArray, width: float, height: float, facing: float) -> FloatArray:
@@ -232,10 +245,12 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
                 "center_m": t.center.tolist(),
                 "corners_m": t.corners.tolist(),
                 "markers_m": {k: np.asarray(v).tolist() for k, v in t.markers.items()},
+                "marks": [mark_document(mark) for mark in t.marks],
             }
             for t in plant.targets
         ],
         "receivers": [_receiver_document(r) for r in plant.receivers],
+        "cameras": [camera_document(camera) for camera in plant.cameras],
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))

@@ -1,0 +1,70 @@
+"""Marks on a target: what a camera finds it by."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_vectors
+
+#: Kinds of marks, each with its point (where its coordinates are) and its drawing at turn 0.
+KINDS: dict[str, str] = {
+    "corner": "an L; its outer vertex, arms to the right and down",
+    "tee": "a T; the middle of the outer edge of its bar, stem down",
+    "square": "a filled square; its centre",
+    "disc": "a filled disc; its centre",
+    "tag": "an ArUco or AprilTag square; its centre, upright",
+    "picture": "whatever a taught picture shows; the picture's centre",
+}
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A dark mark on a light target.
+
+    Attributes
+    ----------
+    name
+        Unique on its target ("upper_left").
+    kind
+        One of :data:`KINDS`.
+    point
+        Where it is, ENU metres, (3,): of which point of the drawing, :data:`KINDS` says.
+    size
+        Length of an arm, of the bar and of the whole T, side or diameter, m.
+    stroke
+        Breadth of the strokes of a corner or a tee, m.
+    turn
+        The drawing is turned by this, counterclockwise as seen from the front, rad.
+    code
+        Of a tag: dictionary of OpenCV and number, "4X4_50:7" or "APRILTAG_36h11:7". Of a
+        picture: its file, beside the plant file.
+    """
+
+    name: str
+    kind: str
+    point: FloatArray
+    size: float
+    stroke: float = 0.0
+    turn: float = 0.0
+    code: str = ""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise InputError(f"mark {self.name}: kind {self.kind!r}; known: {', '.join(KINDS)}")
+        point = as_vectors(self.point, f"mark {self.name}: point")
+        if point.shape != (3,):
+            raise InputError(f"mark {self.name}: point {point.shape} must have the shape (3,)")
+        object.__setattr__(self, "point", point)
+        if not (np.isfinite(self.size) and self.size > 0.0):
+            raise InputError(f"mark {self.name}: size {self.size} m must be above 0")
+        if not np.isfinite(self.turn):
+            raise InputError(f"mark {self.name}: turn {self.turn} rad must be finite")
+        if self.kind in ("corner", "tee") and not 0.0 < self.stroke < self.size:
+            raise InputError(
+                f"mark {self.name}: stroke {self.stroke} m must be above 0 and below its size "
+                f"of {self.size} m"
+            )
+        if self.kind in ("tag", "picture") and not self.code:
+            what = 'a dictionary and number as "4X4_50:7"' if self.kind == "tag" else "a file"
+            raise InputError(f"mark {self.name}: a {self.kind} needs its code, {what}")

@@ -1,0 +1,1 @@
+"""The target camera: from a photograph to a place in metres, or the reason why not."""

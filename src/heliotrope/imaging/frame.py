@@ -1,0 +1,74 @@
+"""A frame: what a camera saw, when, and how certain the time is."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+
+#: Pixels of a frame: grey (H, W) or blue-green-red (H, W, 3), 8 or 16 bit.
+Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph.
+
+    Attributes
+    ----------
+    pixels
+        Grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
+    name
+        What to call it: a file's path, a source and a number.
+    time
+        Middle of the exposure, with its zone; None if unknown.
+    time_deviation
+        Standard deviation of the time, s; NaN if unknown.
+    exposure
+        s; NaN if unknown.
+    gain
+        Of the sensor, relative; NaN if unknown.
+    count
+        Frames averaged into it.
+    """
+
+    pixels: Pixels
+    name: str = ""
+    time: datetime | None = None
+    time_deviation: float = float("nan")
+    exposure: float = float("nan")
+    gain: float = float("nan")
+    count: int = 1
+
+    def __post_init__(self) -> None:
+        shape = self.pixels.shape
+        if not (len(shape) == 2 or (len(shape) == 3 and shape[2] == 3)) or min(shape) < 1:
+            raise InputError(f"{self.name or 'frame'}: pixels {shape} must be (H, W) or (H, W, 3)")
+        if self.pixels.dtype not in (np.uint8, np.uint16):
+            raise InputError(
+                f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; give uint8 or uint16"
+            )
+        if self.time is not None and self.time.tzinfo is None:
+            raise InputError(f"{self.name or 'frame'}: its time has no zone")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    @property
+    def full_scale(self) -> float:
+        """The greatest value that a pixel can have."""
+        return float(np.iinfo(self.pixels.dtype).max)
+
+    @property
+    def grey(self) -> npt.NDArray[Any]:
+        """Brightness (H, W) in the frame's own type: the weights of Rec. 601."""
+        import cv2
+
+        if self.pixels.ndim == 2:
+            return self.pixels
+        return cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY)
