@@ -5,8 +5,8 @@ have been published. Positions are WGS84; they are converted exactly.
 """
 
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats._json import Node, read_json
 from heliotrope.field.formats._textfile import write_text
 from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, enu_to_geodetic, geodetic_to_enu
@@ -27,6 +28,18 @@ Origin = tuple[float, float, float]
 
 # θ₀ of the first joint counts from the horizontal, the file's from the vertical.
 _AXIS_1_ZERO = -0.5 * np.pi
+
+#: Length and breadth of the strokes of Jülich's marks, m, read off photographs.
+MARK_SIZE, MARK_STROKE = 0.735, 0.15
+# What stands at the measured points: kind and turn.
+_MARKS = {
+    "upper_left": ("corner", 0.0),
+    "upper_middle": ("tee", 0.0),
+    "upper_right": ("corner", -0.5 * np.pi),
+    "lower_right": ("corner", np.pi),
+    "lower_middle": ("tee", np.pi),
+    "lower_left": ("corner", 0.5 * np.pi),
+}
 
 
 @dataclass(frozen=True)
@@ -208,7 +221,7 @@ def read_tower(path: str | Path) -> Tower:
             raise
         except InputError as error:
             raise node.fail(str(error)) from None
-    return Tower(origin, tuple(targets), tuple(receivers))
+    return Tower(origin, with_marks(targets), tuple(receivers))
 
 
 def _corners(node: Node, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
@@ -226,6 +239,29 @@ def _target(name: str, node: Node, points: dict[str, FloatArray]) -> Target:
     corners = _corners(node, points)
     markers = {k: v for k, v in points.items() if k != "center"}
     return Target(name, corners, points["center"], markers)
+
+
+def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
+    """Return targets with the marks that stand at their measured points at Jülich.
+
+    Ls stand at free corners, Ts at the middles and where two targets meet; the points are
+    on their outer edges. The files do not say so: it is read off published photographs,
+    sizes to a centimetre.
+    """
+    marked = []
+    for target in targets:
+        corners = [c for t in targets if t is not target for c in t.corners]
+        marks = []
+        for name, point in target.markers.items():
+            if name not in _MARKS:
+                continue
+            kind, turn = _MARKS[name]
+            if kind == "corner" and any(np.linalg.norm(point - c) < 0.05 for c in corners):
+                side = -1.0 if name.endswith("right") else 1.0
+                kind, turn = "tee", side * 0.5 * np.pi
+            marks.append(Mark(name, kind, point, MARK_SIZE, MARK_STROKE, turn))
+        marked.append(replace(target, marks=tuple(marks)))
+    return tuple(marked)
 
 
 def _receiver(name: str, kind: str, node: Node, points: dict[str, FloatArray]) -> Receiver:

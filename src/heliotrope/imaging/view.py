@@ -1,0 +1,287 @@
+"""A view: how a plane with targets lies in one frame, with its covariance."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.camera import Camera
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.projection import undistort
+
+#: Of a lens of which nothing is known: standard deviation of k1 at a focal length of
+#: the frame's longer side. A lens for photography stays below.
+LENS_DEVIATION = 0.1
+
+
+@dataclass(frozen=True)
+class Face:
+    """A plane with one or more targets on it.
+
+    Attributes
+    ----------
+    targets
+        Of which each lies within some centimetres of the plane.
+    origin
+        ENU metres, (3,).
+    axes
+        Unit axes to the right as seen from the front, and up, (2, 3).
+    """
+
+    targets: tuple[Target, ...]
+    origin: FloatArray
+    axes: FloatArray
+
+    def plane(self, points: npt.ArrayLike) -> FloatArray:
+        """Return metres right of and above the origin, (..., 2), of ENU points (..., 3)."""
+        return np.asarray((np.asarray(points, dtype=np.float64) - self.origin) @ self.axes.T)
+
+    def point(self, plane: npt.ArrayLike) -> FloatArray:
+        """Return ENU points (..., 3) of places in the plane (..., 2)."""
+        return self.origin + np.asarray(plane, dtype=np.float64) @ self.axes
+
+    @property
+    def span(self) -> FloatArray:
+        """Least and greatest plane coordinates of the targets' corners, (2, 2)."""
+        corners = self.plane(np.concatenate([t.corners for t in self.targets]))
+        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+
+
+def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
+    """Return targets grouped by the plane that they lie in.
+
+    Parameters
+    ----------
+    targets
+        Of a plant.
+    apart
+        Corners nearer to a plane than this, m, lie in it.
+    """
+    groups: list[list[Target]] = []
+    for target in targets:
+        for group in groups:
+            first = group[0]
+            depth = np.abs((target.corners - first.center) @ first.normal)
+            # Two towers may show their targets in one plane by chance, far apart.
+            reach = 2.0 * max(first.width, first.height, target.width, target.height)
+            near = any(np.linalg.norm(target.center - g.center) < reach for g in group)
+            if depth.max() < apart and near and float(target.normal @ first.normal) > 0.98:
+                group.append(target)
+                break
+        else:
+            groups.append([target])
+    found = []
+    for group in groups:
+        origin = np.mean([t.center for t in group], axis=0)
+        found.append(Face(tuple(group), origin, group[0].axes))
+    return found
+
+
+@dataclass(frozen=True)
+class View:
+    """How a face lies in a frame.
+
+    Attributes
+    ----------
+    face
+        The plane.
+    lens
+        Focal length and distortion, known or estimated with the view.
+    H_norm_plane
+        From plane metres to undistorted x/z, y/z, (3, 3).
+    covariance
+        Of the eight free numbers of the homography and of k1, (9, 9), in the scaled
+        coordinates of :func:`fit_view`.
+    residual
+        RMS of the points' residuals, pixels.
+    """
+
+    face: Face
+    lens: Camera
+    H_norm_plane: FloatArray
+    covariance: FloatArray
+    residual: float
+
+    def to_pixels(self, plane: npt.ArrayLike) -> FloatArray:
+        """Return pixels (..., 2) of places in the plane (..., 2), m."""
+        place = np.asarray(plane, dtype=np.float64)
+        return distort(self.lens, _apply(self.H_norm_plane, place))
+
+    def to_plane(self, pixels: npt.ArrayLike) -> FloatArray:
+        """Return places in the plane (..., 2), m, that pixels (..., 2) show."""
+        return _apply(np.linalg.inv(self.H_norm_plane), undistort(self.lens, pixels))
+
+    def scale(self, plane: npt.ArrayLike) -> FloatArray:
+        """Return d(pixel)/d(plane), pixels per metre, (..., 2, 2)."""
+        place = np.asarray(plane, dtype=np.float64)
+        step = 1e-3
+        sides = [
+            (self.to_pixels(place + step * e) - self.to_pixels(place - step * e)) / (2.0 * step)
+            for e in np.eye(2)
+        ]
+        return np.stack(sides, axis=-1)
+
+    def covariance_at(self, plane: npt.ArrayLike) -> FloatArray:
+        """Return the covariance, m², (2, 2), of the place that a certain pixel shows.
+
+        It is that of the view alone: of the marks, their survey and the lens.
+        """
+        place = np.asarray(plane, dtype=np.float64)
+        numbers = _numbers(self.face, self.H_norm_plane, self.lens)
+        J = _slopes(lambda p: _predict(self.face, self.lens, p, place[None])[0], numbers)
+        moved = np.linalg.solve(self.scale(place), J)
+        return np.asarray(moved @ self.covariance @ moved.T)
+
+
+def distort(lens: Camera, plane: npt.ArrayLike) -> FloatArray:
+    """Return pixels (..., 2) of undistorted places x/z, y/z (..., 2); Brown and Conrady."""
+    return _distort(lens.matrix, lens.distortion, np.asarray(plane, dtype=np.float64))
+
+
+def _distort(m: FloatArray, distortion: FloatArray, plane: FloatArray) -> FloatArray:
+    x, y = plane[..., 0], plane[..., 1]
+    k1, k2, p1, p2, k3 = distortion
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    v = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([m[0, 0] * u + m[0, 1] * v + m[0, 2], m[1, 1] * v + m[1, 2]], axis=-1)
+
+
+def unknown_lens(size: tuple[int, int]) -> Camera:
+    """Return a lens of which only the size of the frames is known, without distortion."""
+    focal = float(max(size))
+    matrix = np.array(
+        [[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]]
+    )
+    return Camera("unknown", size, matrix)
+
+
+def homography(plane: FloatArray, norm: FloatArray) -> FloatArray:
+    """Return the direct linear transform (3, 3) of four or more pairs (N, 2)."""
+    middle, scale = plane.mean(axis=0), np.ptp(plane, axis=0).max()
+    x, y = ((plane - middle) / scale).T
+    u, v = norm.T
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y, -u], axis=-1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y, -v], axis=-1),
+        ]
+    )
+    H = np.linalg.svd(rows)[2][-1].reshape(3, 3)
+    shift = np.array([[1.0, 0.0, -middle[0]], [0.0, 1.0, -middle[1]], [0.0, 0.0, scale]])
+    H = H @ shift
+    return np.asarray(H / H[2, 2]) if abs(H[2, 2]) > 1e-12 else np.asarray(H)
+
+
+def fit_view(
+    face: Face,
+    plane: FloatArray,
+    pixels: FloatArray,
+    covariance: FloatArray,
+    lens: Camera,
+    lens_known: bool,
+) -> View:
+    """Return the view of greatest posterior probability.
+
+    Parameters
+    ----------
+    face
+        The plane.
+    plane, pixels
+        Points in the plane, m, and where they are seen, (N, 2), N ≥ 4.
+    covariance
+        Of the pixels, survey included, (N, 2, 2).
+    lens
+        To begin with; without ``lens_known`` its k1 is estimated, with a prior of
+        :data:`LENS_DEVIATION`.
+
+    Notes
+    -----
+    The covariance is scaled by the residuals as far as there are more of them than
+    unknowns: (ν + χ²)/(ν + dof) with ν = 4, never below 1.
+    """
+    white = np.linalg.inv(np.linalg.cholesky(covariance))
+    # A thousandth of the prior holds a known lens without a second code path.
+    deviation = LENS_DEVIATION * (1e-4 if lens_known else 1.0)
+    prior = lens.distortion[0]
+
+    def residuals(numbers: FloatArray) -> FloatArray:
+        miss = _predict(face, lens, numbers, plane) - pixels
+        whitened = np.einsum("nij,nj->ni", white, miss).ravel()
+        return np.append(whitened, (numbers[8] - prior) / deviation)
+
+    numbers = _numbers(face, homography(plane, undistort(lens, pixels)), lens)
+    J, cost = _slopes(residuals, numbers), np.inf
+    for _ in range(20):
+        miss = residuals(numbers)
+        J = _slopes(residuals, numbers)
+        step = np.linalg.lstsq(J, -miss, rcond=None)[0]
+        numbers = numbers + step
+        # The start is within a pixel or two: Gauss-Newton converges from there.
+        before, cost = cost, float(miss @ miss)
+        if before - cost <= 1e-6 * cost:
+            break
+    end = residuals(numbers)
+    chi2 = float(end @ end)
+    dof = max(2 * len(plane) - 8 - (0 if lens_known else 1), 0)
+    factor = max((4.0 + chi2) / (4.0 + dof), 1.0)
+    information = J.T @ J
+    H, k1 = _unpack(face, numbers)
+    distortion = lens.distortion.copy()
+    distortion[0] = k1
+    fitted = replace(lens, distortion=distortion)
+    miss = distort(fitted, _apply(H, plane)) - pixels
+    return View(
+        face=face,
+        lens=fitted,
+        H_norm_plane=H,
+        covariance=factor * np.linalg.pinv(information, hermitian=True),
+        residual=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),
+    )
+
+
+def _slopes(function: Callable[[FloatArray], FloatArray], numbers: FloatArray) -> FloatArray:
+    """Return the derivatives of a function by central differences, (M, 9)."""
+    steps = 1e-6 * np.eye(len(numbers))
+    return np.stack(
+        [(function(numbers + step) - function(numbers - step)) / 2e-6 for step in steps], axis=-1
+    )
+
+
+def _apply(H: FloatArray, points: FloatArray) -> FloatArray:
+    x, y = points[..., 0], points[..., 1]
+    w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+    return np.stack(
+        [
+            (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w,
+            (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w,
+        ],
+        axis=-1,
+    )
+
+
+def _scales(face: Face) -> FloatArray:
+    """Plane coordinates over this are of order one."""
+    return np.array([1.0, 1.0, 0.0]) * 0.5 * float(np.ptp(face.span, axis=0).max()) + [0, 0, 1]
+
+
+def _numbers(face: Face, H: FloatArray, lens: Camera) -> FloatArray:
+    """Return the nine unknowns: H of scaled coordinates, its last at 1, and k1."""
+    scaled = (H / H[2, 2]) * _scales(face)
+    return np.append(scaled.ravel()[:8], lens.distortion[0])
+
+
+def _unpack(face: Face, numbers: FloatArray) -> tuple[FloatArray, float]:
+    H = np.append(numbers[:8], 1.0).reshape(3, 3) / _scales(face)
+    return H, float(numbers[8])
+
+
+def _predict(face: Face, lens: Camera, numbers: FloatArray, plane: FloatArray) -> FloatArray:
+    H, k1 = _unpack(face, numbers)
+    distortion = lens.distortion.copy()
+    distortion[0] = k1
+    return _distort(lens.matrix, distortion, _apply(H, plane))
