@@ -1,0 +1,650 @@
+"""Lenses and poses: a chessboard calibrates the lens, known points tell where a camera stands.
+
+Distances in pixels are two-dimensional: a deviation is the root of the mean squared
+length of the residuals. A ``sigma`` is that of one coordinate.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.field.camera import Camera
+from heliotrope.geometry import FloatArray, as_float, as_vectors, cross_matrix
+
+#: Terms of Brown and Conrady's distortion that a lens may have.
+MODELS: dict[str, tuple[int, ...]] = {
+    "none": (), "k1": (0,), "k1 k2": (0, 1), "k1 k2 p1 p2": (0, 1, 2, 3),
+    "k1 k2 p1 p2 k3": (0, 1, 2, 3, 4),
+}  # fmt: skip
+#: Boards whose normals differ by less than this tell the same about the lens, rad.
+SAME_TILT = np.radians(3.0)
+#: A lens whose focal length is less certain is refused, relative.
+FOCAL_LIMIT = 0.1
+#: Priors of marks alone: log of focal length over width ±, principal point over width ±, k1 ±.
+LOG_FOCAL, LOG_FOCAL_SIGMA, CENTER_SIGMA, K1_SIGMA = np.log(3.0), 1.5, 0.02, 0.1
+#: Rows of the covariance of a :class:`CameraFit`.
+POSE = ("turn_right", "turn_down", "turn_forward", "east", "north", "up")
+INNER = ("log_focal", "center_x", "center_y", "k1")
+
+
+@dataclass(frozen=True)
+class Board:
+    """One picture of a chessboard.
+
+    Attributes
+    ----------
+    name, corners
+        Of the picture; inner corners in it, row by row, px, (N, 2), None if not found.
+    reason
+        Why it went not into the lens; empty if it did.
+    deviation, tilt
+        RMS of its residuals, px, and between its normal and the optical axis, rad; NaN if
+        unknown.
+    """
+
+    name: str
+    corners: FloatArray | None
+    reason: str = ""
+    deviation: float = float("nan")
+    tilt: float = float("nan")
+
+    @property
+    def used(self) -> bool:
+        """Whether it went into the lens."""
+        return not self.reason
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A calibrated lens.
+
+    Attributes
+    ----------
+    size, matrix, distortion, deviation
+        As of :class:`~heliotrope.field.camera.Camera`.
+    sigma, model
+        Standard deviations of both focal lengths, the principal point (px) and the five terms
+        of the distortion, (9,); 0 for those that are not in the one of :data:`MODELS` used.
+    boards, coverage
+        All pictures, in their order; share of the frame that boards were seen in.
+    notes
+        What to know about it, in sentences.
+    """
+
+    size: tuple[int, int]
+    matrix: FloatArray
+    distortion: FloatArray
+    deviation: float
+    sigma: FloatArray
+    model: str
+    boards: tuple[Board, ...]
+    coverage: float = float("nan")
+    notes: tuple[str, ...] = ()
+
+    def camera(self, name: str) -> Camera:
+        """Return a camera with this lens that stands nobody knows where."""
+        return Camera(name, self.size, self.matrix, self.distortion, deviation=self.deviation)
+
+
+# -- chessboards -----------------------------------------------------------------------
+
+
+def find_chessboard(grey: npt.ArrayLike, pattern: tuple[int, int]) -> FloatArray | None:
+    """Return the inner corners, px (columns * rows, 2), in a picture (H, W), or None."""
+    import cv2
+
+    picture: Any = _eight_bit(grey)
+    # On drawn boards of known corners: 0.04 to 0.1 px off as SB finds them without flags, 0.2 to
+    # 0.4 px with EXHAUSTIVE, and 0.03 to 0.06 px after cornerSubPix, from wherever they come.
+    found, corners = cv2.findChessboardCornersSB(picture, pattern)
+    if not found:
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
+        found, corners = cv2.findChessboardCornersSB(picture, pattern, flags=flags)
+    if not found:
+        flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCorners(picture, pattern, flags=flags)
+    if not found:
+        return None
+    grid = as_float(corners).reshape(pattern[1], pattern[0], 2)
+    apart = min(np.linalg.norm(np.diff(grid, axis=k), axis=-1).min() for k in (0, 1))
+    half = int(np.clip(0.25 * apart, 2, 15))
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
+    corners = cv2.cornerSubPix(picture, corners, (half, half), (-1, -1), end)
+    return as_float(corners).reshape(-1, 2)
+
+
+def _eight_bit(grey: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+    picture = np.asarray(grey)
+    if picture.ndim != 2 or picture.dtype not in (np.uint8, np.uint16):
+        what = f"picture {picture.shape} of {picture.dtype}"
+        raise InputError(f"{what}; give grey (H, W), uint8 or uint16")
+    if picture.dtype == np.uint8:
+        return np.ascontiguousarray(picture)
+    # Sensors of 10 or 12 bit leave the upper bits empty.
+    top = max(float(picture.max()), 1.0)
+    return np.asarray(np.round(picture * (255.0 / top)), dtype=np.uint8)
+
+
+def calibrate_chessboard(
+    images: Sequence[npt.ArrayLike], pattern: tuple[int, int], square: float,
+    names: Sequence[str] = (),
+) -> Lens:  # fmt: skip
+    """Return the lens that took pictures of a flat chessboard.
+
+    Parameters
+    ----------
+    images
+        Grey (H, W), uint8 or uint16, all of one size; the board at different tilts, 20° to
+        45°, in all parts of the frame.
+    pattern
+        Columns and rows of inner corners.
+    square
+        Side of a square, m.
+    names
+        What to call the pictures; "picture 1" and so on if not given.
+
+    Raises
+    ------
+    InputError
+        If the pattern is found in fewer than three pictures, or what was found does not
+        determine the focal length.
+    """
+    columns, rows = (int(n) for n in pattern)
+    if min(columns, rows) < 3 or max(columns, rows) > 200:
+        what = f"chessboard of {columns} × {rows} inner corners"
+        raise InputError(f"{what}; give 3 to 200 each, counted between the squares")
+    pictures = [_eight_bit(image) for image in images]
+    called = list(names) or [f"picture {k + 1}" for k in range(len(pictures))]
+    if len(pictures) < 3:
+        raise InputError(f"{len(pictures)} pictures of a chessboard; give three or more")
+    height, width = pictures[0].shape
+    for name, picture in zip(called, pictures, strict=True):
+        if picture.shape != (height, width):
+            raise InputError(
+                f"{name}: {picture.shape[1]} × {picture.shape[0]} px, but {called[0]} has "
+                f"{width} × {height} px; give pictures of one camera at one setting"
+            )
+    found = [find_chessboard(picture, (columns, rows)) for picture in pictures]
+    return calibrate_corners((width, height), found, (columns, rows), square, called)
+
+
+def calibrate_corners(
+    size: tuple[int, int], corners: Sequence[FloatArray | None], pattern: tuple[int, int],
+    square: float, names: Sequence[str],
+) -> Lens:  # fmt: skip
+    """Return the lens from corners found elsewhere; the rest as :func:`calibrate_chessboard`.
+
+    ``corners`` has one entry for each picture, px (columns * rows, 2), None where none were
+    found. The terms of the distortion are those with the least Bayesian information criterion.
+    """
+    if not (np.isfinite(square) and square > 0.0):
+        raise InputError(f"squares of {square} m; give their side in metres, above 0")
+    columns, rows = pattern
+    plane = np.indices((rows, columns))[::-1].reshape(2, -1).T * square
+    points = np.pad(plane, ((0, 0), (0, 1)))
+    what = f"the pattern of {columns} × {rows} inner corners"
+    boards = [
+        Board(name, seen, f"{what} is not in it" if seen is None else "")
+        for name, seen in zip(names, corners, strict=True)
+    ]
+    if sum(board.used for board in boards) < 3:
+        have = ", ".join(board.name for board in boards if board.used) or "none"
+        raise InputError(
+            f"{what} is found in {have} of {len(boards)} pictures; three or more are needed: are "
+            "the numbers right, is the whole board in the frame, sharp and not burnt out?"
+        )
+    boards = _without_outliers(size, points, boards)
+    solved = [_solve(size, points, boards, model) for model in MODELS]
+    lens, _, normals = min(solved, key=lambda triple: triple[1])
+    _check_lens(lens, normals)
+    outer = [0, columns - 1, rows * columns - 1, (rows - 1) * columns]
+    seen = [b.corners[outer] for b in boards if b.used and b.corners is not None]
+    lens = replace(lens, coverage=_coverage(size, seen))
+    return replace(lens, notes=_lens_notes(lens))
+
+
+def _solve(
+    size: tuple[int, int], points: FloatArray, boards: Sequence[Board], model: str
+) -> tuple[Lens, float, FloatArray]:
+    """Return the lens with the terms of a model, its criterion and the boards' normals."""
+    import cv2
+
+    kept = (cv2.CALIB_FIX_K1, 0), (cv2.CALIB_FIX_K2, 1), (cv2.CALIB_ZERO_TANGENT_DIST, 2), (
+        cv2.CALIB_FIX_K3, 4)  # fmt: skip
+    flags = sum(flag for flag, term in kept if term not in MODELS[model])
+    seen = [np.float32(b.corners).reshape(-1, 1, 2) for b in boards if b.used]
+    where = [np.float32(points).reshape(-1, 1, 3)] * len(seen)
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
+    try:
+        deviation, matrix, distortion, turns, _, sigma, _, apart = cv2.calibrateCameraExtended(
+            where, seen, size, np.eye(3), np.zeros(5), flags=flags, criteria=end
+        )
+    except cv2.error:
+        raise InputError(_FRONTAL.format("the focal length")) from None
+    if not (np.isfinite(matrix).all() and np.isfinite(sigma).all() and np.isfinite(deviation)):
+        raise InputError(_FRONTAL.format("the focal length"))
+    normals = np.stack([cv2.Rodrigues(as_float(turn))[0][:, 2] for turn in turns])
+    n = 2 * len(seen) * len(points)
+    # The noise is unknown; without any, the digits of the 32-bit corners stand in for it.
+    floor = (np.finfo(np.float32).eps * max(size)) ** 2
+    criterion = n * np.log(0.5 * deviation**2 + floor) + len(MODELS[model]) * np.log(n)
+    tilts = np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0))
+    told = zip(boards, np.cumsum([b.used for b in boards]) - 1, strict=True)
+    after = [replace(b, deviation=float(np.ravel(apart)[k]), tilt=float(tilts[k])) if b.used else b
+             for b, k in told]  # fmt: skip
+    lens = Lens(size, as_float(matrix), as_float(distortion).ravel()[:5], float(deviation),
+                as_float(sigma).ravel()[:9], model, tuple(after))  # fmt: skip
+    return lens, float(criterion), as_float(normals)
+
+
+_FRONTAL = (
+    "{} is not determined: the boards do not tell it from the distance; hold the board at "
+    "three or more different tilts of 20° to 45°"
+)
+
+
+def _without_outliers(
+    size: tuple[int, int], points: FloatArray, boards: Sequence[Board]
+) -> list[Board]:
+    """Refuse boards whose residuals are far above the others', the worst first."""
+    kept = list(boards)
+    while sum(board.used for board in kept) > 3:
+        # With all terms, so that no board is refused for what the lens does.
+        solved = _solve(size, points, kept, "k1 k2 p1 p2 k3")[0].boards
+        apart = np.array([board.deviation if board.used else np.nan for board in solved])
+        usual, worst = float(np.nanmedian(apart)), int(np.nanargmax(apart))
+        if apart[worst] <= max(3.0 * usual, usual + 0.1):
+            break
+        reason = f"its residuals of {apart[worst]:.2f} px are far above the usual {usual:.2f} px"
+        kept[worst] = replace(kept[worst], reason=reason, deviation=float(apart[worst]))
+    return kept
+
+
+def _check_lens(lens: Lens, normals: FloatArray) -> None:
+    """Refuse a lens that the boards do not determine."""
+    f, sigma = lens.matrix[0, 0], lens.sigma[0]
+    if sigma > FOCAL_LIMIT * f or sigma == 0.0:
+        raise InputError(_FRONTAL.format(f"the focal length of {f:.0f} px ± {sigma:.0f} px"))
+    different: list[FloatArray] = []
+    for normal in normals:
+        if all(np.linalg.norm(np.cross(normal, other)) > np.sin(SAME_TILT) for other in different):
+            different.append(normal)
+    if len(different) < 3:
+        tilts = ", ".join(f"{np.degrees(b.tilt):.0f}°" for b in lens.boards if b.used)
+        have = f"{len(different)} differ by more than {np.degrees(SAME_TILT):.0f}°"
+        raise InputError(_FRONTAL.format("the lens") + f" (now {have}; from the axis: {tilts})")
+
+
+def _coverage(size: tuple[int, int], outlines: Sequence[FloatArray]) -> float:
+    """Return the share of the frame inside quadrilaterals (4, 2)."""
+    import cv2
+
+    scale = 256.0 / max(size)
+    mask: Any = np.zeros((int(np.ceil(size[1] * scale)), int(np.ceil(size[0] * scale))), np.uint8)
+    for outline in outlines:
+        cv2.fillConvexPoly(mask, np.round(outline * scale).astype(np.int32), 1)
+    return float(mask.mean())
+
+
+def _lens_notes(lens: Lens) -> tuple[str, ...]:
+    relative, share = 100.0 * lens.sigma[0] / lens.matrix[0, 0], 100.0 * lens.coverage
+    used = sum(board.used for board in lens.boards)
+    notes = (
+        (relative > 1.0, f"the focal length is known to {relative:.1f} %; steeper tilts tell more"),
+        (share < 50.0, f"boards cover {share:.0f} % of the frame; beyond, distortion is guessed"),
+        (used < 6, f"{used} pictures were used; ten or more make a lens that can be trusted"),
+    )  # fmt: skip
+    return tuple(text for said, text in notes if said)
+
+
+# -- poses -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """A camera from points seen.
+
+    Attributes
+    ----------
+    camera, residuals
+        With its pose; seen minus predicted, px, (N, 2).
+    names, covariance
+        Rows: :data:`POSE`, then :data:`INNER` if they were solved; (6, 6) or (10, 10). Turns
+        are about the camera's own axes, rad; the position is in ENU metres.
+    plane_sigma
+        Predicted standard deviation, per coordinate, of where a pixel lies on the plane of
+        the points, between them, m: that of the camera alone, not of what is seen there.
+    other
+        A second pose that explains the points as well, if there is one.
+    notes
+        What the points do not determine and what contradicts them, in sentences.
+    """
+
+    camera: Camera
+    names: tuple[str, ...]
+    covariance: FloatArray
+    residuals: FloatArray
+    plane_sigma: float
+    other: Camera | None = None
+    notes: tuple[str, ...] = ()
+
+    def sigma(self, name: str) -> float:
+        """Return the standard deviation of one row."""
+        k = self.names.index(name)
+        return float(np.sqrt(self.covariance[k, k]))
+
+
+def resection(
+    lens: Lens | Camera, points: npt.ArrayLike, pixels: npt.ArrayLike,
+    sigma: npt.ArrayLike = 0.3, name: str = "camera",
+) -> CameraFit:  # fmt: skip
+    """Return where a camera stands whose lens is known.
+
+    Both poses of a plane (Collins and Bartoli 2014, IPPE) and that of the general problem
+    (SQPnP) are refined by least squares. The covariance is that of the points' noise; the
+    lens counts as known.
+
+    Parameters
+    ----------
+    lens
+        Lens or camera; a camera's pose, if it has one, is not used.
+    points
+        ENU metres, (N, 3), four or more, not on one line.
+    pixels
+        Where they are seen, (N, 2).
+    sigma
+        Standard deviation of a coordinate of the pixels: one number, (N,), or covariances
+        (N, 2, 2) in px².
+    name
+        Of the camera, if a lens is given.
+
+    Raises
+    ------
+    InputError
+        If the points are too few, on one line, or no pose explains them.
+    """
+    base = lens.camera(name) if isinstance(lens, Lens) else lens
+    problem = _problem(*_observed(points, pixels, sigma), base, free=False)
+    return _finish(problem, [np.concatenate(start) for start in _starts(problem, base)])
+
+
+def calibrate_marks(
+    size: tuple[int, int], points: Sequence[npt.ArrayLike], pixels: Sequence[npt.ArrayLike],
+    sigma: float | Sequence[npt.ArrayLike] = 0.3, name: str = "camera",
+) -> CameraFit:  # fmt: skip
+    """Return a camera of which nothing is known but the points that it saw.
+
+    Solves pose, focal length (pixels are square), principal point and k1, the last three with
+    priors: 3 widths within a factor of 4.5, the frame's centre ± 2 % of the width, 0 ± 0.1.
+    What the points do not determine keeps its prior.
+
+    Parameters
+    ----------
+    size
+        Width and height of the frames, px.
+    points, pixels
+        As of :func:`resection`, for each frame of the camera, which stands still between
+        them; four or more points in all. It raises what that raises.
+    sigma
+        As of :func:`resection`; a list has one entry for each frame.
+    name
+        Of the camera.
+    """
+    if not points or len(points) != len(pixels):
+        raise InputError(f"{len(points)} lists of points, {len(pixels)} of pixels; give as many")
+    noise = [sigma] * len(points) if isinstance(sigma, int | float) else sigma
+    frames = [_observed(*frame) for frame in zip(points, pixels, noise, strict=True)]
+    where, seen, white = (np.concatenate(part) for part in zip(*frames, strict=True))
+    problem = _problem(where, seen, white, _pinhole(size, 3.0, name), free=True)
+    tried = []
+    for wide in 0.5 * 2.0 ** np.arange(8):
+        guess = _pinhole(size, wide, name)
+        f = guess.matrix[0, 0]
+        for turn, shift in _starts(problem, guess):
+            x = np.concatenate([turn, shift / f, [np.log(f)], guess.matrix[:2, 2], [0.0]])
+            tried.append((float(np.sum(problem.residuals(x) ** 2)), x))
+    tried.sort(key=lambda pair: pair[0])
+    return _finish(problem, [x for _, x in tried[:6]])
+
+
+def _pinhole(size: tuple[int, int], wide: float, name: str) -> Camera:
+    """Return a camera without distortion whose focal length is ``wide`` widths."""
+    f, (cx, cy) = wide * size[0], (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))
+    return Camera(name, size, np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]))
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Least squares of a pose and, if ``free``, of focal length, principal point and k1.
+
+    The unknowns are the rotation vector and the translation from points about ``origin`` to
+    the camera, then log focal length, principal point and k1. If ``free``, the translation is
+    in units of the focal length: what a frontal plane tells is their ratio.
+    """
+
+    origin: FloatArray
+    local: FloatArray
+    pixels: FloatArray
+    whitener: FloatArray
+    base: Camera
+    free: bool
+
+    def camera(self, x: FloatArray) -> Camera:
+        """Return the camera of unknowns."""
+        matrix, distortion = self.lens(x)
+        position = self.origin - self.turn(x).T @ self.shift(x)
+        return replace(self.base, matrix=matrix, distortion=distortion, position=position,
+                       R_camera_enu=self.turn(x))  # fmt: skip
+
+    def turn(self, x: FloatArray) -> FloatArray:
+        """Return R_camera_enu."""
+        import cv2
+
+        return as_float(cv2.Rodrigues(x[:3])[0])
+
+    def lens(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return matrix and distortion of unknowns."""
+        if not self.free:
+            return self.base.matrix, self.base.distortion
+        f = float(np.exp(np.clip(x[6], -20.0, 20.0)))
+        matrix = np.array([[f, 0.0, x[7]], [0.0, f, x[8]], [0.0, 0.0, 1.0]])
+        return matrix, np.array([x[9], 0.0, 0.0, 0.0, 0.0])
+
+    def predict(self, x: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return pixels (N, 2) and their derivatives (N, 2, P)."""
+        import cv2
+
+        matrix, distortion = self.lens(x)
+        shift = self.shift(x)
+        seen, found = cv2.projectPoints(local, x[:3], shift, matrix, distortion)
+        slope = as_float(found).reshape(len(local), 2, -1)
+        f = matrix[0, 0]
+        focal = (slope[..., 6] + slope[..., 7]) * f + slope[..., 3:6] @ shift
+        inner = [f * slope[..., 3:6], focal[..., None], slope[..., 8:11]]
+        parts = [slope[..., :3], *inner] if self.free else [slope[..., :6]]
+        return as_float(seen).reshape(-1, 2), np.concatenate(parts, axis=-1)
+
+    def shift(self, x: FloatArray) -> FloatArray:
+        """Return the translation, m."""
+        return x[3:6] * self.lens(x)[0][0, 0] if self.free else x[3:6]
+
+    @property
+    def prior(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation of log focal length, principal point and k1."""
+        width, height = self.base.size
+        mean = [LOG_FOCAL + np.log(width), 0.5 * (width - 1), 0.5 * (height - 1), 0.0]
+        sigma = [LOG_FOCAL_SIGMA, CENTER_SIGMA * width, CENTER_SIGMA * width, K1_SIGMA]
+        return np.array(mean), np.array(sigma)
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """Return whitened residuals, those of the priors last."""
+        apart = self.predict(x, self.local)[0] - self.pixels
+        white = np.einsum("nij,nj->ni", self.whitener, apart).ravel()
+        mean, sigma = self.prior
+        return np.concatenate([white, (x[6:] - mean) / sigma]) if self.free else white
+
+    def slopes(self, x: FloatArray) -> FloatArray:
+        """Return the derivatives of :meth:`residuals`."""
+        white = np.einsum("nij,njp->nip", self.whitener, self.predict(x, self.local)[1])
+        prior = np.eye(10)[6:] / self.prior[1][:, None]
+        return np.concatenate([white.reshape(-1, len(x))] + [prior] * self.free)
+
+
+def _observed(
+    points: npt.ArrayLike, pixels: npt.ArrayLike, sigma: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return points, pixels and W (N, 2, 2) with ``W.T @ W`` the inverse of the covariance."""
+    where, seen, given = as_vectors(points, "points"), as_float(pixels), as_float(sigma)
+    if where.ndim != 2 or seen.shape != (len(where), 2):
+        raise InputError(f"points {where.shape} and pixels {seen.shape}; give (N, 3) and (N, 2)")
+    if not np.isfinite(seen).all():
+        row = int(np.argwhere(~np.isfinite(seen))[0, 0])
+        raise InputError(f"pixels[{row}]: {seen[row]} is not finite; leave such points out")
+    if given.shape in ((), (len(where),)):
+        given = np.eye(2) * np.broadcast_to(np.sign(given) * given**2, len(where))[:, None, None]
+    if given.shape != (len(where), 2, 2):
+        raise InputError(f"sigma {given.shape}; give one number, (N,) or (N, 2, 2)")
+    if not (np.isfinite(given).all() and (np.linalg.eigvalsh(given) > 0.0).all()):
+        raise InputError("sigma of the pixels: a variance is not finite and above 0")
+    return where, seen, np.linalg.inv(np.linalg.cholesky(given))
+
+
+def _problem(
+    where: FloatArray, seen: FloatArray, white: FloatArray, base: Camera, free: bool
+) -> _Problem:
+    if len(where) < 4:
+        raise InputError(f"{len(where)} points; four or more tell where a camera stands")
+    origin = where.mean(axis=0)
+    spread = np.linalg.svd(where - origin, compute_uv=False)
+    if spread[1] <= 1e-3 * spread[0]:
+        raise InputError(f"the {len(where)} points lie on one line; take some that span an area")
+    return _Problem(origin, where - origin, seen, white, base, free)
+
+
+def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArray]]:
+    """Return rotation vectors and translations to start from."""
+    import cv2
+
+    local = problem.local
+    _, spread, axes = np.linalg.svd(local)
+    axes = axes * np.linalg.det(axes)
+    ways = [(local, np.eye(3), cv2.SOLVEPNP_SQPNP)]
+    if spread[2] < 0.05 * spread[1]:
+        ways.insert(0, (local @ axes.T * [1.0, 1.0, 0.0], axes, cv2.SOLVEPNP_IPPE))
+    found = []
+    for shape, turned, way in ways:
+        try:
+            _, turns, shifts, _ = cv2.solvePnPGeneric(
+                np.ascontiguousarray(shape), problem.pixels, lens.matrix, lens.distortion, flags=way
+            )
+        except cv2.error:
+            continue
+        for turn, shift in zip(turns, shifts, strict=True):
+            whole = as_float(cv2.Rodrigues(cv2.Rodrigues(turn)[0] @ turned)[0])
+            found.append((whole.ravel(), as_float(shift).ravel()))
+    return [start for start in found if np.isfinite(start).all()]
+
+
+def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
+    """Refine all starts; return the best, and the next if it is hardly worse."""
+    from scipy.optimize import least_squares
+    from scipy.special import chdtri
+
+    solved = []
+    for start in starts:
+        found = least_squares(problem.residuals, start, problem.slopes, method="lm",
+                              x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)  # fmt: skip
+        if (problem.local @ problem.turn(found.x)[2] + problem.shift(found.x)[2] > 0.0).all():
+            solved.append((2.0 * float(found.cost), found.x))
+    name = f"camera {problem.base.name}"
+    if not solved:
+        raise InputError(f"{name}: no pose explains the points; are they named rightly?")
+    solved.sort(key=lambda pair: pair[0])
+    chi2, x = solved[0]
+    camera = problem.camera(x)
+    slopes = problem.slopes(x)
+    freedom = len(slopes) - len(x)
+    # Scaled only where chance does it in one case of a hundred: else it would add noise.
+    scale = chi2 / freedom if freedom and chi2 > chdtri(freedom, 0.01) else 1.0
+    slopes[: 2 * len(problem.local)] /= np.sqrt(scale)
+    rivals = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
+    # The same pose from another start is no other pose.
+    differ = [y for y in rivals if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
+    other = problem.camera(differ[0]) if differ else None
+    size = np.linalg.norm(slopes, axis=0)
+    if not (size.min() > 0.0 and np.linalg.cond(slopes / size) < 1e8):
+        raise InputError(f"{name}: the points do not determine where it stands; take more")
+    raw = np.linalg.inv((slopes / size).T @ (slopes / size)) / size / size[:, None]
+    residuals = problem.pixels - problem.predict(x, problem.local)[0]
+    if problem.free:
+        camera = replace(camera, deviation=float(np.sqrt(2.0 * np.mean(residuals**2))))
+    change = _to_pose(problem, x)
+    fit = CameraFit(camera, POSE + INNER * problem.free, change @ raw @ change.T, residuals,
+                    _plane_sigma(problem, x, raw), other)  # fmt: skip
+    return replace(fit, notes=tuple(_notes(problem, fit, scale)))
+
+
+def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
+    """Return the derivative of turns about the camera's axes and position by the unknowns."""
+    k, shift = cross_matrix(x[:3]), problem.shift(x)
+    angle = max(float(np.linalg.norm(x[:3])), 1e-4)
+    # Left Jacobian of SO(3).
+    a, b = (1.0 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
+    left = np.eye(3) + a * k + b * (k @ k)
+    back = problem.turn(x).T
+    change = np.eye(len(x))
+    change[:3, :3] = left
+    change[3:6, :3] = -back @ cross_matrix(shift) @ left
+    change[3:6, 3:6] = -back
+    if problem.free:
+        change[3:6, 3:6] *= problem.lens(x)[0][0, 0]
+        change[3:6, 6] = -back @ shift
+    return change
+
+
+def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
+    """Return the standard deviation of pixel to plane at the points and half-way between them."""
+    axes = np.linalg.svd(problem.local)[2][:2]
+    few = problem.local[:: len(problem.local) // 40 + 1]
+    points = (0.5 * (few + few[:, None])).reshape(-1, 3)
+    step = 1e-4 * float(np.ptp(few, axis=0).max())
+    across = np.stack(
+        [problem.predict(x, points + step * a)[0] - problem.predict(x, points - step * a)[0]
+         for a in axes], axis=-1,
+    ) / (2.0 * step)  # fmt: skip
+    # The pixel is held: the place on the plane moves by what the prediction does not.
+    moved = np.linalg.solve(across, problem.predict(x, points)[1])
+    return float(np.sqrt(0.5 * np.einsum("nip,pq,niq->n", moved, raw, moved).mean()))
+
+
+def _notes(problem: _Problem, fit: CameraFit, scale: float) -> list[str]:
+    notes = []
+    good = f"pixels on the plane of the points stay good to {1e3 * fit.plane_sigma:.1f} mm"
+    if problem.free and fit.sigma("log_focal") > 0.05:
+        away = np.linalg.norm(np.asarray(fit.camera.position) - problem.origin)
+        have = f"{fit.camera.matrix[0, 0]:.0f} px at {away:.1f} m"
+        unsure = f"uncertain by a factor of {np.exp(fit.sigma('log_focal')):.2f}"
+        notes.append(f"the points do not tell focal length from distance: {have}, {unsure}; {good}")
+    if problem.free:
+        sigma = problem.prior[1]
+        what = ("the principal point", 1, f"the frame's centre ± {sigma[1]:.0f} px"), (
+            "k1", 3, f"0 ± {K1_SIGMA}")  # fmt: skip
+        notes += [
+            f"the points do not determine {quantity}; it keeps its prior, {prior}"
+            for quantity, k, prior in what
+            if fit.sigma(INNER[k]) > 0.7 * sigma[k]
+        ]
+    if fit.other is not None and fit.other.position is not None:
+        place = ", ".join(f"{v:.1f}" for v in fit.other.position)
+        notes.append(f"a second pose explains the points as well, at ({place}) m; {good}")
+    if scale > 1.0:
+        size = np.linalg.norm(fit.residuals, axis=1)
+        notes.append(
+            f"the residuals, up to {size.max():.1f} px at point {int(np.argmax(size)) + 1}, are "
+            f"{np.sqrt(scale):.1f} times what was promised; the covariance is scaled to them"
+        )
+    return notes
