@@ -1,0 +1,211 @@
+"""A face as seen from its front: the frame's brightness on a grid of metres."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.finding import face_marks
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.marks import polygons
+from heliotrope.imaging.view import Face, View, faces
+
+Mask = npt.NDArray[np.bool_]
+
+#: Pixels across the narrower side of a target: a beam's width is tens of them, and a
+#: centroid is found to a twentieth.
+ACROSS = 256
+#: A pixel from this part of the full scale on may be clipped; tone curves end below it.
+CLIPPED = 0.985
+#: The print of a mark is masked with a rim of this, m.
+_RIM = 0.06
+
+
+@dataclass(frozen=True)
+class Rectified:
+    """A face on a grid.
+
+    Attributes
+    ----------
+    face
+        The plane.
+    values
+        Brightness over full scale, (H, W) of float32, row 0 at the top.
+    step
+        Metres from a pixel to the next.
+    first
+        Plane coordinates of the first pixel's centre, m, (2,).
+    surface
+        Where a target's surface is that the frame shows, (H, W).
+    marks
+        Where marks are printed, (H, W).
+    clipped
+        Part of each pixel that is at full scale, (H, W).
+    view
+        How the face lies in the frame; None for a crop.
+    """
+
+    face: Face
+    values: npt.NDArray[np.float32]
+    step: float
+    first: FloatArray
+    surface: Mask
+    marks: Mask
+    clipped: npt.NDArray[np.float32]
+    view: View | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.values.shape[0], self.values.shape[1]
+
+    @cached_property
+    def paint(self) -> Mask:
+        """Where bare paint is seen: neither beyond the targets nor on a mark."""
+        return np.asarray(self.surface & ~self.marks)
+
+    def plane(self, pixels: FloatArray) -> FloatArray:
+        """Return plane coordinates, m, of grid pixels (column, row), (..., 2)."""
+        return np.asarray(self.first + self.step * np.asarray(pixels) * [1.0, -1.0])
+
+    def pixels(self, plane: FloatArray) -> FloatArray:
+        """Return grid pixels (column, row), (..., 2), of plane coordinates, m."""
+        return np.asarray((np.asarray(plane) - self.first) / self.step * [1.0, -1.0])
+
+    @cached_property
+    def axes(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+        """Plane coordinates of columns (W,) and rows (H,), m."""
+        rows, columns = self.shape
+        x = self.first[0] + self.step * np.arange(columns)
+        y = self.first[1] - self.step * np.arange(rows)
+        return x.astype(np.float32), y.astype(np.float32)
+
+
+def rectify(frame: Frame, view: View, grey: npt.NDArray[np.generic] | None = None) -> Rectified:
+    """Return a face of a frame on a grid of metres.
+
+    Parameters
+    ----------
+    frame
+        The photograph.
+    view
+        How the face lies in it.
+    grey
+        Its brightness, if it is at hand.
+    """
+    import cv2
+
+    face = view.face
+    low, high = face.span
+    narrow = min(min(t.width, t.height) for t in face.targets)
+    step = narrow / ACROSS
+    columns, rows = np.ceil((high - low) / step).astype(int)
+    first = np.array([low[0] + 0.5 * step, high[1] - 0.5 * step])
+    brightness = np.ascontiguousarray(frame.grey) if grey is None else grey
+    middle = 0.5 * (low + high)
+    per_metre = float(np.sqrt(abs(np.linalg.det(view.scale(middle)))))
+    reduction = max(1, int(step * per_metre))
+    x = first[0] + step * np.arange(columns)
+    y = first[1] - step * np.arange(rows)
+    places = view.to_pixels(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
+    # Pixel centres of a frame reduced by k: (p + 0.5)/k − 0.5.
+    at = (places + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
+    values = _resample(brightness, reduction, at, frame.full_scale)
+    top = (brightness >= CLIPPED * frame.full_scale).astype(np.uint8) * 255
+    clipped = _resample(top, reduction, at, 255.0) if top.any() else np.zeros_like(values)
+    height, width = brightness.shape
+    inside = (
+        (places[..., 0] >= 0) & (places[..., 1] >= 0)
+        & (places[..., 0] <= width - 1) & (places[..., 1] <= height - 1)
+    )  # fmt: skip
+    surface = _drawn((int(rows), int(columns)), first, step, _outlines(face)) & inside
+    marks = _drawn((int(rows), int(columns)), first, step, _prints(face))
+    if marks.any():
+        rim = 2 * int(np.ceil(_RIM / step)) + 1
+        marks = cv2.dilate(marks.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
+    return Rectified(face, values, step, first, surface, marks, clipped, view)
+
+
+def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
+    """Return a picture that shows exactly one target, its corners at the picture's corners.
+
+    Parameters
+    ----------
+    frame
+        The crop, whatever its size.
+    target
+        What it shows.
+    marks
+        Whether the target's marks are in it.
+    """
+    import cv2
+
+    face = faces((target,))[0]
+    grey = frame.grey
+    step = target.width / grey.shape[1]
+    rows = max(1, round(target.height / step))
+    values = np.asarray(grey, dtype=np.float32) / np.float32(frame.full_scale)
+    top = (values >= CLIPPED).astype(np.float32)
+    if rows != grey.shape[0]:
+        size = (grey.shape[1], rows)
+        values = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_LINEAR), np.float32)
+        top = np.asarray(cv2.resize(top, size, interpolation=cv2.INTER_LINEAR), np.float32)
+    middle = face.plane(target.corners.mean(axis=0))
+    shape = (values.shape[0], values.shape[1])
+    first = middle + 0.5 * step * np.array([1 - shape[1], shape[0] - 1])
+    printed = np.zeros(shape, dtype=bool)
+    if marks and target.marks:
+        printed = _drawn(shape, first, step, _prints(face))
+        rim = 2 * int(np.ceil(_RIM / step)) + 1
+        printed = cv2.dilate(printed.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
+    return Rectified(face, values, step, first, np.ones(shape, dtype=bool), printed, top)
+
+
+def _resample(
+    grey: npt.NDArray[np.generic], reduction: int, at: npt.NDArray[np.float32], full: float
+) -> npt.NDArray[np.float32]:
+    import cv2
+
+    small = grey
+    if reduction > 1:
+        height, width = grey.shape
+        # Whole blocks only, so that a block's centre is where it should be.
+        whole = grey[: height // reduction * reduction, : width // reduction * reduction]
+        size = (width // reduction, height // reduction)
+        small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+    out = cv2.remap(
+        small, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(out, dtype=np.float32) / np.float32(full)
+
+
+def _outlines(face: Face) -> list[FloatArray]:
+    return [face.plane(target.corners) for target in face.targets]
+
+
+def _prints(face: Face) -> list[FloatArray]:
+    marks, places = face_marks(face)
+    shapes = []
+    for mark, place in zip(marks, places, strict=True):
+        if mark.kind == "picture":
+            half = 0.5 * mark.size
+            box = half * np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
+            shapes.append(place + box)
+        else:
+            shapes += [place + shape for shape in polygons(mark)]
+    return shapes
+
+
+def _drawn(
+    shape: tuple[int, int], first: FloatArray, step: float, shapes: list[FloatArray]
+) -> Mask:
+    import cv2
+
+    raster = np.zeros(shape, dtype=np.uint8)
+    for polygon in shapes:
+        spot = (polygon - first) / step * [1.0, -1.0]
+        cv2.fillPoly(raster, [np.round(16.0 * spot).astype(np.int32)], 1, shift=4)
+    return raster > 0
