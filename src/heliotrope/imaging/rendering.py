@@ -1,0 +1,434 @@
+"""Synthetic frames: a target with beams on it as a camera sees it, with the truth.
+
+Light is written as the irradiance (W/m²) on perfectly white diffuse paint that would look as
+bright. Paint, borders and marks cover pixels by exact areas; beams are averaged over pixels.
+See docs/explanation/rendering.md.
+"""
+
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+import numpy as np
+
+from heliotrope.errors import InputError
+from heliotrope.field.marks import Mark
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.imaging._painting import Image, Plane, background, mark_shapes
+from heliotrope.imaging._render_kernels import ambient_field, coverage, expose, sample_plane
+from heliotrope.imaging.beams import deposit
+from heliotrope.imaging.frame import Frame, Pixels
+from heliotrope.imaging.projection import project
+from heliotrope.imaging.scenes import (
+    Lens,
+    Paint,
+    Scene,
+    Sensor,
+    Shadow,
+    Surroundings,
+    Thrown,
+    example_camera,
+    example_target,
+    exposed,
+)
+
+__all__ = [
+    "BeamTruth",
+    "Lens",
+    "MarkTruth",
+    "Paint",
+    "Rendered",
+    "Scene",
+    "Sensor",
+    "Shadow",
+    "Surroundings",
+    "Thrown",
+    "example_camera",
+    "example_target",
+    "exposed",
+    "point_spread",
+    "render",
+]
+
+#: Blue, green, red of beams and of ambient light in colour frames, relative to grey.
+BEAM_TINT, AMBIENT_TINT = (0.80, 1.0, 1.08), (1.15, 1.0, 0.88)
+#: A mark is lit if beams add this much of the ambient light, and covered if its contrast is
+#: below this many standard deviations of the noise.
+LIT, COVERED = 0.5, 3.0
+
+
+@dataclass(frozen=True)
+class BeamTruth:
+    """Where one beam is.
+
+    Attributes
+    ----------
+    target
+        Its name.
+    centroid, point, pixel
+        Centre of the energy on the plane, also beyond the border: metres right of and above
+        the target's centre (2,), ENU metres (3,), and where the camera sees that point (2,).
+    centroid_on_target, pixel_on_target
+        The same of what falls on the target; NaN if nothing does.
+    share_on_target
+        Of the energy.
+    share_clipped
+        Of its light in the frame, as painted surfaces return it: on clipped pixels.
+    peak
+        Reading, in full scales and not clipped, where its light is strongest.
+    """
+
+    target: str
+    centroid: FloatArray
+    point: FloatArray
+    pixel: FloatArray
+    centroid_on_target: FloatArray
+    pixel_on_target: FloatArray
+    share_on_target: float
+    share_clipped: float
+    peak: float
+
+
+@dataclass(frozen=True)
+class MarkTruth:
+    """What one mark looks like.
+
+    Attributes
+    ----------
+    target, name
+        Which mark.
+    pixel
+        Where its point is seen, (2,).
+    in_frame
+        Whether that is in the frame.
+    light
+        Flux of the beams on it over the ambient light, mean.
+    contrast
+        Reading of the paint less that of the mark, after clipping, in full scales, mean.
+    lit
+        Whether ``light`` is above a half.
+    covered
+        Whether the contrast is below three standard deviations of a pixel's noise.
+    """
+
+    target: str
+    name: str
+    pixel: FloatArray
+    in_frame: bool
+    light: float
+    contrast: float
+    lit: bool
+    covered: bool
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A frame and its truth.
+
+    Attributes
+    ----------
+    frame
+        What the camera gives.
+    beams, marks
+        In the order of the scene.
+    clipped
+        Share of the readings at full scale.
+    level
+        Readings without noise, clipping and encoding, in full scales, float32, of the shape
+        of the frame; None unless asked for.
+    """
+
+    frame: Frame
+    beams: tuple[BeamTruth, ...]
+    marks: tuple[MarkTruth, ...]
+    clipped: float
+    level: Image | None = None
+
+
+def render(
+    scene: Scene,
+    seed: int,
+    *,
+    name: str = "",
+    time: datetime | None = None,
+    level: bool = False,
+) -> Rendered:
+    """Return a frame of a scene and its truth; the same seed gives the same noise.
+
+    Parameters
+    ----------
+    scene
+        What there is to see. What stays (camera, targets, paint, surroundings) is worked
+        out once and kept for the last four combinations.
+    seed
+        Of the noise, 0 or more.
+    name, time
+        For the frame.
+    level
+        Whether to give the readings without noise too.
+
+    Raises
+    ------
+    InputError
+        If nobody knows where the camera stands, or it does not see the front of a target.
+    """
+    stays = background(scene)
+    ambient = stays.sky * np.float32(scene.surroundings.sky)
+    seen: list[tuple[slice, slice, Image]] = []
+    thrown = [replace(t, beam=t.beam.swept(t.motion)) for t in scene.beams]
+    beams = np.zeros_like(ambient)
+    for plane in stays.planes:
+        _add_ambient(scene, plane, ambient)
+    for one in thrown:
+        index = [t.name for t in scene.targets].index(one.target)
+        rows, columns, light = _beam_image(scene, stays.planes[index], index, one)
+        beams[rows, columns] += light
+        seen.append((rows, columns, light))
+    readings = _through_lens(scene, ambient, beams)
+    pixels, clipped = _expose(scene.sensor, readings, seed)
+    highest = readings if readings.ndim == 2 else readings.max(axis=2)
+    truths = tuple(
+        _beam_truth(scene, t, image, highest) for t, image in zip(thrown, seen, strict=True)
+    )
+    sensor = scene.sensor
+    return Rendered(
+        Frame(pixels, name, time, exposure=sensor.exposure, gain=sensor.gain),
+        truths,
+        _mark_truths(scene, thrown),
+        clipped,
+        readings if level else None,
+    )
+
+
+def _ambient_terms(scene: Scene) -> tuple[float, ...]:
+    shadow = scene.shadow or Shadow(left=1.0)
+    into = (np.cos(shadow.angle), np.sin(shadow.angle))
+    terms = (*scene.gradient, *shadow.point, *into, shadow.softness, shadow.left)
+    return tuple(float(term) for term in terms)
+
+
+def _add_ambient(scene: Scene, plane: Plane, image: Image) -> None:
+    light: Image = plane.reflectance * np.float32(scene.ambient)
+    if scene.shadow is not None or any(scene.gradient):
+        relative = np.empty_like(image)
+        ambient_field(plane.u, plane.v, plane.share, _ambient_terms(scene), relative)
+        light *= relative
+    image += light
+
+
+def _beam_image(
+    scene: Scene, plane: Plane, index: int, thrown: Thrown
+) -> tuple[slice, slice, Image]:
+    """Return the rows and columns that a beam reaches, and its returned light there, W/m²."""
+    width, height = scene.camera.size
+    outline = thrown.beam.corners
+    ends = np.roll(outline, -1, axis=0)
+    part = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None, None]
+    seen = project(
+        scene.camera, scene.targets[index].point(outline + part * (ends - outline))
+    ).reshape(-1, 2)
+    if np.isfinite(seen).all():
+        low, high = np.floor(seen.min(axis=0)) - 3, np.ceil(seen.max(axis=0)) + 4
+    else:
+        low, high = np.zeros(2), np.array([width, height])
+    left, top = np.clip(low, 0, [width, height]).astype(int).tolist()
+    right, bottom = np.clip(high, 0, [width, height]).astype(int).tolist()
+    rows, columns = slice(top, max(bottom, top)), slice(left, max(right, left))
+    u, v, share, reflectance = (
+        np.ascontiguousarray(a[rows, columns])
+        for a in (plane.u, plane.v, plane.share, plane.reflectance)
+    )
+    light = np.zeros_like(u)
+    if light.size:
+        # A pixel sees at most eight samples each way.
+        pixel = float(np.abs(np.gradient(u, axis=1)).max()) if u.shape[1] > 1 else 0.0
+        beam = thrown.beam.coarser(int(pixel / (8.0 * thrown.beam.step)))
+        sample_plane(u, v, share, beam.flux, beam.origin, beam.step, light)
+    return rows, columns, light * reflectance * np.float32(thrown.strength * scene.cloud)
+
+
+def _through_lens(scene: Scene, ambient: Image, beams: Image) -> Image:
+    """Return readings without noise and clipping, in full scales."""
+    lens, sensor = scene.lens, scene.sensor
+    if sensor.colour:
+        light = np.stack(
+            [
+                ambient * np.float32(a) + beams * np.float32(b)
+                for a, b in zip(AMBIENT_TINT, BEAM_TINT, strict=True)
+            ],
+            axis=-1,
+        )
+    else:
+        light = ambient + beams
+    light = _blurred(light, lens.rest)
+    level = light * np.float32(sensor.scale)
+    level += np.float32(sensor.offset + lens.veil * float(level.mean()))
+    if lens.ghost > 0.0:
+        _add_ghost(level, lens)
+    return level
+
+
+def _blurred(image: Image, lens: Lens) -> Image:
+    import cv2
+
+    moved = float(np.hypot(*lens.shake))
+    if lens.defocus == 0.0 and moved == 0.0:
+        return image
+    edge = cv2.BORDER_REPLICATE
+    if not lens.disc and moved == 0.0:
+        line = _bell(lens.defocus)
+        return np.asarray(cv2.sepFilter2D(image, -1, line, line, borderType=edge), np.float32)
+    return np.asarray(cv2.filter2D(image, -1, point_spread(lens), borderType=edge), np.float32)
+
+
+def _bell(sigma: float) -> FloatArray:
+    reach = int(np.ceil(4.0 * sigma))
+    value = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    return as_float(value / value.sum())
+
+
+def point_spread(lens: Lens) -> FloatArray:
+    """Return disc or Gaussian of a lens with its shake, of sum 1 and symmetric, (K, K)."""
+    from scipy.signal import convolve2d
+
+    spread = np.ones((1, 1))
+    if lens.defocus > 0.0 and lens.disc:
+        reach = int(np.ceil(lens.defocus + 0.5))
+        around = np.arange(128) * (2.0 * np.pi / 128)
+        circle = lens.defocus * np.stack([np.cos(around), np.sin(around)], axis=-1)
+        spread = coverage([circle + reach], (2 * reach + 1, 2 * reach + 1))
+    elif lens.defocus > 0.0:
+        spread = np.outer(_bell(lens.defocus), _bell(lens.defocus))
+    shake = as_float(lens.shake)
+    if shake.any():
+        reach = int(np.ceil(0.5 * np.abs(shake).max()))
+        count = 8 * reach + 2
+        places = ((np.arange(count) + 0.5) / count - 0.5)[:, None] * shake + reach
+        trail = deposit(places, np.full(count, 1.0 / count), (2 * reach + 1, 2 * reach + 1))
+        spread = convolve2d(spread, trail)
+    return as_float(spread / spread.sum())
+
+
+def _add_ghost(level: Image, lens: Lens) -> None:
+    height, width = level.shape[:2]
+    x = np.exp(-0.5 * ((np.arange(width) - lens.ghost_at[0]) / lens.ghost_radius) ** 2)
+    y = np.exp(-0.5 * ((np.arange(height) - lens.ghost_at[1]) / lens.ghost_radius) ** 2)
+    blob = lens.ghost * np.outer(y, x).astype(np.float32)
+    level += blob if level.ndim == 2 else blob[:, :, None]
+
+
+def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
+    """Return pixels, and which share of them is clipped."""
+    if seed < 0:
+        raise InputError(f"render: seed {seed} must be 0 or more")
+    # The noise is not for secrets: the quickest generator that NumPy has.
+    rng = np.random.Generator(np.random.SFC64(seed))
+    noise = rng.standard_normal(level.size, dtype=np.float32)
+    out: Pixels = np.empty(level.shape, np.uint8 if sensor.bits == 8 else np.uint16)
+    per_electron = sensor.gain / sensor.electrons
+    curve = _srgb(np.linspace(0.0, 1.0, 4096)) if sensor.srgb else np.empty(0)
+    clipped = expose(
+        level.reshape(-1), noise, float(sensor.read_noise), per_electron, float(sensor.offset),
+        curve, 2**sensor.bits - 1, out.reshape(-1),
+    )  # fmt: skip
+    return out, clipped / level.size
+
+
+def _srgb(share: FloatArray) -> FloatArray:
+    """Encode linear light 0 to 1 (IEC 61966-2-1)."""
+    return np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1.0 / 2.4) - 0.055)
+
+
+# -- truth -----------------------------------------------------------------------------
+
+
+def _beam_truth(
+    scene: Scene, thrown: Thrown, image: tuple[slice, slice, Image], level: Image
+) -> BeamTruth:
+    target = _target(scene, thrown.target)
+    share, landed = thrown.beam.on_target(target)
+    centroid = thrown.beam.centroid
+    both = target.point(np.stack([centroid, np.where(share > 0.0, landed, 0.0)]))
+    pixels = project(scene.camera, both)
+    rows, columns, light = image
+    under = level[rows, columns]
+    total = float(light.sum(dtype=np.float64))
+    clipped, peak = 0.0, float("nan")
+    if total > 0.0:
+        clipped = float(light[under >= 1.0].sum(dtype=np.float64)) / total
+        peak = float(under[np.unravel_index(int(light.argmax()), light.shape)])
+    return BeamTruth(
+        target=thrown.target,
+        centroid=centroid,
+        point=both[0],
+        pixel=pixels[0],
+        centroid_on_target=landed,
+        pixel_on_target=pixels[1] if share > 0.0 else np.full(2, np.nan),
+        share_on_target=share,
+        share_clipped=clipped,
+        peak=peak,
+    )
+
+
+def _target(scene: Scene, name: str) -> Target:
+    return next(target for target in scene.targets if target.name == name)
+
+
+def _mark_truths(scene: Scene, thrown: list[Thrown]) -> tuple[MarkTruth, ...]:
+    truths = []
+    tints = (AMBIENT_TINT, BEAM_TINT) if scene.sensor.colour else ((1.0,), (1.0,))
+    for target in scene.targets:
+        for mark in target.marks:
+            # A grid over what the mark spans, paint and strokes alike.
+            corners = np.concatenate(mark_shapes(target, mark))
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            part = (np.arange(5) + 0.5) / 5
+            places = low + np.stack(np.meshgrid(part, part), axis=-1) * (high - low)
+            ambient = scene.ambient * _relative_ambient(scene, places)
+            flux = np.zeros(places.shape[:-1])
+            for one in thrown:
+                if one.target == target.name:
+                    flux += one.strength * scene.cloud * one.beam.at(places)
+            truths.append(_mark_truth(scene, target, mark, ambient, flux, tints))
+    return tuple(truths)
+
+
+def _mark_truth(
+    scene: Scene,
+    target: Target,
+    mark: Mark,
+    ambient: FloatArray,
+    flux: FloatArray,
+    tints: tuple[tuple[float, ...], tuple[float, ...]],
+) -> MarkTruth:
+    sensor = scene.sensor
+    # The darkest channel keeps its contrast longest.
+    light = sensor.scale * np.min([a * ambient + b * flux for a, b in zip(*tints, strict=True)], 0)
+    white, dark = (
+        np.minimum(sensor.offset + r * light, 1.0)
+        for r in (scene.paint.reflectance, scene.paint.mark)
+    )
+    contrast = float((white - dark).mean())
+    electrons = np.maximum(white.mean() - sensor.offset, 0.0) * sensor.electrons / sensor.gain
+    noise = np.sqrt(electrons + sensor.read_noise**2) * sensor.gain / sensor.electrons
+    pixel = project(scene.camera, mark.point)
+    width, height = scene.camera.size
+    relative = float(flux.mean() / ambient.mean()) if ambient.mean() > 0.0 else float("inf")
+    return MarkTruth(
+        target=target.name,
+        name=mark.name,
+        pixel=pixel,
+        in_frame=bool(-0.5 <= pixel[0] < width - 0.5 and -0.5 <= pixel[1] < height - 0.5),
+        light=relative,
+        contrast=contrast,
+        lit=relative > LIT,
+        covered=bool(contrast < COVERED * noise),
+    )
+
+
+def _relative_ambient(scene: Scene, places: FloatArray) -> FloatArray:
+    """Return gradient and shadow at places of the plane (..., 2), as the frame shows them."""
+    u, v = (np.ascontiguousarray(places[..., k], dtype=np.float32) for k in (0, 1))
+    out = np.empty_like(u)
+    ambient_field(u, v, np.ones_like(u), _ambient_terms(scene), out)
+    return as_float(out)

@@ -1,0 +1,417 @@
+"""Scenes for synthetic frames: target, beams, light, paint, lens and sensor."""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.camera import Camera
+from heliotrope.field.marks import Mark
+from heliotrope.field.target import Target
+from heliotrope.geometry import as_float, rotation
+from heliotrope.imaging.beams import Beam
+from heliotrope.imaging.projection import look_at
+
+
+@dataclass(frozen=True)
+class Paint:
+    """How a target is painted, and has aged.
+
+    Attributes
+    ----------
+    reflectance, mark
+        Of the white paint and of the marks.
+    panels
+        Columns and rows of metal sheets.
+    seam, seam_width
+        Reflectance of the gaps between sheets, and their breadth, m.
+    wear
+        Standard deviation of the reflectance over decimetres, relative.
+    stains, stain
+        How many, and the greatest loss of reflectance in one, relative.
+    patch
+        Reflectance of a repaired patch; 0: there is none.
+    seed
+        Where stains, wear and patch are.
+    """
+
+    reflectance: float = 0.85
+    mark: float = 0.08
+    panels: tuple[int, int] = (4, 4)
+    seam: float = 0.55
+    seam_width: float = 0.008
+    wear: float = 0.01
+    stains: int = 5
+    stain: float = 0.12
+    patch: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("reflectance", "mark", "seam", "patch", "stain"):
+            _share(f"paint: {name}", getattr(self, name))
+        if min(self.panels) < 1 or self.stains < 0 or not self.seam_width >= 0.0:
+            raise InputError("paint: panels must be 1 or more, stains and seam_width 0 or more")
+        if not 0.0 <= self.wear <= 0.3:
+            raise InputError(f"paint: wear {self.wear} must be from 0 to 0.3")
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is around the target: a wall in its plane, and sky.
+
+    Attributes
+    ----------
+    wall
+        How far the wall reaches beyond the target to the left, right, up and down, m.
+    reflectance
+        Of the wall. Light of beams that misses the target falls on it.
+    sky
+        Brightness of the sky, W/m² on white.
+    texture
+        Standard deviation over metres, relative, of wall and sky.
+    clutter
+        Number of light and dark boxes on the wall.
+    seed
+        Where they are.
+    """
+
+    wall: tuple[float, float, float, float] = (1.5, 1.5, 3.0, 30.0)
+    reflectance: float = 0.3
+    sky: float = 250.0
+    texture: float = 0.06
+    clutter: int = 12
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _share("surroundings: reflectance", self.reflectance)
+        wall = as_float(self.wall)
+        if wall.shape != (4,) or not (np.isfinite(wall) & (wall >= 0.0)).all():
+            raise InputError(f"surroundings: wall {self.wall} m needs 4 numbers, 0 or more")
+        if not (np.isfinite(self.sky) and self.sky >= 0.0) or self.clutter < 0:
+            raise InputError("surroundings: sky (W/m²) and clutter must be 0 or more")
+        if not 0.0 <= self.texture <= 0.3:
+            raise InputError(f"surroundings: texture {self.texture} must be from 0 to 0.3")
+
+
+@dataclass(frozen=True)
+class Shadow:
+    """An edge of shadow of the ambient light.
+
+    Attributes
+    ----------
+    point
+        On the edge, metres right of and above the target's centre, (2,).
+    angle
+        Into the shadow, counterclockwise from the right as seen from the front, rad.
+    softness
+        Breadth of the edge, m.
+    left
+        Share of the light that is left in the shadow.
+    """
+
+    point: tuple[float, float] = (0.0, 0.0)
+    angle: float = 0.0
+    softness: float = 0.05
+    left: float = 0.4
+
+    def __post_init__(self) -> None:
+        _share("shadow: left", self.left)
+        if not (np.isfinite([*self.point, self.angle]).all() and self.softness >= 0.0):
+            raise InputError("shadow: point and angle must be finite, softness (m) 0 or more")
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What blurs and veils a frame.
+
+    Attributes
+    ----------
+    defocus
+        Standard deviation of a Gaussian, or radius of a disc, px.
+    disc
+        Which of the two. A disc comes on top of a Gaussian of 0.5 px.
+    shake
+        Movement of the camera during the exposure, to the right and down, px; the truth is
+        the middle of it.
+    veil
+        Stray light everywhere, as a share of the frame's mean light.
+    ghost, ghost_at, ghost_radius
+        A reflection in the lens: peak as a share of the full scale, place and standard
+        deviation, px.
+    """
+
+    defocus: float = 0.6
+    disc: bool = False
+    shake: tuple[float, float] = (0.0, 0.0)
+    veil: float = 0.02
+    ghost: float = 0.0
+    ghost_at: tuple[float, float] = (0.0, 0.0)
+    ghost_radius: float = 40.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.defocus <= 50.0 or not np.hypot(*self.shake) <= 100.0:
+            raise InputError(
+                f"lens: defocus {self.defocus} px, shake {self.shake} px; give 0 to 50, at most 100"
+            )
+        _share("lens: veil", self.veil)
+        if not (self.ghost >= 0.0 and self.ghost_radius > 0.0 and np.isfinite(self.ghost_at).all()):
+            raise InputError("lens: ghost must be 0 or more, its radius (px) above 0")
+
+    @property
+    def base(self) -> float:
+        """Standard deviation, px, of the part of the blur that paint is seen with beforehand."""
+        if self.disc and self.defocus > 0.0:
+            return 0.5
+        return min(self.defocus, 0.6)
+
+    @property
+    def rest(self) -> "Lens":
+        """What is left to be blurred in the frame."""
+        if self.disc:
+            return self
+        return replace(self, defocus=float(np.sqrt(self.defocus**2 - self.base**2)))
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How light becomes numbers.
+
+    Attributes
+    ----------
+    electrons
+        At full scale, at gain 1.
+    sensitivity
+        Electrons a second for each W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
+    exposure
+        s.
+    gain
+        Relative: electrons / gain fill the scale.
+    read_noise
+        Standard deviation, electrons.
+    offset
+        What darkness reads, as a share of the full scale.
+    bits
+        8, or 12, which are spread over 16 so that 4095 reads 65535.
+    srgb
+        Encoded by the curve of sRGB; otherwise linear.
+    colour
+        Blue, green, red with light of two tints; otherwise grey.
+    """
+
+    electrons: float = 10_000.0
+    sensitivity: float = 6000.0
+    exposure: float = 1e-3
+    gain: float = 1.0
+    read_noise: float = 6.0
+    offset: float = 0.01
+    bits: int = 8
+    srgb: bool = False
+    colour: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("electrons", "sensitivity", "exposure", "gain"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"sensor: {name} {value} must be above 0 and finite")
+        if not (np.isfinite(self.read_noise) and self.read_noise >= 0.0):
+            raise InputError(f"sensor: read_noise {self.read_noise} e- must be 0 or more")
+        if not 0.0 <= self.offset < 1.0:
+            raise InputError(f"sensor: offset {self.offset} must be from 0 to below 1")
+        if self.bits not in (8, 12):
+            raise InputError(f"sensor: {self.bits} bits; give 8 or 12")
+
+    @property
+    def scale(self) -> float:
+        """Share of the full scale for each W/m² on white."""
+        return self.sensitivity * self.exposure * self.gain / self.electrons
+
+
+@dataclass(frozen=True)
+class Thrown:
+    """A beam on a target.
+
+    Attributes
+    ----------
+    target
+        Name of the target.
+    beam
+        What falls on it.
+    strength
+        Factor of its flux.
+    motion
+        How far it moves during the exposure, metres right and up; the beam is as it is in
+        the middle.
+    """
+
+    target: str
+    beam: Beam
+    strength: float = 1.0
+    motion: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.strength) and self.strength >= 0.0):
+            raise InputError(f"beam on {self.target}: strength {self.strength} must be 0 or more")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What there is to see.
+
+    Attributes
+    ----------
+    camera
+        With its position and rotation.
+    targets
+        With their marks; pictures cannot be drawn.
+    beams
+        :class:`Thrown`, or tuples of its arguments.
+    ambient
+        Irradiance of the targets without beams, W/m².
+    gradient
+        Relative increase of it to the right and upwards, 1/m, about each target's centre.
+    shadow
+        On each target's plane.
+    cloud
+        Factor of all beams: 1 under a clear sky.
+    paint, surroundings, lens, sensor
+        See there.
+    """
+
+    camera: Camera
+    targets: tuple[Target, ...]
+    beams: tuple[Thrown, ...] = ()
+    ambient: float = 150.0
+    gradient: tuple[float, float] = (0.0, 0.0)
+    shadow: Shadow | None = None
+    cloud: float = 1.0
+    paint: Paint = field(default_factory=Paint)
+    surroundings: Surroundings = field(default_factory=Surroundings)
+    lens: Lens = field(default_factory=Lens)
+    sensor: Sensor = field(default_factory=Sensor)
+
+    def __post_init__(self) -> None:
+        if not self.targets:
+            raise InputError("scene: no target; give at least one")
+        names = [target.name for target in self.targets]
+        if len(set(names)) < len(names):
+            raise InputError(f"scene: targets {', '.join(names)}: a name occurs twice")
+        given: tuple[Any, ...] = self.beams
+        thrown = tuple(b if isinstance(b, Thrown) else Thrown(*b) for b in given)
+        for beam in thrown:
+            if beam.target not in names:
+                raise UnknownNameError("target", beam.target, names)
+        object.__setattr__(self, "beams", thrown)
+        if not (np.isfinite(self.ambient) and self.ambient >= 0.0):
+            raise InputError(f"scene: ambient {self.ambient} W/m² must be 0 or more")
+        _share("scene: cloud", self.cloud)
+        if not np.isfinite(self.gradient).all():
+            raise InputError(f"scene: gradient {self.gradient} 1/m must be finite")
+
+
+def exposed(scene: Scene, peak: float = 0.8) -> Scene:
+    """Return the scene with the exposure at which its brightest beam reads ``peak``.
+
+    Parameters
+    ----------
+    scene
+        With beams, or with ambient light alone, whose paint then reads ``peak``.
+    peak
+        Reading on the target's paint where the strongest beam is strongest, of the full scale.
+    """
+    sensor = scene.sensor
+    if not peak > sensor.offset:
+        raise InputError(f"scene: peak {peak} must be above the sensor's offset {sensor.offset}")
+    flux = max((b.beam.peak * b.strength * scene.cloud for b in scene.beams), default=0.0)
+    light = scene.paint.reflectance * (scene.ambient + flux)
+    if not light > 0.0:
+        raise InputError("scene: neither ambient light nor beams; nothing to expose for")
+    exposure = sensor.exposure * (peak - sensor.offset) / (light * sensor.scale)
+    return replace(scene, sensor=replace(sensor, exposure=exposure))
+
+
+def example_target(
+    side: float = 8.0, center: tuple[float, float, float] = (0.0, 0.0, 40.0), name: str = "target"
+) -> Target:
+    """Return a square target that faces north, with eight marks a little inside its border.
+
+    Corners at its four corners and tees half-way, of 0.6 m with strokes of 0.12 m on a side
+    of 8 m, and in proportion on others.
+    """
+    middle, half = as_float(center), 0.5 * side
+    # Who looks south at it has west on the right.
+    right, up = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    inset = half - 0.0375 * side
+    size, stroke = 0.075 * side, 0.015 * side
+    quarter = 0.5 * np.pi
+    places = {
+        "upper_left": ("corner", -1, 1, 0), "upper_right": ("corner", 1, 1, -1),
+        "lower_right": ("corner", 1, -1, 2), "lower_left": ("corner", -1, -1, 1),
+        "top": ("tee", 0, 1, 0), "right": ("tee", 1, 0, -1),
+        "bottom": ("tee", 0, -1, 2), "left": ("tee", -1, 0, 1),
+    }  # fmt: skip
+    marks = tuple(
+        Mark(mark, kind, middle + inset * (x * right + y * up), size, stroke, turns * quarter)
+        for mark, (kind, x, y, turns) in places.items()
+    )
+    ends = [(-half, half), (half, half), (half, -half), (-half, -half)]
+    corners = np.stack([middle + x * right + y * up for x, y in ends])
+    return Target(name, corners, middle, marks=marks)
+
+
+def example_camera(
+    target: Target,
+    distance: float = 200.0,
+    size: tuple[int, int] = (1600, 1200),
+    *,
+    side: float = 0.21,
+    below: float = 0.19,
+    roll: float = 0.006,
+    fill: float = 0.7,
+    distortion: float = 0.004,
+    name: str = "camera",
+) -> Camera:
+    """Return a camera that sees a target from below and from the side, through a bent lens.
+
+    Parameters
+    ----------
+    target
+        What it looks at, nearly: the target's centre is a little off the frame's middle.
+    distance
+        From the target's centre, m.
+    size
+        Width and height of a frame, pixels.
+    side, below
+        Angles off the target's normal, to the right as seen from its front and downwards, rad.
+    roll
+        Turn about the line of sight, rad.
+    fill
+        Share of the frame's lesser side that the target takes up.
+    distortion
+        Inward shift of the frame's corners, as a share of their distance from the middle.
+    name
+        Of the camera.
+    """
+    if not (distance > 0.0 and fill > 0.0):
+        raise InputError(f"camera: distance {distance} m and fill {fill} must be above 0")
+    width, height = size
+    right, up = target.axes
+    towards = np.cos(below) * (np.cos(side) * target.normal + np.sin(side) * right)
+    position = target.center + distance * (towards - np.sin(below) * up)
+    extent = max(target.width, target.height)
+    focal = fill * min(size) * distance / extent
+    aim = target.center + 0.02 * extent * (right - up)
+    R = rotation([0.0, 0.0, 1.0], roll) @ look_at(position, aim)
+    corner = float(np.hypot(0.5 * width, 0.5 * height)) / focal
+    lens = [
+        -1.2 * distortion / corner**2, 0.2 * distortion / corner**4,
+        0.03 * distortion / corner, -0.02 * distortion / corner, 0.0,
+    ]  # fmt: skip
+    middle = 0.5 * (np.array(size) - 1.0) + [0.004 * width, -0.003 * height]
+    matrix = np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]])
+    return Camera(name, size, matrix, np.array(lens), position, R, targets=(target.name,))
+
+
+def _share(what: str, value: float) -> None:
+    if not 0.0 <= value <= 1.0:
+        raise InputError(f"{what} {value} must be from 0 to 1")
