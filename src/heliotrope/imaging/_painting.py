@@ -22,8 +22,8 @@ Image = npt.NDArray[np.float32]
 _KNOTS = 16
 #: Pieces of polygons' edges, px: a lens bends them by less than 1e-4 px.
 _PIECE = 4.0
-#: Cells of a pixel, each way, in which paint is blurred, and rows of pixels at a time.
-_FINE, _BAND = 5, 128
+#: Cells of a pixel, each way, in which paint is blurred, and pixels at a time, each way.
+_FINE, _TILE = 5, 64
 
 
 @dataclass(frozen=True)
@@ -142,15 +142,20 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
     taps = np.arange(-_FINE * margin, _FINE * margin + 1) / (_FINE * blur)
     kernel = np.convolve(np.exp(-0.5 * taps**2), np.ones(_FINE), mode="same")
     kernel /= kernel.sum()
-    out = np.empty(shape, dtype=np.float32)
+    out = coverage(polygons, shape).astype(np.float32)
+    # Only near edges is there anything to blur.
+    window = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    near = np.asarray(cv2.dilate(out, window)) - np.asarray(cv2.erode(out, window)) > 0.0
     first = _FINE * margin + _FINE // 2
-    for top in range(0, shape[0], _BAND):
-        rows = min(_BAND, shape[0] - top)
-        size = (_FINE * (rows + 2 * margin), _FINE * (shape[1] + 2 * margin))
-        moved = [_FINE * (p - [0, top]) + first for p in polygons]
-        fine = coverage(moved, size).astype(np.float32)
-        soft = np.asarray(cv2.sepFilter2D(fine, -1, kernel, kernel))
-        out[top : top + rows] = soft[first::_FINE, first::_FINE][:rows, : shape[1]]
+    for top in range(0, shape[0], _TILE):
+        for left in range(0, shape[1], _TILE):
+            tile = out[top : top + _TILE, left : left + _TILE]
+            if not near[top : top + _TILE, left : left + _TILE].any():
+                continue
+            moved = [_FINE * (p - [left, top]) + first for p in polygons]
+            fine = coverage(moved, tuple(_FINE * (n + 2 * margin) for n in tile.shape))
+            soft = np.asarray(cv2.sepFilter2D(fine.astype(np.float32), -1, kernel, kernel))
+            tile[:] = soft[first::_FINE, first::_FINE][: tile.shape[0], : tile.shape[1]]
     return out
 
 
