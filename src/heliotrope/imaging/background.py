@@ -4,14 +4,14 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Image
 from heliotrope.imaging.rectify import Mask, Rectified
 
 #: The fit looks at every so-many-th pixel.
-_STRIDE = 4
+_STRIDE = 6
 #: Order of the polynomial across a target; more along a longer face.
 _ORDER = 6
 #: Light on a target is smooth: standard deviation of the terms of order n, over the mean,
@@ -23,7 +23,7 @@ _PATCH = 0.4
 #: Brighter than the background by this many deviations: a beam.
 _HOT = 3.0
 #: What is near a beam holds its tails: pixels of the fit's grid.
-_NEAR = 4
+_NEAR = 3
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Background:
         Part of the paint that was free of beams.
     """
 
-    values: npt.NDArray[np.float32]
+    values: Image
     deviation: float
     noise: float
     patch: float
@@ -105,8 +105,8 @@ class EmptyTarget:
         Frames after which a frame counts a third.
     """
 
-    reflectance: npt.NDArray[np.float32]
-    weight: npt.NDArray[np.float32]
+    reflectance: Image
+    weight: Image
     memory: float = 50.0
 
     @staticmethod
@@ -169,7 +169,7 @@ def beams(picture: Rectified, background: Background) -> Mask:
     return cv2.dilate(hot.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
 
-def smooth(picture: Rectified, values: FloatArray, sigma: float) -> npt.NDArray[np.float32]:
+def smooth(picture: Rectified, values: Image, sigma: float) -> Image:
     """Return values smoothed over bare paint; on a mark what its surroundings say.
 
     Parameters
@@ -217,7 +217,7 @@ def _polynomials(shape: tuple[int, int], orders: tuple[int, int]) -> tuple[Float
     along_y = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, shape[0]), orders[1])
     terms = _terms(orders)
     table = np.stack([np.outer(along_y[:, j], along_x[:, i]) for i, j, _ in terms], axis=-1)
-    return table, np.array([order for _, _, order in terms])
+    return np.asarray(table, dtype=np.float64), np.array([order for _, _, order in terms])
 
 
 def _ridge(
@@ -225,13 +225,14 @@ def _ridge(
 ) -> tuple[FloatArray, FloatArray]:
     """Numbers of greatest posterior probability and their covariance."""
     information = A.T @ A / variance + np.diag(prior)
-    covariance = np.linalg.pinv(information, hermitian=True)
-    return covariance @ (A.T @ b) / variance, covariance
+    covariance = np.linalg.inv(information)
+    numbers = np.asarray(covariance @ (A.T @ b) / variance, dtype=np.float64)
+    return numbers, np.asarray(covariance, dtype=np.float64)
 
 
 def _fit(
     picture: Rectified,
-    pattern: npt.NDArray[np.float32],
+    pattern: Image,
     orders: tuple[int, int],
     method: str,
 ) -> Background:
@@ -251,7 +252,7 @@ def _fit(
             "is too small in the frame or covered"
         )
     level = float(np.median(b))
-    prior = np.zeros(A.shape[1])
+    prior = np.full(A.shape[1], (0.1 / max(level, 0.01)) ** 2)
     prior[order > 0.0] = (order[order > 0.0] ** 1.5 / (_UNEVEN * max(level, 0.01))) ** 2
     area = (picture.step * _STRIDE) ** 2
     patch, free = max(_PATCH / area, 1.0), b <= np.percentile(b, 60.0)
@@ -259,11 +260,11 @@ def _fit(
     cross = np.ones((3, 3), np.uint8)
     reach = np.ones((2 * _NEAR + 1, 2 * _NEAR + 1), np.uint8)
     for _ in range(15):
-        numbers, _ = _ridge(A[free], b[free], patch * spread**2, prior)
+        numbers = _ridge(A[free], b[free], patch * spread**2, prior)[0]
         left = b - A @ numbers
         middle = np.median(left[free])
         spread = 1.4826 * float(np.median(np.abs(left[free] - middle))) + 0.15 / 255.0
-        hot = np.zeros(paint.shape, dtype=np.uint8)
+        hot: Image = np.zeros(paint.shape, dtype=np.uint8)
         hot[paint] = left > _HOT * spread
         hot = cv2.dilate(cv2.morphologyEx(hot, cv2.MORPH_OPEN, cross), reach)
         now = hot[paint] == 0
@@ -279,8 +280,8 @@ def _fit(
     rough = picture.values - smooth(picture, picture.values, 1.0)
     noise = 1.4826 * float(np.median(np.abs(rough[picture.paint]))) * 1.05
     return Background(
-        values.astype(np.float32), deviation, noise, patch * area, small, covariance, _STRIDE, method,
-        float(free.mean()),
+        values.astype(np.float32), deviation, noise, patch * area, small, covariance, _STRIDE,
+        method, float(free.mean()),
     )  # fmt: skip
 
 

@@ -8,9 +8,8 @@ import numpy.typing as npt
 
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Image
 from heliotrope.imaging.marks import polygons, tag_dictionary
-
-Grey = npt.NDArray[np.uint8]
 
 #: Side of the raster that shapes are compared on.
 _RASTER = 20
@@ -100,7 +99,7 @@ def drawings(marks: Sequence[Mark], roll: float = 0.0) -> tuple[list[Drawing], l
     return found, which
 
 
-def _standard(raster: npt.NDArray[np.uint8]) -> FloatArray:
+def _standard(raster: Image) -> FloatArray:
     """Zero mean and unit norm; a filled square keeps its constant, or it would be nothing."""
     flat = raster.astype(np.float64).ravel() / 255.0 - 0.35
     return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-9))
@@ -125,7 +124,7 @@ class Outlines:
     reduction: int
 
 
-def outlines(grey: Grey, reduction: int, ratio: float) -> Outlines:
+def outlines(grey: Image, reduction: int, ratio: float) -> Outlines:
     """Return the parts of a frame that are darker than their surroundings.
 
     A mark's reflectance is a fraction of the paint's, whatever the light: the frame over its
@@ -186,7 +185,7 @@ def candidates(seen: Outlines, drawn: Sequence[Drawing]) -> Candidates:
     return Candidates(which, points, seen.reduction * boxes[:, 2:], alike[part, which])
 
 
-def find_tags(grey: Grey, marks: Sequence[Mark]) -> dict[str, FloatArray]:
+def find_tags(grey: Image, marks: Sequence[Mark]) -> dict[str, FloatArray]:
     """Return the corners (4, 2), pixels, of the tags among marks that a frame shows, by name.
 
     From the upper left as seen, clockwise, of the upright tag.
@@ -205,9 +204,8 @@ def find_tags(grey: Grey, marks: Sequence[Mark]) -> dict[str, FloatArray]:
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         corners, identities, _ = detector.detectMarkers(grey)
-        if identities is None:
-            continue
-        for place, identity in zip(corners, np.ravel(identities), strict=True):
-            if int(identity) in names:
-                found[names[int(identity)]] = place.reshape(4, 2).astype(np.float64)
+        seen = [] if len(corners) == 0 else np.ravel(np.asarray(identities)).tolist()
+        for place, name in zip(corners, seen, strict=True):
+            if name in names:
+                found[names[name]] = np.asarray(place).reshape(4, 2).astype(np.float64)
     return found

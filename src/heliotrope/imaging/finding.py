@@ -1,17 +1,16 @@
 """Targets in a raw frame, by their marks: where, how well, or why not."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging import constellation, detection
-from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.projection import project
 from heliotrope.imaging.refinement import Refined, refine
 from heliotrope.imaging.view import Face, View, faces, fit_view, unknown_lens
@@ -44,6 +43,10 @@ class FoundMark:
         Whether the view stands on it.
     reason
         Why not; empty if it is used.
+    contrast
+        Its brightness over that of its surroundings; NaN of a tag.
+    blur
+        Of its upright and level edges, m, (2,); NaN of a tag.
     """
 
     mark: Mark
@@ -51,6 +54,8 @@ class FoundMark:
     covariance: FloatArray
     used: bool
     reason: str = ""
+    contrast: float = float("nan")
+    blur: FloatArray = field(default_factory=lambda: np.full(2, np.nan))
 
 
 @dataclass(frozen=True)
@@ -187,6 +192,7 @@ class _Search:
     def __init__(self, look: _Look, face: Face, marks: list[Mark], plane: FloatArray) -> None:
         self.look, self.face, self.marks, self.plane = look, face, marks, plane
         self.tags = detection.find_tags(look.eight, marks)
+        self.looks: dict[int, Refined] = {}
 
     def from_map(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Attempt:
         """Refine every mark about ``pixels`` (M, 2), then fit, without those that stray."""
@@ -200,13 +206,14 @@ class _Search:
                 else:
                     reasons[k] = "not seen"
                 continue
-            refined = refine(self.look.grey, mark, pixels[k], scales[k], search,
-                             self.look.pictures.get(mark.code) if mark.kind == "picture" else None)  # fmt: skip
+            picture = self.look.pictures.get(mark.code) if mark.kind == "picture" else None
+            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture)
             problem = _problem(refined, mark)
             if refined is None or problem:
                 reasons[k] = problem
             else:
                 seen[k] = refined.pixel, refined.covariance
+                self.looks[k] = refined
         return self.fit(seen, reasons)
 
     def fit(
@@ -249,7 +256,7 @@ class _Search:
     def _points(
         self, used: list[int], seen: dict[int, tuple[FloatArray, FloatArray]]
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Points, pixels and covariances; a tag gives its corners, three marks their parallelogram."""
+        """Points, pixels, covariances; a tag gives four corners, three marks a parallelogram."""
         plane, pixels, covariance = [], [], []
         per_metre = self._per_metre(used, seen)
         for k in used:
@@ -313,7 +320,9 @@ def _detections(search: _Search, rolls: Sequence[float]) -> Iterator[_Attempt]:
     base = max(1, round(max(search.look.grey.shape) / 700))
     for roll in rolls:
         drawn, which = detection.drawings([search.marks[k] for k in outlined], roll)
-        for reduction in dict.fromkeys((base, max(1, base // 2), 2 * base)[: 1 if rolls == _ROLLS[:1] else 3]):
+        for reduction in dict.fromkeys(
+            (base, max(1, base // 2), 2 * base)[: 1 if rolls == _ROLLS[:1] else 3]
+        ):
             for ratio in (0.72, 0.85):
                 seen = detection.candidates(search.look.outlines(reduction, ratio), drawn)
                 found = constellation.match(
@@ -336,7 +345,7 @@ def _problem(refined: Refined | None, mark: Mark) -> str:
     return ""
 
 
-def _eight_bit(grey: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:
+def _eight_bit(grey: Image) -> Image:
     if grey.dtype == np.uint8:
         return np.asarray(grey, dtype=np.uint8)
     # 12 bits in 16 are common: what is there is stretched to what can be.
@@ -375,4 +384,6 @@ def _found_mark(search: _Search, best: _Attempt, k: int) -> FoundMark:
         pixel = np.full(2, np.nan) if best.view is None else best.view.to_pixels(search.plane[k])
         covariance = np.full((2, 2), np.nan)
     used = best.view is not None and k in best.used
-    return FoundMark(search.marks[k], pixel, covariance, used, best.reasons.get(k, ""))
+    look = search.looks.get(k) if k in best.seen else None
+    found = FoundMark(search.marks[k], pixel, covariance, used, best.reasons.get(k, ""))
+    return found if look is None else replace(found, contrast=look.contrast, blur=look.blur)

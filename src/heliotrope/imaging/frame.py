@@ -11,6 +11,8 @@ from heliotrope.errors import InputError
 
 #: Pixels of a frame: grey (H, W) or blue-green-red (H, W, 3), 8 or 16 bit.
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+#: Values on a grid of pixels, of any type: what OpenCV takes and gives.
+Image = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Frame:
         return float(np.iinfo(self.pixels.dtype).max)
 
     @property
-    def grey(self) -> npt.NDArray[Any]:
+    def grey(self) -> Image:
         """Brightness (H, W) in the frame's own type: the weights of Rec. 601."""
         import cv2
 

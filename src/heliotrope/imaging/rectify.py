@@ -9,7 +9,7 @@ import numpy.typing as npt
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.finding import face_marks
-from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.marks import polygons
 from heliotrope.imaging.view import Face, View, faces
 
@@ -49,12 +49,12 @@ class Rectified:
     """
 
     face: Face
-    values: npt.NDArray[np.float32]
+    values: Image
     step: float
     first: FloatArray
     surface: Mask
     marks: Mask
-    clipped: npt.NDArray[np.float32]
+    clipped: Image
     view: View | None = None
 
     @property
@@ -76,7 +76,7 @@ class Rectified:
         return np.asarray((np.asarray(plane) - self.first) / self.step * [1.0, -1.0])
 
     @cached_property
-    def axes(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    def axes(self) -> tuple[Image, Image]:
         """Plane coordinates of columns (W,) and rows (H,), m."""
         rows, columns = self.shape
         x = self.first[0] + self.step * np.arange(columns)
@@ -84,7 +84,7 @@ class Rectified:
         return x.astype(np.float32), y.astype(np.float32)
 
 
-def rectify(frame: Frame, view: View, grey: npt.NDArray[np.generic] | None = None) -> Rectified:
+def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
     """Return a face of a frame on a grid of metres.
 
     Parameters
@@ -164,9 +164,7 @@ def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
     return Rectified(face, values, step, first, np.ones(shape, dtype=bool), printed, top)
 
 
-def _resample(
-    grey: npt.NDArray[np.generic], reduction: int, at: npt.NDArray[np.float32], full: float
-) -> npt.NDArray[np.float32]:
+def _resample(grey: Image, reduction: int, at: Image, full: float) -> Image:
     import cv2
 
     small = grey

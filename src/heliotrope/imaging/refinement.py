@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging.frame import Image
 from heliotrope.imaging.marks import polygons
 
 #: Samples are this many pixels apart.
@@ -32,12 +33,16 @@ class Refined:
         Brightness of the drawing over that of its surroundings, 1 for nothing there.
     explained
         Part of the variance that the drawing explains, at most 1.
+    blur
+        Standard deviation of what softens its edges, across upright and level ones, m,
+        (2,); it cannot be told below two pixels.
     """
 
     pixel: FloatArray
     covariance: FloatArray
     contrast: float
     explained: float
+    blur: FloatArray
 
 
 @lru_cache(maxsize=256)
@@ -65,7 +70,7 @@ def _drawn(kind: str, key: tuple[float, ...], code: str, step: float) -> tuple[F
 
 
 def refine(
-    grey: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    grey: Image,
     mark: Mark,
     pixel: FloatArray,
     scale: FloatArray,
@@ -123,14 +128,14 @@ def _template(mark: Mark, step: float, picture: FloatArray | None) -> tuple[Floa
         return drawn, first
     import cv2
 
-    count = max(int(round(mark.size / step)), 4)
+    count = max(round(float(mark.size / step)), 4)
     small = cv2.resize(picture.astype(np.float32), (count, count), interpolation=cv2.INTER_AREA)
     offset = 0.5 * mark.size * (1.0 - 1.0 / count)
     return small.astype(np.float64) / max(float(small.max()), 1.0), np.array([-offset, offset])
 
 
 def _sample(
-    grey: npt.NDArray[np.generic], pixel: FloatArray, scale: FloatArray, first: FloatArray,
+    grey: Image, pixel: FloatArray, scale: FloatArray, first: FloatArray,
     step: float, shape: npt.NDArray[np.intp],
 ) -> FloatArray | None:  # fmt: skip
     """Return the frame on a grid of the plane; None if less than most of it is in the frame."""
@@ -142,12 +147,10 @@ def _sample(
     rows, columns = int(shape[0]), int(shape[1])
     corners = b + np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]]) @ A.T
     height, width = grey.shape
-    inside = (
-        (corners[:, 0] > -0.2 * np.ptp(corners[:, 0])) & (corners[:, 1] > -0.2 * np.ptp(corners[:, 1]))
-        & (corners[:, 0] < width + 0.2 * np.ptp(corners[:, 0]))
-        & (corners[:, 1] < height + 0.2 * np.ptp(corners[:, 1]))
-    )  # fmt: skip
-    if not inside.all() or not np.isfinite(corners).all():
+    if not np.isfinite(corners).all():
+        return None
+    beyond = 0.2 * np.ptp(corners, axis=0)
+    if (corners < -beyond).any() or (corners > [width, height] + beyond).any():
         return None
     warped = cv2.warpAffine(
         grey, np.column_stack([A, b]), (columns, rows),
@@ -157,7 +160,7 @@ def _sample(
 
 
 def _adjust(
-    grey: npt.NDArray[np.generic], template: FloatArray, first: FloatArray, step: float,
+    grey: Image, template: FloatArray, first: FloatArray, step: float,
     pixel: FloatArray, scale: FloatArray, shift: FloatArray,
 ) -> Refined | None:  # fmt: skip
     """Gauss-Newton on the shift, with brightness a + b·x + c·y + d·drawing at each step."""
@@ -193,9 +196,14 @@ def _adjust(
     covariance = _SHARED * variance * np.linalg.pinv(information, hermitian=True)
     plane = covariance[4:, 4:] / max(float(numbers[3] ** 2), 1e-12)
     plain = flat - even @ np.linalg.solve(even.T @ even, even.T @ flat)
+    # A soft step of height d has the slope d/(√2π σ) at its middle.
+    down, right = np.gradient(flat.reshape(template.shape))
+    steepest = np.array([np.percentile(np.abs(right), 98.5), np.percentile(np.abs(down), 98.5)])
+    blur = step * abs(numbers[3]) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
     return Refined(
         pixel=pixel + scale @ shift,
         covariance=scale @ plane @ scale.T + _FLOOR**2 * np.eye(2),
         contrast=float((numbers[0] + numbers[3]) / max(float(numbers[0]), 1e-9)),
         explained=1.0 - float(np.var(residual)) / max(float(np.var(plain)), 1e-9),
+        blur=blur,
     )

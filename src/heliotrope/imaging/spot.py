@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.background import Background, smooth
+from heliotrope.imaging.frame import Image
 from heliotrope.imaging.rectify import Mask, Rectified
 
 #: A beam rises by this many deviations of the background's remains, and this much of it.
@@ -106,9 +106,11 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     foot = _FOOT * background.deviation
     level = float(np.median(background.values[picture.paint]))
     seed = max(_SEED * background.deviation, _SEED_PART * level)
-    tops = _tops(soft, picture, foot, seed)
-    if tops is None:
+    # Tops are broad: every third pixel shows them.
+    coarse = _tops(soft[::3, ::3], picture.surface[::3, ::3], foot, seed)
+    if coarse is None:
         return []
+    tops = np.repeat(np.repeat(coarse, 3, axis=0), 3, axis=1)[: soft.shape[0], : soft.shape[1]]
     spots = []
     for number in range(1, int(tops.max()) + 1):
         core = _core(soft, tops == number, foot)
@@ -118,7 +120,7 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     return sorted(spots, key=lambda s: -s.power)
 
 
-def _core(soft: npt.NDArray[np.float32], owned: Mask, foot: float) -> Mask:
+def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     """What hangs together with a beam's top above its foot."""
     import cv2
 
@@ -135,13 +137,14 @@ def _core(soft: npt.NDArray[np.float32], owned: Mask, foot: float) -> Mask:
     neck = int(_NECK * breadth)
     if neck < 2:
         return np.asarray(core)
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * neck + 1, 2 * neck + 1))
-    opened = cv2.morphologyEx(core.astype(np.uint8), cv2.MORPH_OPEN, disc)
-    _, labels = cv2.connectedComponents(opened | half.astype(np.uint8), connectivity=4)
+    # Opened by a disc: what is farther from the rim than its radius, and what is near that.
+    inner = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, 5) <= neck
+    opened = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5) <= neck
+    _, labels = cv2.connectedComponents((core & opened | half).astype(np.uint8), connectivity=4)
     return np.asarray(labels == labels[top])
 
 
-def _light(picture: Rectified, background: Background) -> npt.NDArray[np.float32]:
+def _light(picture: Rectified, background: Background) -> Image:
     """What beams add; where a mark covers the paint, what is around it says."""
     added = picture.values - background.values
     if not picture.marks.any():
@@ -150,13 +153,10 @@ def _light(picture: Rectified, background: Background) -> npt.NDArray[np.float32
     return np.where(picture.marks, around, added).astype(np.float32)
 
 
-def _tops(
-    soft: npt.NDArray[np.float32], picture: Rectified, foot: float, seed: float
-) -> npt.NDArray[np.int32] | None:
+def _tops(soft: Image, inside: Mask, foot: float, seed: float) -> Image | None:
     """Number the beams: falling levels show tops appear, grow and meet."""
     import cv2
 
-    inside = picture.surface
     highest = float(soft[inside].max(initial=0.0))
     if highest < seed:
         return None
@@ -201,17 +201,17 @@ def _meeting(
         if label == 0 or len(tops) < 2:
             continue
         highest = max(tops, key=lambda t: peaks[t])
-        for top in tops:
-            if top != highest and level > (1.0 - _DIP) * peaks[top]:
-                gone.append((highest, top))
+        gone += [
+            (highest, top) for top in tops if top != highest and level > (1.0 - _DIP) * peaks[top]
+        ]
         held[label] = [t for t in tops if t == highest or level <= (1.0 - _DIP) * peaks[t]]
     return gone
 
 
 def _spread(
-    owner: npt.NDArray[np.int32], labels: npt.NDArray[np.int32], held: dict[int, list[int]],
+    owner: Image, labels: Image, held: dict[int, list[int]],
     places: dict[int, tuple[int, int]],
-) -> npt.NDArray[np.int32]:  # fmt: skip
+) -> Image:  # fmt: skip
     """Give the pixels of this level to their tops; where several share, to the nearest."""
     from scipy.ndimage import distance_transform_edt
 
@@ -233,9 +233,7 @@ def _spread(
     return grown
 
 
-def _renumbered(
-    owner: npt.NDArray[np.int32], peaks: dict[int, float]
-) -> npt.NDArray[np.int32] | None:
+def _renumbered(owner: Image, peaks: dict[int, float]) -> Image | None:
     if not peaks:
         return None
     table = np.zeros(int(owner.max()) + 1, dtype=np.int32)
@@ -246,15 +244,15 @@ def _renumbered(
 
 
 def _measure(
-    picture: Rectified, background: Background, light: npt.NDArray[np.float32],
-    soft: npt.NDArray[np.float32], core: Mask, tops: npt.NDArray[np.int32],
+    picture: Rectified, background: Background, light: Image,
+    soft: Image, core: Mask, tops: Image,
 ) -> Spot:  # fmt: skip
     """Return the moments of one beam and how certain they are."""
     import cv2
 
     step = picture.step
     radius = np.sqrt(core.sum() / np.pi)
-    grow = max(int(round(_TAIL * radius)), 2)
+    grow = max(round(float(_TAIL * radius)), 2)
     size = (2 * grow + 1, 2 * grow + 1)
     wide = cv2.dilate(core.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, size))
     region = (wide > 0) & picture.surface & ((tops == 0) | core)
@@ -263,7 +261,7 @@ def _measure(
     x, y = picture.axes[0][box[1]].astype(np.float64), picture.axes[1][box[0]].astype(np.float64)
     weight = np.where(inside, light[box], 0.0).astype(np.float64)
     total, centroid = _centroid(weight, x, y)
-    tight, narrow = _centroid(np.where(core[box], weight, 0.0), x, y)
+    _, narrow = _centroid(np.where(core[box], weight, 0.0), x, y)
     dx, dy = x - centroid[0], y - centroid[1]
     moments = _second(np.maximum(weight, 0.0), dx, dy)
     peak = float(soft[core].max())
@@ -338,7 +336,7 @@ def _from_background(
     return np.asarray(fit + (patch * background.deviation**2 + background.noise**2) * spread)
 
 
-def _edge(picture: Rectified, soft: npt.NDArray[np.float32], region: Mask) -> float:
+def _edge(picture: Rectified, soft: Image, region: Mask) -> float:
     """Greatest brightness of a beam at the border of what is seen of the target."""
     import cv2
 

@@ -1,7 +1,8 @@
 """A view: how a plane with targets lies in one frame, with its covariance."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -111,7 +112,8 @@ class View:
 
     def to_plane(self, pixels: npt.ArrayLike) -> FloatArray:
         """Return places in the plane (..., 2), m, that pixels (..., 2) show."""
-        return _apply(np.linalg.inv(self.H_norm_plane), undistort(self.lens, pixels))
+        inverse = np.asarray(np.linalg.inv(self.H_norm_plane), dtype=np.float64)
+        return _apply(inverse, undistort(self.lens, pixels))
 
     def scale(self, plane: npt.ArrayLike) -> FloatArray:
         """Return d(pixel)/d(plane), pixels per metre, (..., 2, 2)."""
@@ -130,7 +132,7 @@ class View:
         """
         place = np.asarray(plane, dtype=np.float64)
         numbers = _numbers(self.face, self.H_norm_plane, self.lens)
-        J = _slopes(lambda p: _predict(self.face, self.lens, p, place[None])[0], numbers)
+        J = _slopes(lambda p: _predict(self.face, self.lens, p, place[None])[..., 0, :], numbers)
         moved = np.linalg.solve(self.scale(place), J)
         return np.asarray(moved @ self.covariance @ moved.T)
 
@@ -140,7 +142,9 @@ def distort(lens: Camera, plane: npt.ArrayLike) -> FloatArray:
     return _distort(lens.matrix, lens.distortion, np.asarray(plane, dtype=np.float64))
 
 
-def _distort(m: FloatArray, distortion: FloatArray, plane: FloatArray) -> FloatArray:
+def _distort(
+    m: FloatArray, distortion: Sequence[Any] | FloatArray, plane: FloatArray
+) -> FloatArray:
     x, y = plane[..., 0], plane[..., 1]
     k1, k2, p1, p2, k3 = distortion
     r2 = x * x + y * y
@@ -211,14 +215,14 @@ def fit_view(
 
     def residuals(numbers: FloatArray) -> FloatArray:
         miss = _predict(face, lens, numbers, plane) - pixels
-        whitened = np.einsum("nij,nj->ni", white, miss).ravel()
-        return np.append(whitened, (numbers[8] - prior) / deviation)
+        whitened = (white @ miss[..., None]).reshape(*miss.shape[:-2], -1)
+        held = (numbers[..., 8:] - prior) / deviation
+        return np.concatenate([whitened, held], axis=-1)
 
     numbers = _numbers(face, homography(plane, undistort(lens, pixels)), lens)
-    J, cost = _slopes(residuals, numbers), np.inf
+    J, cost = np.empty((0, 9)), np.inf
     for _ in range(20):
-        miss = residuals(numbers)
-        J = _slopes(residuals, numbers)
+        miss, J = residuals(numbers), _slopes(residuals, numbers)
         step = np.linalg.lstsq(J, -miss, rcond=None)[0]
         numbers = numbers + step
         # The start is within a pixel or two: Gauss-Newton converges from there.
@@ -232,24 +236,23 @@ def fit_view(
     information = J.T @ J
     H, k1 = _unpack(face, numbers)
     distortion = lens.distortion.copy()
-    distortion[0] = k1
+    distortion[0] = float(k1)
     fitted = replace(lens, distortion=distortion)
     miss = distort(fitted, _apply(H, plane)) - pixels
     return View(
         face=face,
         lens=fitted,
         H_norm_plane=H,
-        covariance=factor * np.linalg.pinv(information, hermitian=True),
+        covariance=np.asarray(factor * np.linalg.pinv(information, hermitian=True), np.float64),
         residual=float(np.sqrt(np.mean(np.sum(miss**2, axis=-1)))),
     )
 
 
 def _slopes(function: Callable[[FloatArray], FloatArray], numbers: FloatArray) -> FloatArray:
-    """Return the derivatives of a function by central differences, (M, 9)."""
+    """Return the derivatives by central differences, (M, 9), of a function of (..., 9)."""
     steps = 1e-6 * np.eye(len(numbers))
-    return np.stack(
-        [(function(numbers + step) - function(numbers - step)) / 2e-6 for step in steps], axis=-1
-    )
+    ahead, back = function(numbers + steps), function(numbers - steps)
+    return np.asarray(((ahead - back) / 2e-6).T)
 
 
 def _apply(H: FloatArray, points: FloatArray) -> FloatArray:
@@ -275,13 +278,17 @@ def _numbers(face: Face, H: FloatArray, lens: Camera) -> FloatArray:
     return np.append(scaled.ravel()[:8], lens.distortion[0])
 
 
-def _unpack(face: Face, numbers: FloatArray) -> tuple[FloatArray, float]:
-    H = np.append(numbers[:8], 1.0).reshape(3, 3) / _scales(face)
-    return H, float(numbers[8])
+def _unpack(face: Face, numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return homographies (..., 3, 3) and k1 (...) of the unknowns (..., 9)."""
+    ones = np.ones((*numbers.shape[:-1], 1))
+    H = np.concatenate([numbers[..., :8], ones], axis=-1).reshape(*numbers.shape[:-1], 3, 3)
+    return np.asarray(H / _scales(face)), np.asarray(numbers[..., 8])
 
 
 def _predict(face: Face, lens: Camera, numbers: FloatArray, plane: FloatArray) -> FloatArray:
+    """Return pixels (..., N, 2) of places (N, 2) for unknowns (..., 9)."""
     H, k1 = _unpack(face, numbers)
-    distortion = lens.distortion.copy()
-    distortion[0] = k1
-    return _distort(lens.matrix, distortion, _apply(H, plane))
+    homogeneous = np.column_stack([plane, np.ones(len(plane))])
+    seen = homogeneous @ np.swapaxes(H, -1, -2)
+    norm = seen[..., :2] / seen[..., 2:]
+    return _distort(lens.matrix, (k1[..., None], *lens.distortion[1:]), norm)
