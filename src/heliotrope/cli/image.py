@@ -1,0 +1,267 @@
+"""``heliotrope image``: where the beams of photographs stand on their targets."""
+
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from heliotrope.cli import _calibration as shared
+from heliotrope.cli._common import open_plant, print_json
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from distributed import Client
+
+    from heliotrope.field.camera import Camera
+    from heliotrope.field.target import Target
+    from heliotrope.imaging.campaign import Job, Outcome
+    from heliotrope.imaging.log import Entry, Log
+    from heliotrope.sun import Site
+
+
+def image(
+    paths: Annotated[list[Path], typer.Argument(help="Photographs, or folders of them.")],
+    plant: Annotated[
+        Path, typer.Option(help="Plant file or folder, or PAINT's tower-measurements.json.")
+    ],
+    target: Annotated[str, typer.Option(help="The target that the beam was sent to.")] = "",
+    crop: Annotated[
+        bool, typer.Option("--crop", help="Each picture shows exactly one target.")
+    ] = False,
+    camera: Annotated[str, typer.Option(help="Which camera of the plant took them.")] = "",
+    empty: Annotated[
+        Path | None, typer.Option(help="The same camera's photograph without the beam.")
+    ] = None,
+    annotated: Annotated[Path | None, typer.Option(help="Folder for annotated pictures.")] = Path(
+        "out/image"
+    ),
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Write annotated pictures.")
+    ] = True,
+    to_sightings: Annotated[
+        Path | None, typer.Option(help="Write the sightings to this CSV or Parquet table.")
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option(help="CSV: file or id, heliostat, motor positions, time.")
+    ] = None,
+    heliostat: Annotated[str, typer.Option(help="Whose beam it is, if no log says so.")] = "",
+    processes: Annotated[
+        int, typer.Option(min=0, help="Processes on this machine; 0: one a core.")
+    ] = 0,
+    scheduler: shared.SchedulerOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Find targets and spots in photographs: metres with covariance, or the reason why not."""
+    from heliotrope.imaging import campaign
+    from heliotrope.imaging.log import read_log
+
+    place = open_place(plant)
+    files = _files(paths)
+    table: Log | None = None if log is None else read_log(log)
+    entries = campaign.known_of(files, table, heliostat)
+    job = _job(place, target, crop, camera, empty, annotated if pictures else None)
+    with _cluster(scheduler) as client, shared.progress("reading", as_json) as advance:
+        outcomes = campaign.process_many(
+            files, job, entries,
+            processes=processes or len(os.sched_getaffinity(0)), client=client, progress=advance,
+        )  # fmt: skip
+    left_out: list[str] = []
+    count = 0
+    if to_sightings is not None:
+        count, left_out = _write(to_sightings, outcomes, entries, place)
+    _show(outcomes, as_json, to_sightings, count, left_out)
+    broken = [o for o in outcomes if o.problem]
+    for outcome in broken:
+        print(f"heliotrope: {outcome.problem}", file=sys.stderr)
+    if broken or (to_sightings is not None and not count):
+        raise typer.Exit(2)
+
+
+@dataclass(frozen=True)
+class Place:
+    """What of a plant the photographs need.
+
+    Attributes
+    ----------
+    targets, cameras
+        Of the plant.
+    site
+        Its reference point.
+    names
+        Of its heliostats; empty if the file has none.
+    folder
+        Of the plant file: taught pictures lie there.
+    """
+
+    targets: "tuple[Target, ...]"
+    cameras: "tuple[Camera, ...]"
+    site: "Site"
+    names: tuple[str, ...]
+    folder: Path
+
+
+def open_place(path: Path) -> Place:
+    """Return targets, cameras and site of a plant, or of PAINT's tower file alone."""
+    from heliotrope.errors import InputError
+    from heliotrope.sun import Site
+
+    if path.suffix.lower() == ".json":
+        from heliotrope.field.formats.paint import read_tower
+
+        tower = read_tower(path)
+        place = Place(tower.targets, (), Site(*tower.origin), (), path.parent)
+    else:
+        found = open_plant(path)
+        folder = path if path.is_dir() else path.parent
+        place = Place(found.targets, found.cameras, found.site, found.names, folder)
+    if not place.targets:
+        raise InputError(f"{path}: there is no target in it; add [[targets]] with their marks")
+    return place
+
+
+def _files(paths: Sequence[Path]) -> list[Path]:
+    from heliotrope.errors import FormatError
+    from heliotrope.imaging.reading import find_images
+
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found = find_images(path)
+            if not found:
+                raise FormatError(path, "there is no image in this folder; give PNG, JPEG or TIFF")
+            files += found
+        else:
+            files.append(path)
+    return files
+
+
+def _job(
+    place: Place, target: str, crop: bool, camera: str,
+    empty: Path | None, annotated: Path | None,
+) -> "Job":  # fmt: skip
+    from heliotrope.errors import UnknownNameError
+    from heliotrope.imaging.campaign import Job
+    from heliotrope.imaging.photograph import Settings
+    from heliotrope.imaging.reading import read_image
+    from heliotrope.imaging.teaching import read_pictures
+
+    names = [t.name for t in place.targets]
+    if target and target not in names:
+        raise UnknownNameError("target", target, names)
+    cameras = [c.name for c in place.cameras]
+    if camera and camera not in cameras:
+        raise UnknownNameError("camera", camera, cameras)
+    # A plant with one camera took them with that; its size of frames is checked on use.
+    known = next((c for c in place.cameras if c.name == camera), None)
+    if not camera and len(place.cameras) == 1:
+        known = place.cameras[0]
+    if annotated is not None:
+        annotated.mkdir(parents=True, exist_ok=True)
+    taught = read_pictures(place.folder, place.targets)
+    return Job(
+        targets=place.targets,
+        origin=(place.site.latitude_deg, place.site.longitude_deg, place.site.height),
+        camera=known,
+        settings=Settings(pictures=taught),
+        crop=crop,
+        target=target,
+        annotated=annotated,
+        without=None if empty is None else read_image(empty),
+    )
+
+
+@contextmanager
+def _cluster(scheduler: str | None) -> "Iterator[Client | None]":
+    if scheduler is None:
+        yield None
+        return
+    from heliotrope.calibration import cluster
+
+    client = cluster.connect(scheduler)
+    try:
+        yield client
+    finally:
+        cluster.disconnect(client)
+
+
+def _write(
+    path: Path, outcomes: "Sequence[Outcome]", entries: "Sequence[Entry | None]", place: Place
+) -> tuple[int, list[str]]:
+    """Write the table of sightings; return how many, and a line for each that gives none."""
+    from heliotrope.calibration.sighting_table import write_sightings
+    from heliotrope.imaging.campaign import to_sightings
+
+    # A tower's file names no heliostats: those of the log are what there is.
+    names = place.names or tuple(sorted({e.heliostat for e in entries if e and e.heliostat}))
+    seen, left_out = to_sightings(outcomes, entries, names, place.site)
+    if seen is None:
+        return 0, left_out
+    write_sightings(path, seen, names, ["camera_target"] * len(seen))
+    return len(seen), left_out
+
+
+def _show(
+    outcomes: "Sequence[Outcome]", as_json: bool, table: Path | None, count: int,
+    left_out: list[str],
+) -> None:  # fmt: skip
+    read = [o for o in outcomes if not o.problem]
+    if as_json:
+        print_json(
+            {
+                "images": [o.document for o in read],
+                "unreadable": [{"file": str(o.path), "problem": o.problem} for o in outcomes
+                               if o.problem],
+                "sightings": None if table is None else {"file": str(table), "count": count},
+                "left_out": left_out,
+            }
+        )  # fmt: skip
+        return
+    if len(read) <= 40:
+        _print_spots(read)
+    if table is not None and count:
+        print(f"{count} sightings of {len(outcomes)} photographs: {table}")
+    for line in left_out[:40]:
+        print(f"left out: {line}")
+    if len(left_out) > 40:
+        print(f"left out: {len(left_out) - 40} more (all with --json)")
+    drawn = [o.annotated for o in read if o.annotated is not None]
+    if drawn:
+        print(f"annotated pictures: {drawn[0] if len(drawn) == 1 else drawn[0].parent}")
+
+
+def _print_spots(outcomes: "Sequence[Outcome]") -> None:
+    for outcome in outcomes:
+        print(outcome.path.name)
+        readings = outcome.document["targets"]
+        for reading in readings:
+            if not reading["found"]:
+                # A camera sees few of a plant's targets: what is absent matters if all are.
+                if not any(r["found"] for r in readings):
+                    print(f"  {reading['target']}: {reading['reasons'][0]['text']}")
+                continue
+            print(f"  {reading['target']}: {'good' if reading['good'] else 'not good'}")
+            for reason in reading["reasons"]:
+                print(f"    {reason['name']}: {reason['text']}")
+            for k, spot in enumerate(reading["spots"], start=1):
+                print(f"    spot {k}{_numbers(spot)}")
+        for spot in outcome.document["beside_the_targets"]:
+            print(f"  beside the targets\n    spot  {_numbers(spot)}")
+
+
+def _numbers(spot: "dict[str, Any]") -> str:
+    import numpy as np
+
+    covariance = np.asarray(spot["covariance_right_up_m2"], dtype=np.float64)
+    right, up = np.sqrt(np.diag(covariance))
+    correlation = covariance[0, 1] / (right * up) if right * up > 0.0 else 0.0
+    return (
+        f"  E {spot['east_m']:.3f}  N {spot['north_m']:.3f}  U {spot['up_m']:.3f} m"
+        f"   {spot['latitude_deg']:.8f}° {spot['longitude_deg']:.8f}° {spot['altitude_m']:.3f} m"
+        f"   ± {1e3 * right:.0f} right, {1e3 * up:.0f} up mm, correlation {correlation:+.2f}"
+    )
