@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -225,11 +226,16 @@ def _show(
     if len(read) <= 40:
         _print_spots(read)
     if table is not None and count:
-        print(f"{count} sightings of {len(outcomes)} photographs: {table}")
-    for line in left_out[:40]:
+        noun = "sighting" if count == 1 else "sightings"
+        print(f"{count} {noun} of {len(outcomes)} photographs: {table}")
+    elif table is not None:
+        print(f"no sighting in {len(outcomes)} photographs: {table} is not written")
+    for line in left_out[:12]:
         print(f"left out: {line}")
-    if len(left_out) > 40:
-        print(f"left out: {len(left_out) - 40} more (all with --json)")
+    if len(left_out) > 12:
+        reasons = Counter(line.split(": ", 1)[-1].split(":")[0] for line in left_out[12:])
+        listed = ", ".join(f"{count} × {reason}" for reason, count in reasons.most_common())
+        print(f"left out: {len(left_out) - 12} more ({listed}); all with --json")
     drawn = [o.annotated for o in read if o.annotated is not None]
     if drawn:
         print(f"annotated pictures: {drawn[0] if len(drawn) == 1 else drawn[0].parent}")
