@@ -1,0 +1,646 @@
+"""Motion between frames: did a beam move across the scene, where and how surely.
+
+Two frames of a camera that stands still differ by more than a beam: noise, another exposure,
+a cloud, wind at the mast. Each is modelled and taken out before a difference counts:
+
+1. Frames are reduced to at most 400 × 300 px, which also averages noise.
+2. Gain (with a slope across the frame) and offset are fitted robustly to cell means.
+3. A shift of the camera is measured by least squares in 8 × 6 tiles (Lucas and Kanade 1981),
+   if it is large from a start by phase correlation. It is believed only if tiles all over the
+   frame agree: a beam alone in the dark must not pass for a shaken camera.
+4. The difference is examined at three scales. Its deviation is measured for each level of
+   brightness (photon noise) and for each unit of gradient (what a shift leaves at edges); both
+   are the lesser of both frames: a beam does not raise the noise at the place where it came to.
+5. The threshold follows from the number of independent places and the rate of false alarms.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.imaging.frame import Frame, Pixels
+
+_WIDTH, _HEIGHT = 400, 300  # of what is examined
+_CELL = 8  # reduced pixels of a cell whose mean enters the fit of gain and offset
+_TILES, _SCALES, _LEVELS = (8, 6), 3, 8
+_SATURATED = 0.98  # of the full scale; above, a pixel knows no gain
+_PARTLY = 0.88  # of the full scale; above, a mean of pixels may hide saturated ones
+#: Of what a shift leaves at edges: medians that make a deviation; its bounds in reduced pixels,
+#: and its upper bound in pixels of the frame if no shift was believed.
+_EDGE, _LEAST_EDGE, _MOST_EDGE, _UNSURE = 2.0, 0.02, 0.1, 0.75
+_APART = 4  # pixels between places whose difference is noise: more than smoothing joins
+#: On the threshold of known normal noise: its deviation is measured, and edges have longer tails.
+_MARGIN = 1.2
+#: Of white noise smoothed as for the shift: mean square of a gradient of the mean of two frames
+#: over that of their difference; and pixels that make one independent value.
+_NOISE_GRADIENT, _JOINED = 0.064, 4.3
+_NORMAL = 1.4826  # deviation of a normal distribution over the median of its absolute values
+_Image = npt.NDArray[Any]  # (H, W), float32 unless said
+_Pair = tuple[float, float]  # right and down, pixels
+
+
+@dataclass(frozen=True)
+class Region:
+    """A connected part of a frame where light appeared or vanished.
+
+    Attributes
+    ----------
+    appeared
+        True if it became lighter, False if darker.
+    area_px
+        Pixels of the frame.
+    centroid_px
+        Of the difference, pixels right and down.
+    significance
+        Greatest difference in it, in deviations of the noise.
+    """
+
+    appeared: bool
+    area_px: float
+    centroid_px: _Pair
+    significance: float
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What changed between two frames.
+
+    Attributes
+    ----------
+    moved
+        Whether anything changed significantly.
+    significance, threshold
+        The greatest difference anywhere, and what it had to exceed, in deviations of the noise.
+    area_px
+        Of all regions together, pixels of the frame.
+    appeared_px, vanished_px
+        Centroids of the light that came and of that which went, pixels right and down, or NaN.
+    shift_px
+        By how much the scene stands further right and down in the second frame; 0 if
+        there was no shift that could be believed.
+    brightness_ratio
+        Of what did not move, second to first frame, in the middle of them.
+    regions
+        The most significant first.
+    problem
+        Why the frames cannot be compared, and nothing is said to have moved; empty if they can.
+    """
+
+    moved: bool = False
+    significance: float = 0.0
+    threshold: float = math.nan
+    area_px: float = 0.0
+    appeared_px: _Pair = (math.nan, math.nan)
+    vanished_px: _Pair = (math.nan, math.nan)
+    shift_px: _Pair = (0.0, 0.0)
+    brightness_ratio: float = math.nan
+    regions: tuple[Region, ...] = ()
+    problem: str = ""
+
+
+@dataclass(frozen=True)
+class MotionSettings:
+    """What counts as motion.
+
+    Attributes
+    ----------
+    false_alarms
+        Accepted rate of pairs of still frames that are said to have moved.
+    min_area_px
+        Regions below this area are left out, pixels of the frame.
+    max_shift_px, max_ratio
+        Greatest shift of the camera, pixels of the frame, and greatest change of brightness,
+        up or down, that are corrected; above, the frames cannot be compared.
+    """
+
+    false_alarms: float = 1e-3
+    min_area_px: float = 16.0
+    max_shift_px: float = 16.0
+    max_ratio: float = 3.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.false_alarms < 0.5:
+            raise InputError(f"false alarms {self.false_alarms} must be above 0 and below 0.5")
+        if not (self.min_area_px >= 0.0 and 0.0 <= self.max_shift_px < math.inf):
+            text = f"least area {self.min_area_px} px and greatest shift {self.max_shift_px} px"
+            raise InputError(f"{text} must be 0 or more")
+        if not 1.0 < self.max_ratio < math.inf:
+            raise InputError(f"greatest ratio of brightness {self.max_ratio} must be above 1")
+
+
+DEFAULT = MotionSettings()
+
+
+@dataclass(frozen=True)
+class _View:
+    """A frame as it is examined: grey, of full scale 1, reduced by ``factor``."""
+
+    image: _Image
+    cells: _Image  # float64, means of cells of it
+    factor: int
+    step: float  # one digit, of the full scale
+    size: tuple[int, int]
+
+
+def detect_motion(
+    before: Frame | Pixels,
+    after: Frame | Pixels,
+    mask: npt.ArrayLike | None = None,
+    settings: MotionSettings = DEFAULT,
+) -> Motion:
+    """Return what moved between two frames of a camera that stands still.
+
+    Parameters
+    ----------
+    before, after
+        Frames, or pixels (H, W) or (H, W, 3) of uint8 or uint16, of the same size.
+    mask
+        Where motion counts, (H, W), true or not 0; everywhere if None. The rest still
+        helps to find shift and brightness.
+    settings
+        What counts as motion.
+
+    Raises
+    ------
+    InputError
+        If the sizes differ, or the mask is of another size or covers everything.
+    """
+    one, two = _view(before), _view(after)
+    return _compare(one, two, _mask(mask, one), settings)
+
+
+def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
+    """Return by how many pixels the scene stands further right and down in ``after``.
+
+    None if no shift explains the frames in tiles all over them: without texture, or of different
+    scenes. Below 1 px it is good to about 0.05 px where there is texture. Raises InputError if
+    the sizes differ.
+    """
+    one, two = _view(before), _view(after)
+    found = _register(_expected(one, two)[0], two.image)
+    return (found[0] * one.factor, found[1] * one.factor) if found else None
+
+
+# -- preparation -----------------------------------------------------------------------
+
+
+def _view(given: Frame | Pixels) -> _View:
+    import cv2
+
+    frame = given if isinstance(given, Frame) else Frame(given)
+    width, height = frame.size
+    if min(width, height) < 16:
+        raise InputError(f"a frame of {width} × {height} px; motion needs 16 × 16 px or more")
+    factor = max(1, math.ceil(width / _WIDTH), math.ceil(height / _HEIGHT))
+    grey = frame.grey
+    if factor > 1:
+        # Whole blocks alone: the shares of a fractional reduction vary over the frame.
+        size = (width // factor, height // factor)
+        grey = grey[: size[1] * factor, : size[0] * factor]
+        grey = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    image = grey.astype(np.float32) * np.float32(1.0 / frame.full_scale)
+    return _View(image, _cells(image), factor, 1.0 / frame.full_scale, frame.size)
+
+
+def _mask(mask: npt.ArrayLike | None, view: _View) -> _Image | None:
+    import cv2
+
+    if mask is None:
+        return None
+    given = np.asarray(mask) != 0
+    if given.shape != (view.size[1], view.size[0]):
+        raise InputError(f"a mask of {given.shape} does not fit frames of {view.size[::-1]} px")
+    if not given.any():
+        raise InputError("the mask leaves nothing where motion could count")
+    size = view.image.shape[1::-1]
+    share = cv2.resize(given.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(share > 0.0, dtype=np.uint8)
+
+
+# -- brightness ------------------------------------------------------------------------
+
+
+def _cells(image: _Image) -> _Image:
+    import cv2
+
+    h, w = image.shape
+    size = (max(1, w // _CELL), max(1, h // _CELL))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def _expected(one: _View, two: _View) -> tuple[_Image, float]:
+    """Return the first frame in the light of the second, and the ratio of brightness.
+
+    Gain, its slopes across the frame and the offset are fitted with Tukey's weights; without
+    contrast offset and gain cannot be told apart, and there is no offset.
+    """
+    if one.size != two.size:
+        raise InputError(
+            f"frames of {one.size[0]} × {one.size[1]} and {two.size[0]} × {two.size[1]} px "
+            "cannot be compared; give two of the same camera"
+        )
+    a, b = one.cells, two.cells
+    y, x = np.mgrid[-1.0 : 1.0 : a.shape[0] * 1j, -1.0 : 1.0 : a.shape[1] * 1j]
+    dark = one.step + two.step
+    good = (a < _PARTLY) & (b < _PARTLY) & (a > dark)
+    good |= good.sum() < 32
+    a, b, x, y = a[good], b[good], x[good], y[good]
+    start = max(float(_median(b)), one.step) / max(float(_median(a)), one.step)
+    spread = _NORMAL * float(_median(np.abs(a - _median(a))))
+    design = np.stack([a, a * x, a * y, np.ones_like(a)], axis=-1)
+    p, rest = _fitted(design, b, start, one.step)
+    if spread < 10.0 * rest + dark:
+        p, _ = _fitted(design[:, :3], b, start, one.step)
+    h, w = one.image.shape
+    u = np.linspace(-1.0, 1.0, w, dtype=np.float32)
+    v = np.linspace(-1.0, 1.0, h, dtype=np.float32)[:, None]
+    gain = (np.float32(p[0]) + np.float32(p[1]) * u) + np.float32(p[2]) * v
+    offset = np.float32(p[3] if len(p) > 3 else 0.0)
+    return one.image * gain + offset, float(p[0])
+
+
+def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Image, float]:
+    """Return the parameters of a robust fit, and the deviation of what it leaves."""
+    p = np.zeros(design.shape[1])
+    p[0] = start
+    scale = step
+    for _ in range(8):
+        rest = b - design @ p
+        scale = max(_NORMAL * float(_median(np.abs(rest))), 0.1 * step)
+        weight = np.square(np.clip(1.0 - np.square(rest / (4.685 * scale)), 0.0, None))
+        normal = design.T @ (weight[:, None] * design)
+        normal[np.diag_indices_from(normal)] += 1e-9 * max(1.0, float(np.trace(normal)))
+        p = p + np.linalg.solve(normal, design.T @ (weight * rest))
+    return p, scale
+
+
+# -- shift -----------------------------------------------------------------------------
+
+
+def _register(a: _Image, b: _Image) -> _Pair | None:
+    """Return the shift of b against a, pixels; None if none can be believed."""
+    import cv2
+
+    if min(a.shape) < 32:
+        return None
+    near = _refine(a, b, (0.0, 0.0))
+    if near is not None and math.hypot(*near[1]) < 0.5:
+        return near[1]
+    # Half the size is four times as quick, and as good as the least squares need it.
+    size = (a.shape[1] // 2, a.shape[0] // 2)
+    halves = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (a, b)]
+    (x, y), _ = cv2.phaseCorrelate(halves[0], halves[1], cv2.createHanningWindow(size, cv2.CV_32F))
+    far = _refine(a, b, (2.0 * x, 2.0 * y)) if math.hypot(x, y) < 0.25 * min(size) else None
+    found = [refined for refined in (near, far) if refined is not None]
+    return max(found)[1] if found else None
+
+
+def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
+    """Return the number of tiles that agree and their shift."""
+    import cv2
+
+    # A central difference is a gradient only of what is smooth.
+    a, b = (cv2.GaussianBlur(i, (5, 5), 1.0) for i in (a, b))
+    x, y = start
+    agreed = 0
+    for _ in range(3):
+        found = _tile_shift(_moved(a, x, y), b)
+        if found is None:
+            return None
+        agreed, dx, dy = found
+        x, y = x + dx, y + dy
+        if math.hypot(dx, dy) < 0.01:
+            break
+    return agreed, (x, y)
+
+
+def _moved(image: _Image, x: float, y: float) -> _Image:
+    """Return the image x pixels further right and y further down."""
+    import cv2
+
+    if x == 0.0 and y == 0.0:
+        return image
+    # The cubic kernel of Keys (1981, a = -0.5) at the exact place: a warp by OpenCV would round
+    # that to 1/32 px, which at an edge of 200 digits leaves 3 of them.
+    whole = [math.floor(x), math.floor(y)]
+    kernels = []
+    for part in (x - whole[0], y - whole[1]):
+        d = np.abs(part + np.arange(-2.0, 2.0))  # from the place to the four pixels about it
+        near = 1.5 * d**3 - 2.5 * d**2 + 1.0
+        kernels.append(np.where(d <= 1.0, near, -0.5 * d**3 + 2.5 * d**2 - 4.0 * d + 2.0))
+    edge = cv2.BORDER_REPLICATE
+    out = cv2.sepFilter2D(image, cv2.CV_32F, kernels[0], kernels[1], anchor=(2, 2), borderType=edge)
+    if whole != [0, 0]:
+        matrix = np.array([[1.0, 0.0, whole[0]], [0.0, 1.0, whole[1]]])
+        size, how = (image.shape[1], image.shape[0]), cv2.INTER_NEAREST
+        out = cv2.warpAffine(out, matrix, size, flags=how, borderMode=edge)
+    return out
+
+
+def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
+    """Return how many tiles agree on a small shift, and the shift, pixels."""
+    import cv2
+
+    # The gradient of the mean of both: its noise does not depend on that of the difference.
+    both, d = cv2.addWeighted(a, 0.5, b, 0.5, 0.0), a - b
+    gx = cv2.Sobel(both, cv2.CV_32F, 1, 0, scale=0.125)
+    gy = cv2.Sobel(both, cv2.CV_32F, 0, 1, scale=0.125)
+    xx, xy, yy, xd, yd, dd = (
+        cv2.resize(p, _TILES, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
+        for p in (gx * gx, gx * gy, gy * gy, gx * d, gy * d, d * d)
+    )
+    # Noise has gradients too: those of the quietest tile are nobody's texture.
+    quiet = min(float(np.partition(dd, 4)[4]) * _NOISE_GRADIENT, float(min(xx.min(), yy.min())))
+    xx, yy = xx - quiet, yy - quiet
+    trace, determinant = xx + yy, xx * yy - xy * xy
+    weaker = 0.5 * trace - np.sqrt(np.maximum(0.25 * trace * trace - determinant, 0.0))
+    safe = np.where(determinant > 0.0, determinant, 1.0)
+    dx, dy = (yy * xd - xy * yd) / safe, (xx * yd - xy * xd) / safe
+    # Deviation of a tile's shift across its weaker direction, from what the shift leaves.
+    pixels = a.size / len(xx) / _JOINED
+    left = np.maximum(dd - xd * dx - yd * dy, 1e-12)
+    deviation = np.sqrt(left / np.maximum(pixels * weaker, 1e-30))
+    good = (determinant > 0.0) & (deviation < 0.1) & (weaker > 2.0 * left * _NOISE_GRADIENT)
+    if good.sum() < 4:
+        return None
+    mx, my = _median(dx[good]), _median(dy[good])
+    near = good & (np.hypot(dx - mx, dy - my) < np.maximum(4.0 * deviation, 0.05))
+    rows, columns = np.divmod(np.flatnonzero(near), _TILES[0])
+    spread = max(np.ptp(columns) / _TILES[0], np.ptp(rows) / _TILES[1]) if len(rows) else 0.0
+    if len(rows) < max(4.0, 0.5 * good.sum()) or spread < 0.4:
+        return None
+    # All tiles that agree, as one: also those sharp in one direction only.
+    s = [v[near].sum() for v in (xx, xy, yy, xd, yd)]
+    whole = s[0] * s[2] - s[1] * s[1]
+    x, y = (s[2] * s[3] - s[1] * s[4]) / whole, (s[0] * s[4] - s[1] * s[3]) / whole
+    return int(near.sum()), float(x), float(y)
+
+
+# -- difference ------------------------------------------------------------------------
+
+
+def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettings) -> Motion:
+    if problem := _exposed(one, "first") or _exposed(two, "second"):
+        return Motion(problem=problem)
+    wanted, ratio = _expected(one, two)
+    if not 1.0 / settings.max_ratio <= ratio <= settings.max_ratio:
+        text = f"the brightness changed by {ratio:.3g}, the limit is {settings.max_ratio:g}"
+        return Motion(brightness_ratio=ratio, problem=text)
+    believed = _register(wanted, two.image)
+    found = believed or (0.0, 0.0)
+    edge = max(_MOST_EDGE, 0.0 if believed else _UNSURE / one.factor)
+    shift = (found[0] * one.factor, found[1] * one.factor)
+    if math.hypot(*shift) > settings.max_shift_px:
+        text = f"the camera moved by {math.hypot(*shift):.1f} of {settings.max_shift_px:g} px"
+        return Motion(shift_px=shift, brightness_ratio=ratio, problem=text)
+    parts = _difference(one, two, wanted, found, ratio)
+    counts = np.ones(wanted.shape, np.uint8) if mask is None else mask
+    threshold = _threshold(places := int(np.count_nonzero(counts)), settings)
+    high, low, weight = _significance(parts, counts, two.step, edge)
+    unit = 2 * one.factor
+    regions = [
+        *_regions(high, weight, threshold, True, unit, settings.min_area_px),
+        *_regions(-low, weight, threshold, False, unit, settings.min_area_px),
+    ]
+    regions.sort(key=lambda pair: -pair[0].significance)
+    area = sum(region.area_px for region, _ in regions)
+    if area > 0.5 * places * one.factor**2:
+        problem = "more than half of the frame changed: another scene, or the light of it"
+    return Motion(
+        moved=bool(regions) and not problem,
+        significance=float(max(high.max(), -low.min())),
+        threshold=threshold,
+        area_px=area,
+        appeared_px=_centroid(regions, True),
+        vanished_px=_centroid(regions, False),
+        shift_px=shift,
+        brightness_ratio=ratio,
+        regions=tuple(region for region, _ in regions),
+        problem=problem,
+    )
+
+
+def _exposed(view: _View, which: str) -> str:
+    most, full = float(view.cells.max()), float((view.cells >= _SATURATED).mean())
+    if most < 4.0 * view.step:
+        return f"the {which} frame is dark: no more than {most / view.step:.1f} digits"
+    if full > 0.5:
+        return f"the {which} frame is overexposed: {100 * full:.0f} % of it are saturated"
+    return ""
+
+
+def _difference(one: _View, two: _View, wanted: _Image, shift: _Pair, ratio: float) -> list[_Image]:
+    """Return the difference, the lesser brightness and gradient, and 1 where they are known."""
+    import cv2
+
+    bright = np.maximum(one.image, wanted)
+    if math.hypot(*shift) > 0.005:
+        wanted, bright = _moved(wanted, *shift), _moved(bright, *shift)
+    wanted = np.minimum(wanted, np.float32(1.0))
+    d = two.image - wanted
+    # What is saturated in part says only that it is bright.
+    level = np.minimum(wanted, two.image)
+    blind = np.maximum(bright, two.image) > _PARTLY
+    blind &= level > (_PARTLY - 0.1) * min(1.0, ratio)
+    x, y = (math.ceil(abs(s)) + 1 for s in shift)  # at its edges a shifted frame knows nothing
+    blind[:y], blind[-y:], blind[:, :x], blind[:, -x:] = True, True, True, True
+    d[blind] = 0.0
+    slopes = [
+        cv2.magnitude(*(cv2.Sobel(i, cv2.CV_32F, k, 1 - k, scale=0.125) for k in (0, 1)))
+        for i in (wanted, two.image)
+    ]
+    gradient = cv2.dilate(np.minimum(*slopes), np.ones((3, 3), np.uint8))
+    return [d, level, gradient, 1.0 - blind.astype(np.float32)]
+
+
+def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
+    """Return the deviation where nothing moved: of places close by, so that no beam is noise."""
+    import cv2
+
+    d, level, gradient, _ = parts
+    n = max(1, math.isqrt(d.size // 5_000))
+    every = np.s_[n // 2 :: n, n // 2 : -_APART : n]
+    samples = [i[every].ravel() for i in parts]
+    beside = [i[n // 2 :: n, n // 2 + _APART :: n].ravel() for i in (d, parts[3])]
+    known = np.minimum(samples[3], beside[1]) > 0.99
+    if np.count_nonzero(known) < 8 * _LEVELS:
+        return np.full_like(d, step)
+    samples[3] = samples[0] - beside[0]
+    rest, light, slope, apart = (np.abs(sample[known]) for sample in samples)
+    order = np.argsort(light)[: len(light) // _LEVELS * _LEVELS]
+    # In each bin of brightness the half with the lesser gradients shows the noise.
+    bins = order.reshape(_LEVELS, -1)
+    flat = np.argpartition(slope[bins], bins.shape[1] // 2, axis=1)[:, : bins.shape[1] // 2]
+    flat = np.take_along_axis(bins, flat, axis=1)
+    noise = np.maximum(_NORMAL / math.sqrt(2.0) * _median(apart[flat]), step)
+    places = _median(light[flat])
+    digits = np.arange(256) / 255.0
+    table = np.interp(digits, places, noise)
+    # Above the brightest bin photon noise grows on, with the root of the brightness.
+    table *= np.sqrt(np.maximum(digits / max(float(places[-1]), 1e-3), 1.0))
+    quiet = cv2.LUT(cv2.convertScaleAbs(level, alpha=255.0), table.astype(np.float32))
+    # What a shift leaves at edges, per gradient, where the gradient is greatest.
+    sharp = np.argpartition(slope, -(len(slope) // 32))[-(len(slope) // 32) :]
+    left = np.square(rest[sharp]) - np.square(quiet[every].ravel()[known][sharp])
+    ratio = np.sqrt(np.maximum(left, 0.0)) / np.maximum(slope[sharp], 1e-9)
+    share = min(max(_EDGE * float(_median(ratio)), _LEAST_EDGE), edge)
+    return cv2.magnitude(quiet, np.float32(share) * gradient)
+
+
+def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the medians of rows; as np.median, without its checks, which take longer."""
+    half = values.shape[-1] // 2
+    return np.asarray(np.partition(values, half, axis=-1)[..., half])
+
+
+def _significance(
+    parts: list[_Image], counts: _Image, step: float, edge: float
+) -> tuple[_Image, _Image, _Image]:
+    """Return the greatest and least significance of all scales, and the difference, halved."""
+    import cv2
+
+    area = cv2.INTER_AREA
+    middle = (counts.shape[1] // 2, counts.shape[0] // 2)
+    high = low = np.zeros(middle[::-1], np.float32)
+    weight = cv2.resize(parts[0], middle, interpolation=area)
+    for scale in range(_SCALES):
+        if scale and min(counts.shape) < 32:
+            break
+        if scale:
+            size = (counts.shape[1] // 2, counts.shape[0] // 2)
+            parts = [cv2.resize(i, size, interpolation=area) for i in parts]
+            counts = cv2.resize(counts, size, interpolation=cv2.INTER_NEAREST)
+        smooth = cv2.GaussianBlur(parts[0], (3, 3), 0.85, borderType=cv2.BORDER_CONSTANT)
+        part = 0.5**scale
+        z = smooth / _deviation([smooth, *parts[1:]], 0.3 * step * part, edge * part) * counts
+        if scale == 0:
+            quads = [z[i::2, j::2][: middle[1], : middle[0]] for i in (0, 1) for j in (0, 1)]
+            most, least = np.maximum.reduce(quads), np.minimum.reduce(quads)
+        else:
+            most = least = cv2.resize(z, middle, interpolation=cv2.INTER_NEAREST)
+        high, low = np.maximum(high, most), np.minimum(low, least)
+    return high, low, weight
+
+
+def _threshold(places: float, settings: MotionSettings) -> float:
+    """Return the significance that noise exceeds at the accepted rate, of either sign."""
+    from scipy.special import ndtri
+
+    # The smoothing of a scale joins about four of its pixels to one independent place.
+    independent = sum(max(1.0, places / 4.0**scale / 4.0) for scale in range(_SCALES))
+    return _MARGIN * float(-ndtri(settings.false_alarms / (2.0 * independent)))
+
+
+def _regions(
+    z: _Image, weight: _Image, threshold: float, appeared: bool, unit: int, least: float
+) -> list[tuple[Region, float]]:
+    """Return regions above 0.6 thresholds that exceed the threshold somewhere, with weights."""
+    import cv2
+
+    grown = (z > 0.6 * threshold).astype(np.uint8)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
+    found = []
+    for label in np.unique(labels[z > threshold]):
+        x, y, w, h, n = (int(v) for v in boxes[label])
+        cut = (slice(y, y + h), slice(x, x + w))
+        inside = labels[cut] == label
+        light = np.abs(weight[cut]) * inside
+        total = float(light.sum())
+        if n * unit * unit < least or total <= 0.0:
+            continue
+        middle = (
+            float((light.sum(axis=0) @ np.arange(x, x + w)) / total + 0.5) * unit - 0.5,
+            float((light.sum(axis=1) @ np.arange(y, y + h)) / total + 0.5) * unit - 0.5,
+        )
+        peak = float((z[cut] * inside).max())
+        found.append((Region(appeared, float(n * unit * unit), middle, peak), total))
+    return found
+
+
+def _centroid(found: list[tuple[Region, float]], appeared: bool) -> _Pair:
+    own = [(region.centroid_px, weight) for region, weight in found if region.appeared == appeared]
+    total = sum(weight for _, weight in own) or math.nan
+    x, y = (sum(place[i] * weight for place, weight in own) / total for i in (0, 1))
+    return x, y
+
+
+# -- a stream --------------------------------------------------------------------------
+
+
+class MotionState(Enum):
+    """What a :class:`MotionDetector` says of a frame."""
+
+    WARMING_UP = "warming up"
+    STILL = "still"
+    MOVING = "moving"
+    UNUSABLE = "unusable"
+
+
+class MotionDetector:
+    """Compares each frame of a stream with what was there before.
+
+    The background is the mean of the frames with forgetting. Light that came and stays counts
+    as moving until it is forgotten, after about ``memory · ln(significance / threshold)`` frames.
+    Frames that cannot be compared are not learnt; ``memory`` of them in a row start it anew.
+
+    Parameters
+    ----------
+    mask, settings
+        As for :func:`detect_motion`.
+    memory
+        Frames in which the weight of what was seen falls to 1/e.
+    warm_up
+        Frames before it says anything.
+    """
+
+    def __init__(
+        self,
+        mask: npt.ArrayLike | None = None,
+        settings: MotionSettings = DEFAULT,
+        memory: float = 20.0,
+        warm_up: int = 5,
+    ) -> None:
+        if not 1.0 <= memory < math.inf or warm_up < 1:
+            raise InputError(f"memory {memory} and warm-up {warm_up} frames must be 1 or more")
+        self._mask, self._settings = mask, settings
+        self._memory, self._warm_up = memory, warm_up
+        self._background: _View | None = None
+        self._learnt = self._refused = 0
+
+    def update(self, frame: Frame | Pixels) -> tuple[MotionState, Motion]:
+        """Take the next frame; return what it shows against the background.
+
+        Raises InputError if the mask does not fit, or the frame has another size than before.
+        """
+        view = _view(frame)
+        mask = _mask(self._mask, view)
+        if self._background is None:
+            if problem := _exposed(view, "first"):
+                return MotionState.UNUSABLE, Motion(problem=problem)
+            self._background, self._learnt, self._refused = view, 1, 0
+            return MotionState.WARMING_UP, Motion(brightness_ratio=1.0)
+        motion = _compare(self._background, view, mask, self._settings)
+        if motion.problem:
+            self._refused += 1
+            self._background = None if self._refused >= self._memory else self._background
+            return MotionState.UNUSABLE, motion
+        self._learn(view, motion)
+        if self._learnt <= self._warm_up:
+            return MotionState.WARMING_UP, motion
+        return MotionState.MOVING if motion.moved else MotionState.STILL, motion
+
+    def _learn(self, view: _View, motion: Motion) -> None:
+        """Bring the background to the light of the frame, then the frame into it."""
+        assert self._background is not None
+        old, _ = _expected(self._background, view)
+        x, y = (-s / view.factor for s in motion.shift_px)
+        new = _moved(view.image, x, y) if math.hypot(x, y) > 0.005 else view.image
+        self._learnt, self._refused = self._learnt + 1, 0
+        share = np.float32(max(1.0 / self._learnt, 1.0 - math.exp(-1.0 / self._memory)))
+        image = old + share * (new - old)
+        self._background = replace(view, image=image, cells=_cells(image))
