@@ -63,6 +63,7 @@ def drawn(turn: FloatArray, shift: FloatArray, seed: int) -> npt.NDArray[np.uint
     ahead = undistort(lens, np.stack([x, y], axis=-1)).astype(np.float32)
     fine = cv2.resize(ahead, (3 * width, 3 * height), interpolation=cv2.INTER_LINEAR)
     line = np.concatenate([fine, np.ones((*fine.shape[:2], 1), np.float32)], axis=-1)
+    turn, shift = turn.astype(np.float32), shift.astype(np.float32)
     away = (shift @ turn[:, 2]) / (line @ turn[:, 2])
     place = ((line * away[..., None] - shift) @ turn[:, :2]) / SQUARE
     cell = np.floor(place).astype(int)
@@ -318,7 +319,7 @@ def on_plane(seen: Camera, pixels: FloatArray) -> FloatArray:
 def test_marks_alone_map_the_plane_as_well_as_they_say(position: Any, points: FloatArray) -> None:
     grid = (0.5 * (points + points[:, None])).reshape(-1, 3)
     ratio, marginal = [], []
-    for seed in range(16):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         focal = 4000.0 * np.exp(rng.normal(0.0, 0.3))
         true = camera(position, focal, rng.normal(0.0, 0.1), rng.normal(0.0, 32.0, 2))

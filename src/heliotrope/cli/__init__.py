@@ -10,10 +10,12 @@ import typer
 
 from heliotrope import __version__
 from heliotrope.cli.calibrate import calibrate
+from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.demo import demo
 from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
+from heliotrope.cli.image import image
 from heliotrope.cli.plan import plan
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
@@ -48,6 +50,8 @@ def _root(
 app.command()(sun)
 app.command()(track)
 app.add_typer(field_app, name="field")
+app.add_typer(camera_app, name="camera")
+app.command()(image)
 app.command()(calibrate)
 app.command()(plan)
 app.command()(evaluate)

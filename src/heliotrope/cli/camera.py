@@ -1,0 +1,421 @@
+"""``heliotrope camera``: calibrate the cameras that look at targets, and teach them the targets."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+import typer
+
+from heliotrope.cli._common import open_plant, print_json, print_table
+from heliotrope.errors import FormatError, InputError
+
+if TYPE_CHECKING:
+    from heliotrope.field.camera import Camera
+    from heliotrope.field.plant import Plant
+    from heliotrope.imaging.frame import Frame
+    from heliotrope.imaging.lens import CameraFit, Lens
+    from heliotrope.imaging.teaching import Taught, Wish
+
+app = typer.Typer(help="Calibrate and teach target cameras.", no_args_is_help=True)
+
+PlantArgument = Annotated[Path, typer.Argument(help="Plant file (TOML).")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+OutOption = Annotated[
+    Path | None, typer.Option("--out", help="Plant file to write; default: PLANT itself.")
+]
+Value = TypeVar("Value")
+
+
+@app.callback()
+def _root() -> None:
+    """Calibrate and teach target cameras."""
+
+
+@app.command()
+def calibrate(
+    plant: PlantArgument,
+    images: Annotated[list[Path], typer.Argument(help="Pictures of the board or the targets.")],
+    camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")],
+    chessboard: Annotated[
+        str | None, typer.Option(help="Inner corners of a chessboard, COLUMNSxROWS, as 9x6.")
+    ] = None,
+    square: Annotated[float | None, typer.Option(help="Side of its squares, m.")] = None,
+    anew: Annotated[
+        bool, typer.Option("--anew", help="From marks: solve a known lens again, too.")
+    ] = False,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate the lens from pictures of a chessboard, or lens and place from targets' marks."""
+    if (chessboard is None) != (square is None):
+        raise InputError("--chessboard and --square go together: --chessboard 9x6 --square 0.03")
+    board = None if chessboard is None or square is None else (_pattern(chessboard), square)
+    place = _place_to_write(plant, out)
+    loaded = open_plant(plant)
+    frames = [_read(image) for image in images]
+    if board is not None:
+        _from_chessboard(loaded, (plant, place), frames, camera, board, as_json)
+    else:
+        _from_marks(loaded, (plant, place), frames, camera, anew, as_json)
+
+
+def _pattern(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,3})\s*[x×X]\s*(\d{1,3})", text)
+    if not match:
+        raise InputError(f"--chessboard {text!r}: write the inner corners as 9x6")
+    return int(match[1]), int(match[2])
+
+
+def _from_chessboard(
+    plant: "Plant", places: tuple[Path, Path], frames: "Sequence[Frame]", name: str,
+    board: tuple[tuple[int, int], float], as_json: bool,
+) -> None:  # fmt: skip
+    from dataclasses import replace
+
+    from heliotrope.imaging.lens import calibrate_chessboard
+    from heliotrope.imaging.teaching import with_camera, write_with_pictures
+
+    lens = calibrate_chessboard([f.grey for f in frames], *board, [f.name for f in frames])
+    old = next((c for c in plant.cameras if c.name == name), None)
+    camera = lens.camera(name)
+    if old is not None:
+        # Its place was found with the old lens.
+        camera = replace(camera, targets=old.targets, source=old.source)
+    write_with_pictures(with_camera(plant, camera), places[1], places[0].parent)
+    forgotten = old is not None and old.position is not None
+    _show_lens(lens, camera, places[1], as_json, forgotten)
+
+
+def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgotten: bool) -> None:
+    notes = list(lens.notes)
+    if forgotten:
+        notes.append(
+            "where the camera stands was found with the old lens and is forgotten; find it again: "
+            "heliotrope camera calibrate without --chessboard, or teach"
+        )
+    if as_json:
+        boards = [
+            {"name": b.name, "used": b.used, "reason": b.reason, "deviation_px": b.deviation,
+             "tilt_rad": b.tilt}
+            for b in lens.boards
+        ]  # fmt: skip
+        sigma = {"focal_px": lens.sigma[:2], "center_px": lens.sigma[2:4],
+                 "distortion": lens.sigma[4:]}  # fmt: skip
+        print_json({**_document(camera), "sigma": sigma, "terms": lens.model,
+                    "coverage": lens.coverage, "pictures": boards, "notes": notes,
+                    "written": str(place)})  # fmt: skip
+        return
+    for board in lens.boards:
+        print(f"{board.name}: " + (f"{board.deviation:.2f} px" if board.used else
+                                   f"left out: {board.reason}"))  # fmt: skip
+    (fx, fy), (cx, cy) = lens.matrix.diagonal()[:2], lens.matrix[:2, 2]
+    s = lens.sigma
+    print(f"focal length {fx:.1f} ± {s[0]:.1f}, {fy:.1f} ± {s[1]:.1f} px; principal point "
+          f"{cx:.1f} ± {s[2]:.1f}, {cy:.1f} ± {s[3]:.1f} px")  # fmt: skip
+    terms = [
+        f"{term} {value:.4f} ± {sigma:.4f}"
+        for term, value, sigma in zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, s[4:],
+                                      strict=True)
+        if sigma > 0.0
+    ]  # fmt: skip
+    print("distortion: " + (", ".join(terms) or "none that the pictures show"))
+    print(f"deviation {lens.deviation:.2f} px; boards cover {100 * lens.coverage:.0f} % of the "
+          "frame")  # fmt: skip
+    _print_notes(notes)
+    print(f"camera {camera.name} written to {place}")
+
+
+def _from_marks(
+    plant: "Plant", places: tuple[Path, Path], frames: "Sequence[Frame]", name: str,
+    anew: bool, as_json: bool,
+) -> None:  # fmt: skip
+    from dataclasses import replace
+
+    from heliotrope.imaging import teaching
+
+    old = next((c for c in plant.cameras if c.name == name), None)
+    sizes = {frame.size for frame in frames} | ({old.size} if old else set())
+    if len(sizes) > 1:
+        listed = ", ".join(f"{w} × {h}" for w, h in sorted(sizes))
+        raise InputError(f"camera {name}: frames of {listed} px; give pictures of one size")
+    seen = teaching.see_marks(plant, places[0].parent, frames, old)
+    fit = teaching.fit_marks(frames[0].size, seen, old, name, anew)
+    camera = replace(
+        fit.camera, targets=old.targets if old else seen.targets, source=old.source if old else ""
+    )
+    teaching.write_with_pictures(teaching.with_camera(plant, camera), places[1], places[0].parent)
+    if as_json:
+        print_json({**_document(camera), **_fit_document(fit), "marks": len(fit.residuals),
+                    "not_found": list(seen.reasons), "written": str(places[1])})  # fmt: skip
+        return
+    for reason in seen.reasons:
+        print(reason)
+    _print_fit(fit, len(fit.residuals), "marks")
+    print(f"camera {name} written to {places[1]}")
+
+
+@app.command()
+def teach(
+    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's form.")],
+    image: Annotated[Path, typer.Argument(help="A picture of the target.")],
+    target: Annotated[str, typer.Option("--target", help="Name of the target.")],
+    at: Annotated[
+        list[str] | None,
+        typer.Option(help="Where a point is, NAME=X,Y in pixels; repeat it, four or more."),
+    ] = None,
+    click: Annotated[bool, typer.Option("--click", help="Click the points in a browser.")] = False,
+    kind: Annotated[
+        list[str] | None,
+        typer.Option(help="What is at the points: corner, tee, square, disc or picture; "
+                          "NAME=KIND for one of them."),
+    ] = None,
+    size: Annotated[
+        list[str] | None, typer.Option(help="Size of the marks, m; NAME=SIZE for one of them.")
+    ] = None,
+    stroke: Annotated[
+        list[str] | None,
+        typer.Option(help="Breadth of the strokes of corners and tees, m; or NAME=BREADTH."),
+    ] = None,
+    camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")] = "camera",
+    sigma_px: Annotated[float, typer.Option(help="How well the points are given, px.")] = 1.0,
+    anew: Annotated[bool, typer.Option("--anew", help="Solve a known lens again, too.")] = False,
+    out: OutOption = None,
+    as_json: JsonOption = False,
+) -> None:  # fmt: skip
+    """Tell once where a target's points are in a picture: its marks and the camera's place."""
+    from heliotrope.imaging import teaching
+
+    place = _place_to_write(plant, out)
+    loaded = open_plant(plant)
+    surface = loaded.target(target)
+    frame = _read(image)
+    given = dict(_at(text) for text in at or [])
+    wishes, wish = _wishes(kind or [], size or [], stroke or [])
+    if click:
+        from heliotrope.imaging._click_page import click_points
+
+        given |= click_points(surface, frame, given, image.name, _announcer(as_json))
+    taught = teaching.teach(
+        loaded, target, frame, given, camera=camera, wishes=wishes, wish=wish, sigma=sigma_px,
+        anew=anew, prefix=f"{place.stem}-{target}",
+    )  # fmt: skip
+    teaching.write_taught(taught, place, plant.parent)
+    _show_taught(taught, place, as_json)
+
+
+def _announcer(quiet: bool) -> Callable[[str], None]:
+    """Tell where the page is, beside JSON too."""
+
+    def announce(address: str) -> None:
+        typer.echo(f"click the points at {address}", err=quiet)
+
+    return announce
+
+
+def _at(text: str) -> tuple[str, tuple[float, float]]:
+    name, found, pair = text.rpartition("=")
+    parts = pair.split(",")
+    if found and name and len(parts) == 2:
+        try:
+            return name, (float(parts[0]), float(parts[1]))
+        except ValueError:
+            pass
+    raise InputError(f"--at {text!r}: write NAME=X,Y with pixels, as upper_left=812.5,304")
+
+
+def _wishes(
+    kinds: Sequence[str], sizes: Sequence[str], strokes: Sequence[str]
+) -> "tuple[dict[str, Wish], Wish]":
+    from heliotrope.imaging.teaching import Wish
+
+    def metres(text: str) -> float:
+        try:
+            return float(text)
+        except ValueError:
+            raise InputError(f"{text!r} is no number of metres") from None
+
+    kind = _split(kinds, str)
+    size, stroke = _split(sizes, metres), _split(strokes, metres)
+
+    def of(name: str) -> Wish:
+        try:
+            return Wish(
+                kind.get(name, kind.get("")), size.get(name, size.get("")),
+                stroke.get(name, stroke.get("")),
+            )  # fmt: skip
+        except InputError as error:
+            raise InputError(f"point {name}: {error}" if name else str(error)) from None
+
+    names = sorted((set(kind) | set(size) | set(stroke)) - {""})
+    return {name: of(name) for name in names}, of("")
+
+
+def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Value]:
+    """Return values by the name before "=", and the one without under ""."""
+    found: dict[str, Value] = {}
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        if name in found:
+            raise InputError(f"{text!r}: given twice" + (f" for point {name}" if name else ""))
+        found[name] = read(value)
+    return found
+
+
+def _show_taught(taught: "Taught", place: Path, as_json: bool) -> None:
+    if as_json:
+        points = [
+            {"name": p.name, "pixel": p.pixel, "sigma_px": _sigma(p.covariance),
+             "mark": p.mark.kind if p.mark else None, "refined": p.refined, "note": p.note}
+            for p in taught.points
+        ]  # fmt: skip
+        print_json({**_document(taught.plant.camera(taught.camera)), **_fit_document(taught.fit),
+                    "target": taught.target, "points": points,
+                    "pictures": sorted(taught.pictures), "written": str(place)})  # fmt: skip
+        return
+    import numpy as np
+
+    rows = []
+    for point, residual in zip(taught.points, taught.fit.residuals, strict=True):
+        x, y = point.pixel
+        kind = "–" if point.mark is None else point.mark.kind
+        how = "refined" if point.refined else "as given"
+        rows.append([point.name, f"{x:.2f}", f"{y:.2f}", f"{_sigma(point.covariance):.2f}",
+                     f"{np.hypot(*residual):.2f}", kind, how])  # fmt: skip
+    print_table(["point", "x px", "y px", "± px", "off px", "mark", ""], rows,
+                title=f"target {taught.target}")  # fmt: skip
+    for point in taught.points:
+        if point.note:
+            print(f"{point.name}: {point.note}")
+    _print_fit(taught.fit, len(taught.points), "points")
+    print(f"camera {taught.camera} and {sum(p.mark is not None for p in taught.points)} marks "
+          f"written to {place}")  # fmt: skip
+
+
+@app.command()
+def show(
+    plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's form.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Print the cameras of a plant and how they see its targets."""
+    import numpy as np
+
+    from heliotrope.imaging.teaching import sights
+
+    loaded = open_plant(plant)
+    if not loaded.cameras and not as_json:
+        print(f"{plant}: there are no cameras; heliotrope camera teach makes one")
+        return
+    seen = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
+    if as_json:
+        print_json([
+            {**_document(camera), "targets": {s.target: vars(s) for s in seen[camera.name]}}
+            for camera in loaded.cameras
+        ])  # fmt: skip
+        return
+    rows = []
+    for camera in loaded.cameras:
+        wide, high = np.degrees(_field(camera))
+        where = "–" if camera.position is None else ", ".join(f"{v:.2f}" for v in camera.position)
+        bent = " ".join(f"{v:.3g}" for v in np.trim_zeros(camera.distortion, "b")) or "0"
+        rows.append([
+            camera.name, "{} × {}".format(*camera.size), f"{camera.matrix[0, 0]:.1f}",
+            f"{wide:.2f} × {high:.2f}", where, bent,
+            f"{camera.deviation:.2f}" if camera.deviation > 0.0 else "–",
+        ])  # fmt: skip
+    print_table(["camera", "frame px", "focal px", "field °", "east, north, up m",
+                 "distortion k1 k2 p1 p2 k3", "deviation px"], rows)  # fmt: skip
+    table = [
+        [name, s.target, f"{s.distance:.1f}", f"{1e3 * s.metres_per_pixel:.1f}",
+         f"{np.degrees(s.obliquity):.0f}", f"{100 * s.share:.0f}", str(s.marks)]
+        for name, listed in seen.items() for s in listed
+    ]  # fmt: skip
+    if table:
+        print_table(["camera", "target", "distance m", "mm/px", "oblique °", "in the frame %",
+                     "marks"], table)  # fmt: skip
+    for camera in loaded.cameras:
+        if camera.position is None:
+            print(f"camera {camera.name}: where it stands is not known; heliotrope camera "
+                  "calibrate (or teach) finds it")  # fmt: skip
+
+
+# -- shared ----------------------------------------------------------------------------
+
+
+def _place_to_write(plant: Path, out: Path | None) -> Path:
+    """Return the plant file to write, before anything is worked out."""
+    if plant.suffix.lower() == ".json":
+        raise FormatError(
+            plant, "a tower alone is no plant; give the folder that has heliostat properties too "
+            "(properties/ID.json), and --out plant.toml"
+        )  # fmt: skip
+    place = plant if out is None else out
+    if place.suffix.lower() != ".toml":
+        raise InputError(f"{place}: only plant files (TOML) are written; add --out plant.toml")
+    if not place.parent.is_dir():
+        raise InputError(f"{place}: there is no folder {place.parent}; make it first")
+    return place
+
+
+def _read(image: Path) -> "Frame":
+    from heliotrope.imaging.reading import read_image
+
+    return read_image(image)
+
+
+def _field(camera: "Camera") -> Any:
+    """Angles of view, across and up, rad, (2,)."""
+    import numpy as np
+
+    from heliotrope.imaging.projection import undistort
+
+    width, height = camera.size
+    cx, cy = camera.matrix[:2, 2]
+    ends = undistort(camera, [[-0.5, cy], [width - 0.5, cy], [cx, -0.5], [cx, height - 0.5]])
+    angles = np.arctan(np.diagonal(ends.reshape(2, 2, 2), axis1=0, axis2=2))
+    return np.abs(np.diff(angles, axis=0))[0]
+
+
+def _document(camera: "Camera") -> dict[str, Any]:
+    import numpy as np
+
+    place = {} if camera.position is None else {
+        "position_m": camera.position, "rotation": camera.R_camera_enu}  # fmt: skip
+    return {
+        "camera": camera.name, "size_px": camera.size,
+        "focal_px": np.diagonal(camera.matrix)[:2], "center_px": camera.matrix[:2, 2],
+        "field_deg": np.degrees(_field(camera)), "distortion": camera.distortion,
+        "deviation_px": camera.deviation, **place,
+    }  # fmt: skip
+
+
+def _fit_document(fit: "CameraFit") -> dict[str, Any]:
+    return {
+        "sigma": {name: fit.sigma(name) for name in fit.names},
+        "residuals_px": fit.residuals,
+        "plane_sigma_m": fit.plane_sigma,
+        "notes": list(fit.notes),
+    }
+
+
+def _sigma(covariance: Any) -> float:
+    """One number for two coordinates."""
+    return float((0.5 * (covariance[0, 0] + covariance[1, 1])) ** 0.5)
+
+
+def _print_fit(fit: "CameraFit", count: int, what: str) -> None:
+    import numpy as np
+
+    position = np.asarray(fit.camera.position)
+    names = zip(position, ("east", "north", "up"), strict=True)
+    place = ", ".join(f"{v:.2f} ± {fit.sigma(name):.2f}" for v, name in names)
+    rms = float(np.sqrt(np.mean(np.sum(fit.residuals**2, axis=1))))
+    print(f"{count} {what}, residuals {rms:.2f} px; pixels on their plane good to "
+          f"{1e3 * fit.plane_sigma:.1f} mm")  # fmt: skip
+    print(f"camera at ({place}) m; focal length {fit.camera.matrix[0, 0]:.1f} px")
+    _print_notes(fit.notes)
+
+
+def _print_notes(notes: Sequence[str]) -> None:
+    for note in notes:
+        print(f"note: {note}")

@@ -1,0 +1,528 @@
+"""A page on this machine alone that asks where points are in a picture.
+
+OpenCV is used without windows, so the browser shows the picture: one address on 127.0.0.1
+that ends in a random word, one page without anything from elsewhere, one answer.
+"""
+
+import json
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler
+from socketserver import ThreadingTCPServer
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.teaching import known_points
+
+#: An answer is a few hundred bytes for each point.
+_LONGEST = 1 << 20
+Pixel = tuple[float, float]
+
+
+@dataclass
+class _State:
+    """What is asked, and what came."""
+
+    token: str
+    nonce: str
+    page: bytes
+    picture: bytes
+    size: tuple[int, int]
+    names: frozenset[str]
+    answer: dict[str, Pixel] | None = None
+    over: threading.Event = field(default_factory=threading.Event)
+
+
+class _Server(ThreadingTCPServer):
+    # Not http.server's own, which asks the network for this machine's name.
+    daemon_threads = True
+
+    def __init__(self, state: _State) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.state = state
+        self.port = int(self.socket.getsockname()[1])
+
+
+class _Handler(BaseHTTPRequestHandler):
+    timeout = 30.0
+
+    @property
+    def _state(self) -> _State:
+        return cast("_Server", self.server).state
+
+    @property
+    def _port(self) -> int:
+        return cast("_Server", self.server).port
+
+    def log_message(self, format: str, *args: Any) -> None:  # noqa: A002 - the base's name
+        """Keep quiet: the terminal belongs to the command."""
+
+    def _allowed(self) -> str | None:
+        """Return what is asked for, behind the random word; None if it is not for us."""
+        # A page from elsewhere may resolve its own name to this machine, but says that name.
+        here = self.headers.get("Host") in (f"127.0.0.1:{self._port}", f"localhost:{self._port}")
+        _, word, *rest = (self.path.split("/") + ["", ""])[:4]
+        known = secrets.compare_digest(word.encode(), self._state.token.encode())
+        if here and known:
+            return rest[0]
+        self._send(404, b"not here\n")
+        return None
+
+    def _send(self, status: int, body: bytes, kind: str = "text/plain; charset=utf-8") -> None:
+        nonce = self._state.nonce
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Cache-Control", "no-store")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header(
+            "Content-Security-Policy",
+            f"default-src 'none'; img-src 'self'; connect-src 'self'; script-src 'nonce-{nonce}'; "
+            f"style-src 'nonce-{nonce}'; base-uri 'none'; form-action 'none'; "
+            "frame-ancestors 'none'",
+        )
+        self.end_headers()
+        self.wfile.write(body)
+
+    def do_GET(self) -> None:
+        wanted = self._allowed()
+        if wanted == "":
+            self._send(200, self._state.page, "text/html; charset=utf-8")
+        elif wanted == "picture.png":
+            self._send(200, self._state.picture, "image/png")
+        elif wanted is not None:
+            self._send(404, b"not here\n")
+
+    def do_POST(self) -> None:
+        wanted = self._allowed()
+        if wanted is None:
+            return
+        if wanted == "cancel":
+            self._send(200, b"cancelled\n")
+            self._state.over.set()
+            return
+        if wanted != "points":
+            self._send(404, b"not here\n")
+            return
+        try:
+            answer = self._read()
+        except InputError as error:
+            self._send(400, f"{error}\n".encode())
+            return
+        self._state.answer = answer
+        self._send(200, b"thank you\n")
+        self._state.over.set()
+
+    def _read(self) -> dict[str, Pixel]:
+        length = self.headers.get("Content-Length", "")
+        if not length.isascii() or not length.isdigit() or int(length) > _LONGEST:
+            raise InputError(f"the answer's length {length!r} is not a number up to {_LONGEST}")
+        try:
+            document = json.loads(self.rfile.read(int(length)))
+        except ValueError:
+            raise InputError("the answer is no JSON") from None
+        points = document.get("points") if isinstance(document, dict) else None
+        if not isinstance(points, dict):
+            raise InputError('the answer has no "points"')
+        return {name: self._point(name, value) for name, value in points.items()}
+
+    def _point(self, name: str, value: object) -> Pixel:
+        if name not in self._state.names:
+            raise InputError(f"nobody asked for point {name!r}")
+        width, height = self._state.size
+        if not (isinstance(value, list) and len(value) == 2 and all(
+            isinstance(v, int | float) and not isinstance(v, bool) for v in value
+        )):  # fmt: skip
+            raise InputError(f"point {name}: give two numbers, pixels right and down")
+        x, y = (float(v) for v in value)
+        # NaN fails too.
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise InputError(f"point {name}: {x}, {y} is not in the picture of {width} × {height}")
+        return x, y
+
+
+def ask(
+    picture: npt.NDArray[np.uint8],
+    places: Mapping[str, Pixel],
+    given: Mapping[str, Pixel],
+    title: str,
+    announce: Callable[[str], None],
+    fewest: int = 4,
+    aspect: float = 1.0,
+) -> dict[str, Pixel]:
+    """Return the pixels that a person clicked, by name.
+
+    Parameters
+    ----------
+    picture
+        Grey (H, W) or blue-green-red (H, W, 3), uint8.
+    places
+        What to ask for, in this order, and where each lies on the target: from the left and
+        from above, 0 to 1.
+    given
+        Points that are known already; the page shows them.
+    title
+        Of the page.
+    announce
+        Is told the page's address once it can be opened; this function waits for the answer.
+    fewest
+        The page takes no answer with fewer points, those given included.
+    aspect
+        Width of the target over its height, for the page's sketch of it.
+
+    Raises
+    ------
+    InputError
+        If the person cancels.
+    """
+    import cv2
+
+    done, encoded = cv2.imencode(".png", picture)
+    if not done:
+        raise InputError(f"{title}: the picture {picture.shape} cannot be shown")
+    token, nonce = secrets.token_urlsafe(16), secrets.token_urlsafe(16)
+    size = picture.shape[1], picture.shape[0]
+    page = _page(nonce, title, places, given, size, fewest, aspect)
+    state = _State(token, nonce, page, encoded.tobytes(), size, frozenset(places))
+    with _Server(state) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True)
+        thread.start()
+        try:
+            announce(f"http://127.0.0.1:{server.port}/{token}/")
+            # In pieces, so that Ctrl-C is heard.
+            while not state.over.wait(0.2):
+                pass
+        finally:
+            server.shutdown()
+            thread.join()
+    if state.answer is None:
+        raise InputError(f"{title}: cancelled in the browser; nothing is written")
+    return state.answer
+
+
+def click_points(
+    target: Target, frame: Frame, given: Mapping[str, Pixel], title: str,
+    announce: Callable[[str], None],
+) -> dict[str, Pixel]:  # fmt: skip
+    """Ask a person in a browser for the points of a target that are not given yet.
+
+    ``announce`` is told the page's address, on this machine alone.
+
+    Raises
+    ------
+    InputError
+        If the person cancels.
+    """
+    known = {name: p for name, p in known_points(target).items() if name not in given}
+    points = np.array(list(known.values())).reshape(-1, 3)
+    plane = target.plane_coordinates(points)
+    corners = target.plane_coordinates(target.corners)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    share = np.clip((plane - low) / (high - low), 0.0, 1.0)
+    places = {name: (float(x), float(1.0 - y)) for name, (x, y) in zip(known, share, strict=True)}
+    # As bright as the screen can: faint frames are hard to click in.
+    pixels = frame.pixels.astype(np.float32)
+    top = max(float(np.percentile(pixels, 99.9)), 1.0)
+    shown = np.clip(pixels * (255.0 / top), 0.0, 255.0).astype(np.uint8)
+    aspect = float((high - low)[0] / (high - low)[1])
+    return ask(shown, places, given, f"{title}: target {target.name}", announce, aspect=aspect)
+
+
+def _page(
+    nonce: str, title: str, places: Mapping[str, Pixel], given: Mapping[str, Pixel],
+    size: Sequence[int], fewest: int, aspect: float,
+) -> bytes:  # fmt: skip
+    data = {
+        "title": title,
+        "size": list(size),
+        "points": [{"name": name, "place": list(place)} for name, place in places.items()],
+        "given": [{"name": name, "at": list(at)} for name, at in given.items()],
+        "fewest": fewest,
+        "aspect": aspect,
+    }
+    # Inside a script element only "<" could end it.
+    text = json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")
+    return _HTML.replace("@NONCE@", nonce).replace("@DATA@", text).encode()
+
+
+_HTML = r"""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<title>Heliotrope: points of a target</title>
+<link rel="icon" href="data:,">
+<style nonce="@NONCE@">
+  * { box-sizing: border-box; }
+  html, body { height: 100%; margin: 0; }
+  body { display: flex; font: 14px/1.45 system-ui, sans-serif; color: #1c2127;
+    background: #f4f5f6; }
+  #picture { flex: 1; min-width: 0; height: 100%; background: #3a4048; cursor: crosshair; }
+  aside { width: 300px; height: 100%; padding: 14px; display: flex; flex-direction: column;
+    gap: 8px; border-left: 1px solid #c9ced4;
+    overflow: hidden auto; }
+  h1 { font-size: 15px; margin: 0; overflow-wrap: anywhere; }
+  #ask { flex: none; min-height: 42px; font-weight: 600; overflow-wrap: anywhere; }
+  #ask span { display: block; font-weight: 400; color: #59616b; }
+  #sketch { flex: none; width: 100%; height: 90px; }
+  #glass { flex: none; width: 100%; height: 170px; border: 1px solid #9aa2ab;
+    background: #3a4048; }
+  ol { flex: 1 0 96px; overflow: auto; margin: 0; padding: 0; list-style: none;
+    border: 1px solid #c9ced4; background: #fff; }
+  li { display: flex; justify-content: space-between; gap: 8px; padding: 3px 8px; cursor: pointer;
+    overflow-wrap: anywhere; }
+  li.now { background: #dbe9f8; }
+  li.given { color: #59616b; cursor: default; }
+  li span { color: #59616b; font-variant-numeric: tabular-nums; white-space: nowrap; }
+  .keys { display: grid; grid-template-columns: 1fr 1fr; gap: 6px; }
+  button { font: inherit; padding: 6px; border: 1px solid #9aa2ab; border-radius: 4px;
+    background: #fff; cursor: pointer; }
+  button:disabled { color: #9aa2ab; cursor: default; }
+  #done:enabled { background: #1f5fa8; border-color: #1f5fa8; color: #fff; }
+  #said { min-height: 20px; color: #a02020; overflow-wrap: anywhere; }
+  small { color: #59616b; }
+</style>
+<canvas id="picture"></canvas>
+<aside>
+  <h1></h1>
+  <canvas id="sketch"></canvas>
+  <div id="ask"></div>
+  <canvas id="glass"></canvas>
+  <ol></ol>
+  <div class="keys">
+    <button id="undo">Undo</button><button id="skip">Skip</button>
+    <button id="cancel">Cancel</button><button id="done">Done</button>
+  </div>
+  <div id="said" role="status"></div>
+  <small>Wheel: closer. Drag: move. Arrows: nudge the last point by a quarter of a pixel, with
+  Shift by four. S: skip, Backspace: undo, Enter: done.</small>
+</aside>
+<script id="data" type="application/json" nonce="@NONCE@">@DATA@</script>
+<script nonce="@NONCE@">
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const byId = (id) => document.getElementById(id);
+const [width, height] = data.size;
+const found = new Map();          // name -> [x, y], centre of the first pixel is 0, 0
+const history = [];
+let now = 0, last = null, mouse = null, over = false;
+const view = { scale: 1, x: 0, y: 0 };
+const image = new Image();
+document.querySelector("h1").textContent = data.title;
+
+const fit = (canvas) => {
+  const ratio = window.devicePixelRatio || 1;
+  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+  canvas.width = Math.round(w * ratio);
+  canvas.height = Math.round(h * ratio);
+  const pen = canvas.getContext("2d");
+  pen.setTransform(ratio, 0, 0, ratio, 0, 0);
+  pen.clearRect(0, 0, w, h);
+  return [pen, w, h];
+};
+const toPixel = (sx, sy) => [(sx - view.x) / view.scale - 0.5, (sy - view.y) / view.scale - 0.5];
+const inside = ([x, y]) => x >= -0.5 && y >= -0.5 && x <= width - 0.5 && y <= height - 0.5;
+const cross = (pen, x, y, colour, size = 9) => {
+  for (const [line, ink] of [[4, "#000"], [2, colour]]) {
+    pen.lineWidth = line;
+    pen.strokeStyle = ink;
+    pen.beginPath();
+    for (const [a, b] of [[1, 0], [-1, 0], [0, 1], [0, -1]]) {
+      pen.moveTo(x + 3 * a, y + 3 * b);
+      pen.lineTo(x + size * a, y + size * b);
+    }
+    pen.stroke();
+  }
+};
+const label = (pen, text, x, y) => {
+  pen.font = "12px system-ui, sans-serif";
+  pen.lineWidth = 3;
+  pen.strokeStyle = "#000";
+  pen.strokeText(text, x, y);
+  pen.fillStyle = "#fff";
+  pen.fillText(text, x, y);
+};
+const paint = (pen, scale, x, y) => {
+  pen.imageSmoothingEnabled = scale < 2;
+  pen.drawImage(image, x, y, width * scale, height * scale);
+};
+const marks = (pen, scale, x, y, named) => {
+  const one = ([name, at], colour) => {
+    const [sx, sy] = [(at[0] + 0.5) * scale + x, (at[1] + 0.5) * scale + y];
+    cross(pen, sx, sy, colour);
+    if (named) label(pen, name, sx + 10, sy - 6);
+  };
+  data.given.forEach((g) => one([g.name, g.at], "#8fd3ff"));
+  found.forEach((at, name) => one([name, at], name === last ? "#ffe14d" : "#5dff7a"));
+};
+const drawPicture = () => {
+  const [pen] = fit(byId("picture"));
+  paint(pen, view.scale, view.x, view.y);
+  marks(pen, view.scale, view.x, view.y, true);
+};
+const drawGlass = () => {
+  const [pen, w, h] = fit(byId("glass"));
+  const at = mouse || found.get(last);
+  if (!at) return;
+  const scale = Math.max(8, 2 * view.scale);
+  const [x, y] = [w / 2 - (at[0] + 0.5) * scale, h / 2 - (at[1] + 0.5) * scale];
+  paint(pen, scale, x, y);
+  marks(pen, scale, x, y, false);
+  cross(pen, w / 2, h / 2, "#ff5050", 14);
+};
+const drawSketch = () => {
+  const [pen, w, h] = fit(byId("sketch"));
+  const a = Math.min(w - 16, (h - 16) * data.aspect), b = a / data.aspect;
+  const box = [(w - a) / 2, (h - b) / 2, a, b];
+  pen.strokeStyle = "#59616b";
+  pen.strokeRect(...box);
+  data.points.forEach((point, k) => {
+    const x = box[0] + point.place[0] * box[2], y = box[1] + point.place[1] * box[3];
+    pen.beginPath();
+    pen.arc(x, y, k === now ? 6 : 3, 0, 7);
+    pen.fillStyle = k === now ? "#1f5fa8" : found.has(point.name) ? "#3f9c54" : "#b4bac1";
+    pen.fill();
+  });
+};
+const tell = () => {
+  const ask = byId("ask"), hint = document.createElement("span");
+  const point = data.points[now];
+  ask.textContent = point ? `Click on ${point.name}` : "That was all";
+  hint.textContent = point ? `${now + 1} of ${data.points.length}` : "Look once more, then Done";
+  ask.append(hint);
+  const list = document.querySelector("ol");
+  list.textContent = "";
+  const row = (name, at, kind, pick) => {
+    const item = document.createElement("li"), where = document.createElement("span");
+    item.className = kind;
+    item.textContent = name;
+    where.textContent = at ? `${at[0].toFixed(2)}, ${at[1].toFixed(2)}` : "–";
+    item.append(where);
+    if (pick) item.addEventListener("click", pick);
+    list.append(item);
+    if (kind === "now") item.scrollIntoView({ block: "nearest" });
+  };
+  data.points.forEach((p, k) =>
+    row(p.name, found.get(p.name), k === now ? "now" : "", () => { now = k; draw(); }));
+  data.given.forEach((g) => row(g.name, g.at, "given", null));
+  byId("undo").disabled = !history.length;
+  byId("skip").disabled = now >= data.points.length;
+  byId("done").disabled = found.size + data.given.length < data.fewest;
+  const missing = data.fewest - found.size - data.given.length;
+  byId("done").title = missing > 0 ? `${missing} more needed` : "";
+};
+const draw = () => { if (!over) { drawPicture(); drawGlass(); drawSketch(); tell(); } };
+const next = () => {
+  now += 1;
+  while (now < data.points.length && found.has(data.points[now].name)) now += 1;
+};
+const put = (at) => {
+  const point = data.points[now];
+  if (!point || !inside(at)) return;
+  history.push([now, last, found.get(point.name)]);
+  found.set(point.name, at);
+  last = point.name;
+  next();
+  draw();
+};
+const undo = () => {
+  if (!history.length) return;
+  const [k, before, at] = history.pop();
+  const name = data.points[k].name;
+  if (at) found.set(name, at); else found.delete(name);
+  [now, last] = [k, before];
+  draw();
+};
+const skip = () => { if (now < data.points.length) { next(); draw(); } };
+const send = async (place, body) => {
+  byId("said").textContent = "";
+  try {
+    const reply = await fetch(place, { method: "POST", body });
+    const text = (await reply.text()).trim();
+    if (!reply.ok) { byId("said").textContent = text; return; }
+    over = true;
+    document.querySelector("aside").textContent =
+      place === "cancel" ? "Cancelled; nothing is written. This page can be closed."
+        : "Thank you. The command goes on; this page can be closed.";
+  } catch (error) {
+    byId("said").textContent = "The command no longer listens; start it again.";
+  }
+};
+const done = () => {
+  if (!byId("done").disabled) send("points", JSON.stringify({ points: Object.fromEntries(found) }));
+};
+byId("undo").addEventListener("click", undo);
+byId("skip").addEventListener("click", skip);
+byId("cancel").addEventListener("click", () => send("cancel", ""));
+byId("done").addEventListener("click", done);
+
+const canvas = byId("picture");
+let down = null;
+canvas.addEventListener("mousedown", (e) => {
+  down = { x: e.offsetX, y: e.offsetY, ox: view.x, oy: view.y, moved: false };
+});
+window.addEventListener("mousemove", (e) => {
+  if (over) return;
+  const box = canvas.getBoundingClientRect();
+  const [x, y] = [e.clientX - box.left, e.clientY - box.top];
+  if (down) {
+    down.moved ||= Math.hypot(x - down.x, y - down.y) > 4;
+    if (down.moved) {
+      [view.x, view.y] = [down.ox + x - down.x, down.oy + y - down.y];
+      drawPicture();
+    }
+  }
+  const at = toPixel(x, y);
+  mouse = e.target === canvas && inside(at) ? at : null;
+  drawGlass();
+});
+window.addEventListener("mouseup", (e) => {
+  if (down && !down.moved && e.target === canvas && e.button === 0) {
+    put(toPixel(e.offsetX, e.offsetY));
+  }
+  down = null;
+});
+canvas.addEventListener("wheel", (e) => {
+  e.preventDefault();
+  const factor = Math.exp(-0.002 * Math.max(-200, Math.min(200, e.deltaY)));
+  const scale = Math.min(64, Math.max(0.02, view.scale * factor));
+  view.x = e.offsetX - (e.offsetX - view.x) * (scale / view.scale);
+  view.y = e.offsetY - (e.offsetY - view.y) * (scale / view.scale);
+  view.scale = scale;
+  draw();
+}, { passive: false });
+window.addEventListener("keydown", (e) => {
+  if (over || e.ctrlKey || e.metaKey || e.altKey) return;
+  const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+  const step = steps[e.key], at = found.get(last);
+  if (step && at) {
+    const size = e.shiftKey ? 4 : 0.25;
+    const moved = [at[0] + size * step[0], at[1] + size * step[1]];
+    if (inside(moved)) found.set(last, moved);
+    mouse = null;
+    draw();
+  } else if (e.key === "Backspace") undo();
+  else if (e.key === "s" || e.key === "S") skip();
+  else if (e.key === "Enter" && e.target.tagName !== "BUTTON") done();
+  else return;
+  e.preventDefault();
+});
+const start = () => {
+  const [w, h] = [canvas.clientWidth, canvas.clientHeight];
+  view.scale = Math.min((w - 20) / width, (h - 20) / height);
+  view.x = (w - width * view.scale) / 2;
+  view.y = (h - height * view.scale) / 2;
+  draw();
+};
+window.addEventListener("resize", draw);
+image.addEventListener("load", start);
+image.src = "picture.png";
+</script>
+</html>
+"""

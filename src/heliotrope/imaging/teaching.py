@@ -1,0 +1,650 @@
+"""Teaching: a person says once where the known points of a target are in a picture.
+
+Each point is refined to a fraction of a pixel where a mark of a known kind is there;
+otherwise what the picture shows around it becomes a mark itself. The points also tell where
+the camera stands.
+"""
+
+import hashlib
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.camera import Camera
+from heliotrope.field.marks import Mark
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.lens import CameraFit, calibrate_marks, resection
+
+CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
+#: Kinds that a person can name.
+KINDS = ("corner", "tee", "square", "disc", "picture")
+#: A taught picture's side over the target's shorter one, where no size is named.
+SHARE = 0.12
+#: Sides of a taught picture, px.
+SMALLEST, LARGEST = 12, 512
+#: A hand is wrong by no more than this, px.
+REACH = 12.0
+#: A drawing must explain this much of what is there, and be darker than its surroundings.
+EXPLAINED, CONTRAST = 0.5, 0.93
+#: A picture that can be found again no better than this shows an edge or nothing, px.
+VAGUE = 0.5
+
+Pixel = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be taught at a point.
+
+    Attributes
+    ----------
+    kind
+        One of :data:`KINDS`; None: the mark that the target has there, or a picture.
+    size, stroke
+        As of :class:`~heliotrope.field.marks.Mark`, m; None: of a picture a share of the
+        target, of strokes a fifth of the size.
+    """
+
+    kind: str | None = None
+    size: float | None = None
+    stroke: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind is not None and self.kind not in KINDS:
+            raise InputError(f"kind {self.kind!r} cannot be taught; known: {', '.join(KINDS)}")
+        if self.kind not in (None, "picture") and self.size is None:
+            raise InputError(f"a {self.kind} needs its size in metres (--size)")
+        for what, value in (("size", self.size), ("stroke", self.stroke)):
+            if value is not None and not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"{what} {value} m; give metres above 0")
+
+
+@dataclass(frozen=True)
+class TaughtPoint:
+    """One point of the target in the picture.
+
+    Attributes
+    ----------
+    name
+        Of the point.
+    pixel, covariance
+        Where it is, (2,), and how well that is known, px² (2, 2).
+    mark
+        What the target has there from now on; None: nothing that could be found again.
+    refined
+        Whether the mark's drawing was laid over the picture; else it is where the hand put it.
+    note
+        Why it is not as wished; empty if it is.
+    """
+
+    name: str
+    pixel: FloatArray
+    covariance: FloatArray
+    mark: Mark | None
+    refined: bool
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Taught:
+    """What came of teaching.
+
+    Attributes
+    ----------
+    plant
+        With the marks and the camera.
+    target, camera
+        Names of the target and the camera.
+    fit
+        Of the camera.
+    points
+        As they were given.
+    pictures
+        Taught pictures (N, N), uint8, by the name of their file, which is their code.
+    """
+
+    plant: Plant
+    target: str
+    camera: str
+    fit: CameraFit
+    points: tuple[TaughtPoint, ...]
+    pictures: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
+
+
+def known_points(target: Target) -> dict[str, FloatArray]:
+    """Return the points of a target that have names: marks, markers, corners; ENU metres.
+
+    A name that occurs among several of them is that of the first.
+    """
+    points = {mark.name: mark.point for mark in target.marks}
+    for name, point in target.markers.items():
+        points.setdefault(name, as_float(point))
+    for name, point in zip(CORNERS, target.corners, strict=True):
+        # A surveyed corner may stand under a name of its own.
+        if not any(np.linalg.norm(point - other) < 1e-3 for other in points.values()):
+            points.setdefault(name, point)
+    return points
+
+
+def teach(
+    plant: Plant, target: str, frame: Frame, given: Mapping[str, Pixel], *,
+    camera: str = "camera", wishes: Mapping[str, Wish] | None = None, wish: Wish | None = None,
+    sigma: float = 1.0, anew: bool = False, prefix: str = "mark",
+) -> Taught:  # fmt: skip
+    """Return the plant with marks on a target and with the camera that took a picture of it.
+
+    Parameters
+    ----------
+    plant
+        Which has the target.
+    target
+        Its name.
+    frame
+        The picture.
+    given
+        Where points are, pixels by the names of :func:`known_points`; four or more, each
+        within :data:`REACH` of the truth.
+    camera
+        Its name. If the plant has it, its lens counts as known; else it is solved too, see
+        :func:`~heliotrope.imaging.lens.calibrate_marks`.
+    wishes, wish
+        What to teach at points by name, and at the others.
+    sigma
+        Standard deviation of a coordinate of a point given by hand, px.
+    anew
+        Whether to solve the lens of a camera that the plant has.
+    prefix
+        What names of taught pictures begin with.
+
+    Raises
+    ------
+    InputError
+        If names are unknown, points are too few, not in the picture, or do not lie there as
+        they do on the target.
+    """
+    if not (np.isfinite(sigma) and sigma > 0.0):
+        raise InputError(f"sigma {sigma} px; give a standard deviation above 0")
+    surface = plant.target(target)
+    named = _check_points(surface, frame, given)
+    for name in set(wishes or {}) - set(named):
+        raise UnknownNameError(f"point of target {target} among those given:", name, list(named))
+    known = next((c for c in plant.cameras if c.name == camera), None)
+    if known is not None and known.size != frame.size:
+        raise InputError(
+            f"camera {camera}: its frames have {known.size[0]} × {known.size[1]} px, the picture "
+            f"{frame.size[0]} × {frame.size[1]} px; give a picture of that camera as it is"
+        )
+    plane = surface.plane_coordinates(np.array(list(named.values())))
+    pixels = np.array([given[name] for name in named], dtype=np.float64)
+    H = _homography(surface, plane, pixels, list(named))
+    old = {mark.name: mark for mark in surface.marks}
+    asked = {n: (wishes or {}).get(n, wish or Wish()) for n in named}
+    drawn = [_drawing(name, point, asked[name], old.get(name)) for name, point in named.items()]
+    found = [TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
+             for n, x in zip(named, pixels, strict=True)]  # fmt: skip
+    # Once more with the scale and turn of what was found: a hand's are off by some per cent.
+    for search in (REACH, 0.25 * REACH):
+        for k, mark in enumerate(drawn):
+            if mark is not None:
+                found[k] = _refine(frame, found[k], mark, (H, plane[k]), search)
+        H = _homography(surface, plane, np.array([p.pixel for p in found]), list(named))
+    pictures: dict[str, npt.NDArray[np.uint8]] = {}
+    for k, (name, point) in enumerate(named.items()):
+        if found[k].mark is None:
+            size = SHARE * min(surface.width, surface.height)
+            if asked[name].kind in (None, "picture"):
+                size = asked[name].size or size
+            found[k] = _picture(frame, found[k], point, size, (H, plane[k]), prefix, pictures)
+    fit = _fit(frame, known, camera, anew, np.array(list(named.values())), found, H, plane)
+    solved = _with_target(fit.camera, target, known)
+    plant = _with_marks(plant, surface, [p.mark for p in found if p.mark is not None], solved)
+    return Taught(plant, target, camera, fit, tuple(found), pictures)
+
+
+def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = None) -> None:
+    """Write the new pictures beside a plant file, then the rest as :func:`write_with_pictures`.
+
+    Names of pictures depend on what they show, so that an older plant file keeps its own.
+    """
+    from heliotrope.imaging.reading import write_image
+
+    for name, picture in taught.pictures.items():
+        write_image(picture, Path(path).with_name(name))
+    write_with_pictures(taught.plant, path, folder)
+
+
+def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | None = None) -> None:
+    """Write a plant file, last, after copies of the taught pictures that lie in ``folder``.
+
+    Its table stays CSV or parquet as it was.
+    """
+    import tomllib
+    from operator import methodcaller
+
+    from heliotrope.field.formats._textfile import write_file
+    from heliotrope.field.formats.plant_file import write_plant
+
+    place = Path(path)
+    table = ""
+    if place.exists():
+        try:
+            table = str(tomllib.loads(place.read_text("utf-8-sig")).get("heliostats", ""))
+        except ValueError:
+            raise FormatError(place, "this is no plant file; write to another place") from None
+    codes = {m.code for t in plant.targets for m in t.marks if m.kind == "picture"}
+    for code in codes if folder is not None else ():
+        source = Path(folder or "") / code
+        if source.is_file() and not place.with_name(code).exists():
+            write_file(place.with_name(code), methodcaller("write", source.read_bytes()))
+    write_plant(plant, place, "parquet" if table.endswith(".parquet") else "csv")
+
+
+def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, FloatArray]:
+    """Return taught pictures (N, N) by their code, from beside their plant file.
+
+    Raises
+    ------
+    FormatError
+        If one is missing or is no square picture.
+    """
+    from heliotrope.imaging.reading import read_image
+
+    found = {}
+    for mark in (mark for target in targets for mark in target.marks if mark.kind == "picture"):
+        file = Path(folder) / mark.code
+        if not file.is_file():
+            raise FormatError(
+                file, f"there is no such picture of mark {mark.name}; copy it beside the plant "
+                "file, or teach the mark again (heliotrope camera teach)"
+            )  # fmt: skip
+        grey = read_image(file).grey
+        if grey.shape[0] != grey.shape[1]:
+            raise FormatError(
+                file, f"{grey.shape[1]} × {grey.shape[0]} px; a mark's picture is square"
+            )
+        found[mark.code] = as_float(grey)
+    return found
+
+
+# -- points ----------------------------------------------------------------------------
+
+
+def _check_points(
+    target: Target, frame: Frame, given: Mapping[str, Pixel]
+) -> dict[str, FloatArray]:
+    """Return the ENU points that were given, in their order."""
+    known = known_points(target)
+    width, height = frame.size
+    for name, (x, y) in given.items():
+        if name not in known:
+            raise UnknownNameError(f"point of target {target.name}", name, list(known))
+        if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+            raise InputError(
+                f"point {name}: {x}, {y} is not in the picture of {width} × {height} px"
+            )
+    if len(given) < 4:
+        raise InputError(
+            f"target {target.name}: {len(given)} points are given; four or more tell where the "
+            f"camera stands (it has {', '.join(known)})"
+        )
+    names = list(given)
+    for k, name in enumerate(names):
+        for other in names[:k]:
+            if np.hypot(*np.subtract(given[name], given[other])) < 3.0:
+                raise InputError(f"points {other} and {name} are given at one place, {given[name]}")
+    return {name: known[name] for name in names}
+
+
+def _homography(
+    target: Target, plane: FloatArray, pixels: FloatArray, names: Sequence[str]
+) -> FloatArray:
+    """Return H_pixel_plane (3, 3), if the points lie in the picture as on the target."""
+    import cv2
+
+    what = f"target {target.name}: the points {', '.join(names)}"
+    if np.linalg.svd(plane - plane.mean(axis=0), compute_uv=False)[1] < 0.02 * np.ptp(plane):
+        raise InputError(f"{what} lie on one line; give some that span an area")
+    # None, where there is no solution, becomes a NaN.
+    found = as_float(cv2.findHomography(plane, pixels)[0])
+    if not np.isfinite(found).all():
+        raise InputError(f"{what} cannot be a view of it; are names exchanged?")
+    depth = np.column_stack([plane, np.ones(len(plane))]) @ found[2]
+    turned = [float(np.linalg.det(_scale(found, p))) for p in plane]
+    # Rows run downwards: a face seen from its front turns the other way round.
+    if (depth * depth[0] > 0.0).all() and min(turned) > 0.0:
+        raise InputError(f"{what} lie mirrored in the picture; are left and right exchanged?")
+    miss = _mapped(found, plane) - pixels
+    if not ((depth * depth[0] > 0.0).all() and max(turned) < 0.0) or (
+        np.sqrt(np.mean(miss**2)) > 0.05 * np.ptp(pixels, axis=0).max()
+    ):
+        raise InputError(f"{what} do not lie in the picture as on the target; are two exchanged?")
+    return found
+
+
+def _mapped(H: FloatArray, plane: FloatArray) -> FloatArray:
+    seen = np.column_stack([plane, np.ones(len(plane))]) @ H.T
+    return as_float(seen[:, :2] / seen[:, 2:])
+
+
+def _scale(H: FloatArray, place: FloatArray) -> FloatArray:
+    """Return d(pixel)/d(plane), px/m (2, 2)."""
+    x, y, w = H @ [place[0], place[1], 1.0]
+    return as_float((H[:2, :2] - np.outer([x / w, y / w], H[2, :2])) / w)
+
+
+def _per_metre(H: FloatArray, place: FloatArray) -> float:
+    return float(np.sqrt(abs(np.linalg.det(_scale(H, place)))))
+
+
+# -- marks -----------------------------------------------------------------------------
+
+
+def _drawing(name: str, point: FloatArray, wish: Wish, old: Mark | None) -> Mark | None:
+    """Return the drawn mark that should be there; None if a picture is to be taken."""
+    if wish.kind is None and old is not None and old.kind != "picture":
+        return old
+    if wish.kind in (None, "picture") or wish.size is None:
+        return None
+    stroke = 0.0
+    if wish.kind in ("corner", "tee"):
+        stroke = 0.2 * wish.size if wish.stroke is None else wish.stroke
+    turn = old.turn if old is not None and old.kind == wish.kind else 0.0
+    return Mark(name, wish.kind, point, wish.size, stroke, turn)
+
+
+def _refine(
+    frame: Frame, here: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
+) -> TaughtPoint:
+    """Lay a mark's drawing over the picture, at whichever quarter turn explains most."""
+    from heliotrope.imaging.refinement import Refined, refine
+
+    scale = _scale(*view)
+    search = reach / (mark.size * _per_metre(*view))
+    turned = [mark]
+    if mark.kind in ("corner", "tee"):
+        turned += [replace(mark, turn=mark.turn + k * 0.5 * np.pi) for k in (1, -1, 2)]
+    best: tuple[Refined, Mark] | None = None
+    for trial in turned:
+        found = refine(frame.grey, trial, here.pixel, scale, search)
+        # A drawing brighter than its surroundings is no mark.
+        if found is not None and found.contrast <= CONTRAST and (
+            best is None or found.explained > best[0].explained
+        ):  # fmt: skip
+            best = found, trial
+    if best is None or best[0].explained < EXPLAINED:
+        share = "nothing" if best is None else f"{100 * max(best[0].explained, 0.0):.0f} %"
+        what = f"no {mark.kind} of {mark.size:g} m was recognised there: it explains {share}"
+        return replace(here, note=what)
+    found, trial = best
+    return TaughtPoint(here.name, found.pixel, found.covariance, trial, refined=True)
+
+
+def _picture(
+    frame: Frame, here: TaughtPoint, point: FloatArray, size: float,
+    view: tuple[FloatArray, FloatArray], prefix: str,
+    pictures: dict[str, npt.NDArray[np.uint8]],
+) -> TaughtPoint:  # fmt: skip
+    """Take what the picture shows around a point, upright in the plane, as its mark."""
+    import cv2
+
+    (H, place), side = view, size * _per_metre(*view)
+    if side < SMALLEST:
+        return _nothing(here, f"a picture of {size:.2f} m has {side:.0f} px; {SMALLEST} are needed")
+    # Odd, so that one pixel's centre is the point.
+    count = min(int(side), LARGEST) // 2 * 2 + 1
+    offset = (np.arange(count) - count // 2) * (size / count)
+    right, up = np.meshgrid(offset, -offset)
+    grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
+    # The hand says where the point is; the view, how the plane lies about it.
+    spots = _mapped(H, grid) + here.pixel - _mapped(H, place[None])[0]
+    width, height = frame.size
+    if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
+        return _nothing(here, f"a picture of {size:.2f} m about it leaves the frame; --size less")
+    maps = spots.reshape(count, count, 2).astype(np.float32)
+    grey: Any = _eight_bit(frame)
+    patch = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
+    picture = np.asarray(patch, dtype=np.uint8)
+    vague = _vagueness(picture) * side / count
+    if not vague < VAGUE:
+        return _nothing(here, "there is only an edge, or nothing, to know it by")
+    code = _file_name(prefix, here.name, picture)
+    pictures[code] = picture
+    return replace(here, mark=Mark(here.name, "picture", point, size, code=code))
+
+
+def _nothing(here: TaughtPoint, why: str) -> TaughtPoint:
+    before = f"{here.note}; " if here.note else ""
+    return replace(here, note=f"{before}{why}: it tells the camera's place, but is no mark")
+
+
+def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
+    """Return the standard deviation, px, with which a picture can be found along its worst way.
+
+    From its structure tensor and its noise (Förstner and Gülch 1987).
+    """
+    p = picture.astype(np.float64)
+    # The noise: what a second difference along both axes leaves (Immerkær 1996).
+    rough = p[:-2] - 2.0 * p[1:-1] + p[2:]
+    rough = rough[:, :-2] - 2.0 * rough[:, 1:-1] + rough[:, 2:]
+    noise = max(1.4826 * float(np.median(np.abs(rough))) / 6.0, 1.0)
+    right = 0.5 * (p[1:-1, 2:] - p[1:-1, :-2])
+    down = 0.5 * (p[2:, 1:-1] - p[:-2, 1:-1])
+    tensor = np.array([[np.sum(a * b) for b in (right, down)] for a in (right, down)])
+    least = float(np.linalg.eigvalsh(tensor)[0])
+    # Slopes of pure noise are slopes too.
+    return noise / np.sqrt(least) if least > 2.0 * right.size * noise**2 else float("inf")
+
+
+def _eight_bit(frame: Frame) -> npt.NDArray[np.uint8]:
+    grey = np.asarray(frame.grey)
+    if grey.dtype == np.uint8:
+        return np.asarray(grey, dtype=np.uint8)
+    # Sensors of 10 or 12 bit leave the upper bits empty.
+    top = max(float(grey.max()), 1.0)
+    return np.asarray(np.round(grey * (255.0 / top)), dtype=np.uint8)
+
+
+def _file_name(prefix: str, name: str, picture: npt.NDArray[np.uint8]) -> str:
+    word = hashlib.sha256(picture.tobytes()).hexdigest()[:8]
+    plain = [re.sub(r"[^\w.-]+", "_", part) for part in (prefix, name)]
+    return f"{plain[0]}-{plain[1]}-{word}.png"
+
+
+# -- camera and plant ------------------------------------------------------------------
+
+
+def _fit(
+    frame: Frame, known: Camera | None, name: str, anew: bool, points: FloatArray,
+    found: Sequence[TaughtPoint], H: FloatArray, plane: FloatArray,
+) -> CameraFit:  # fmt: skip
+    from heliotrope.imaging.finding import SURVEY
+
+    pixels = np.array([p.pixel for p in found])
+    survey = np.array([(SURVEY * _per_metre(H, place)) ** 2 for place in plane])
+    covariance = np.array([p.covariance for p in found]) + survey[:, None, None] * np.eye(2)
+    if known is not None and not anew:
+        return resection(known, points, pixels, covariance)
+    return calibrate_marks(frame.size, [points], [pixels], [covariance], name)
+
+
+def _with_target(camera: Camera, target: str, known: Camera | None) -> Camera:
+    """Return the camera with the target among those that it sees."""
+    if known is None:
+        return replace(camera, targets=(target,))
+    seen = known.targets
+    if seen and target not in seen:
+        seen = (*seen, target)
+    return replace(camera, targets=seen, source=known.source)
+
+
+def _with_marks(plant: Plant, target: Target, marks: Sequence[Mark], camera: Camera) -> Plant:
+    new = {mark.name: mark for mark in marks}
+    kept = [new.pop(mark.name, mark) for mark in target.marks]
+    taught = replace(target, marks=(*kept, *new.values()))
+    targets = tuple(taught if t.name == target.name else t for t in plant.targets)
+    return with_camera(replace(plant, targets=targets), camera)
+
+
+def with_camera(plant: Plant, camera: Camera) -> Plant:
+    """Return the plant with a camera, in the place of the one of that name if there is one."""
+    names = [c.name for c in plant.cameras]
+    if camera.name not in names:
+        return replace(plant, cameras=(*plant.cameras, camera))
+    return replace(
+        plant, cameras=tuple(camera if c.name == camera.name else c for c in plant.cameras)
+    )
+
+
+# -- cameras and marks already known ---------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SeenMarks:
+    """Marks found in frames.
+
+    Attributes
+    ----------
+    points, pixels, covariances
+        For each frame with any: ENU metres (N, 3), pixels (N, 2), px² with the survey's (N, 2, 2).
+    targets
+        Whose marks they are.
+    reasons
+        What was not found, and why, in sentences.
+    """
+
+    points: tuple[FloatArray, ...]
+    pixels: tuple[FloatArray, ...]
+    covariances: tuple[FloatArray, ...]
+    targets: tuple[str, ...]
+    reasons: tuple[str, ...]
+
+
+def see_marks(
+    plant: Plant, folder: str | Path, frames: Sequence[Frame], camera: Camera | None
+) -> SeenMarks:
+    """Return the marks of a plant's targets in frames; taught pictures lie in ``folder``.
+
+    Raises
+    ------
+    InputError
+        If no target has marks, or none is found.
+    """
+    from heliotrope.imaging.finding import SURVEY, FoundMark, find_targets
+
+    targets = [t for t in plant.targets if t.marks]
+    if camera is not None and camera.targets:
+        targets = [t for t in targets if t.name in camera.targets]
+    if not targets:
+        raise InputError(
+            "no target that this camera sees has marks; teach them first (heliotrope camera "
+            "teach), or give a chessboard"
+        )
+    pictures = read_pictures(folder, targets)
+    points, pixels, covariances, names, reasons = [], [], [], [], []
+    for frame in frames:
+        marks: list[tuple[FoundMark, FloatArray]] = []
+        for found in find_targets(frame, targets, camera, pictures=pictures):
+            if not found.found or found.view is None:
+                reasons.append(f"{frame.name}: target {found.target.name}: {found.reason}")
+                continue
+            names.append(found.target.name)
+            for seen in found.marks:
+                if seen.used and not any(seen.mark == other.mark for other, _ in marks):
+                    place = found.view.face.plane(seen.mark.point)
+                    per_metre = abs(np.linalg.det(found.view.scale(place)))
+                    marks.append((seen, seen.covariance + per_metre * SURVEY**2 * np.eye(2)))
+        if marks:
+            points.append(np.array([seen.mark.point for seen, _ in marks]))
+            pixels.append(np.array([seen.pixel for seen, _ in marks]))
+            covariances.append(np.array([covariance for _, covariance in marks]))
+    if not points:
+        raise InputError("no target was found: " + "; ".join(reasons))
+    return SeenMarks(
+        tuple(points), tuple(pixels), tuple(covariances), tuple(dict.fromkeys(names)),
+        tuple(reasons),
+    )  # fmt: skip
+
+
+def fit_marks(
+    size: tuple[int, int], seen: SeenMarks, known: Camera | None, name: str, anew: bool
+) -> CameraFit:
+    """Return the camera that saw marks; of a known one only its place, unless ``anew``."""
+    if known is None or anew:
+        return calibrate_marks(size, seen.points, seen.pixels, seen.covariances, name)
+    parts = seen.points, seen.pixels, seen.covariances
+    points, pixels, covariances = (np.concatenate(part) for part in parts)
+    return resection(known, points, pixels, covariances)
+
+
+@dataclass(frozen=True)
+class Sight:
+    """How a camera sees a target.
+
+    Attributes
+    ----------
+    target
+        Its name.
+    distance
+        From the camera to its centre, m.
+    metres_per_pixel
+        On it, at its centre: the root of the area that a pixel covers, m.
+    obliquity
+        Between the line of sight and its normal, rad.
+    share
+        Of a grid on it, what the frame holds.
+    marks
+        How many of its marks the frame holds.
+    """
+
+    target: str
+    distance: float
+    metres_per_pixel: float
+    obliquity: float
+    share: float
+    marks: int
+
+
+def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
+    """Return how a camera sees the targets that it names, or any, if they face it in its frame."""
+    from heliotrope.imaging.projection import project
+
+    if camera.position is None:
+        return []
+    found = []
+    for target in targets:
+        ray = camera.position - target.center
+        distance = float(np.linalg.norm(ray))
+        facing = float(ray @ target.normal) / distance
+        if (camera.targets and target.name not in camera.targets) or facing <= 0.0:
+            continue
+        half = 0.5 * np.array([target.width, target.height])
+        steps = np.linspace(-1.0, 1.0, 21)
+        middle = target.plane_coordinates(target.corners).mean(axis=0)
+        grid = middle + half * np.stack(np.meshgrid(steps, steps), axis=-1)
+        share = _held(camera, project(camera, target.point(grid))).mean()
+        marks = np.array([mark.point for mark in target.marks]).reshape(-1, 3)
+        around = project(camera, target.point([[-0.01, 0], [0.01, 0], [0, -0.01], [0, 0.01]]))
+        if share == 0.0 or not np.isfinite(around).all():
+            continue
+        area = abs(float(np.linalg.det([around[1] - around[0], around[3] - around[2]]))) / 4e-4
+        if area > 0.0:
+            oblique = float(np.arccos(min(facing, 1.0)))
+            count = int(_held(camera, project(camera, marks)).sum())
+            found.append(Sight(target.name, distance, area**-0.5, oblique, float(share), count))
+    return found
+
+
+def _held(camera: Camera, pixels: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether the frame holds pixels (..., 2); it does not hold what is behind the camera."""
+    with np.errstate(invalid="ignore"):
+        held = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
+    return np.asarray(held.all(axis=-1))
