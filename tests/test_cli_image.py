@@ -1,0 +1,264 @@
+"""``heliotrope image``: photographs in, positions, pictures and sightings out."""
+
+import json
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from data import juelich
+from heliotrope.calibration.sighting_table import read_sightings
+from heliotrope.cli import main
+from heliotrope.field.example import azimuth_elevation
+from heliotrope.field.formats.paint import Tower, write_tower
+from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import enu_to_geodetic
+from heliotrope.imaging.beams import gaussian_beam
+from heliotrope.imaging.reading import read_image, write_image
+from heliotrope.imaging.rendering import (
+    Rendered,
+    Scene,
+    example_camera,
+    example_target,
+    exposed,
+    render,
+)
+from heliotrope.sun import Site, vector
+
+SITE = Site(37.0, -2.0, 500.0)
+ORIGIN = (37.0, -2.0, 500.0)
+TARGET = example_target(8.0)
+CAMERA = example_camera(TARGET, size=(800, 600))
+
+
+def _photograph(at: tuple[float, float], seed: int, beams: int = 1) -> Rendered:
+    thrown = tuple(
+        ("target", gaussian_beam((at[0], at[1] - 3.0 * k), 0.7, 0.5, 0.4), 700.0)
+        for k in range(beams)
+    )
+    scene = Scene(CAMERA, (TARGET,), thrown)
+    return render(exposed(scene) if beams else scene, seed)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three photographs with their log and a plant, and what is true of them."""
+    truth = []
+    photographs = tmp_path / "photographs"
+    photographs.mkdir()
+    lines = ["file,heliostat,timestamp,target,axis_1_motor_position,axis_2_motor_position"]
+    for k, at in enumerate([(0.5, 0.3), (-1.2, 0.8), (0.1, -1.4)]):
+        rendered = _photograph(at, k)
+        write_image(rendered.frame, photographs / f"p{k}.png")
+        truth.append(rendered.beams[0].point.tolist())
+        lines.append(f"p{k}.png,H{k % 2},2026-06-21T1{k}:00:00Z,target,{100 + k},{200 + k}")
+    (tmp_path / "truth.json").write_text(json.dumps(truth))
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    names = ("H0", "H1")
+    mechanism = azimuth_elevation(np.array([[0.0, -100.0, 0.0], [20.0, -120.0, 0.0]]))
+    mirrors = Heliostats(names, mechanism, np.full(2, 2.0), np.full(2, 1.5))
+    plant = Plant("test", SITE, {"azel": mirrors}, (TARGET,), cameras=(CAMERA,))
+    write_plant(plant, tmp_path / "plant.toml")
+    return tmp_path
+
+
+@pytest.fixture
+def call(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Run a command; return exit code, output and errors."""
+
+    def run(*arguments: Any) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["heliotrope", "image", *map(str, arguments)])
+        with pytest.raises(SystemExit) as leaving:
+            main()
+        captured = capsys.readouterr()
+        return int(leaving.value.code or 0), str(captured.out), str(captured.err)
+
+    return run
+
+
+def test_json_gives_position_covariance_and_quality(folder: Path, call: Any) -> None:
+    code, out, err = call(
+        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
+        "--annotated", folder / "seen",
+    )  # fmt: skip
+    assert code == 0, err
+    (image,) = json.loads(out)["images"]
+    (reading,) = image["targets"]
+    (spot,) = reading["spots"]
+    truth = np.array(json.loads((folder / "truth.json").read_text())[0])
+    place = np.array([spot[f"{axis}_m"] for axis in ("east", "north", "up")])
+    covariance = np.array(spot["covariance_enu_m2"])
+    assert reading["good"], reading["reasons"]
+    assert np.linalg.norm(place - truth) < 0.03
+    assert np.linalg.norm(place - truth) < 4.0 * np.sqrt(np.trace(covariance))
+    latitude, longitude, altitude = enu_to_geodetic(place, ORIGIN)
+    assert spot["latitude_deg"] == pytest.approx(float(latitude), abs=1e-12)
+    assert spot["longitude_deg"] == pytest.approx(float(longitude), abs=1e-12)
+    assert spot["altitude_m"] == pytest.approx(float(altitude), abs=1e-9)
+    assert spot["sigma_major_m"] == pytest.approx(0.7, abs=0.05)
+    drawn = read_image(image["annotated"])
+    assert drawn.pixels.shape[2] == 3
+
+
+def test_screen_names_spots_and_reasons(folder: Path, call: Any) -> None:
+    write_image(_photograph((0.0, 1.5), 7, beams=2).frame, folder / "two.png")
+    write_image(_photograph((0.0, 0.0), 8, beams=0).frame, folder / "none.png")
+    code, out, _ = call(
+        folder / "two.png", folder / "none.png", "--plant", folder / "plant.toml", "--no-pictures"
+    )
+    assert code == 0
+    assert "several spots: another spot on it has" in out
+    assert "spot 2  E" in out
+    assert "no spot: no spot stands out of the background" in out
+    assert "annotated" not in out
+
+
+def test_sightings_of_a_folder(folder: Path, call: Any) -> None:
+    table = folder / "sightings.csv"
+    code, out, err = call(
+        folder / "photographs", "--plant", folder / "plant.toml", "--to-sightings", table,
+        "--log", folder / "log.csv", "--no-pictures",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "3 sightings of 3 photographs" in out
+    seen, kinds, left = read_sightings(table, ("H0", "H1"))
+    assert not left
+    assert set(kinds) == {"camera_target"}
+    assert seen.heliostat.tolist() == [0, 1, 0]
+    assert seen.counts[1].tolist() == [101.0, 201.0]
+    truth = np.array(json.loads((folder / "truth.json").read_text()))
+    assert np.linalg.norm(seen.destination - truth, axis=1).max() < 0.03
+    sun = vector(datetime(2026, 6, 21, 11, tzinfo=UTC), SITE)
+    assert seen.source[1] == pytest.approx(sun, abs=1e-12)
+    spread = np.sqrt(np.trace(seen.destination_covariance, axis1=1, axis2=2))
+    assert (spread > 0.001).all()
+    assert (spread < 0.05).all()
+
+
+def test_sightings_name_what_is_left_out(folder: Path, call: Any) -> None:
+    photographs = folder / "photographs"
+    write_image(_photograph((0.0, 0.0), 8, beams=0).frame, photographs / "p3.png")
+    write_image(_photograph((0.0, 0.0), 9).frame, photographs / "p4.png")
+    write_image(_photograph((0.0, 0.0), 10).frame, photographs / "p5.png")
+    (photographs / "p6.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with (folder / "log.csv").open("a") as log:
+        log.write("p3.png,H0,2026-06-21T13:00:00Z,target,1,2\n")
+        log.write("p4.png,H9,2026-06-21T13:00:00Z,target,1,2\n")
+        log.write("p6.png,H0,2026-06-21T13:00:00Z,target,1,2\n")
+    code, out, err = call(
+        photographs, "--plant", folder / "plant.toml", "--to-sightings", folder / "s.parquet",
+        "--log", folder / "log.csv", "--no-pictures", "--json", "--processes", 1,
+    )  # fmt: skip
+    found = json.loads(out)
+    assert code == 2, "a file could not be read"
+    assert err.count("\n") == 1
+    assert "p6.png" in err
+    assert found["sightings"]["count"] == 3
+    assert len(read_sightings(folder / "s.parquet", ("H0", "H1"))[0]) == 3
+    left = {line.split(": ", 1)[0]: line.split(": ", 1)[1] for line in found["left_out"]}
+    assert left["p3.png"].startswith("no spot")
+    assert left["p4.png"] == "the plant has no heliostat H9"
+    assert left["p5.png"].startswith("nothing is known of it")
+    assert "p6.png" in left
+
+
+def test_processes_change_nothing(folder: Path, call: Any) -> None:
+    files = [folder / "photographs" / f"p{k % 3}.png" for k in range(8)]
+    plant = ("--plant", folder / "plant.toml", "--no-pictures", "--json")
+    documents = [json.loads(call(*files, *plant, "--processes", n)[1]) for n in (1, 2)]
+    assert documents[0] == documents[1]
+    assert len(documents[0]["images"]) == 8
+
+
+def test_dask_changes_nothing(folder: Path, call: Any) -> None:
+    pytest.importorskip("distributed")
+    files = sorted((folder / "photographs").glob("*.png"))
+    plant = ("--plant", folder / "plant.toml", "--no-pictures", "--json")
+    here = json.loads(call(*files, *plant)[1])
+    there = json.loads(call(*files, *plant, "--scheduler", "local:1")[1])
+    for a, b in zip(here["images"], there["images"], strict=True):
+        assert {**a, "file": ""} == {**b, "file": ""}
+
+
+def test_an_empty_frame_serves_as_background(folder: Path, call: Any) -> None:
+    write_image(_photograph((0.0, 0.0), 8, beams=0).frame, folder / "empty.png")
+    code, out, err = call(
+        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
+        "--empty", folder / "empty.png", "--no-pictures",
+    )  # fmt: skip
+    assert code == 0, err
+    spot = json.loads(out)["images"][0]["targets"][0]["spots"][0]
+    truth = np.array(json.loads((folder / "truth.json").read_text())[0])
+    place = np.array([spot[f"{axis}_m"] for axis in ("east", "north", "up")])
+    assert np.linalg.norm(place - truth) < 0.03
+
+
+def test_a_tower_file_is_plant_enough(folder: Path, call: Any) -> None:
+    tower = juelich() / "tower-measurements.json"
+    image = juelich() / "images" / "target-camera" / "213508-raw.png"
+    code, out, err = call(
+        image, "--plant", tower, "--json", "--no-pictures", "--heliostat", "AB12",
+        "--to-sightings", folder / "s.csv",
+    )  # fmt: skip
+    assert code == 0, err
+    assert json.loads(out)["sightings"]["count"] == 1
+    seen, _, _ = read_sightings(folder / "s.csv", ("AB12",))
+    # The file beside the photograph gives motors and sun.
+    assert seen.counts.tolist() == [[22170.0, 11616.0]]
+    azimuth, elevation = np.radians([36.9225463959062, 57.351935820685455])
+    sun = [np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth),
+           np.sin(elevation)]  # fmt: skip
+    assert seen.source[0] == pytest.approx(sun, abs=1e-12)
+
+
+def test_crops_need_their_target(folder: Path, call: Any) -> None:
+    rendered = _photograph((0.5, 0.3), 1).frame.pixels
+    write_image(np.ascontiguousarray(rendered[100:500, 200:600]), folder / "crop.png")
+    common = (folder / "crop.png", "--plant", folder / "plant.toml", "--no-pictures", "--crop")
+    code, _, err = call(*common)
+    assert code == 2
+    assert "a crop shows one target, but which? Give --target (one of target)" in err
+    assert call(*common, "--target", "target")[0] == 0
+
+
+BAD: list[tuple[str, list[str], str]] = [
+    ("absent.png", [], "there is no such file"),
+    ("photographs/p0.png", ["--target", "tower"], "there is no target 'tower'"),
+    ("photographs/p0.png", ["--camera", "left"], "there is no camera 'left'"),
+    ("photographs/p0.png", ["--log", "absent.csv"], "there is no such file"),
+    ("photographs/p0.png", ["--log", "bad.csv"], "there is no column heliostat"),
+    ("photographs/p0.png", ["--log", "naive.csv"], "line 2, column timestamp"),
+    ("photographs/p0.png", ["--log", "text.csv"], "'x' is not a number"),
+    ("nothing", [], "there is no image in this folder"),
+]
+
+
+@pytest.mark.parametrize(("file", "options", "text"), BAD)
+def test_bad_input_is_one_line(
+    folder: Path, call: Any, monkeypatch: pytest.MonkeyPatch, file: str, options: list[str],
+    text: str,
+) -> None:  # fmt: skip
+    monkeypatch.chdir(folder)
+    (folder / "nothing").mkdir()
+    (folder / "bad.csv").write_text("file,axis_1_motor_position\np0.png,1\n")
+    head = "file,heliostat,timestamp,axis_1_motor_position,axis_2_motor_position\n"
+    (folder / "naive.csv").write_text(head + "p0.png,H0,2026-06-21T12:00:00,1,2\n")
+    (folder / "text.csv").write_text(head + "p0.png,H0,2026-06-21T12:00:00Z,x,2\n")
+    code, _, err = call(file, "--plant", "plant.toml", "--no-pictures", *options)
+    assert code == 2
+    assert text in err
+    assert err.count("\n") == 1, err
+    assert "Traceback" not in err
+
+
+def test_plant_without_targets_is_refused(tmp_path: Path, call: Any) -> None:
+    write_tower(Tower(ORIGIN, (), ()), tmp_path / "tower-measurements.json")
+    write_image(_photograph((0.5, 0.3), 1).frame, tmp_path / "a.png")
+    code, _, err = call(tmp_path / "a.png", "--plant", tmp_path / "tower-measurements.json")
+    assert code == 2
+    assert "there is no target in it" in err
