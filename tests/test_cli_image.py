@@ -262,3 +262,55 @@ def test_plant_without_targets_is_refused(tmp_path: Path, call: Any) -> None:
     code, _, err = call(tmp_path / "a.png", "--plant", tmp_path / "tower-measurements.json")
     assert code == 2
     assert "there is no target in it" in err
+
+
+def test_live_folder_is_read_and_kept(folder: Path, call: Any) -> None:
+    code, out, err = call(
+        folder / "photographs", "--plant", folder / "plant.toml", "--live", "--limit", 3,
+        "--keep", folder / "kept", "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    lines = [json.loads(line) for line in out.splitlines()]
+    truth = json.loads((folder / "truth.json").read_text())
+    assert len(lines) == 3
+    for line, place in zip(lines, truth, strict=True):
+        (reading,) = line["targets"]
+        spot = reading["spots"][0]
+        assert spot["east_m"] == pytest.approx(place[0], abs=0.03)
+        # The frame is kept, with its result beside it.
+        assert read_image(line["kept"]).size == (800, 600)
+        beside = json.loads(Path(line["kept"]).with_suffix(".json").read_text())
+        assert beside["result"]["targets"][0]["spots"][0]["east_m"] == spot["east_m"]
+
+
+def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
+    for k in range(4):
+        write_image(_photograph((0.5, 0.3), 40 + k).frame, folder / f"burst-{k}.png")
+    (folder / "burst").mkdir()
+    for k in range(4):
+        (folder / f"burst-{k}.png").rename(folder / "burst" / f"{k}.png")
+    code, out, err = call(
+        folder / "burst", "--plant", folder / "plant.toml", "--live", "--limit", 1, "--burst", 4,
+        "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    (line,) = [json.loads(text) for text in out.splitlines()]
+    assert line["targets"][0]["good"]
+
+
+@pytest.mark.parametrize(
+    ("source", "text"),
+    [
+        (["nowhere"], "there is no such folder or file"),
+        (["a", "b"], "--live follows one source, not 2"),
+        (["usb:97"], "there is no such device"),
+        (["http://127.0.0.1:9/x"], "127.0.0.1:9"),
+    ],
+)
+def test_live_sources_that_are_not_there(
+    folder: Path, call: Any, source: list[str], text: str
+) -> None:
+    code, _, err = call(*source, "--plant", folder / "plant.toml", "--live", "--limit", 1)
+    assert code == 2
+    assert text in err
+    assert err.strip().count("\n") == 0, err

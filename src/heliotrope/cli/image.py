@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 
 
 def image(
-    paths: Annotated[list[Path], typer.Argument(help="Photographs, or folders of them.")],
+    paths: Annotated[
+        list[str], typer.Argument(help="Photographs, folders of them; with --live a source.")
+    ],
     plant: Annotated[
         Path, typer.Option(help="Plant file or folder, or PAINT's tower-measurements.json.")
     ],
@@ -56,6 +58,17 @@ def image(
         int, typer.Option(min=0, help="Processes on this machine; 0: one a core.")
     ] = 0,
     scheduler: shared.SchedulerOption = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Follow a watched folder, video, rtsp://, http://, usb:0."),
+    ] = False,
+    limit: Annotated[
+        int | None, typer.Option(min=1, help="With --live: frames after which it ends.")
+    ] = None,
+    burst: Annotated[int, typer.Option(min=1, help="With --live: frames averaged into one.")] = 1,
+    archive: Annotated[
+        Path | None, typer.Option("--keep", help="With --live: folder for frames and results.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Find targets and spots in photographs: metres with covariance, or the reason why not."""
@@ -63,7 +76,11 @@ def image(
     from heliotrope.imaging.log import read_log
 
     place = open_place(plant)
-    files = _files(paths)
+    if live:
+        job = _job(place, target, crop, camera, empty, None)
+        _follow(paths, place, job, limit, burst, archive, as_json)
+        return
+    files = _files([Path(path) for path in paths])
     table: Log | None = None if log is None else read_log(log)
     entries = campaign.known_of(files, table, heliostat)
     job = _job(place, target, crop, camera, empty, annotated if pictures else None)
@@ -82,6 +99,25 @@ def image(
         print(f"heliotrope: {outcome.problem}", file=sys.stderr)
     if broken or (to_sightings is not None and not count):
         raise typer.Exit(2)
+
+
+def _follow(
+    paths: list[str], place: "Place", job: "Job", limit: int | None, burst: int,
+    archive: Path | None, as_json: bool,
+) -> None:  # fmt: skip
+    from heliotrope.cli._live import follow
+    from heliotrope.errors import InputError
+    from heliotrope.imaging.sources import open_source
+
+    if len(paths) != 1:
+        raise InputError(f"--live follows one source, not {len(paths)}; give one")
+    # The name of one of the plant's cameras stands for its source.
+    named = next((c for c in place.cameras if c.name == paths[0]), None)
+    text = named.source if named is not None else paths[0]
+    folder = place.folder if named is not None else Path()
+    frames = None if limit is None else limit * burst
+    source = open_source(text, folder=folder, watch=Path(text).is_dir(), limit=frames)
+    follow(source, job, burst=burst, archive=archive, as_json=as_json)
 
 
 @dataclass(frozen=True)
@@ -224,7 +260,7 @@ def _show(
         )  # fmt: skip
         return
     if len(read) <= 40:
-        _print_spots(read)
+        print_spots(read)
     if table is not None and count:
         noun = "sighting" if count == 1 else "sightings"
         print(f"{count} {noun} of {len(outcomes)} photographs: {table}")
@@ -241,7 +277,8 @@ def _show(
         print(f"annotated pictures: {drawn[0] if len(drawn) == 1 else drawn[0].parent}")
 
 
-def _print_spots(outcomes: "Sequence[Outcome]") -> None:
+def print_spots(outcomes: "Sequence[Outcome]") -> None:
+    """Print the spots of photographs, target by target."""
     for outcome in outcomes:
         print(outcome.path.name)
         readings = outcome.document["targets"]

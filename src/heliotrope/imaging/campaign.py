@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,6 +28,7 @@ from heliotrope.imaging.photograph import (
     read_photograph,
 )
 from heliotrope.imaging.reading import read_image, write_image
+from heliotrope.imaging.view import View
 from heliotrope.sun import Site, vector
 
 if TYPE_CHECKING:
@@ -101,6 +102,8 @@ class Outcome:
         Of the photograph.
     annotated
         The annotated picture, if one was written.
+    views
+        How the faces lie in the frame, for the next one.
     """
 
     path: Path
@@ -113,6 +116,7 @@ class Outcome:
     time: datetime | None = None
     time_deviation: float = float("nan")
     annotated: Path | None = None
+    views: tuple[View, ...] = ()
 
 
 def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
@@ -129,13 +133,30 @@ def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
     """
     try:
         frame = read_image(path)
-        return look(frame, path, job, entry)
+        return replace(look(frame, path, job, entry), views=())
     except HeliotropeError as error:
         return Outcome(path, problem=str(error))
 
 
-def look(frame: Frame, path: Path, job: Job, entry: Entry | None = None) -> Outcome:
+def look(
+    frame: Frame,
+    path: Path,
+    job: Job,
+    entry: Entry | None = None,
+    previous: Sequence[View] = (),
+) -> Outcome:
     """Return what a frame shows.
+
+    Parameters
+    ----------
+    frame, path
+        The photograph and what to call it.
+    job
+        How to read it.
+    entry
+        What is known of it.
+    previous
+        Views of an earlier frame of the same camera.
 
     Raises
     ------
@@ -150,8 +171,9 @@ def look(frame: Frame, path: Path, job: Job, entry: Entry | None = None) -> Outc
         if name:
             _target(job, name, path)
         photograph = read_photograph(
-            frame, job.targets, job.camera, settings=job.settings, without=job.without
-        )
+            frame, job.targets, job.camera, settings=job.settings, previous=previous,
+            without=job.without,
+        )  # fmt: skip
     reading, refusal = meant(photograph, name)
     drawn = None
     if job.annotated is not None:
@@ -168,6 +190,7 @@ def look(frame: Frame, path: Path, job: Job, entry: Entry | None = None) -> Outc
         time=frame.time,
         time_deviation=frame.time_deviation,
         annotated=drawn,
+        views=photograph.views,
     )
 
 
@@ -337,7 +360,7 @@ def _on_cluster(
     # The job holds the targets and may hold an empty frame: it travels once.
     shared = client.scatter(job, broadcast=True)  # type: ignore[no-untyped-call]
     futures = {
-        client.submit(process, path.resolve(), shared, entry, pure=False): k  # type: ignore[no-untyped-call]
+        client.submit(process, path.resolve(), shared, entry, pure=False): k
         for k, (path, entry) in enumerate(tasks)
     }
     for future in completed(list(futures)):  # type: ignore[no-untyped-call]
