@@ -1,106 +1,153 @@
 """All messages of the wire, version 2: one table.
 
-A row: number, name, payload as (field, struct code, unit), who may send it, meaning.
-Numbers are little-endian. Codes are those of ``struct``; ``s`` alone is a rest of bytes.
+A row: number, name, who may send it, codes of the payload, names of its fields. Codes are
+those of ``struct``, little-endian; ``s`` alone is a rest of bytes. A field of several numbers
+has a code with a count ("18d"). Names of fields end in their unit; the meaning of a message
+stands in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
+microcontroller it costs no memory there).
 
 Who may send a message:
 
 ANYONE     taken from everybody at any time: what makes the field safe
-AUTHORITY  moves the mirror: needs the command authority's token, and expires
-KEY        changes what is stored: needs a truncated HMAC, and authority
-CLUSTER    from the cluster controller, every second or so
+AUTHORITY  moves the mirror: token of the one authority, and expires
+KEY        changes what is stored: a truncated HMAC and an edition besides
+CLUSTER    from the cluster controller, every second or so: time, sun, session
+ASK        a question of the cluster controller; it changes nothing
 NODE       an answer of a local controller
+
+Payloads of AUTHORITY and KEY messages begin with a head, which their rows leave out: the
+authority's ``token``; ``expires_s``, the GPS second after which the command is void; and for
+KEY the ``edition``, a number that only rises, kept in the journal, so that a stored value
+cannot be set again by a recorded message, whatever was reset in between.
+
+GPS seconds count from 6 January 1980 without leap seconds, modulo 2^32.
 """
 
-ANYONE, AUTHORITY, KEY, CLUSTER, NODE = 0, 1, 2, 3, 4
+ANYONE, AUTHORITY, KEY, CLUSTER, NODE, ASK = 0, 1, 2, 3, 4, 5
 
-#: Every command that moves carries this head: the authority's token, and the time (s of GPS
-#: week time, of the cluster's clock) after which it is void.
-HEAD = (("token", "I", ""), ("expires_s", "I", "s"))
+#: Codes and names of the fields that begin every payload of a class.
+HEADS = {AUTHORITY: ("II", "token expires_s"), KEY: ("III", "token expires_s edition")}
 
 MESSAGES = (
-    # Questions and answers.
-    (0x01, "QUERY_STEPS", (), CLUSTER, "ask for step counts"),
-    (0x02, "STEPS", (("primary", "i", "steps"), ("secondary", "i", "steps"),
-                     ("primary_goal", "i", "steps"), ("secondary_goal", "i", "steps")),
-     NODE, "step counts and where they are going"),
-    (0x03, "QUERY_STATUS", (), CLUSTER, "ask for state and flags"),
-    (0x04, "STATUS", (("state", "B", ""), ("flags", "I", ""), ("fault", "B", ""),
-                      ("uptime_s", "I", "s"), ("sun_age_ms", "I", "ms"),
-                      ("supply_mv", "H", "mV"), ("temperature_c", "b", "°C"),
-                      ("armature_crc", "I", ""), ("boots", "H", "")),
-     NODE, "state, flags and health"),
-    (0x05, "QUERY_POSITION", (), CLUSTER, "ask where the heliostat stands"),
-    (0x06, "POSITION", (("east", "f", "m"), ("north", "f", "m"), ("up", "f", "m")),
-     NODE, "where the heliostat stands, ENU"),
-    (0x07, "QUERY_DIAGNOSIS", (), CLUSTER, "ask for the last movement diagnosis"),
-    (0x08, "DIAGNOSIS", (("result", "B", ""), ("moved_primary", "i", "steps"),
-                         ("moved_secondary", "i", "steps"), ("tilt_x", "f", "rad"),
-                         ("tilt_y", "f", "rad")),
-     NODE, "whether the mirror moved as ordered, by accelerometer or limit switch"),
-    (0x09, "QUERY_STORED", (("item", "B", ""),), CLUSTER, "ask for a stored record"),
-    (0x0A, "STORED", (("item", "B", ""), ("data", "s", "")), NODE, "a stored record"),
-    (0x0B, "DISCOVER", (("low", "I", ""), ("high", "I", "")), CLUSTER,
-     "ask all whose serial number lies between to answer, in slots drawn by chance"),
-    (0x0C, "HERE", (("serial", "I", ""), ("firmware", "H", ""), ("address", "H", "")),
-     NODE, "serial number, firmware and address"),
-    (0x0D, "ACK", (("sequence_of", "H", ""), ("type_of", "B", ""), ("result", "B", "")),
-     NODE, "what became of a command"),
-    # Time and sun.
-    (0x10, "TIME", (("week", "H", ""), ("time_of_week_ms", "I", "ms"), ("quality", "B", "")),
-     CLUSTER, "GPS time"),
-    (0x11, "SUN", (("time_s", "I", "s"), ("east", "i", "2^-30"), ("north", "i", "2^-30"),
-                   ("up", "i", "2^-30"), ("east_rate", "h", "2^-30/s"),
-                   ("north_rate", "h", "2^-30/s"), ("up_rate", "h", "2^-30/s")),
-     CLUSTER, "unit vector to the sun and its rate; the only thing that renews the lease"),
-    # What makes the field safe: from anyone, always.
-    (0x20, "DEFOCUS", (), ANYONE, "beams off the receiver, now"),
-    (0x21, "STOW", (), ANYONE, "go to the stow position"),
-    (0x22, "LOCK", (), ANYONE, "stop and hold position"),
-    # System states.
-    (0x30, "APPROACH", HEAD, AUTHORITY, "leave stow for standby by the safe way"),
-    (0x31, "IDLE", HEAD, AUTHORITY, "hold position, ready"),
-    (0x32, "TRACK", HEAD, AUTHORITY, "track the sun onto the aim"),
-    (0x33, "REFOCUS", HEAD, AUTHORITY, "back from defocus to the aim"),
-    (0x34, "UNLOCK", HEAD, AUTHORITY, "release a lock"),
-    (0x35, "CLEAR_FAULT", HEAD, AUTHORITY, "leave FAULT for IDLE, the cause being gone"),
-    # Aim and motion.
-    (0x40, "AIM", HEAD + (("east", "f", "m"), ("north", "f", "m"), ("up", "f", "m")),
-     AUTHORITY, "point to send the beam to, ENU"),
-    (0x41, "LOCK_AIM", HEAD + (("locked", "B", ""),), AUTHORITY, "hold the aim against changes"),
-    (0x42, "JOG", HEAD + (("axis", "B", ""), ("steps", "i", "steps")), AUTHORITY,
-     "move one axis by hand: up and down, east and west"),
-    (0x43, "GOTO", HEAD + (("primary", "i", "steps"), ("secondary", "i", "steps")), AUTHORITY,
-     "move to step counts"),
-    (0x44, "ROUGH", HEAD + (("rough", "B", ""),), AUTHORITY, "rough or fine stepping"),
-    (0x45, "SEARCH", HEAD + (("pitch", "f", "rad"), ("radius", "f", "rad")), AUTHORITY,
-     "move the beam in a spiral about its aim, to be found by the target's camera"),
-    (0x46, "DIAGNOSE", HEAD, AUTHORITY, "move a little and back, and see whether it moved"),
-    (0x47, "STANDBY", HEAD + (("east", "f", "m"), ("north", "f", "m"), ("up", "f", "m")),
-     AUTHORITY, "standby point beside the receiver, ENU"),
-    # What is stored.
-    (0x50, "SET_ARMATURE", (("numbers", "18d", ""),), KEY,
-     "axes, origins, vertex and normal of the calibrated heliostat, in place of a matrix"),
-    (0x51, "SET_DRIVES", (("axis", "B", ""), ("kind", "B", ""), ("numbers", "10d", "")), KEY,
-     "how steps become angles"),
-    (0x52, "SET_BIAS", (("primary", "f", "rad"), ("secondary", "f", "rad")), KEY,
-     "biases of the angles"),
-    (0x53, "SET_POSITION", (("east", "d", "m"), ("north", "d", "m"), ("up", "d", "m")), KEY,
-     "where the heliostat stands, ENU"),
-    (0x54, "SET_ADDRESS", (("serial", "I", ""), ("address", "H", "")), KEY, "address on the bus"),
-    (0x55, "ZERO", (("primary", "i", "steps"), ("secondary", "i", "steps")), KEY,
-     "declare the present step counts"),
-    (0x56, "SET_STOW", (("primary", "i", "steps"), ("secondary", "i", "steps")), KEY,
-     "step counts of the stow position"),
-    (0x57, "SET_LIMITS", (("axis", "B", ""), ("low", "i", "steps"), ("high", "i", "steps"),
-                          ("rate", "I", "steps/s"), ("acceleration", "I", "steps/s²"),
-                          ("backlash", "H", "steps")), KEY, "range, rate and backlash of an axis"),
-    (0x58, "SET_DEFOCUS", (("primary", "f", "rad"), ("secondary", "f", "rad")), KEY,
-     "how far angles go when defocused"),
+    # Ask for step counts.
+    (0x01, "QUERY_STEPS", ASK, "", ""),
+    # Step counts, and where they are going.
+    (0x02, "STEPS", NODE, "iiii", "primary secondary primary_goal secondary_goal"),
+    # Ask for state and flags.
+    (0x03, "QUERY_STATUS", ASK, "", ""),
+    # State, flags and health.
+    (0x04, "STATUS", NODE, "BIBIIHbIH",
+     "state flags fault uptime_s sun_age_ms supply_mv temperature_degc armature_crc boots"),
+    # Ask where the heliostat stands.
+    (0x05, "QUERY_POSITION", ASK, "", ""),
+    # Where the heliostat stands, ENU.
+    (0x06, "POSITION", NODE, "fff", "east_m north_m up_m"),
+    # Ask for the last diagnosis of movement.
+    (0x07, "QUERY_DIAGNOSIS", ASK, "", ""),
+    # Whether the mirror moved as ordered, by accelerometer or limit switch.
+    (0x08, "DIAGNOSIS", NODE, "Biiff",
+     "result moved_primary moved_secondary tilt_x_rad tilt_y_rad"),
+    # Ask for a stored item, by its number in the journal.
+    (0x09, "QUERY_STORED", ASK, "B", "item"),
+    # A stored item.
+    (0x0A, "STORED", NODE, "Bs", "item data"),
+    # Ask all whose serial number lies between to answer, in slots drawn by chance.
+    (0x0B, "DISCOVER", ASK, "II", "low high"),
+    # Serial number, firmware and address.
+    (0x0C, "HERE", NODE, "IHH", "serial firmware address"),
+    # What became of a command.
+    (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result"),
+    # GPS time.
+    (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality"),
+    # Unit vector to the sun at a GPS second, in 2^-30, and its rate, in 2^-28 a second (the
+    # sun's 7.3e-5 rad/s would not fit 16 bits of 2^-30); the only thing that renews the lease.
+    (0x11, "SUN", CLUSTER, "Iiiihhh", "time_s east north up east_rate north_rate up_rate"),
+    # The sender's session: its epoch, which rises with every start; the upper bits of its
+    # sequence; and the token of the authority that commands through it (0: nobody).
+    (0x12, "SESSION", CLUSTER, "IHI", "epoch rollover token"),
+    # Beams off the receiver, now.
+    (0x20, "DEFOCUS", ANYONE, "", ""),
+    # Go to the stow position: one heliostat, or all by broadcast.
+    (0x21, "STOW", ANYONE, "", ""),
+    # Leave stow for standby by the safe way.
+    (0x30, "APPROACH", AUTHORITY, "", ""),
+    # Hold position, ready.
+    (0x31, "IDLE", AUTHORITY, "", ""),
+    # Track the sun onto the aim.
+    (0x32, "TRACK", AUTHORITY, "", ""),
+    # Back from defocus to the aim.
+    (0x33, "REFOCUS", AUTHORITY, "", ""),
+    # Release a lock.
+    (0x34, "UNLOCK", AUTHORITY, "", ""),
+    # Leave FAULT, the cause being gone.
+    (0x35, "CLEAR_FAULT", AUTHORITY, "", ""),
+    # Stop and hold position.
+    (0x36, "LOCK", AUTHORITY, "", ""),
+    # Point to send the beam to, ENU.
+    (0x40, "AIM", AUTHORITY, "fff", "east_m north_m up_m"),
+    # Hold the aim against changes.
+    (0x41, "LOCK_AIM", AUTHORITY, "B", "locked"),
+    # Move one axis by hand: up and down, east and west.
+    (0x42, "JOG", AUTHORITY, "Bi", "axis steps"),
+    # Move to step counts.
+    (0x43, "GOTO", AUTHORITY, "ii", "primary secondary"),
+    # Rough or fine stepping.
+    (0x44, "ROUGH", AUTHORITY, "B", "rough"),
+    # Move the beam in a spiral about its aim, to be found by the target's camera.
+    (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad"),
+    # Move a little and back, and see whether it moved.
+    (0x46, "DIAGNOSE", AUTHORITY, "", ""),
+    # Standby point beside the receiver, ENU.
+    (0x47, "STANDBY", AUTHORITY, "fff", "east_m north_m up_m"),
+    # Axes, origins, vertex and normal of the calibrated heliostat, in place of a matrix.
+    (0x50, "SET_ARMATURE", KEY, "18d", "numbers"),
+    # How steps become angles.
+    (0x51, "SET_DRIVES", KEY, "BB10d", "axis kind numbers"),
+    # Biases of the angles.
+    (0x52, "SET_BIAS", KEY, "ff", "primary_rad secondary_rad"),
+    # Where the heliostat stands, ENU.
+    (0x53, "SET_POSITION", KEY, "ddd", "east_m north_m up_m"),
+    # Address on the bus.
+    (0x54, "SET_ADDRESS", KEY, "IH", "serial address"),
+    # Declare the present step counts.
+    (0x55, "ZERO", KEY, "ii", "primary secondary"),
+    # Step counts of the stow position.
+    (0x56, "SET_STOW", KEY, "ii", "primary secondary"),
+    # Range, rate and backlash of an axis.
+    (0x57, "SET_LIMITS", KEY, "BiiIIH",
+     "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash"),
+    # How far the angles go when defocused.
+    (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad"),
 )  # fmt: skip
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}
 ROW_OF = {row[0]: row for row in MESSAGES}
+
+
+def name_of(number: int) -> str:
+    """Return the name of a message number, "" if the table has none."""
+    row = ROW_OF.get(number)
+    return row[1] if row else ""
+
+
+def who_of(number: int) -> int:
+    """Return who may send a message; -1 if the table has no such number."""
+    row = ROW_OF.get(number)
+    return row[2] if row else -1
+
+
+def codes_of(number: int) -> str:
+    """Return the ``struct`` codes of a message's payload with its head, without byte order."""
+    row = ROW_OF[number]
+    return HEADS[row[2]][0] + row[3] if row[2] in HEADS else row[3]
+
+
+def fields_of(number: int) -> list[str]:
+    """Return the names of a message's fields with those of its head."""
+    row = ROW_OF[number]
+    head = HEADS[row[2]][1] if row[2] in HEADS else ""
+    return (head + " " + row[4]).split()
+
 
 #: Results in ACK.
 DONE, REFUSED_STATE, REFUSED_AUTHORITY, REFUSED_KEY, EXPIRED, DUPLICATE, BAD_VALUE, BUSY = range(8)
