@@ -1,0 +1,78 @@
+"""Time as a counter that wraps: the arithmetic of MicroPython's ``ticks_ms``, written out.
+
+Ticks are integers modulo 2^30. A difference is taken as the shorter way round, so it lies in
+[-2^29, 2^29): half the period is 6.2 days in milliseconds, 8.9 minutes in microseconds.
+MicroPython's own ``ticks_diff`` gives the same numbers; CPython has none.
+"""
+
+PERIOD = 1 << 30
+HALF = PERIOD >> 1
+
+
+def add(tick: int, delta: int) -> int:
+    """Return the tick that lies ``delta`` after ``tick`` (before, if negative)."""
+    return (tick + delta) & (PERIOD - 1)
+
+
+def diff(later: int, earlier: int) -> int:
+    """Return how far ``later`` lies after ``earlier``: negative if it lies before."""
+    return ((later - earlier + HALF) & (PERIOD - 1)) - HALF
+
+
+class Deadline:
+    """A span of time that ends on time or too early, never too late (invariant 9).
+
+    It holds what is left, not the instant of its end, so it stays right when the counter wraps.
+    Every step of the counter between two looks is charged with its size, whatever its sign: a
+    jump, forwards or backwards, can only shorten the span. Once over, it stays over until
+    ``start`` is called. It is over when made.
+
+    It must be looked at at least once in 2^29 ticks: a counter that wrapped unseen cannot be
+    told from one that stood still. A loop that hangs for longer, or a counter that stands
+    still, is the hardware watchdog's to end.
+
+    Attributes
+    ----------
+    left
+        Ticks left at the last look.
+    """
+
+    def __init__(self) -> None:
+        self.left = 0
+        self._seen = 0
+
+    def start(self, now: int, span: int) -> None:
+        """Begin a new span.
+
+        Parameters
+        ----------
+        now
+            The present tick.
+        span
+            Length in ticks, 0 to 2^29 - 1.
+
+        Raises
+        ------
+        ValueError
+            A span that the counter cannot measure. The old span is then over.
+        """
+        self.left = 0
+        if not 0 <= span < HALF:
+            raise ValueError(f"span of {span} ticks: must be 0 to {HALF - 1}")
+        self._seen = now
+        self.left = span
+
+    def look(self, now: int) -> int:
+        """Charge the time since the last look, and return what is left (0: over)."""
+        step = diff(now, self._seen)
+        self._seen = now
+        self.left = max(0, self.left - abs(step))
+        return self.left
+
+    def over(self, now: int) -> bool:
+        """Return whether the span is over."""
+        return self.look(now) == 0
+
+    def end(self) -> None:
+        """End the span at once."""
+        self.left = 0

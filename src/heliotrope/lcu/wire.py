@@ -1,0 +1,592 @@
+"""Frames of the wire, version 2: bytes in, frames out, and which of them may act.
+
+A frame, before byte stuffing (numbers little-endian)::
+
+    version  to  from  sequence  type  payload  [MAC]  CRC-32
+       1      2    2       2       1   0..236     8       4      bytes
+
+COBS removes every zero from it, and a zero ends it. ``from`` 0 is the cluster controller, ``to``
+0xFFFF is everybody. The MAC stands in messages of class KEY only. The CRC covers all before it.
+A receiver that starts amid a frame, or hears noise, is in step again at the next zero; a sender
+may begin with a zero to end whatever noise came before.
+
+**What makes a frame old.** Sequence numbers alone cannot tell a restart of their sender, or a
+link that came back after an hour, from a replay. So the sender keeps a 32-bit count of its
+frames; the lower 16 bits are the sequence, and once a second it broadcasts SESSION with the
+upper ones, its epoch and the token of the one authority. The epoch rises with every start of
+the sender (the GPS second of the start serves, and needs no memory) and whenever the count is
+used up. A receiver takes a SESSION whose (epoch, count) is greater than the one it holds, and
+between SESSIONs each frame whose sequence is 1 to 32767 after the last one taken. After a
+restart of the receiver, or 10 s of silence (far less than 32768 frames last on the bus), nothing
+but SESSION is taken first. Frames of before a sender's restart that are still under way fail by
+their token, which changes with the epoch. A sender whose commands are answered "duplicate" for
+any other reason starts a new epoch.
+
+What acts has a second and a third lock: it expires by the clock, and what is stored carries a MAC
+and an edition that only rises. DEFOCUS and STOW pass no lock at all; questions change nothing.
+This stops accidents. Against a person at the bus only the MAC protects, thus what is stored.
+
+The hash is injected: ``sha256(data) -> 32 bytes``.
+"""
+
+import math
+import struct
+from binascii import crc32
+
+from . import messages, ticks
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has neither module
+    from collections.abc import Callable
+    from typing import Any
+
+VERSION = 2
+CLUSTER_ADDRESS = 0
+BROADCAST = 0xFFFF
+
+#: Longest frame with its stuffing and its zero, and the longest payload that it leaves, bytes.
+FRAME_LIMIT = 250
+MAC_SIZE = 8
+HEADER = "<BHHHB"
+HEADER_SIZE = 8
+CRC_SIZE = 4
+PAYLOAD_LIMIT = FRAME_LIMIT - 2 - HEADER_SIZE - CRC_SIZE
+
+#: A command that claims to be good for longer than this has another clock than ours, s.
+HORIZON_S = 3600
+#: After this silence of a sender its next frame must be a SESSION, ms.
+SILENCE_MS = 10000
+
+RANGES = {"B": (0, 255), "b": (-128, 127), "H": (0, 65535), "h": (-32768, 32767),
+          "I": (0, 4294967295), "i": (-2147483648, 2147483647)}  # fmt: skip
+LARGEST_SINGLE = 3.4028234e38
+LARGEST_DOUBLE = 1.7976931348623157e308
+
+
+def stuff(data: bytes) -> bytes:
+    """Return ``data`` without zeros (consistent overhead byte stuffing), without an end."""
+    out = bytearray()
+    start = 0
+    while True:
+        end = data.find(b"\0", start, start + 254)
+        if end >= 0:
+            out.append(end - start + 1)
+            out += data[start:end]
+            start = end + 1
+        elif len(data) - start >= 254:
+            out.append(255)
+            out += data[start : start + 254]
+            start += 254
+            if start == len(data):
+                return bytes(out)
+        else:
+            out.append(len(data) - start + 1)
+            out += data[start:]
+            return bytes(out)
+
+
+def unstuff(data: bytes) -> "bytes | None":
+    """Undo ``stuff``; None if ``data`` cannot be its result."""
+    out = bytearray()
+    start = 0
+    size = len(data)
+    while start < size:
+        code = data[start]
+        end = start + code
+        if code == 0 or end > size:
+            return None
+        out += data[start + 1 : end]
+        if code < 255 and end < size:
+            out.append(0)
+        start = end
+    return bytes(out)
+
+
+def _single(codes: str) -> str:
+    """Write counts out: "B3d" -> "Bddd"."""
+    out = ""
+    count = ""
+    for code in codes:
+        if "0" <= code <= "9":
+            count += code
+        else:
+            out += code * int(count or "1")
+            count = ""
+    return out
+
+
+def _refusal(code: str, value: "Any") -> str:
+    """Return why a value does not fit a code, or ""."""
+    if code == "s":
+        return "" if isinstance(value, (bytes, bytearray)) else f"{value!r} is not bytes"
+    if code in RANGES:
+        low, high = RANGES[code]
+        if not isinstance(value, (int, bool)):
+            return f"{value!r} is not a whole number"
+        return "" if low <= value <= high else f"{value} is not within {low} to {high}"
+    if not isinstance(value, (int, float)) or value != value:
+        return f"{value!r} is not a number"
+    limit = LARGEST_SINGLE if code == "f" else LARGEST_DOUBLE
+    return "" if -limit <= value <= limit else f"{value} is not within {-limit} to {limit}"
+
+
+def pack(name: str, *values: "Any") -> bytes:
+    """Make a message's payload, head included.
+
+    Parameters
+    ----------
+    name
+        Name of the message, as in the table.
+    *values
+        All its numbers in order, those of fields with several numbers one by one.
+
+    Raises
+    ------
+    ValueError
+        An unknown name, a wrong number of values, or a value that its code cannot hold.
+        (``struct`` of MicroPython would cut it off in silence.)
+    """
+    number = messages.NUMBER_OF.get(name)
+    if number is None:
+        raise ValueError(f"no message {name!r}; see the table in messages")
+    codes = _single(messages.codes_of(number))
+    if len(values) != len(codes):
+        fields = " ".join(messages.fields_of(number))
+        raise ValueError(f"{name}: {len(values)} values, {len(codes)} needed: {fields}")
+    for place, code in enumerate(codes):
+        refusal = _refusal(code, values[place])
+        if refusal:
+            raise ValueError(f"{name}, value {place + 1}: {refusal}")
+    if codes.endswith("s"):
+        return struct.pack("<" + codes[:-1], *values[:-1]) + bytes(values[-1])
+    return struct.pack("<" + codes, *values)
+
+
+def fits(number: int, size: int) -> bool:
+    """Return whether a payload of ``size`` bytes can be that of a known message."""
+    codes = messages.codes_of(number)
+    if codes.endswith("s"):
+        return size >= struct.calcsize("<" + codes[:-1])
+    return size == struct.calcsize("<" + codes)
+
+
+def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
+    """Read a message's payload, head included.
+
+    Returns
+    -------
+    tuple or None
+        The numbers as ``pack`` takes them; None if the message is unknown, the length is wrong,
+        or a number is not finite (which no sender means, and which would pass every comparison).
+    """
+    if number not in messages.ROW_OF or not fits(number, len(payload)):
+        return None
+    codes = messages.codes_of(number)
+    if codes.endswith("s"):
+        size = struct.calcsize("<" + codes[:-1])
+        head = struct.unpack("<" + codes[:-1], payload[:size])
+        return tuple(head) + (bytes(payload[size:]),)
+    values = struct.unpack("<" + codes, payload)
+    for value in values:
+        if isinstance(value, float) and not math.isfinite(value):
+            return None
+    return values
+
+
+class Frame:
+    """A frame that came whole.
+
+    Attributes
+    ----------
+    to, sender, sequence, number
+        As in the header; ``number`` is the type of the message.
+    payload
+        Bytes with the head, without the MAC. A known message has a length that fits; of an
+        unknown one it is all that stood before the CRC.
+    mac
+        8 bytes in messages of class KEY, else b"".
+    """
+
+    def __init__(
+        self, to: int, sender: int, sequence: int, number: int, payload: bytes, mac: bytes = b""
+    ) -> None:
+        self.to = to
+        self.sender = sender
+        self.sequence = sequence
+        self.number = number
+        self.payload = payload
+        self.mac = mac
+
+    @property
+    def name(self) -> str:
+        """Name of the message, "" if unknown."""
+        return messages.name_of(self.number)
+
+    def values(self) -> "tuple[Any, ...] | None":
+        """Return the payload's numbers; see ``unpack``."""
+        return unpack(self.number, self.payload)
+
+    def body(self) -> bytes:
+        """Return what the MAC covers: header and payload."""
+        return (
+            struct.pack(HEADER, VERSION, self.to, self.sender, self.sequence, self.number)
+            + self.payload
+        )
+
+    def for_address(self, address: int) -> bool:
+        """Return whether the frame is meant for ``address``."""
+        return self.to in (address, BROADCAST)
+
+
+def hmac_sha256(sha256: "Callable[[bytes], bytes]", key: bytes, data: bytes) -> bytes:
+    """Return HMAC-SHA256 (RFC 2104), 32 bytes."""
+    if len(key) > 64:
+        key = sha256(key)
+    key = key + bytes(64 - len(key))
+    inner = sha256(bytes([byte ^ 0x36 for byte in key]) + data)
+    return sha256(bytes([byte ^ 0x5C for byte in key]) + inner)
+
+
+def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bytes:
+    """Return the MAC of a frame: HMAC-SHA256 over header and payload, its first 8 bytes.
+
+    Raises
+    ------
+    ValueError
+        An empty key.
+    """
+    if not key:
+        raise ValueError(f"{frame.name or frame.number}: needs a key to be sent")
+    return hmac_sha256(sha256, key, frame.body())[:MAC_SIZE]
+
+
+def verify(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bool:
+    """Return whether a frame carries the MAC of ``key``; never with an empty key.
+
+    All bytes are compared whatever the first ones say, so the time taken tells nothing.
+    """
+    if not key or len(frame.mac) != MAC_SIZE:
+        return False
+    expected = authenticate(sha256, key, frame)
+    differ = 0
+    for place in range(MAC_SIZE):
+        differ |= expected[place] ^ frame.mac[place]
+    return differ == 0
+
+
+def encode(frame: Frame) -> bytes:
+    """Return a frame's bytes on the wire, its zero included.
+
+    Raises
+    ------
+    ValueError
+        An address, sequence or type out of range; a payload that does not fit the message or
+        the frame; a MAC missing in a message of class KEY, or present in another.
+    """
+    what = frame.name or f"message {frame.number}"
+    header = (("to", frame.to), ("from", frame.sender), ("sequence", frame.sequence))
+    for title, value in header + (("type", frame.number),):
+        refusal = _refusal("B" if title == "type" else "H", value)
+        if refusal:
+            raise ValueError(f"{what}: {title}: {refusal}")
+    if frame.name and not fits(frame.number, len(frame.payload)):
+        raise ValueError(f"{what}: a payload of {len(frame.payload)} bytes does not fit it")
+    needs = MAC_SIZE if messages.who_of(frame.number) == messages.KEY else 0
+    if len(frame.mac) != needs:
+        raise ValueError(f"{what}: a MAC of {len(frame.mac)} bytes, {needs} needed")
+    if len(frame.payload) + needs > PAYLOAD_LIMIT:
+        raise ValueError(
+            f"{what}: {len(frame.payload) + needs} bytes of payload and MAC, "
+            f"at most {PAYLOAD_LIMIT} fit a frame"
+        )
+    data = frame.body() + frame.mac
+    return stuff(data + struct.pack("<I", crc32(data))) + b"\0"
+
+
+class Reader:
+    """Bytes in any pieces in, whole frames out; at most one frame's bytes are kept.
+
+    Attributes
+    ----------
+    good, crc, cobs, length, version
+        Counts of what came: whole frames; wrong checksums; impossible stuffing; frames too
+        long, too short or of a length that does not fit their message; frames of another
+        version. A frame that is counted under anything but ``good`` changes nothing else.
+    """
+
+    def __init__(self) -> None:
+        self.good = 0
+        self.crc = 0
+        self.cobs = 0
+        self.length = 0
+        self.version = 0
+        self._kept = bytearray()
+        self._too_long = False
+
+    def feed(self, data: bytes) -> "list[Frame]":
+        """Take bytes as they came, and return the frames that ended in them."""
+        data = bytes(data)
+        frames: list[Frame] = []
+        start = 0
+        while True:
+            end = data.find(b"\0", start)
+            self._keep(data[start:] if end < 0 else data[start:end])
+            if end < 0:
+                return frames
+            frame = self._end()
+            if frame is not None:
+                frames.append(frame)
+            start = end + 1
+
+    def _keep(self, piece: bytes) -> None:
+        if len(self._kept) + len(piece) >= FRAME_LIMIT:
+            self._too_long = True
+            self._kept = bytearray()
+        if not self._too_long:
+            self._kept += piece
+
+    def _end(self) -> "Frame | None":
+        stuffed = bytes(self._kept)
+        self._kept = bytearray()
+        if self._too_long:
+            self._too_long = False
+            self.length += 1
+            return None
+        return self._decode(stuffed) if stuffed else None
+
+    def _decode(self, stuffed: bytes) -> "Frame | None":
+        data = unstuff(stuffed)
+        if data is None:
+            self.cobs += 1
+            return None
+        end = len(data) - CRC_SIZE
+        if end < HEADER_SIZE:
+            self.length += 1
+            return None
+        if struct.unpack("<I", data[end:])[0] != crc32(data[:end]):
+            self.crc += 1
+            return None
+        version, to, sender, sequence, number = struct.unpack(HEADER, data[:HEADER_SIZE])
+        if version != VERSION:
+            self.version += 1
+            return None
+        mac = b""
+        if messages.who_of(number) == messages.KEY:
+            end = max(HEADER_SIZE, end - MAC_SIZE)
+            mac = data[end:-CRC_SIZE]
+        payload = data[HEADER_SIZE:end]
+        if number in messages.ROW_OF and not fits(number, len(payload)):
+            self.length += 1
+            return None
+        self.good += 1
+        return Frame(to, sender, sequence, number, payload, mac)
+
+
+def expired(expires_s: int, now_s: "int | None") -> bool:
+    """Return whether a command is void by the clock.
+
+    Parameters
+    ----------
+    expires_s
+        Last GPS second at which it is good, modulo 2^32.
+    now_s
+        The present GPS second, modulo 2^32; None if it is not known: then every command is void.
+
+    Notes
+    -----
+    A command good for more than ``HORIZON_S`` is void too: with 32 bits that wrap, long ago and
+    far ahead are the same.
+    """
+    return now_s is None or ((expires_s - now_s) & 0xFFFFFFFF) > HORIZON_S
+
+
+class Replay:
+    """Which frames of one sender are new; see the head of this module.
+
+    Attributes
+    ----------
+    epoch, count
+        Of the last frame taken; ``epoch`` is -1 before the first SESSION.
+    """
+
+    def __init__(self) -> None:
+        self.epoch = -1
+        self.count = 0
+        self._heard = ticks.Deadline()
+
+    def session(self, epoch: int, rollover: int, sequence: int, tick: int) -> bool:
+        """Take a SESSION, and return whether it is new.
+
+        Parameters
+        ----------
+        epoch, rollover
+            Of its payload.
+        sequence
+            Of its header.
+        tick
+            When it came, in ms; see ``ticks``.
+        """
+        count = (rollover << 16) | sequence
+        if self.epoch >= 0:
+            ahead = (epoch - self.epoch) & 0xFFFFFFFF
+            if ahead >= 0x80000000 or (ahead == 0 and count <= self.count):
+                return False
+        self.epoch = epoch
+        self.count = count
+        self._heard.start(tick, SILENCE_MS)
+        return True
+
+    def look(self, tick: int) -> bool:
+        """Return whether the sender was heard of late; see ``ticks.Deadline`` for how often."""
+        return not self._heard.over(tick)
+
+    def fresh(self, sequence: int, tick: int) -> bool:
+        """Return whether any other frame is new, and if it is, take it."""
+        if not self.look(tick):
+            return False
+        ahead = (sequence - self.count) & 0xFFFF
+        if not 0 < ahead < 0x8000:
+            return False
+        self.count += ahead
+        self._heard.start(tick, SILENCE_MS)
+        return True
+
+
+class Gate:
+    """Decides of each frame that came whether it may act: invariants 4 and 5 in one place.
+
+    Parameters
+    ----------
+    sha256
+        The hash, or None where nothing may be stored.
+    key
+        Key of this local controller, b"" for none: then nothing can be stored.
+    edition
+        Edition of the last stored message, from the journal.
+    sender
+        Address from where commands come.
+
+    Attributes
+    ----------
+    token
+        Of the one authority, 0 if nobody has it.
+    edition
+        Of the last stored message; the caller stores it together with what the message sets.
+    """
+
+    def __init__(
+        self,
+        sha256: "Callable[[bytes], bytes] | None" = None,
+        key: bytes = b"",
+        edition: int = 0,
+        sender: int = CLUSTER_ADDRESS,
+    ) -> None:
+        self.replay = Replay()
+        self.token = 0
+        self.edition = edition
+        self._sha256 = sha256
+        self._key = key
+        self._sender = sender
+
+    def judge(self, frame: Frame, tick: int, now_s: "int | None") -> int:
+        """Return DONE if the frame may act, else the result that says why not.
+
+        Parameters
+        ----------
+        frame
+            A frame meant for this address.
+        tick
+            When it came, in ms.
+        now_s
+            The present GPS second, or None if not known.
+        """
+        who = messages.who_of(frame.number)
+        if who in (messages.ANYONE, messages.ASK):
+            return messages.DONE
+        values = frame.values()
+        if values is None or who == messages.NODE:
+            return messages.BAD_VALUE
+        if frame.sender != self._sender:
+            return messages.REFUSED_AUTHORITY
+        if frame.name == "SESSION":
+            if not self.replay.session(values[0], values[1], frame.sequence, tick):
+                return messages.DUPLICATE
+            self.token = values[2]
+            return messages.DONE
+        if not self.replay.fresh(frame.sequence, tick):
+            return messages.DUPLICATE
+        if who == messages.CLUSTER:
+            return messages.DONE
+        if self.token == 0 or values[0] != self.token:
+            return messages.REFUSED_AUTHORITY
+        if expired(values[1], now_s):
+            return messages.EXPIRED
+        return self._judge_key(frame, values[2]) if who == messages.KEY else messages.DONE
+
+    def _judge_key(self, frame: Frame, edition: int) -> int:
+        if self._sha256 is None or not verify(self._sha256, self._key, frame):
+            return messages.REFUSED_KEY
+        if edition <= self.edition:
+            return messages.DUPLICATE
+        self.edition = edition
+        return messages.DONE
+
+
+class Sender:
+    """Numbers and frames what one sender sends: the other side of ``Gate``.
+
+    Parameters
+    ----------
+    address
+        Of the sender.
+    epoch
+        Greater than at any earlier start: the GPS second of the start.
+    sha256
+        The hash, for messages of class KEY.
+
+    Attributes
+    ----------
+    epoch, count
+        Of the last frame made.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        epoch: int,
+        sha256: "Callable[[bytes], bytes] | None" = None,
+    ) -> None:
+        self.address = address
+        self.epoch = epoch
+        self.count = 0
+        self._sha256 = sha256
+
+    def frame(self, to: int, name: str, *values: "Any", key: bytes = b"") -> bytes:
+        """Return the next frame's bytes; ``key`` is the receiver's, for class KEY.
+
+        Raises
+        ------
+        ValueError
+            See ``pack`` and ``encode``.
+        """
+        return self._make(to, name, pack(name, *values), key)
+
+    def session(self, token: int) -> bytes:
+        """Return a SESSION for everybody, to be sent once a second; ``token`` 0: no authority.
+
+        Within the last 65536 numbers of an epoch the next one is begun.
+        """
+        if self.count >= 0xFFFF0000:
+            self.epoch = (self.epoch + 1) & 0xFFFFFFFF
+            self.count = 0
+        upper = (self.count + 1) >> 16
+        return self._make(BROADCAST, "SESSION", pack("SESSION", self.epoch, upper, token), b"")
+
+    def _make(self, to: int, name: str, payload: bytes, key: bytes) -> bytes:
+        number = messages.NUMBER_OF[name]
+        frame = Frame(to, self.address, (self.count + 1) & 0xFFFF, number, payload)
+        if messages.who_of(number) == messages.KEY and self._sha256 is not None:
+            frame.mac = authenticate(self._sha256, key, frame)
+        data = encode(frame)
+        self.count += 1
+        return data
