@@ -5,14 +5,53 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.detection import Candidates, Drawing
 from heliotrope.imaging.view import homography
 
+Places = npt.NDArray[np.intp]
+
 #: A first guess is scaled from one candidate alone: so much of a distance it may be wrong.
 _LOOSE = 0.25
 #: Of the size of a mark: a candidate nearer than this to its place is the mark.
-_TIGHT = 0.6
+_TIGHT = 0.5
+#: Second moments over those that a guess predicts: so much more or less is the same mark.
+_SPREAD = 2.6
+#: A camera is upright if the face's up is so near the frame's, rad.
+_UPRIGHT = 0.3
+#: Least correlation of what is found where a mark should be.
+_RESEMBLES = 0.55
+#: Guesses that are weighed, and those that are followed.
+_GUESSES, _FOLLOWED = 1200, 10
+
+
+@dataclass(frozen=True)
+class Constellation:
+    """Marks as they lie in their plane.
+
+    Attributes
+    ----------
+    drawn
+        The different drawings.
+    which
+        For each mark its drawing, (M,).
+    plane
+        Places of the marks' points, m, (M, 2).
+    middle
+        Places of their centres of area, m, (M, 2).
+    covariance
+        Second moments, m², (M, 2, 2).
+    turn
+        Matrices of the marks' turns, (M, 2, 2).
+    """
+
+    drawn: tuple[Drawing, ...]
+    which: Places
+    plane: FloatArray
+    middle: FloatArray
+    covariance: FloatArray
+    turn: FloatArray
 
 
 @dataclass(frozen=True)
@@ -24,115 +63,154 @@ class Match:
     marks, candidates
         Which mark is which candidate, (K,) each.
     H_pixel_plane
-        From plane metres to pixels, (3, 3); affine if only three match.
+        From plane metres to pixels, (3, 3); affine if fewer than five match.
     score
-        Sum of the likenesses.
+        Number of marks; among as many, the more upright view, then the likelier shapes.
     """
 
-    marks: npt.NDArray[np.intp]
-    candidates: npt.NDArray[np.intp]
+    marks: Places
+    candidates: Places
     H_pixel_plane: FloatArray
-    score: float
+    score: tuple[int, float, float]
 
 
-def match(
-    seen: Candidates, drawn: list[Drawing], which: npt.NDArray[np.intp], plane: FloatArray,
-    roll: float = 0.0,
-) -> Match | None:  # fmt: skip
+def constellation(
+    marks: list[Mark], drawn: list[Drawing], which: Places, plane: FloatArray
+) -> Constellation:
+    """Return marks (M,) with their drawings at places (M, 2) in the plane, m."""
+    angle = np.array([mark.turn for mark in marks])
+    cos, sin = np.cos(angle), np.sin(angle)
+    turn = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+    middle = np.array([drawn[w].middle for w in which])
+    spread = np.array([drawn[w].covariance for w in which])
+    return Constellation(
+        tuple(drawn), which, plane, plane + (turn @ middle[..., None])[..., 0],
+        turn @ spread @ np.swapaxes(turn, 1, 2), turn,
+    )  # fmt: skip
+
+
+def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool) -> Match | None:
     """Return the assignment that explains most marks, or None if no three agree.
 
-    Every candidate gives, by its place and its size, a first guess of where all marks
-    are; those found there give an affine map, then a homography.
+    Every candidate gives, in every way in which it may be a mark, a first guess of where all
+    marks are; those found there give an affine map, then a homography.
 
     Parameters
     ----------
     seen
         Candidates of a frame.
-    drawn
-        The drawings.
-    which
-        For each mark its drawing, (M,).
-    plane
-        Places of the marks, m, (M, 2).
-    roll
-        The face is turned by this in the frame, counterclockwise, rad.
+    marks
+        The marks.
+    up
+        Where the face's upper side is in the frame, as far as anybody knows, (2,).
+    upright
+        Look only at guesses that agree with that.
     """
-    cos, sin = np.cos(roll), np.sin(roll)
-    rolled = plane @ np.array([[cos, sin], [-sin, cos]])
+    linear, mark, part = _guesses(seen, marks, up, upright)
+    if len(linear) == 0:
+        return None
+    apart = marks.middle[None] - marks.middle[mark][:, None]
+    offset = (linear[:, None] @ apart[..., None])[..., 0]
+    guess = seen.middle[part][:, None] + offset
+    size = np.sqrt(np.trace(seen.covariance[part], axis1=1, axis2=2))
+    slack = _LOOSE * np.linalg.norm(offset, axis=-1) + size[:, None]
+    taken = _gather(seen, marks, guess, linear, slack)
+    count = (taken >= 0).sum(axis=1)
+    least = min(3, len(marks.which))
+    order = np.argsort(-count, kind="stable")
     best: Match | None = None
-    tried: set[tuple[int, ...]] = set()
-    for i in range(len(seen.drawing)):
-        for m in np.flatnonzero(which == seen.drawing[i]):
-            scale = seen.extent[i] / drawn[seen.drawing[i]].size * [1.0, -1.0]
-            guess = seen.point[i] + (rolled - rolled[m]) * scale
-            apart = np.linalg.norm((rolled - rolled[m]) * scale, axis=-1)
-            slack = _LOOSE * apart + 0.5 * float(seen.extent[i].max())
-            taken = _gather(seen, which, guess, slack)
-            if (taken >= 0).sum() < min(3, len(plane)):
-                continue
-            found = _settle(seen, drawn, which, plane, taken, roll)
-            if found is None:
-                continue
-            key = tuple(found.candidates)
-            if key in tried:
-                continue
-            tried.add(key)
-            if best is None or found.score > best.score:
-                best = found
+    tried: set[bytes] = set()
+    for g in order:
+        if count[g] < least or len(tried) >= _FOLLOWED:
+            break
+        key = taken[g].tobytes()
+        if key in tried:
+            continue
+        tried.add(key)
+        found = _settle(seen, marks, taken[g], up)
+        if found is not None and (best is None or found.score > best.score):
+            best = found
     return best
 
 
+def _guesses(
+    seen: Candidates, marks: Constellation, up: FloatArray, upright: bool
+) -> tuple[FloatArray, Places, Places]:
+    """Return linear maps plane to pixels (G, 2, 2), each with a mark (G,) and its candidate."""
+    way, mark = np.nonzero(seen.drawing[:, None] == marks.which[None])
+    # A drawing is turned first, then laid in the plane: B = A · turn.
+    linear = seen.linear[way] @ np.swapaxes(marks.turn[mark], 1, 2)
+    if upright:
+        kept = np.flatnonzero(_lean(linear, up) < _UPRIGHT)
+    else:
+        likeness = seen.likeness[seen.part[way], seen.drawing[way]]
+        kept = np.argsort(-likeness, kind="stable")[:_GUESSES]
+    return linear[kept], mark[kept], seen.part[way[kept]]
+
+
+def _lean(linear: FloatArray, up: FloatArray) -> FloatArray:
+    """Angles, rad, (G,), between where linear maps (G, 2, 2) take up, and where it should be."""
+    seen = linear[:, :, 1]
+    along, across = seen @ up, seen[:, 0] * up[1] - seen[:, 1] * up[0]
+    return np.asarray(np.abs(np.arctan2(across, along)))
+
+
 def _gather(
-    seen: Candidates, which: npt.NDArray[np.intp], guess: FloatArray, slack: FloatArray
-) -> npt.NDArray[np.intp]:
-    """For each mark the nearest candidate of its drawing within reach, or -1."""
-    apart = np.linalg.norm(seen.point[None] - guess[:, None], axis=-1)
-    apart = np.where(seen.drawing[None] == which[:, None], apart, np.inf)
-    nearest = np.argmin(apart, axis=1)
-    near = apart[np.arange(len(guess)), nearest] < slack
-    taken = np.where(near, nearest, -1)
-    # One candidate cannot be two marks: it is the nearer one.
-    for c in np.unique(taken[taken >= 0]):
-        rivals = np.flatnonzero(taken == c)
-        if len(rivals) > 1:
-            keep = rivals[np.argmin(apart[rivals, c])]
-            taken[rivals[rivals != keep]] = -1
-    return taken
+    seen: Candidates, marks: Constellation, guess: FloatArray, linear: FloatArray,
+    slack: FloatArray,
+) -> Places:  # fmt: skip
+    """Return for each guess (G, M, 2) and mark the nearest candidate that fits, or −1, (G, M)."""
+    apart = np.linalg.norm(seen.middle[None, None] - guess[:, :, None], axis=-1)
+    alike = seen.likeness.T[marks.which] > _RESEMBLES
+    g, m, p = np.nonzero((apart < slack[..., None]) & alike[None])
+    A = linear[g] if linear.ndim == 3 else linear[g, m]
+    wanted = A @ marks.covariance[m] @ np.swapaxes(A, 1, 2)
+    ratio = np.linalg.solve(wanted, seen.covariance[p])
+    trace = 0.5 * np.trace(ratio, axis1=1, axis2=2)
+    area = np.sqrt(np.maximum(np.linalg.det(ratio), 1e-12))
+    fits = (trace < _SPREAD) & (area > 1.0 / _SPREAD) & (area < _SPREAD)
+    g, m, p = g[fits], m[fits], p[fits]
+    taken = np.full(guess.shape[:2], -1)
+    # The nearest is written last; then a candidate that is two marks is the nearer one.
+    order = np.argsort(-apart[g, m, p], kind="stable")
+    taken[g[order], m[order]] = p[order]
+    owner = np.full((len(guess), len(seen.middle)), -1)
+    owner[g[order], p[order]] = m[order]
+    rows = np.arange(len(guess))[:, None]
+    own = owner[rows, np.maximum(taken, 0)] == np.arange(guess.shape[1])
+    return np.where(own, taken, -1)
 
 
-def _settle(
-    seen: Candidates,
-    drawn: list[Drawing],
-    which: npt.NDArray[np.intp],
-    plane: FloatArray,
-    taken: npt.NDArray[np.intp],
-    roll: float,
-) -> Match | None:
+def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArray) -> Match | None:
     """Fit, gather again, and fit, until nothing changes."""
     H = np.eye(3)
-    for _ in range(4):
+    for _ in range(5):
         held = np.flatnonzero(taken >= 0)
-        if len(held) < 3 or np.linalg.matrix_rank(plane[held] - plane[held[0]], tol=0.1) < 2:
+        middle = marks.middle[held]
+        if len(held) < 3 or np.linalg.matrix_rank(middle - middle[0], tol=0.1) < 2:
             return None
-        H = _affine(plane[held], seen.point[taken[held]])
+        H = _affine(middle, seen.middle[taken[held]])
         if len(held) >= 5:
-            H = homography(plane[held], seen.point[taken[held]])
-        if not _upright(H, plane):
+            H = homography(middle, seen.middle[taken[held]])
+        if not _front(H, marks.plane):
             return None
-        guess = mapped(H, plane)
-        extent = np.array([drawn[w].size for w in which]) * _stretch(H, plane, roll)
-        # Four points make a homography exactly, and an affine map bends by perspective.
+        guess = mapped(H, marks.middle)
+        linear = scales(H, marks.middle)
+        size = np.sqrt(12.0 * np.trace(
+            linear @ marks.covariance @ np.swapaxes(linear, 1, 2), axis1=1, axis2=2
+        ))  # fmt: skip
+        # An affine map bends by perspective.
         loose = 0.04 * float(np.ptp(guess, axis=0).max()) if len(held) < 5 else 0.0
-        again = _gather(seen, which, guess, _TIGHT * extent.max(axis=-1) + loose)
-        alike = np.abs(np.log(seen.extent[again] / np.maximum(extent, 1e-9))).max(axis=-1) < 0.6
-        again = np.where(alike, again, -1)
+        again = _gather(seen, marks, guess[None], linear[None], (_TIGHT * size + loose)[None])[0]
         if (again == taken).all():
             break
         taken = again
     held = np.flatnonzero(taken >= 0)
     if len(held) < 3:
         return None
-    return Match(held, taken[held], H, float(seen.likeness[taken[held]].sum()))
+    lean = float(_lean(scales(H, marks.plane.mean(axis=0)[None]), up)[0])
+    likeness = float(seen.likeness[taken[held], marks.which[held]].sum())
+    return Match(held, taken[held], H, (len(held), -round(lean, 1), likeness))
 
 
 def _affine(plane: FloatArray, pixels: FloatArray) -> FloatArray:
@@ -153,14 +231,7 @@ def scales(H: FloatArray, plane: FloatArray) -> FloatArray:
     return np.stack([(mapped(H, plane + 0.01 * e) - middle) / 0.01 for e in np.eye(2)], axis=-1)
 
 
-def _stretch(H: FloatArray, plane: FloatArray, roll: float) -> FloatArray:
-    """Pixels per metre along the frame's rows and columns at places in the plane, (M, 2)."""
-    cos, sin = np.cos(roll), np.sin(roll)
-    turned = scales(H, plane) @ np.array([[cos, sin], [-sin, cos]])
-    return np.asarray(np.linalg.norm(turned, axis=-2))
-
-
-def _upright(H: FloatArray, plane: FloatArray) -> bool:
+def _front(H: FloatArray, plane: FloatArray) -> bool:
     """Whether the face is seen from its front: a right turn in it is one in the frame."""
     corners = np.column_stack([plane, np.ones(len(plane))]) @ H.T
     if (corners[:, 2] * corners[0, 2] <= 0.0).any():

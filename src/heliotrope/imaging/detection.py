@@ -1,7 +1,14 @@
-"""Dark drawings on something light, wherever they are in a frame: candidates for marks."""
+"""Dark drawings on something light, wherever they are in a frame: candidates for marks.
 
-from collections.abc import Sequence
+A flat drawing seen from far is an affine map of itself. A part of a frame and a drawing are
+compared after both were made as broad as they are long, by their second moments; what is left
+is a rotation, which their brightness around the middle tells. So each candidate gives the whole
+affine map, whatever the roll of the camera and however far it stands to the side.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +17,44 @@ from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.marks import polygons, tag_dictionary
+from heliotrope.imaging.refinement import coverage
 
-#: Side of the raster that shapes are compared on.
-_RASTER = 20
 #: Least correlation of a candidate's shape with a drawing.
-_ALIKE = 0.7
+_ALIKE = 0.72
+#: Other rotations within this of the best are kept as well.
+_NEARLY = 0.08
+#: Profiles: radii in standard deviations, and directions.
+_RADII = np.linspace(0.3, 2.7, 9)
+_TURNS = 32
+#: A square seen at 75° off its normal is this much longer than broad.
+_OBLIQUE = 4.0
+#: Parts of a frame that are looked at, and candidates that are kept.
+_PARTS, _KEPT = 300, 60
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A shape that one or more marks have, at turn 0.
+
+    Attributes
+    ----------
+    middle
+        Its centre of area, m right of and above its point, (2,).
+    covariance
+        Its second moments over its area, m², (2, 2).
+    profile
+        Fourier transform of its brightness around the middle, (9, 17).
+    size
+        As the mark's, m.
+    turning
+        Whether it looks another way when turned; a disc does not.
+    """
+
+    middle: FloatArray
+    covariance: FloatArray
+    profile: npt.NDArray[np.complex128]
+    size: float
+    turning: bool
 
 
 @dataclass(frozen=True)
@@ -23,86 +63,24 @@ class Candidates:
 
     Attributes
     ----------
-    drawing
-        Which of the drawings, (N,).
-    point
-        Where the drawing's point is, pixels of the frame, (N, 2).
-    extent
-        Width and height, pixels, (N, 2).
+    middle
+        Centre of area, pixels of the frame, (P, 2).
+    covariance
+        Second moments, pixels², (P, 2, 2).
     likeness
-        Correlation with the drawing, (N,).
+        Correlation with each drawing, (P, D).
+    part, drawing
+        Each way in which a shape may be a drawing: which, (K,) each.
+    linear
+        d(pixel)/d(drawing's metres) in that way, (K, 2, 2).
     """
 
-    drawing: npt.NDArray[np.intp]
-    point: FloatArray
-    extent: FloatArray
+    middle: FloatArray
+    covariance: FloatArray
     likeness: FloatArray
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """A shape that one or more marks have.
-
-    Attributes
-    ----------
-    raster
-        What it looks like in its bounding box, zero mean and unit norm, (20 · 20,).
-    anchor
-        Where its point is in the bounding box: 0 to 1 to the right and downwards, (2,).
-    size
-        Width and height, m, (2,).
-    """
-
-    raster: FloatArray
-    anchor: FloatArray
-    size: FloatArray
-
-
-def drawings(marks: Sequence[Mark], roll: float = 0.0) -> tuple[list[Drawing], list[int]]:
-    """Return the different drawings of marks, and for each mark which one it is.
-
-    Parameters
-    ----------
-    marks
-        Without tags and pictures, which are not found by their outline.
-    roll
-        The whole target is turned by this, counterclockwise, rad.
-    """
-    import cv2
-
-    found: list[Drawing] = []
-    which = []
-    cos, sin = np.cos(roll), np.sin(roll)
-    turn = np.array([[cos, sin], [-sin, cos]])
-    for mark in marks:
-        shapes = [shape @ turn for shape in polygons(mark)]
-        points = np.concatenate(shapes)
-        low, high = points.min(axis=0), points.max(axis=0)
-        size = high - low
-        fine = 8 * _RASTER
-        raster = np.zeros((fine, fine), dtype=np.uint8)
-        for shape in shapes:
-            spot = np.stack([shape[:, 0] - low[0], high[1] - shape[:, 1]], axis=-1) / size
-            cv2.fillPoly(raster, [np.round(spot * fine).astype(np.int32)], 255)
-        small = cv2.resize(raster, (_RASTER, _RASTER), interpolation=cv2.INTER_AREA)
-        anchor = np.array([-low[0], high[1]]) / size
-        drawing = Drawing(_standard(small), anchor, size)
-        for k, other in enumerate(found):
-            if np.allclose(other.anchor, anchor, atol=0.02) and (
-                float(other.raster @ drawing.raster) > 0.97
-            ):
-                which.append(k)
-                break
-        else:
-            which.append(len(found))
-            found.append(drawing)
-    return found, which
-
-
-def _standard(raster: Image) -> FloatArray:
-    """Zero mean and unit norm; a filled square keeps its constant, or it would be nothing."""
-    flat = raster.astype(np.float64).ravel() / 255.0 - 0.35
-    return np.asarray(flat / max(float(np.linalg.norm(flat)), 1e-9))
+    part: npt.NDArray[np.intp]
+    drawing: npt.NDArray[np.intp]
+    linear: FloatArray
 
 
 @dataclass(frozen=True)
@@ -111,21 +89,103 @@ class Outlines:
 
     Attributes
     ----------
-    boxes
-        Left, top, width and height, reduced pixels, (N, 4).
-    rasters
-        Each part in its box, as :class:`Drawing` has it, (N, 20 · 20).
+    middle
+        Centre of area, pixels of the frame, (N, 2).
+    covariance
+        Second moments, pixels², (N, 2, 2).
+    profile
+        As :class:`Drawing` has it, (N, 9, 17).
+    """
+
+    middle: FloatArray
+    covariance: FloatArray
+    profile: npt.NDArray[np.complex128]
+
+
+def drawings(marks: Sequence[Mark]) -> tuple[list[Drawing], npt.NDArray[np.intp]]:
+    """Return the different drawings of marks, without tags and pictures, and each mark's (M,)."""
+    known: dict[tuple[str, float, float], int] = {}
+    found: list[Drawing] = []
+    which = []
+    for mark in marks:
+        key = (mark.kind, mark.size, mark.stroke)
+        if key not in known:
+            known[key] = len(found)
+            found.append(_drawing(*key))
+        which.append(known[key])
+    return found, np.array(which, dtype=np.intp)
+
+
+@lru_cache(maxsize=256)
+def _drawing(kind: str, size: float, stroke: float) -> Drawing:
+    shapes = polygons(Mark("drawing", kind, np.zeros(3), size, stroke))
+    low = np.concatenate(shapes).min(axis=0) - 0.5 * size
+    high = np.concatenate(shapes).max(axis=0) + 0.5 * size
+    step = size / 48
+    columns, rows = np.ceil((high - low) / step).astype(int).tolist()
+    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step for p in shapes]
+    raster = coverage(cells, (rows, columns))
+    y, x = np.mgrid[0:rows, 0:columns]
+    spots = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float64)
+    share = raster.ravel() / raster.sum()
+    middle = share @ spots
+    spread = (spots - middle).T @ ((spots - middle) * share[:, None])
+    profile = _profiles((255.0 * raster).astype(np.uint8), middle[None], spread[None])[0]
+    place = np.array([low[0] + (middle[0] + 0.5) * step, high[1] - (middle[1] + 0.5) * step])
+    flip = np.diag([1.0, -1.0])
+    return Drawing(place, step**2 * flip @ spread @ flip, profile, size, kind != "disc")
+
+
+def _roots(covariance: FloatArray) -> FloatArray:
+    """Symmetric square roots of symmetric matrices (N, 2, 2)."""
+    values, vectors = np.linalg.eigh(covariance)
+    lengths = np.sqrt(np.maximum(values, 1e-12))
+    return np.asarray((vectors * lengths[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _profiles(
+    mask: Image, middle: FloatArray, covariance: FloatArray
+) -> npt.NDArray[np.complex128]:
+    """Fourier transforms, along circles, of a mask about places (N, 2), (N, 9, 17)."""
+    import cv2
+
+    if len(middle) == 0:
+        return np.empty((0, len(_RADII), _TURNS // 2 + 1), dtype=np.complex128)
+    angle = np.arange(_TURNS) * (2.0 * np.pi / _TURNS)
+    circle = np.stack([np.cos(angle), np.sin(angle)])
+    rays = (_RADII[:, None, None] * circle[None]).transpose(1, 0, 2).reshape(2, -1)
+    places = (middle[:, :, None] + _roots(covariance) @ rays).astype(np.float32)
+    seen = cv2.remap(
+        mask, np.ascontiguousarray(places[:, 0]), np.ascontiguousarray(places[:, 1]),
+        cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0,
+    )  # fmt: skip
+    # A ring stands for its area.
+    weight = np.repeat(np.sqrt(_RADII), _TURNS)
+    values = np.asarray(seen, dtype=np.float64).reshape(len(middle), -1)
+    values = (values - values @ weight[:, None] ** 2 / np.sum(weight**2)) * weight
+    values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
+    return np.asarray(np.fft.rfft(values.reshape(-1, len(_RADII), _TURNS), axis=2))
+
+
+@dataclass(frozen=True)
+class Lightened:
+    """A frame, reduced, and what it would be without narrow dark things.
+
+    Attributes
+    ----------
+    small, closed
+        The frame, and its closing, (h, w).
     reduction
         Of the frame.
     """
 
-    boxes: FloatArray
-    rasters: FloatArray
+    small: Image
+    closed: Image
     reduction: int
 
 
-def outlines(grey: Image, reduction: int, ratio: float) -> Outlines:
-    """Return the parts of a frame that are darker than their surroundings.
+def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
+    """Return a frame (H, W), 8 or 16 bit, reduced, and closed where it is narrowly dark.
 
     A mark's reflectance is a fraction of the paint's, whatever the light: the frame over its
     closing, which has no marks any more, is that fraction, in the shade and in a beam.
@@ -133,79 +193,202 @@ def outlines(grey: Image, reduction: int, ratio: float) -> Outlines:
     Parameters
     ----------
     grey
-        A frame, (H, W).
+        The frame.
     reduction
         It is looked at at this fraction of its size.
-    ratio
-        Darker than this fraction of the surroundings.
+    broad
+        Strokes narrower than this are closed, reduced pixels.
     """
     import cv2
 
     height, width = grey.shape
     small = grey
     if reduction > 1:
-        small = cv2.resize(
-            grey, (width // reduction, height // reduction), interpolation=cv2.INTER_AREA
-        )
-    # Strokes up to 16 reduced pixels broad are closed.
-    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((17, 17), np.uint8))
-    mask = cv2.compare(small, cv2.convertScaleAbs(closed, alpha=ratio, beta=-1.0), cv2.CMP_LT)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
-    left, top, wide, high, area = (stats[:, k] for k in range(5))
-    limit = max(mask.shape) // 4
+        whole = grey[: height // reduction * reduction, : width // reduction * reduction]
+        size = (width // reduction, height // reduction)
+        small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+    if small.dtype != np.uint8:
+        small = small.astype(np.float32)
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((broad, broad), np.uint8))
+    return Lightened(small, closed, reduction)
+
+
+def outlines(light: Lightened, ratio: float) -> Outlines:
+    """Return the parts of a frame that are darker than ``ratio`` of their surroundings."""
+    import cv2
+
+    small, closed, reduction = light.small, light.closed, light.reduction
+    if small.dtype == np.uint8:
+        # Nothing is told by one count.
+        limit = cv2.convertScaleAbs(closed, alpha=ratio, beta=-1.0)
+    else:
+        # Of 16 bit as much of what is there, for sensors leave bits empty.
+        limit = ratio * closed - 0.01 * float(small.mean())
+    mask = cv2.compare(small, limit, cv2.CMP_LT)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    wide, high, area = stats[:, 2], stats[:, 3], stats[:, 4]
+    most = max(mask.shape) // 3
     keep = (
-        (wide >= 5) & (high >= 5) & (area >= 12) & (wide <= limit) & (high <= limit)
-        & (wide < 5 * high) & (high < 5 * wide)
+        (np.maximum(wide, high) >= 5) & (np.minimum(wide, high) >= 3) & (area >= 10)
+        & (wide <= most) & (high <= most)
     )  # fmt: skip
     keep[0] = False
     # Clutter has thousands of parts; marks are among the larger ones.
     numbers = np.flatnonzero(keep)
-    numbers = numbers[np.argsort(-area[numbers], kind="stable")][:400]
-    rasters = np.empty((len(numbers), _RASTER * _RASTER))
-    for k, n in enumerate(numbers):
-        part = labels[top[n] : top[n] + high[n], left[n] : left[n] + wide[n]] == n
-        scaled = cv2.resize(
-            part.astype(np.uint8) * 255, (_RASTER, _RASTER), interpolation=cv2.INTER_AREA
-        )
-        rasters[k] = _standard(scaled)
-    return Outlines(stats[numbers, :4].astype(np.float64), rasters, reduction)
+    numbers = numbers[np.argsort(-area[numbers], kind="stable")][:_PARTS]
+    renamed = np.full(count, -1)
+    renamed[numbers] = np.arange(len(numbers))
+    middle, covariance = _moments(labels, mask, renamed, len(numbers))
+    profile = _profiles(mask, middle, covariance)
+    # Pixel centres are at whole numbers, in the reduced frame and in the full one.
+    middle = reduction * (middle + 0.5) - 0.5
+    return Outlines(middle, reduction**2 * covariance, profile)
+
+
+def _moments(
+    labels: Image, mask: Image, renamed: npt.NDArray[np.intp], count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Centres (N, 2) and covariances (N, 2, 2) of labelled parts, reduced pixels."""
+    import cv2
+
+    spots = cv2.findNonZero(mask)
+    if count == 0 or spots is None:
+        return np.empty((0, 2)), np.empty((0, 2, 2))
+    x, y = spots.reshape(-1, 2).T
+    part = renamed[labels[y, x]]
+    held = part >= 0
+    x, y, part = x[held].astype(np.float64), y[held].astype(np.float64), part[held]
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.bincount(part, values, count) / number)
+
+    number = np.bincount(part, minlength=count)
+    center = np.stack([mean(x), mean(y)], axis=-1)
+    x, y = x - center[part, 0], y - center[part, 1]
+    xy = mean(x * y)
+    # A pixel has an extent itself.
+    rows = [np.stack([mean(x * x) + 1 / 12, xy], -1), np.stack([xy, mean(y * y) + 1 / 12], -1)]
+    return center, np.stack(rows, axis=-2)
 
 
 def candidates(seen: Outlines, drawn: Sequence[Drawing]) -> Candidates:
-    """Return the outlines that look like one of the drawings, the likest first, at most 80."""
-    alike = seen.rasters @ np.stack([d.raster for d in drawn]).T
-    best = alike.max(axis=1, initial=-1.0)
-    part, which = np.nonzero(alike > np.maximum(_ALIKE, best - 0.1)[:, None])
-    order = np.argsort(-alike[part, which], kind="stable")[:80]
-    part, which = part[order], which[order]
-    anchors = np.array([d.anchor for d in drawn]).reshape(-1, 2)[which]
-    boxes = seen.boxes[part]
-    # Pixel centres are at whole numbers, in the reduced frame and in the full one.
-    points = seen.reduction * (boxes[:, :2] + anchors * boxes[:, 2:]) - 0.5
-    return Candidates(which, points, seen.reduction * boxes[:, 2:], alike[part, which])
+    """Return the outlines that look like one of the drawings, the likest first, at most 60."""
+    profiles = np.stack([d.profile for d in drawn])
+    spectrum = np.einsum("prk,drk->pdk", seen.profile, profiles.conj())
+    alike = np.fft.irfft(spectrum, n=_TURNS, axis=2)
+    best = alike.max(axis=2, initial=-1.0)
+    order = np.argsort(-best.max(axis=1, initial=-1.0), kind="stable")[:_KEPT]
+    order = order[best[order].max(axis=1, initial=-1.0) > _ALIKE]
+    alike, best = alike[order], best[order]
+    middle, covariance = seen.middle[order], seen.covariance[order]
+    peaks = (alike >= np.roll(alike, 1, axis=2)) & (alike > np.roll(alike, -1, axis=2))
+    turning = np.array([d.turning for d in drawn], dtype=bool)
+    peaks[:, ~turning] = True
+    level = np.maximum(np.maximum(best, best.max(axis=1, keepdims=True) - 0.1) - _NEARLY, _ALIKE)
+    part, which, turn = np.nonzero(peaks & (alike > level[..., None]))
+    roots = _roots(covariance)
+    flip = np.diag([1.0, -1.0])
+    inverse = np.stack(
+        [np.linalg.inv(_roots((flip @ d.covariance @ flip)[None])[0]) for d in drawn]
+    )
+    before, after = (alike[part, which, (turn + k) % _TURNS] for k in (-1, 1))
+    bend = before - 2.0 * alike[part, which, turn] + after
+    fine = np.where(bend < -1e-6, 0.5 * (before - after) / np.minimum(bend, -1e-6), 0.0)
+    angle = (turn + fine) * (2.0 * np.pi / _TURNS)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.stack([np.stack([cos, -sin], -1), np.stack([sin, cos], -1)], axis=-2)
+    linear = roots[part] @ turned @ inverse[which] @ flip
+    lengths = np.linalg.svd(linear, compute_uv=False)
+    plain = lengths[:, 0] < _OBLIQUE * lengths[:, 1]
+    return Candidates(middle, covariance, best, part[plain], which[plain], linear[plain])
 
 
-def find_tags(grey: Image, marks: Sequence[Mark]) -> dict[str, FloatArray]:
-    """Return the corners (4, 2), pixels, of the tags among marks that a frame shows, by name.
+# -- tags and pictures -----------------------------------------------------------------
 
-    From the upper left as seen, clockwise, of the upright tag.
+
+def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list[FloatArray]]:
+    """Return the corners (4, 2), pixels, of all tags of some dictionaries of OpenCV.
+
+    By dictionary and number; from the upper left as seen, clockwise, of the upright tag.
     """
     import cv2
 
-    found: dict[str, FloatArray] = {}
-    tags = [mark for mark in marks if mark.kind == "tag"]
-    wanted: dict[int, dict[int, str]] = {}
-    for mark in tags:
-        number, identity = tag_dictionary(mark)
-        wanted.setdefault(number, {})[identity] = mark.name
-    for number, names in wanted.items():
+    found: dict[tuple[int, int], list[FloatArray]] = {}
+    for number in numbers:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         detector = cv2.aruco.ArucoDetector(dictionary, parameters)
         corners, identities, _ = detector.detectMarkers(grey)
         seen = [] if len(corners) == 0 else np.ravel(np.asarray(identities)).tolist()
-        for place, name in zip(corners, seen, strict=True):
-            if name in names:
-                found[names[name]] = np.asarray(place).reshape(4, 2).astype(np.float64)
+        for place, identity in zip(corners, seen, strict=True):
+            corner = np.asarray(place).reshape(4, 2).astype(np.float64)
+            found.setdefault((number, int(identity)), []).append(corner)
     return found
+
+
+def tag_number(mark: Mark) -> tuple[int, int]:
+    """Return OpenCV's dictionary and the number in it of a tag."""
+    return tag_dictionary(mark)
+
+
+def find_pictures(
+    grey: Image, marks: Sequence[Mark], pictures: Mapping[str, FloatArray]
+) -> Candidates:
+    """Return where taught pictures may be in an upright frame, at any of fourteen sizes.
+
+    Parameters
+    ----------
+    grey
+        A frame, (H, W), 8 bit.
+    marks
+        Pictures all; drawing k is mark k.
+    pictures
+        By the marks' codes.
+    """
+    import cv2
+
+    reduction = max(1, round(max(grey.shape) / 480))
+    size = (grey.shape[1] // reduction, grey.shape[0] // reduction)
+    small = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    rows = []
+    for k, mark in enumerate(marks):
+        if mark.code not in pictures:
+            continue
+        picture = np.asarray(pictures[mark.code], dtype=np.float32)
+        for side in np.unique(np.round(9.0 * 1.2 ** np.arange(14)).astype(int)).tolist():
+            if side >= min(size) // 2:
+                break
+            drawn = cv2.resize(picture, (side, side), interpolation=cv2.INTER_AREA)
+            alike = cv2.matchTemplate(
+                small, np.clip(drawn, 0.0, 255.0).astype(np.uint8), cv2.TM_CCOEFF_NORMED
+            )
+            for _ in range(4):
+                _, value, _, at = cv2.minMaxLoc(alike)
+                if value < 0.6:
+                    break
+                rows.append((k, side, at[0], at[1], value))
+                x, y = max(at[0] - side // 2, 0), max(at[1] - side // 2, 0)
+                alike[y : at[1] + side // 2 + 1, x : at[0] + side // 2 + 1] = -1.0
+    rows = sorted(rows, key=lambda row: -row[4])[:_KEPT]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    which = table[:, 0].astype(np.intp)
+    side = reduction * table[:, 1]
+    middle = reduction * (table[:, 2:4] + 0.5 * table[:, 1:2]) - 0.5
+    likeness = np.zeros((len(table), len(marks)))
+    likeness[np.arange(len(table)), which] = table[:, 4]
+    lengths = np.array([mark.size for mark in marks])[which]
+    linear = (side / lengths)[:, None, None] * np.diag([1.0, -1.0])
+    return Candidates(
+        middle, (side**2 / 12.0)[:, None, None] * np.eye(2), likeness,
+        np.arange(len(table)), which, linear,
+    )  # fmt: skip
+
+
+def picture_drawings(marks: Sequence[Mark]) -> list[Drawing]:
+    """Return filled squares for pictures: where they are and how large, not how they look."""
+    none = np.zeros((len(_RADII), _TURNS // 2 + 1), dtype=np.complex128)
+    return [
+        Drawing(np.zeros(2), mark.size**2 / 12.0 * np.eye(2), none, mark.size, True)
+        for mark in marks
+    ]

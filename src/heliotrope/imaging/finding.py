@@ -1,6 +1,6 @@
 """Targets in a raw frame, by their marks: where, how well, or why not."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,21 +10,23 @@ from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging import constellation, detection
-from heliotrope.imaging.frame import Frame, Image
+from heliotrope.imaging._attempt import FEWEST, SURVEY, Attempt, Look, Pictures, Search
+from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.refinement import Refined, refine
-from heliotrope.imaging.view import Face, View, faces, fit_view, unknown_lens
+from heliotrope.imaging.view import Face, View, faces
 
-#: Survey and paint: standard deviation of a mark's place on its target, m.
-SURVEY = 0.005
-#: A mark must explain this much of what is around it, and be darker than its surroundings.
-_EXPLAINED, _CONTRAST = 0.5, 0.93
-#: A mark farther from where the others put it than this many deviations is not used.
-_STRAY = 5.0
-#: Fewest marks, by which the view is determined, and fewest of those that should be there.
-_FEWEST, _SHARE = 3, 0.5
-#: A camera may hang at an angle: turns of the face that are tried, rad.
-_ROLLS = (0.0, 0.35, -0.35, 0.7, -0.7, 0.5 * np.pi, -0.5 * np.pi, np.pi)
+__all__ = [
+    "SURVEY", "FoundMark", "FoundTarget", "Pictures", "face_marks", "find_targets",
+]  # fmt: skip
+
+#: Of what should be in the frame: with so much of it, other ways of looking are left.
+_ENOUGH = 0.7
+#: Darker than these fractions of the surroundings.
+_RATIOS = (0.72, 0.85)
+#: The longer side of a frame, reduced, in which outlines are looked for first, pixels.
+_LONGER = 700
+#: Two faces that lie in one place of the frame: one is it, if so much more of it was seen.
+_CLEARER = 0.2
 
 
 @dataclass(frozen=True)
@@ -83,9 +85,6 @@ class FoundTarget:
     view: View | None = None
 
 
-Pictures = Mapping[str, FloatArray]
-
-
 def find_targets(
     frame: Frame,
     targets: Sequence[Target],
@@ -103,24 +102,38 @@ def find_targets(
         Of which marks are known. Those in one plane are found together.
     camera
         If its lens is known it is used; if its pose is known too, marks are first looked
-        for where they should be.
+        for where they should be. One of another size of frames is not believed.
     previous
         Views of earlier frames of the same camera: looked at first.
     pictures
         Of taught marks, by their code.
+
+    Notes
+    -----
+    Marks that look the same after a quarter or half a turn of the target do not tell a turned
+    camera from an upright one: without a pose or an earlier view, the more upright is taken.
     """
-    look = _Look(frame, camera, pictures or {})
-    found: dict[str, FoundTarget] = {}
-    planes = faces(tuple(targets))
+    look = Look(frame, camera, pictures or {})
+    searches = []
+    for face in faces(tuple(targets)):
+        marks, plane = face_marks(face)
+        searches.append(_Face(Search(look, face, marks, plane), _earlier(face, previous, look)))
     # A camera that shows one face upright is not turned for another.
-    for rolls in (_ROLLS[:1], _ROLLS[1:]):
-        for face in planes:
-            old = next((v for v in previous if _same(v.face, face)), None)
-            for result in _find_face(look, face, old, rolls):
-                found[result.target.name] = result
-        if any(f.found for f in found.values()):
+    for turned in (False, True):
+        for each in searches:
+            each.look(turned)
+        if any(each.best is not None and each.best.view is not None for each in searches):
             break
+    _one_place_each(searches)
+    found = {r.target.name: r for each in searches for r in each.results()}
     return [found[target.name] for target in targets]
+
+
+def _earlier(face: Face, previous: Sequence[View], look: Look) -> View | None:
+    for view in previous:
+        if _same(view.face, face) and view.lens.size == look.size:
+            return view
+    return None
 
 
 def _same(a: Face, b: Face) -> bool:
@@ -133,257 +146,276 @@ def face_marks(face: Face) -> tuple[list[Mark], FloatArray]:
     for target in face.targets:
         for mark in target.marks:
             # Two targets that meet share the marks of their common corners.
-            if not any(
-                mark.kind == m.kind and np.linalg.norm(mark.point - m.point) < 0.05 for m in kept
-            ):
+            if not any(_one(mark, m) for m in kept):
                 kept.append(mark)
     return kept, face.plane(np.array([m.point for m in kept]).reshape(-1, 3))
 
 
-def _find_face(
-    look: "_Look", face: Face, previous: View | None, rolls: Sequence[float]
-) -> list[FoundTarget]:
-    marks, plane = face_marks(face)
-    if len(marks) < _FEWEST and not any(m.kind == "tag" for m in marks):
-        text = f"{len(marks)} marks are known of it; name 3 or more (heliotrope camera teach)"
-        return [FoundTarget(t, False, text) for t in face.targets]
-    search = _Search(look, face, marks, plane)
-    best: _Attempt | None = None
-    for attempt in _attempts(search, previous, rolls):
-        if best is None or len(attempt.used) > len(best.used):
-            best = attempt
-        if best.view is not None and len(best.used) >= min(len(marks), max(4, len(marks) - 2)):
-            break
-    return _results(face, search, best)
+def _one(a: Mark, b: Mark) -> bool:
+    """Whether two targets' marks are one mark on their common edge."""
+    return a.kind == b.kind and float(np.linalg.norm(a.point - b.point)) < 0.05
 
 
-class _Look:
-    """One frame, and what was worked out of it."""
+class _Face:
+    """The search for one face."""
 
-    def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
-        self.grey = np.ascontiguousarray(frame.grey)
-        self.eight = _eight_bit(self.grey)
-        self.pictures = pictures
-        self.camera = camera if camera is not None and camera.size == frame.size else None
-        self.lens = self.camera or unknown_lens(frame.size)
-        self._outlines: dict[tuple[int, float], detection.Outlines] = {}
+    def __init__(self, search: Search, previous: View | None) -> None:
+        self.search, self.previous = search, previous
+        self.best: Attempt | None = None
+        #: Shapes that look like one of its marks.
+        self.shapes = 0
+        self.text = ""
 
-    def outlines(self, reduction: int, ratio: float) -> detection.Outlines:
-        key = (reduction, ratio)
-        if key not in self._outlines:
-            self._outlines[key] = detection.outlines(self.eight, reduction, ratio)
-        return self._outlines[key]
+    def look(self, turned: bool) -> None:
+        """Look in one way after another until the face is found."""
+        if not self._known_enough():
+            return
+        for attempt in self._turned() if turned else self._upright():
+            if self.best is None or _rank(attempt) > _rank(self.best):
+                self.best = attempt
+            if self.best.view is not None:
+                expected = len(self.search.expected(self.best.view))
+                if self.best.known or len(self.best.used) >= _ENOUGH * expected:
+                    break
 
+    def _known_enough(self) -> bool:
+        marks = self.search.marks
+        tags = sum(mark.kind == "tag" for mark in marks)
+        if len(marks) + 3 * tags >= FEWEST:
+            return True
+        self.text = f"{len(marks)} marks are known of it; name 3 or more (heliotrope camera teach)"
+        return False
 
-@dataclass(frozen=True)
-class _Attempt:
-    """What came of looking in one way."""
-
-    view: View | None
-    seen: dict[int, tuple[FloatArray, FloatArray]]
-    used: tuple[int, ...]
-    reasons: dict[int, str]
-    text: str
-
-
-class _Search:
-    """One face in one frame."""
-
-    def __init__(self, look: _Look, face: Face, marks: list[Mark], plane: FloatArray) -> None:
-        self.look, self.face, self.marks, self.plane = look, face, marks, plane
-        self.tags = detection.find_tags(look.eight, marks)
-        self.looks: dict[int, Refined] = {}
-
-    def from_map(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Attempt:
-        """Refine every mark about ``pixels`` (M, 2), then fit, without those that stray."""
-        seen: dict[int, tuple[FloatArray, FloatArray]] = {}
-        reasons: dict[int, str] = {}
-        for k, mark in enumerate(self.marks):
-            if mark.kind == "tag":
-                if mark.name in self.tags:
-                    corners = self.tags[mark.name]
-                    seen[k] = corners.mean(axis=0), 0.2**2 * np.eye(2)
-                else:
-                    reasons[k] = "not seen"
-                continue
-            picture = self.look.pictures.get(mark.code) if mark.kind == "picture" else None
-            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture)
-            problem = _problem(refined, mark)
-            if refined is None or problem:
-                reasons[k] = problem
-            else:
-                seen[k] = refined.pixel, refined.covariance
-                self.looks[k] = refined
-        return self.fit(seen, reasons)
-
-    def fit(
-        self, seen: dict[int, tuple[FloatArray, FloatArray]], reasons: dict[int, str]
-    ) -> _Attempt:
-        """Fit a view to what was seen; what strays is left out, the worst first."""
-        used = list(seen)
-        while True:
-            points = self._points(used, seen)
-            if points is None:
-                text = f"only {len(used)} of its {len(self.marks)} marks were seen"
-                return _Attempt(None, seen, tuple(used), reasons, text)
-            plane, pixels, covariance = points
-            view = fit_view(
-                self.face, plane, pixels, covariance, self.look.lens, self.look.camera is not None
+    def _upright(self) -> Iterator[Attempt]:
+        """The quick ways, made as they are asked for."""
+        search, camera = self.search, self.search.look.camera
+        if self.previous is not None:
+            pixels, scales = (
+                self.previous.to_pixels(search.plane),
+                self.previous.scale(search.plane),
             )
-            miss = view.to_pixels(self.plane[used]) - np.array([seen[k][0] for k in used])
-            spread = np.array([self._deviation(k, seen, view) for k in used])
-            stray = np.linalg.norm(miss, axis=-1) / spread
-            worst = int(np.argmax(stray))
-            if stray[worst] < _STRAY or len(used) <= 4:
-                break
-            reasons[used[worst]] = (
-                f"{np.linalg.norm(miss[worst]):.1f} px from where the others put it"
-            )
-            del used[worst]
-        limit = 0.02 * float(np.ptp(self.face.span, axis=0).max())
-        per_metre = float(np.sqrt(abs(np.linalg.det(view.scale(self.plane[used[0]])))))
-        if view.residual > limit * per_metre:
-            text = f"its marks do not fit together: {view.residual:.0f} px RMS"
-            return _Attempt(None, seen, tuple(used), reasons, text)
-        return _Attempt(view, seen, tuple(used), reasons, "")
+            yield search.attempt(pixels, scales, 0.5, known=True)
+        if camera is not None and camera.position is not None:
+            expected = self._projected(camera)
+            if expected is not None:
+                yield search.attempt(*expected, 0.5, known=True)
+        yield from self._tags()
+        base = self._base()
+        for ratio in _RATIOS:
+            yield from self._outlined(base, ratio, upright=True)
 
-    def _deviation(
-        self, k: int, seen: dict[int, tuple[FloatArray, FloatArray]], view: View
-    ) -> float:
-        per_metre = np.abs(np.linalg.det(view.scale(self.plane[k])))
-        return float(np.sqrt(0.5 * np.trace(seen[k][1]) + per_metre * SURVEY**2 + 0.3**2))
+    def _turned(self) -> Iterator[Attempt]:
+        """The thorough ways."""
+        base = self._base()
+        for reduction in dict.fromkeys((base, max(1, base // 2), 2 * base, 4 * base)):
+            for ratio in _RATIOS:
+                yield from self._outlined(reduction, ratio, upright=False)
+        yield from self._pictured()
 
-    def _points(
-        self, used: list[int], seen: dict[int, tuple[FloatArray, FloatArray]]
-    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Points, pixels, covariances; a tag gives four corners, three marks a parallelogram."""
-        plane, pixels, covariance = [], [], []
-        per_metre = self._per_metre(used, seen)
-        for k in used:
-            mark = self.marks[k]
-            survey = (per_metre * SURVEY) ** 2 * np.eye(2)
-            if mark.kind == "tag":
-                half = 0.5 * mark.size
-                cos, sin = np.cos(mark.turn), np.sin(mark.turn)
-                turn = np.array([[cos, sin], [-sin, cos]])
-                box = half * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]]) @ turn
-                plane += list(self.plane[k] + box)
-                pixels += list(self.tags[mark.name])
-                covariance += [seen[k][1] + survey] * 4
-            else:
-                plane.append(self.plane[k])
-                pixels.append(seen[k][0])
-                covariance.append(seen[k][1] + survey)
-        if len(plane) < _FEWEST:
+    def _base(self) -> int:
+        return max(1, round(max(self.search.look.size) / _LONGER))
+
+    def _projected(self, camera: Camera) -> tuple[FloatArray, FloatArray] | None:
+        """Pixels and scales of the marks as a camera's pose has them."""
+        face, plane = self.search.face, self.search.plane
+        towards = np.asarray(camera.position) - face.origin
+        if float(towards @ np.cross(*face.axes)) <= 0.0:
             return None
-        if len(plane) == 3:
-            # Without perspective the fourth corner completes the parallelogram; how far
-            # perspective may move it is what two per cent of the face's size allow.
-            plane.append(plane[0] + plane[2] - plane[1])
-            pixels.append(pixels[0] + pixels[2] - pixels[1])
-            extent = 0.02 * float(np.ptp(pixels, axis=0).max())
-            covariance.append(extent**2 * np.eye(2))
-        return np.array(plane), np.array(pixels), np.array(covariance)
+        pixels = project(camera, face.point(plane))
+        steps = [project(camera, face.point(plane + 0.01 * e)) - pixels for e in np.eye(2)]
+        scales = np.stack(steps, axis=-1) / 0.01
+        return (pixels, scales) if np.isfinite(scales).all() else None
 
-    def _per_metre(self, used: list[int], seen: dict[int, tuple[FloatArray, FloatArray]]) -> float:
-        if len(used) < 2:
-            return 0.0
-        plane = self.plane[used] - self.plane[used].mean(axis=0)
-        pixels = np.array([seen[k][0] for k in used])
-        pixels = pixels - pixels.mean(axis=0)
-        return float(np.sqrt(np.sum(pixels**2) / max(np.sum(plane**2), 1e-12)))
+    def _up(self) -> FloatArray:
+        """Where the upper side of the face is in the frame, as far as anybody knows, (2,)."""
+        camera = self.search.look.camera
+        scale = np.diag([1.0, -1.0])[None]
+        if self.previous is not None:
+            scale = self.previous.scale(self.search.plane)
+        elif camera is not None and camera.position is not None:
+            expected = self._projected(camera)
+            scale = scale if expected is None else expected[1]
+        up = scale.mean(axis=0)[:, 1]
+        return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
 
+    def _tags(self) -> Iterator[Attempt]:
+        """From the tags that were recognised by their code."""
+        search = self.search
+        if not search.tags:
+            return
+        yield self._mapped(search.tag_map(), 0.4)
 
-def _attempts(search: _Search, previous: View | None, rolls: Sequence[float]) -> Iterator[_Attempt]:
-    """Ways to look, the quick ones first; made as they are asked for."""
-    if previous is not None:
-        yield search.from_map(previous.to_pixels(search.plane), previous.scale(search.plane), 0.5)
-    camera = search.look.camera
-    if camera is not None and camera.position is not None:
-        pixels = project(camera, search.face.point(search.plane))
-        steps = [
-            project(camera, search.face.point(search.plane + 0.01 * e)) - pixels for e in np.eye(2)
-        ]
-        if np.isfinite(pixels).all():
-            yield search.from_map(pixels, np.stack(steps, axis=-1) / 0.01, 0.5)
-    yield from _detections(search, rolls)
-
-
-def _detections(search: _Search, rolls: Sequence[float]) -> Iterator[_Attempt]:
-    """Look everywhere: for tags by their code, for the others by their outlines."""
-    outlined = [k for k, m in enumerate(search.marks) if m.kind not in ("tag", "picture")]
-    if search.tags:
-        nowhere = np.full((len(search.plane), 2), np.nan)
-        yield search.from_map(nowhere, np.tile(np.eye(2), (len(search.plane), 1, 1)), 0.0)
-    if not outlined:
-        return
-    base = max(1, round(max(search.look.grey.shape) / 700))
-    for roll in rolls:
-        drawn, which = detection.drawings([search.marks[k] for k in outlined], roll)
-        for reduction in dict.fromkeys(
-            (base, max(1, base // 2), 2 * base)[: 1 if rolls == _ROLLS[:1] else 3]
-        ):
-            for ratio in (0.72, 0.85):
-                seen = detection.candidates(search.look.outlines(reduction, ratio), drawn)
-                found = constellation.match(
-                    seen, drawn, np.array(which), search.plane[outlined], roll
-                )
-                if found is not None:
-                    pixels = constellation.mapped(found.H_pixel_plane, search.plane)
-                    scales = constellation.scales(found.H_pixel_plane, search.plane)
-                    yield search.from_map(pixels, scales, 0.4)
-
-
-def _problem(refined: Refined | None, mark: Mark) -> str:
-    """Why what was found about a mark's place is not the mark; empty if it is."""
-    if refined is None:
-        return "beyond the frame or too small"
-    if refined.explained < _EXPLAINED:
-        return f"covered or not there: its drawing explains {100 * refined.explained:.0f} %"
-    if mark.kind != "picture" and refined.contrast > _CONTRAST:
-        return f"too faint: {100 * refined.contrast:.0f} % of its surroundings"
-    return ""
-
-
-def _eight_bit(grey: Image) -> Image:
-    if grey.dtype == np.uint8:
-        return np.asarray(grey, dtype=np.uint8)
-    # 12 bits in 16 are common: what is there is stretched to what can be.
-    top = max(int(grey.max()), 1)
-    return np.asarray(grey.astype(np.float32) * (255.0 / top), dtype=np.uint8)
-
-
-def _results(face: Face, search: _Search, best: _Attempt | None) -> list[FoundTarget]:
-    total = len(search.marks)
-    if best is None:
-        text = f"none of its {total} marks was seen: not in the frame, or covered"
-        return [FoundTarget(t, False, text) for t in face.targets]
-    fewest = max(_FEWEST, int(np.ceil(_SHARE * total)))
-    view, text = best.view, best.text
-    if any(search.marks[k].kind == "tag" for k in best.used):
-        fewest = 1
-    if view is not None and len(best.used) < fewest:
-        view, text = (
-            None,
-            f"only {len(best.used)} of its {total} marks were seen; {fewest} are needed",
+    def _mapped(self, H: FloatArray, reach: float) -> Attempt:
+        search = self.search
+        pixels, scales = (
+            constellation.mapped(H, search.plane),
+            constellation.scales(H, search.plane),
         )
-    results = []
-    for target in face.targets:
-        own = tuple(
-            _found_mark(search, best, k) for k, mark in enumerate(search.marks)
-            if any(np.linalg.norm(mark.point - m.point) < 0.05 for m in target.marks)
-        )  # fmt: skip
-        results.append(FoundTarget(target, view is not None, text, own, view))
-    return results
+        attempt = search.attempt(pixels, scales, reach)
+        return attempt if attempt.view is None else self._most_upright(attempt, attempt.view)
+
+    def _most_upright(self, attempt: Attempt, view: View) -> Attempt:
+        """Take the turn that is most upright of those in which the marks look the same."""
+        search, up = self.search, self._up()
+        middle = search.plane.mean(axis=0)
+        scale = view.scale(middle)
+
+        def lean(turn: FloatArray) -> float:
+            seen = scale @ turn[:, 1]
+            return -float(seen @ up) / float(np.linalg.norm(seen))
+
+        for turn in sorted([np.eye(2), *symmetries(search.marks, search.plane)], key=lean):
+            if np.allclose(turn, np.eye(2)):
+                return attempt
+            places = middle + (search.plane - middle) @ turn.T
+            other = search.attempt(view.to_pixels(places), view.scale(places) @ turn, 0.3)
+            if other.view is not None and len(other.used) >= len(attempt.used):
+                return other
+        return attempt
+
+    def _outlined(self, reduction: int, ratio: float, upright: bool) -> Iterator[Attempt]:
+        """Dark shapes that look like the marks and lie as they do."""
+        search = self.search
+        kept = [k for k, m in enumerate(search.marks) if m.kind not in ("tag", "picture")]
+        if len(kept) < FEWEST:
+            return
+        drawn, which = detection.drawings([search.marks[k] for k in kept])
+        seen = detection.candidates(search.look.outlines(reduction, ratio), drawn)
+        yield from self._matched(seen, kept, drawn, which, upright)
+
+    def _pictured(self) -> Iterator[Attempt]:
+        """Taught pictures wherever they are, in upright frames."""
+        search = self.search
+        kept = [k for k, m in enumerate(search.marks) if m.kind == "picture"]
+        if len(kept) < FEWEST:
+            return
+        marks = [search.marks[k] for k in kept]
+        seen = detection.find_pictures(search.look.eight, marks, search.look.pictures)
+        yield from self._matched(
+            seen, kept, detection.picture_drawings(marks), np.arange(len(kept)), True
+        )
+
+    def _matched(
+        self, seen: detection.Candidates, kept: list[int], drawn: list[detection.Drawing],
+        which: constellation.Places, upright: bool,
+    ) -> Iterator[Attempt]:  # fmt: skip
+        search = self.search
+        self.shapes = max(self.shapes, len(seen.middle))
+        marks = constellation.constellation(
+            [search.marks[k] for k in kept], drawn, which, search.plane[kept]
+        )
+        found = constellation.match(seen, marks, self._up(), upright)
+        if found is not None:
+            yield self._mapped(found.H_pixel_plane, 0.4)
+
+    def results(self) -> list[FoundTarget]:
+        """What is to be said of each target of the face."""
+        search, best = self.search, self.best
+        targets = search.face.targets
+        if best is None:
+            total = len(search.marks)
+            text = self.text or (
+                f"none of its {total} marks was seen: not in the frame, or covered"
+                if self.shapes == 0
+                else f"no three of its {total} marks were seen together; {self.shapes} shapes in "
+                "the frame look like one of them"
+            )
+            return [FoundTarget(t, False, text) for t in targets]
+        results = []
+        for target in targets:
+            own = tuple(
+                _found_mark(search, best, k) for k, mark in enumerate(search.marks)
+                if any(_one(mark, m) for m in target.marks)
+            )  # fmt: skip
+            results.append(FoundTarget(target, best.view is not None, best.text, own, best.view))
+        return results
 
 
-def _found_mark(search: _Search, best: _Attempt, k: int) -> FoundMark:
+def _rank(attempt: Attempt) -> tuple[bool, int]:
+    return attempt.view is not None, len(attempt.used)
+
+
+def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[FloatArray]:
+    """Return turns (2, 2) by quarters about their middle after which marks look the same.
+
+    Parameters
+    ----------
+    marks
+        Of a face, M.
+    plane
+        Their places, m, (M, 2).
+    """
+    found = []
+    middle = plane.mean(axis=0)
+    for quarter in (1, 2, 3):
+        cos, sin = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarter - 1]
+        turn = np.array([[cos, -sin], [sin, cos]])
+        places = middle + (plane - middle) @ turn.T
+        apart = np.linalg.norm(places[:, None] - plane[None], axis=-1)
+        other = np.argmin(apart, axis=1)
+        same = [
+            apart[k, j] < 0.5 * mark.size and _alike(mark, marks[j], 0.5 * np.pi * quarter)
+            for k, (mark, j) in enumerate(zip(marks, other, strict=True))
+        ]
+        if all(same) and len(set(other.tolist())) == len(marks):
+            found.append(turn)
+    return found
+
+
+def _alike(a: Mark, b: Mark, turned: float) -> bool:
+    """Whether a mark turned by an angle, rad, looks like another."""
+    if a.kind in ("tag", "picture") or (a.kind, a.size, a.stroke) != (b.kind, b.size, b.stroke):
+        return False
+    if a.kind == "disc":
+        return True
+    period = 0.5 * np.pi if a.kind == "square" else 2.0 * np.pi
+    rest = (a.turn + turned - b.turn) / period
+    return bool(abs(rest - np.round(rest)) * period < 0.1)
+
+
+def _one_place_each(found: Sequence[_Face]) -> None:
+    """Of two faces that were found in one place of the frame at most one is there."""
+    for k, first in enumerate(found):
+        for second in found[k + 1 :]:
+            a, b = first.best, second.best
+            if a is None or b is None or a.view is None or b.view is None:
+                continue
+            if not (_covers(a.view, b.view) or _covers(b.view, a.view)):
+                continue
+            clear = _share(first, a) - _share(second, b)
+            if a.known != b.known:
+                clear = 1.0 if a.known else -1.0
+            names = [each.search.face.targets[0].name for each in (first, second)]
+            if clear < _CLEARER:
+                text = f"what was seen may be {names[1]} as well"
+                text += "; name the targets that the camera sees" if clear > -_CLEARER else ""
+                first.best = replace(a, view=None, text=text)
+            if clear > -_CLEARER:
+                text = f"what was seen may be {names[0]} as well"
+                text += "; name the targets that the camera sees" if clear < _CLEARER else ""
+                second.best = replace(b, view=None, text=text)
+
+
+def _share(each: _Face, attempt: Attempt) -> float:
+    return len(attempt.used) / len(each.search.marks)
+
+
+def _covers(a: View, b: View) -> bool:
+    """Whether the middle of one face is seen on another."""
+    place = a.to_plane(b.to_pixels(b.face.span.mean(axis=0)))
+    low, high = a.face.span
+    return bool(((place > low) & (place < high)).all())
+
+
+def _found_mark(search: Search, best: Attempt, k: int) -> FoundMark:
     if k in best.seen:
         pixel, covariance = best.seen[k]
     else:
         pixel = np.full(2, np.nan) if best.view is None else best.view.to_pixels(search.plane[k])
         covariance = np.full((2, 2), np.nan)
     used = best.view is not None and k in best.used
-    look = search.looks.get(k) if k in best.seen else None
+    look = best.looks.get(k)
     found = FoundMark(search.marks[k], pixel, covariance, used, best.reasons.get(k, ""))
-    return found if look is None else replace(found, contrast=look.contrast, blur=look.blur)
+    if look is None or search.marks[k].kind == "tag":
+        return found
+    return replace(found, contrast=look.contrast, blur=look.blur)

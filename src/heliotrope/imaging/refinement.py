@@ -1,4 +1,9 @@
-"""A mark to a fraction of a pixel: its drawing laid over the frame by least squares."""
+"""A mark to a fraction of a pixel: its drawing laid over the frame by least squares.
+
+What a pixel sees of a mark is a + b·x + c·y + (d + e·x + f·y)·drawing: light that changes
+evenly over paint and over print, and stray light. Second derivatives of the drawing stand for
+a blur that is not the one it is drawn with, so blur moves no mark.
+"""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -11,12 +16,23 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.marks import polygons
 
-#: Samples are this many pixels apart.
-_STEP = 2.0
+Values = npt.NDArray[np.float32]
+
+#: Samples across a mark: one for so many pixels, and no more than that in all. What is
+#: searched for is searched more coarsely.
+_PIXELS, _MOST, _COARSE, _FEWEST = 1.5, 32, 20, 6
 #: Neighbouring samples share light by lens and interpolation: so many count as one.
 _SHARED = 4.0
 #: What no fit of a drawing can see: print, relief and blur of a mark, pixels.
-_FLOOR = 0.15
+_FLOOR = 0.1
+#: A drawing is softened by this, samples: about what pixels and a lens do.
+_SOFT = 0.8
+#: Samples are softened by this, so that they and the drawing can be told between samples.
+_SMOOTH = 0.7
+#: Around a drawing, in its own sizes.
+_MARGIN = 0.3
+#: An even light that explains less than this is worth a second look without the light.
+_CLEAR = 0.8
 
 
 @dataclass(frozen=True)
@@ -36,6 +52,9 @@ class Refined:
     blur
         Standard deviation of what softens its edges, across upright and level ones, m,
         (2,); it cannot be told below two pixels.
+    shape
+        What of it is not as drawn: a place d of the drawing is seen where ``d + shape @ d``
+        should be, (2, 2).
     """
 
     pixel: FloatArray
@@ -43,30 +62,36 @@ class Refined:
     contrast: float
     explained: float
     blur: FloatArray
+    shape: FloatArray
 
 
-@lru_cache(maxsize=256)
-def _drawn(kind: str, key: tuple[float, ...], code: str, step: float) -> tuple[FloatArray, ...]:
-    """Return a drawing's coverage on a grid, and the plane coordinates of its first sample."""
-    import cv2
+@dataclass(frozen=True)
+class _Template:
+    """A drawing on a grid of its plane.
 
-    size, stroke, turn = key
-    mark = Mark("drawing", kind, np.zeros(3), size, stroke, turn, code)
-    shapes = polygons(mark)
-    points = np.concatenate(shapes)
-    margin = max(0.3 * float(np.ptp(points, axis=0).max()), 3.0 * step)
-    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
-    count = np.ceil((high - low) / step).astype(int)
-    fine = 8
-    raster = np.zeros((count[1] * fine, count[0] * fine), dtype=np.uint8)
-    for shape in shapes:
-        spot = np.stack([shape[:, 0] - low[0], high[1] - shape[:, 1]], axis=-1) / step * fine
-        # A polygon's edge lies half a fine pixel off its outermost pixel centres.
-        cv2.fillPoly(raster, [np.round((spot - 0.5) * 16).astype(np.int32)], 255, shift=4)
-    small = cv2.resize(raster, (count[0], count[1]), interpolation=cv2.INTER_AREA)
-    soft = cv2.GaussianBlur(small.astype(np.float32) / 255.0, (0, 0), 0.8)
-    first = np.array([low[0] + 0.5 * step, high[1] - 0.5 * step])
-    return soft.astype(np.float64), first
+    Attributes
+    ----------
+    values
+        How much of each cell is drawn, softened, (H, W).
+    first
+        Plane coordinates of the first cell's centre from the mark's point, m, (2,).
+    step
+        From a cell to the next, m.
+    basis
+        Columns: even light (3), drawing, its slopes (2) and second slopes (2), light over
+        the print (2), then its shape (4), (H · W, 14).
+    sign
+        −1 for a drawing, which is darker than what is around it; 1 for a picture.
+    stroke
+        Breadth of its strokes, cells.
+    """
+
+    values: FloatArray
+    first: FloatArray
+    step: float
+    basis: Values
+    sign: float
+    stroke: float
 
 
 def refine(
@@ -88,122 +113,316 @@ def refine(
     pixel
         About where its point is, (2,).
     scale
-        d(pixel)/d(plane) there, pixels per metre, (2, 2).
+        d(pixel)/d(plane) there, pixels per metre, (2, 2). The point is as wrong as this is,
+        by half a size of the mark.
     search
-        How far off it may be, in sizes of the mark.
+        How far off it may be, in sizes of the mark; 0 for no farther than a stroke.
     picture
         Of a taught mark: its picture, upright in the plane, (N, N).
 
     Returns
     -------
-    None if it lies beyond the frame's edge, or nothing like it is there.
+    None if it lies beyond the frame's edge, is smaller than nine pixels, or nothing like it
+    is there.
+    """
+    start = pixel
+    if search > 0.0:
+        about = locate(grey, mark, pixel, scale, search, picture)
+        if about is None:
+            return None
+        start = about[0]
+    count = _count(mark, scale, _MOST)
+    if count < _FEWEST or not np.isfinite(start).all():
+        return None
+    template = _template(mark, count, picture)
+    found = _adjust(grey, template, start, scale, relit=False)
+    if found is not None and found.explained < _CLEAR and picture is None:
+        other = _adjust(grey, template, start, scale, relit=True)
+        if other is not None and other.explained > found.explained:
+            return other
+    return found
+
+
+def locate(
+    grey: Image,
+    mark: Mark,
+    pixel: FloatArray,
+    scale: FloatArray,
+    search: float,
+    picture: FloatArray | None = None,
+) -> tuple[FloatArray, float, float] | None:
+    """Return where about a mark is, (2,), its standard deviation, pixels, and its likeness.
+
+    Parameters are those of :func:`refine`. The likeness is a correlation, at most 1.
     """
     import cv2
 
-    per_metre = float(np.sqrt(abs(np.linalg.det(scale))))
-    step = _STEP / per_metre
-    if mark.size / step < 4.0:
+    count = _count(mark, scale, _COARSE)
+    if count < _FEWEST or not np.isfinite(pixel).all():
         return None
-    template, first = _template(mark, step, picture)
-    reach = int(np.ceil(search * mark.size / step))
-    shape = np.array(template.shape)
-    samples = _sample(grey, pixel, scale, first + [-reach * step, reach * step], step,
-                      shape + 2 * reach)  # fmt: skip
-    if samples is None:
+    template = _template(mark, count, picture)
+    step = template.step
+    reach = int(np.ceil(search * count))
+    shape = (template.values.shape[0] + 2 * reach, template.values.shape[1] + 2 * reach)
+    first = template.first + [-reach * step, reach * step]
+    sampled = _sample(grey, pixel, scale, first, step, shape)
+    if sampled is None:
         return None
-    alike = cv2.matchTemplate(
-        samples.astype(np.float32), template.astype(np.float32), cv2.TM_CCOEFF_NORMED
-    )
-    if picture is None:
-        alike = -alike  # a drawing's coverage is bright where the mark is dark
-    row, column = np.unravel_index(int(np.argmax(alike)), alike.shape)
-    shift = np.array([column - reach, reach - row]) * step
-    return _adjust(grey, template, first, step, pixel, scale, shift)
+    samples = sampled[0]
+    drawn = template.values.astype(np.float32)
+    alike = template.sign * cv2.matchTemplate(samples, drawn, cv2.TM_CCOEFF_NORMED)
+    if picture is None and float(alike.max()) < _CLEAR:
+        even = _relit(samples, template.stroke)
+        other = template.sign * cv2.matchTemplate(even, drawn, cv2.TM_CCOEFF_NORMED)
+        alike = other if other.max() > alike.max() else alike
+    row, column = (int(k) for k in np.unravel_index(int(np.argmax(alike)), alike.shape))
+    right = column - reach + _peak(alike[row], column)
+    up = reach - row - _peak(alike[:, column], row)
+    deviation = 0.25 * step * float(np.sqrt(abs(np.linalg.det(scale))))
+    place = pixel + scale @ np.array([right, up]) * step
+    return place, max(deviation, _FLOOR), float(alike[row, column])
 
 
-def _template(mark: Mark, step: float, picture: FloatArray | None) -> tuple[FloatArray, FloatArray]:
+def _peak(values: Image, at: int) -> float:
+    """Where the parabola through a maximum and its neighbours is highest."""
+    if not 0 < at < len(values) - 1:
+        return 0.0
+    before, here, after = (float(v) for v in values[at - 1 : at + 2])
+    bend = before - 2.0 * here + after
+    return 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+
+
+def _count(mark: Mark, scale: FloatArray, most: int) -> int:
+    """Samples across a mark."""
+    if not np.isfinite(scale).all():
+        return 0
+    return min(most, int(mark.size * np.sqrt(abs(np.linalg.det(scale))) / _PIXELS))
+
+
+# -- drawings --------------------------------------------------------------------------
+
+
+def _template(mark: Mark, count: int, picture: FloatArray | None) -> _Template:
     if picture is None:
-        key = (mark.size, mark.stroke, mark.turn)
-        drawn, first = _drawn(mark.kind, key, mark.code, step)
-        return drawn, first
+        return _drawn(mark.kind, (mark.size, mark.stroke, mark.turn), mark.code, count)
     import cv2
 
-    count = max(round(float(mark.size / step)), 4)
     small = cv2.resize(picture.astype(np.float32), (count, count), interpolation=cv2.INTER_AREA)
-    offset = 0.5 * mark.size * (1.0 - 1.0 / count)
-    return small.astype(np.float64) / max(float(small.max()), 1.0), np.array([-offset, offset])
+    step = mark.size / count
+    first = np.array([-0.5, 0.5]) * (mark.size - step)
+    values = np.asarray(small, dtype=np.float64) / max(float(small.max()), 1.0)
+    return _Template(values, first, step, _basis(values, first, step), 1.0, count)
+
+
+@lru_cache(maxsize=512)
+def _drawn(kind: str, key: tuple[float, float, float], code: str, count: int) -> _Template:
+    import cv2
+
+    size, stroke, turn = key
+    step = size / count
+    shapes = polygons(Mark("drawing", kind, np.zeros(3), size, stroke, turn, code))
+    points = np.concatenate(shapes)
+    margin = max(_MARGIN * float(np.ptp(points, axis=0).max()), 3.0 * step)
+    low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+    columns, rows = np.ceil((high - low) / step).astype(int).tolist()
+    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step for p in shapes]
+    soft = cv2.GaussianBlur(coverage(cells, (rows, columns)), (0, 0), _SOFT)
+    values = np.asarray(soft, dtype=np.float64)
+    first = np.array([low[0] + 0.5 * step, high[1] - 0.5 * step])
+    broad = (stroke or size) / step
+    return _Template(values, first, step, _basis(values, first, step), -1.0, broad)
+
+
+def coverage(shapes: list[FloatArray], size: tuple[int, int]) -> FloatArray:
+    """Return how much of each cell (row, column) polygons cover, exactly, (H, W).
+
+    Parameters
+    ----------
+    shapes
+        Polygons (K, 2) of columns and rows, apart from each other; cell (0, 0) is from 0 to
+        1 in both. They lie within the grid.
+    size
+        Rows and columns.
+
+    Notes
+    -----
+    Green's theorem: each piece of an edge within a cell adds its height to all cells right
+    of it, and in its own cell what lies right of the piece.
+    """
+    out = np.zeros((size[0], size[1] + 1))
+    for shape in shapes:
+        total = np.zeros_like(out)
+        for a, b in zip(shape, np.roll(shape, -1, axis=0), strict=True):
+            crossings = [np.array([0.0, 1.0])]
+            for k in range(2):
+                if a[k] != b[k]:
+                    lines = np.arange(np.ceil(min(a[k], b[k])), max(a[k], b[k]))
+                    crossings.append((lines - a[k]) / (b[k] - a[k]))
+            part = np.unique(np.clip(np.concatenate(crossings), 0.0, 1.0))
+            ends = a + part[:, None] * (b - a)
+            middle = 0.5 * (ends[1:] + ends[:-1])
+            column, row = np.floor(middle).astype(int).T
+            rise = np.diff(ends[:, 1])
+            within = middle[:, 0] - column
+            np.add.at(total, (row, column), rise * (1.0 - within))
+            np.add.at(total, (row, column + 1), rise * within)
+        out += np.abs(np.cumsum(total, axis=1))
+    return np.clip(out[:, :-1], 0.0, 1.0)
+
+
+def _basis(values: FloatArray, first: FloatArray, step: float) -> Values:
+    rows, columns = values.shape
+    down, right = np.gradient(values)
+    slope_x, slope_y = right / step, -down / step
+    x = np.broadcast_to(first[0] + step * np.arange(columns), values.shape)
+    y = np.broadcast_to((first[1] - step * np.arange(rows))[:, None], values.shape)
+    half = 0.5 * step * max(rows, columns)
+    even_x, even_y = (x - x.mean()) / half, (y - y.mean()) / half
+    bend_x = np.gradient(right, axis=1) / step**2
+    bend_y = np.gradient(down, axis=0) / step**2
+    parts = [
+        np.ones_like(values), even_x, even_y, values, slope_x, slope_y, bend_x, bend_y,
+        even_x * values, even_y * values, x * slope_x, y * slope_x, x * slope_y, y * slope_y,
+    ]  # fmt: skip
+    return np.ascontiguousarray(np.stack([part.ravel() for part in parts], axis=-1), np.float32)
+
+
+# -- frames ----------------------------------------------------------------------------
 
 
 def _sample(
-    grey: Image, pixel: FloatArray, scale: FloatArray, first: FloatArray,
-    step: float, shape: npt.NDArray[np.intp],
-) -> FloatArray | None:  # fmt: skip
-    """Return the frame on a grid of the plane; None if less than most of it is in the frame."""
+    grey: Image, pixel: FloatArray, scale: FloatArray, first: FloatArray, step: float,
+    shape: tuple[int, int],
+) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:  # fmt: skip
+    """Return a frame on a grid of the plane, and which of it is in the frame, None for all.
+
+    None if less than most of it is. What is finer than the grid is averaged first.
+    """
     import cv2
 
-    # Row and column to plane, to pixel: one affine map.
+    # Column and row to plane, to pixel: one affine map.
     A = scale @ np.array([[step, 0.0], [0.0, -step]])
     b = pixel + scale @ first
-    rows, columns = int(shape[0]), int(shape[1])
+    rows, columns = shape
     corners = b + np.array([[0, 0], [columns, 0], [0, rows], [columns, rows]]) @ A.T
     height, width = grey.shape
     if not np.isfinite(corners).all():
         return None
-    beyond = 0.2 * np.ptp(corners, axis=0)
-    if (corners < -beyond).any() or (corners > [width, height] + beyond).any():
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    beyond = 0.25 * (high - low)
+    if (low < -beyond).any() or (high > [width - 1, height - 1] + beyond).any():
         return None
+    k = max(1, int(float(np.linalg.norm(A, axis=0).min()) + 1e-9))
+    left, top = np.maximum(np.floor(low).astype(int) - 2 * k, 0).tolist()
+    right, bottom = np.minimum(np.ceil(high).astype(int) + 2 * k + 1, [width, height]).tolist()
+    right, bottom = left + (right - left) // k * k, top + (bottom - top) // k * k
+    if right - left < 2 * k or bottom - top < 2 * k:
+        return None
+    part = grey[top:bottom, left:right].astype(np.float32)
+    if k > 1:
+        size = ((right - left) // k, (bottom - top) // k)
+        part = np.asarray(cv2.resize(part, size, interpolation=cv2.INTER_AREA), np.float32)
+    # Pixel centres of a part reduced by k: (p − left + 0.5)/k − 0.5.
+    at = (b - [left, top] + 0.5) / k - 0.5
     warped = cv2.warpAffine(
-        grey, np.column_stack([A, b]), (columns, rows),
+        part, np.column_stack([A / k, at]), (columns, rows),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
     )  # fmt: skip
-    return np.asarray(warped, dtype=np.float64)
+    inside = None
+    if (low < 0.0).any() or (high > [width - 1, height - 1]).any():
+        x = b[0] + A[0, 0] * np.arange(columns) + A[0, 1] * np.arange(rows)[:, None]
+        y = b[1] + A[1, 0] * np.arange(columns) + A[1, 1] * np.arange(rows)[:, None]
+        inside = (x >= -0.5) & (y >= -0.5) & (x <= width - 0.5) & (y <= height - 0.5)
+    return np.asarray(warped, dtype=np.float32), inside
+
+
+def _relit(samples: Image, stroke: float) -> Image:
+    """Return samples over the light on them, which is what is left when strokes are closed."""
+    import cv2
+
+    broad = 2 * int(0.65 * stroke + 1.5) + 1
+    light = cv2.morphologyEx(samples, cv2.MORPH_CLOSE, np.ones((broad, broad), np.uint8))
+    return np.asarray(100.0 * samples / np.maximum(light, 1.0), dtype=np.float32)
 
 
 def _adjust(
-    grey: Image, template: FloatArray, first: FloatArray, step: float,
-    pixel: FloatArray, scale: FloatArray, shift: FloatArray,
-) -> Refined | None:  # fmt: skip
-    """Gauss-Newton on the shift, with brightness a + b·x + c·y + d·drawing at each step."""
-    rows, columns = template.shape
-    y, x = np.mgrid[0:rows, 0:columns]
-    x, y = x.ravel() - x.mean(), y.mean() - y.ravel()
-    down, right = np.gradient(template)
-    shape = np.array(template.shape)
-    slope = np.column_stack([right.ravel(), -down.ravel()]) / step
-    even = np.column_stack([np.ones(x.size), x / x.max(), y / y.max()])
-    basis = np.column_stack([even, template.ravel(), slope])
-    numbers, weight = np.zeros(6), np.ones(x.size)
-    flat = residual = np.empty(0)
-    information = np.eye(6)
+    grey: Image, template: _Template, pixel: FloatArray, scale: FloatArray, relit: bool
+) -> Refined | None:
+    """Gauss-Newton on the place, with everything else of the model solved at each step."""
+    import cv2
+
+    basis, step, shape = template.basis, template.step, template.values.shape
+    shift = np.zeros(2)
+    numbers, weight = np.zeros(10), np.ones(len(basis), dtype=np.float32)
+    samples = residual = np.empty(0, dtype=np.float32)
+    information = np.eye(10)
     for _ in range(6):
-        samples = _sample(grey, pixel + scale @ shift, scale, first, step, shape)
-        if samples is None:
+        taken = _sample(grey, pixel + scale @ shift, scale, template.first, step, shape)
+        if taken is None:
             return None
-        flat = samples.ravel()
-        weighted = basis * weight[:, None]
-        information = weighted.T @ basis
-        numbers = np.linalg.lstsq(information, weighted.T @ flat, rcond=None)[0]
-        residual = flat - basis @ numbers
-        spread = max(1.4826 * float(np.median(np.abs(residual))), 0.3)
-        weight = 1.0 / np.maximum(np.abs(residual) / (2.0 * spread), 1.0)
+        seen = np.asarray(cv2.GaussianBlur(taken[0], (0, 0), _SMOOTH), dtype=np.float32)
+        seen = _relit(seen, template.stroke) if relit else seen
+        samples = seen.ravel()
+        if taken[1] is not None:
+            weight = weight * taken[1].ravel()
+        information, numbers = _solve(basis[:, :10], weight, samples)
+        residual = samples - basis[:, :10] @ numbers.astype(np.float32)
+        off = np.abs(residual)
+        spread = max(1.4826 * _quantile(off, 0.5), 0.1)
+        weight = (1.0 / np.maximum(off / (2.0 * spread), 1.0)).astype(np.float32)
         # A drawing moved by δ is the drawing less δ times its slope.
         depth = numbers[3] if abs(numbers[3]) > 1e-9 else 1e-9
-        move = np.clip(-numbers[4:] / depth, -3.0 * step, 3.0 * step)
+        move = np.clip(-numbers[4:6] / depth, -2.0 * step, 2.0 * step)
         shift = shift + move
         if float(np.abs(move).max()) < 0.01 * step:
             break
-    variance = float(np.sum(weight * residual**2) / weight.sum())
-    covariance = _SHARED * variance * np.linalg.pinv(information, hermitian=True)
-    plane = covariance[4:, 4:] / max(float(numbers[3] ** 2), 1e-12)
-    plain = flat - even @ np.linalg.solve(even.T @ even, even.T @ flat)
+    place = pixel + scale @ shift
+    return _judged(template, samples, weight, residual, numbers, information, place, scale)
+
+
+def _quantile(values: Values, share: float) -> float:
+    at = int(share * (values.size - 1))
+    return float(np.partition(values, at, axis=None)[at])
+
+
+def _solve(basis: Values, weight: Values, samples: Values) -> tuple[FloatArray, FloatArray]:
+    """Return normal matrix and solution of weighted least squares."""
+    weighted = basis * weight[:, None]
+    information = (weighted.T @ basis).astype(np.float64)
+    aim = (weighted.T @ samples).astype(np.float64)
+    size = np.sqrt(np.maximum(np.diag(information), 1e-12))
+    # Columns of a disc's turn or of a broad blur are nothing: a ridge keeps them so. It is
+    # also above the rounding of sums in single precision.
+    ridge = information / np.outer(size, size) + 1e-6 * np.eye(len(size))
+    return information, np.linalg.solve(ridge, aim / size) / size
+
+
+def _judged(
+    template: _Template, samples: Values, weight: Values, residual: Values,
+    numbers: FloatArray, information: FloatArray, place: FloatArray, scale: FloatArray,
+) -> Refined:  # fmt: skip
+    """Covariance, contrast and the other measures of a mark that was found."""
+    basis, step = template.basis, template.step
+    depth = float(numbers[3])
+    variance = float(np.sum(weight * residual**2) / max(float(weight.sum()), 1e-9))
+    size = np.sqrt(np.maximum(np.diag(information), 1e-12))
+    covariance = np.linalg.pinv(information / np.outer(size, size), hermitian=True)
+    covariance = _SHARED * variance * covariance[4:6, 4:6] / np.outer(size[4:6], size[4:6])
+    plane = covariance / max(depth**2, 1e-12)
+    even = basis[:, :3]
+    plain = samples - even @ np.linalg.solve(even.T @ even, even.T @ samples)
     # A soft step of height d has the slope d/(√2π σ) at its middle.
-    down, right = np.gradient(flat.reshape(template.shape))
-    steepest = np.array([np.percentile(np.abs(right), 98.5), np.percentile(np.abs(down), 98.5)])
-    blur = step * abs(numbers[3]) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
+    down, right = np.gradient(samples.reshape(template.values.shape))
+    steepest = np.array([_quantile(np.abs(slope), 0.985) for slope in (right, down)])
+    blur = step * abs(depth) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
+    _, full = _solve(basis, weight, samples)
+    # A drawing stretched by 1 + s is the drawing less s times the place times its slope.
+    shape = -full[10:].reshape(2, 2) / (full[3] if abs(full[3]) > 1e-9 else 1e-9)
     return Refined(
-        pixel=pixel + scale @ shift,
+        pixel=place,
         covariance=scale @ plane @ scale.T + _FLOOR**2 * np.eye(2),
-        contrast=float((numbers[0] + numbers[3]) / max(float(numbers[0]), 1e-9)),
+        contrast=float((numbers[0] + depth) / max(float(numbers[0]), 1e-9)),
         explained=1.0 - float(np.var(residual)) / max(float(np.var(plain)), 1e-9),
         blur=blur,
+        shape=shape,
     )

@@ -1,0 +1,464 @@
+"""One way of looking for a face: marks found about given places, a view fitted, and judged."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from heliotrope.field.camera import Camera
+from heliotrope.field.marks import Mark
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging import detection
+from heliotrope.imaging.frame import Frame, Image
+from heliotrope.imaging.marks import polygons
+from heliotrope.imaging.refinement import Refined, locate, refine
+from heliotrope.imaging.view import Face, View, fit_view, homography, unknown_lens
+
+Pictures = Mapping[str, FloatArray]
+
+#: Survey and paint: standard deviation of a mark's place on its target, m.
+SURVEY = 0.005
+#: A mark must correlate so well where it is looked for, explain this much of what is around
+#: it there, and be darker than its surroundings.
+LIKE, EXPLAINED, CONTRAST = 0.45, 0.5, 0.93
+#: A mark farther from where the others put it than this many deviations is not used.
+STRAY = 5.0
+#: A mark may be so much longer, broader or more askew than drawn; all of them together this.
+MISSHAPEN, WRONG_SIZE = 0.35, 0.15
+#: Residuals that a view may have, as a part of the face's extent, and pixels on top.
+MISFIT, MISFIT_PIXELS = 0.005, 1.0
+#: Standard deviation, as a part of its extent, to which a target's centre must be known.
+VAGUE = 0.005
+#: Part of the paint between the marks that must be lighter than the print of the nearest.
+LIGHTER = 0.8
+#: A face is not seen flatter than this (least over greatest scale), and its far side not
+#: this much smaller than its near side.
+FLATTEST, NEAREST = 0.2, 3.0
+#: Of points that make a view: fewest if it is known beforehand about where they are, fewest
+#: otherwise, and part of those in the frame.
+FEWEST, ALONE, SHARE = 3, 4, 0.5
+
+
+class Look:
+    """One frame, and what was worked out of it."""
+
+    def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
+        self.grey = np.ascontiguousarray(frame.grey)
+        self.size = frame.size
+        self.pictures = pictures
+        self.camera = camera if camera is not None and camera.size == frame.size else None
+        self.lens = self.camera or unknown_lens(frame.size)
+        self._light: dict[int, detection.Lightened] = {}
+        self._outlines: dict[tuple[int, float], detection.Outlines] = {}
+        self._tags: dict[int, dict[tuple[int, int], list[FloatArray]]] = {}
+
+    @cached_property
+    def eight(self) -> Image:
+        """The frame in 8 bit."""
+        if self.grey.dtype == np.uint8:
+            return self.grey
+        # Sensors leave bits empty, and a beam is brighter than all else: the brightest
+        # thousandth may clip.
+        top = max(float(np.percentile(self.grey[::4, ::4], 99.9)), 1.0)
+        scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
+        return np.asarray(np.minimum(scaled, 255.0), dtype=np.uint8)
+
+    def outlines(self, reduction: int, ratio: float) -> detection.Outlines:
+        """Dark parts of the frame, worked out once for all faces."""
+        key = (reduction, ratio)
+        if reduction not in self._light:
+            self._light[reduction] = detection.lighten(self.grey, reduction)
+        if key not in self._outlines:
+            self._outlines[key] = detection.outlines(self._light[reduction], ratio)
+        return self._outlines[key]
+
+    def tags(self, marks: list[Mark]) -> dict[int, FloatArray]:
+        """Corners (4, 2) of the tags among marks that are seen exactly once, by index."""
+        found = {}
+        for k, mark in enumerate(marks):
+            if mark.kind != "tag":
+                continue
+            key = detection.tag_number(mark)
+            if key[0] not in self._tags:
+                self._tags[key[0]] = detection.find_tags(self.eight, [key[0]])
+            seen = self._tags[key[0]].get(key, [])
+            if len(seen) == 1:
+                found[k] = seen[0]
+        return found
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What came of looking in one way.
+
+    Attributes
+    ----------
+    view
+        None if there is none that can be believed.
+    seen
+        Pixel and covariance of marks that were recognised, by index.
+    used
+        Those that fit together.
+    reasons
+        Why others are not used.
+    text
+        Why there is no view.
+    looks
+        What was measured of each mark.
+    known
+        Whether it was known beforehand about where the face is.
+    """
+
+    view: View | None
+    seen: dict[int, tuple[FloatArray, FloatArray]]
+    used: tuple[int, ...]
+    reasons: dict[int, str]
+    text: str
+    looks: dict[int, Refined]
+    known: bool
+
+
+@dataclass
+class _Seen:
+    """Marks while they are looked for."""
+
+    places: dict[int, tuple[FloatArray, FloatArray]]
+    reasons: dict[int, str]
+    looks: dict[int, Refined]
+
+
+class Search:
+    """One face in one frame."""
+
+    def __init__(self, look: Look, face: Face, marks: list[Mark], plane: FloatArray) -> None:
+        self.look, self.face, self.marks, self.plane = look, face, marks, plane
+        self.tags = look.tags(marks)
+        self.extent = float(np.ptp(face.span, axis=0).max())
+
+    def attempt(
+        self, pixels: FloatArray, scales: FloatArray, search: float, known: bool = False
+    ) -> Attempt:
+        """Look for every mark about ``pixels`` (M, 2) with ``scales`` (M, 2, 2).
+
+        First roughly, which gives a view with its perspective and lens; then again with the
+        scales of that view, on which the places of corners depend.
+        """
+        rough = self._locate(pixels, scales, search)
+        view, used = self._fit(rough, pixels if known else None)
+        if view is None:
+            return self._failed(rough, used, known)
+        fine = self._refine(view, used)
+        view, used = self._fit(fine, pixels if known else None)
+        if view is None:
+            return self._failed(fine, used, known)
+        text = self._problem(view, used, fine, known)
+        return Attempt(
+            None if text else view, fine.places, tuple(used), fine.reasons, text, fine.looks, known
+        )
+
+    def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Seen:
+        seen = _Seen({}, {}, {})
+        for k, mark in enumerate(self.marks):
+            if mark.kind == "tag":
+                if k in self.tags:
+                    seen.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
+                else:
+                    seen.reasons[k] = "not seen, or its code is seen more than once"
+                continue
+            picture = self._picture(mark)
+            if mark.kind == "picture" and picture is None:
+                seen.reasons[k] = f"its picture {mark.code} is not at hand"
+                continue
+            found = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
+            if found is None:
+                seen.reasons[k] = "beyond the frame or too small"
+            elif found[1] < 0.0 or found[2] < LIKE:
+                seen.reasons[k] = f"covered or not there: a likeness of {found[2]:.2f}"
+            else:
+                seen.places[k] = found[0], found[1] ** 2 * np.eye(2)
+        return seen
+
+    def _refine(self, view: View, used: list[int]) -> _Seen:
+        seen = _Seen({}, {}, {})
+        pixels, scales = view.to_pixels(self.plane), view.scale(self.plane)
+        for k, mark in enumerate(self.marks):
+            if mark.kind == "tag" and k not in self.tags:
+                seen.reasons[k] = "not seen, or its code is seen more than once"
+                continue
+            picture = self._picture(mark)
+            if mark.kind == "picture" and picture is None:
+                seen.reasons[k] = f"its picture {mark.code} is not at hand"
+                continue
+            search = 0.0 if k in used else 0.2
+            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture)
+            problem = _problem(refined, mark)
+            if refined is None or problem:
+                seen.reasons[k] = problem
+            else:
+                seen.places[k] = refined.pixel, refined.covariance
+                seen.looks[k] = refined
+        return seen
+
+    def _picture(self, mark: Mark) -> FloatArray | None:
+        return self.look.pictures.get(mark.code) if mark.kind == "picture" else None
+
+    def tag_map(self) -> FloatArray:
+        """Return a map, plane to pixels, (3, 3), of all tags; of one tag an affine one."""
+        places = np.concatenate([self.plane[k] + _square(self.marks[k]) for k in self.tags])
+        pixels = np.concatenate(list(self.tags.values()))
+        if len(self.tags) > 1:
+            return homography(places, pixels)
+        # One tag is too small to tell perspective over the face.
+        rows = np.column_stack([places, np.ones(len(places))])
+        return np.vstack([np.linalg.lstsq(rows, pixels, rcond=None)[0].T, [0.0, 0.0, 1.0]])
+
+    # -- fitting -----------------------------------------------------------------------
+
+    def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[View | None, list[int]]:
+        """Fit a view to what was seen; what strays is left out, the worst first."""
+        used = list(seen.places)
+        while True:
+            points = self._points(used, seen, known)
+            if points is None:
+                return None, used
+            camera = self.look.camera
+            view = fit_view(self.face, *points, self.look.lens, camera is not None)
+            if not np.isfinite(view.H_norm_plane).all():
+                return None, used
+            miss = view.to_pixels(self.plane[used]) - np.array([seen.places[k][0] for k in used])
+            per_metre = np.abs(np.linalg.det(view.scale(self.plane[used])))
+            image = np.array([0.5 * np.trace(seen.places[k][1]) for k in used])
+            spread = np.sqrt(image + per_metre * SURVEY**2 + 0.3**2)
+            apart = np.linalg.norm(miss, axis=-1)
+            worst = int(np.argmax(apart / spread))
+            if apart[worst] < STRAY * spread[worst] or len(used) <= 4:
+                return view, used
+            seen.reasons[used[worst]] = f"{apart[worst]:.1f} px from where the others put it"
+            del used[worst]
+
+    def _points(
+        self, used: list[int], seen: _Seen, known: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
+        """Points, pixels, covariances; a tag gives four corners, three marks four points."""
+        plane, pixels, covariance = [], [], []
+        per_metre = self._per_metre(used, seen)
+        for k in used:
+            mark, (pixel, spread) = self.marks[k], seen.places[k]
+            survey = (per_metre * SURVEY) ** 2 * np.eye(2)
+            if mark.kind == "tag":
+                plane += list(self.plane[k] + _square(mark))
+                corners = self.tags[k]
+                pixels += list(corners + pixel - _crossing(corners))
+                # Its corners share the survey; each is seen to a fifth of a pixel.
+                covariance += [spread + survey + 0.2**2 * np.eye(2)] * 4
+            else:
+                plane.append(self.plane[k])
+                pixels.append(pixel)
+                covariance.append(spread + survey)
+        if len(plane) < FEWEST:
+            return None
+        points, places = np.array(plane), np.array(pixels)
+        if len(plane) == 3:
+            fourth = self._fourth(used, points, places, known)
+            if fourth is None:
+                return None
+            points = np.vstack([points, fourth[0]])
+            places = np.vstack([places, fourth[1]])
+            covariance.append(fourth[2] ** 2 * np.eye(2))
+        elif np.linalg.matrix_rank(points - points.mean(axis=0), tol=0.1) < 2:
+            return None
+        return points, places, np.array(covariance)
+
+    def _fourth(
+        self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        """A fourth point of three, where it is seen, and its standard deviation, pixels.
+
+        Three marks give an affine map. If it is known about where the marks are, that map
+        corrects the known places; otherwise perspective is unknown up to what a lens of
+        fifty degrees would have at this slant.
+        """
+        if np.linalg.matrix_rank(points - points[0], tol=0.1) < 2:
+            return None
+        rows = np.column_stack([points, np.ones(3)])
+        fourth = points[0] + points[2] - points[1]
+        if known is not None:
+            rest = [k for k in range(len(self.plane)) if k not in used]
+            if not rest:
+                return None
+            far = max(
+                rest, key=lambda k: float(np.linalg.norm(points - self.plane[k], axis=1).min())
+            )
+            shift = np.linalg.solve(rows, places - known[used])
+            place = known[far] + np.append(self.plane[far], 1.0) @ shift
+            return self.plane[far], place, 1.0 + 0.1 * float(np.linalg.norm(place - known[far]))
+        affine = np.linalg.solve(rows, places)
+        lengths = np.linalg.svd(affine[:2], compute_uv=False)
+        slant = np.sqrt(max(1.0 - (lengths[1] / lengths[0]) ** 2, 0.02))
+        extent = float(np.linalg.norm(np.ptp(places, axis=0)))
+        spread = 0.5 * slant * extent**2 / max(self.look.size)
+        return fourth, np.append(fourth, 1.0) @ affine, max(spread, 0.005 * extent)
+
+    def _per_metre(self, used: list[int], seen: _Seen) -> float:
+        if len(used) < 2:
+            return 0.0
+        plane = self.plane[used] - self.plane[used].mean(axis=0)
+        pixels = np.array([seen.places[k][0] for k in used])
+        pixels = pixels - pixels.mean(axis=0)
+        return float(np.sqrt(np.sum(pixels**2) / max(np.sum(plane**2), 1e-12)))
+
+    # -- judging -----------------------------------------------------------------------
+
+    def _failed(self, seen: _Seen, used: list[int], known: bool) -> Attempt:
+        text = self._too_few(used, FEWEST)
+        return Attempt(None, seen.places, tuple(used), seen.reasons, text, seen.looks, known)
+
+    def _too_few(self, used: list[int], needed: int) -> str:
+        total = len(self.marks)
+        if not used:
+            return f"none of its {total} marks was seen"
+        names = ", ".join(self.marks[k].name for k in used)
+        return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
+
+    def _problem(self, view: View, used: list[int], seen: _Seen, known: bool) -> str:
+        """Why a view cannot be believed; empty if it can."""
+        points = sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
+        expected = self.expected(view)
+        needed = max(FEWEST if known or len(self.marks) <= ALONE else ALONE,
+                     int(np.ceil(SHARE * len(expected))))  # fmt: skip
+        if points < needed:
+            return self._too_few(used, needed)
+        scale = view.scale(self.plane[used])
+        per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
+        limit = MISFIT * self.extent * float(per_metre.mean()) + MISFIT_PIXELS
+        if not view.residual <= limit:
+            return f"its marks do not fit together: {view.residual:.1f} px RMS, {limit:.1f} borne"
+        if self._impossible(view):
+            return "its marks lie as no camera sees a plane"
+        return self._misshapen(used, seen) or self._dark(view, used, seen) or self._vague(view)
+
+    def expected(self, view: View) -> list[int]:
+        """Marks that the frame should show."""
+        pixels = view.to_pixels(self.plane)
+        inside = ((pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)).all(axis=1)
+        return np.flatnonzero(inside).tolist()
+
+    def _impossible(self, view: View) -> bool:
+        corners = np.concatenate([self.face.plane(t.corners) for t in self.face.targets])
+        depth = np.column_stack([corners, np.ones(len(corners))]) @ view.H_norm_plane[2]
+        if (depth * depth[0] <= 0.0).any():
+            return True
+        lengths = np.linalg.svd(view.scale(corners), compute_uv=False)
+        if (lengths[:, 1] < FLATTEST * lengths[:, 0]).any():
+            return True
+        return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
+
+    def _misshapen(self, used: list[int], seen: _Seen) -> str:
+        """Marks of another size show another target, or wrong sizes in the plant file."""
+        shapes = [
+            seen.looks[k].shape for k in used if k in seen.looks and self.marks[k].kind != "picture"
+        ]
+        if not shapes:
+            return ""
+        middle = np.median(np.array(shapes), axis=0)
+        if np.abs(np.diag(middle)).max() <= WRONG_SIZE:
+            return ""
+        wide, high = 1.0 + np.diag(middle)
+        return (
+            f"its marks are seen {wide:.2f} times as wide and {high:.2f} times as high as they "
+            "should be: another target, or wrong sizes of the marks"
+        )
+
+    def _dark(self, view: View, used: list[int], seen: _Seen) -> str:
+        """What lies between marks is paint, which is lighter than print."""
+        shown = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
+        if not shown:
+            return ""
+        print_, bare = self._levels(view, shown, seen)
+        low, high = self.plane[used].min(axis=0), self.plane[used].max(axis=0)
+        part = (np.arange(14) + 0.5) / 14
+        places = low + np.stack(np.meshgrid(part, part), axis=-1).reshape(-1, 2) * (high - low)
+        apart = np.linalg.norm(places[:, None] - self.plane[None], axis=-1)
+        places = places[(apart > [1.2 * mark.size for mark in self.marks]).all(axis=1)]
+        values = self._at(view.to_pixels(places))
+        nearest = np.argmin(
+            np.linalg.norm(places[:, None] - self.plane[shown][None], axis=-1), axis=1
+        )
+        level = print_[nearest] + 0.1 * (bare - print_)[nearest]
+        valid = np.isfinite(values)
+        if not valid.any():
+            return ""
+        lighter = float((values[valid] > level[valid]).mean())
+        if lighter >= LIGHTER:
+            return ""
+        return f"only {lighter:.0%} of what lies between its marks is lighter than they are"
+
+    def _levels(self, view: View, shown: list[int], seen: _Seen) -> tuple[FloatArray, FloatArray]:
+        """Brightness of marks' prints and of what is around them, (K,) each."""
+        inner = []
+        for k in shown:
+            box = polygons(self.marks[k])[0]
+            # Of an L and a T the first edge is an outer one; half a stroke within is print.
+            step = box[1] - box[0]
+            across = np.array([step[1], -step[0]]) / max(float(np.linalg.norm(step)), 1e-9)
+            depth = (
+                0.5 * self.marks[k].stroke if self.marks[k].stroke else 0.02 * self.marks[k].size
+            )
+            inner.append(self.plane[k] + 0.5 * (box[0] + box[1]) + depth * across)
+        dark = self._at(view.to_pixels(np.array(inner)))
+        contrast = np.array([seen.looks[k].contrast for k in shown])
+        dark = np.where(np.isfinite(dark), dark, 0.0)
+        return dark, dark / np.clip(contrast, 0.05, 1.0)
+
+    def _at(self, pixels: FloatArray) -> FloatArray:
+        """The frame's values at pixels (N, 2), NaN beyond it."""
+        height, width = self.look.grey.shape
+        column, row = np.round(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+        values = self.look.grey[np.where(inside, row, 0), np.where(inside, column, 0)]
+        return np.where(inside, values.astype(np.float64), np.nan)
+
+    def _vague(self, view: View) -> str:
+        for target in self.face.targets:
+            covariance = view.covariance_at(self.face.plane(target.center))
+            deviation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+            limit = VAGUE * max(target.width, target.height)
+            if not deviation <= limit:
+                return (
+                    f"the marks that were seen tell where {target.name} is to {deviation:.3f} m "
+                    f"only; {limit:.3f} m is needed"
+                )
+        return ""
+
+
+def _problem(refined: Refined | None, mark: Mark) -> str:
+    """Why what was found about a mark's place is not the mark; empty if it is."""
+    if refined is None:
+        return "beyond the frame or too small"
+    if refined.explained < EXPLAINED:
+        return f"covered or not there: its drawing explains {100 * refined.explained:.0f} %"
+    if mark.kind == "picture":
+        return ""
+    if refined.contrast > CONTRAST:
+        return f"too faint: {100 * refined.contrast:.0f} % of its surroundings"
+    if np.abs(refined.shape).max() > MISSHAPEN:
+        return "what is there is not of its size or shape"
+    return ""
+
+
+def _square(mark: Mark) -> FloatArray:
+    """Corners of a tag from the upper left, metres from its centre, (4, 2)."""
+    cos, sin = np.cos(mark.turn), np.sin(mark.turn)
+    box = 0.5 * mark.size * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+    return np.asarray(box @ np.array([[cos, sin], [-sin, cos]]))
+
+
+def _crossing(corners: FloatArray) -> FloatArray:
+    """Where the diagonals of four corners cross: the centre of a square, in perspective too."""
+    a, b = corners[2] - corners[0], corners[3] - corners[1]
+    across = a[0] * b[1] - a[1] * b[0]
+    if abs(across) < 1e-9:
+        return np.asarray(corners.mean(axis=0))
+    gap = corners[1] - corners[0]
+    return np.asarray(corners[0] + (gap[0] * b[1] - gap[1] * b[0]) / across * a)
