@@ -16,7 +16,16 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-PACKAGES = ("heliotrope", "numpy", "numba", "scipy", "pvlib", "pandas", "pyarrow")
+PACKAGES = (
+    "heliotrope",
+    "numpy",
+    "opencv-python-headless",
+    "numba",
+    "scipy",
+    "pvlib",
+    "pandas",
+    "pyarrow",
+)
 #: Others that take more than this part of the cores make a measurement doubtful.
 BUSY = 0.1
 

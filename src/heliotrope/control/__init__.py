@@ -1,0 +1,1 @@
+"""Three tiers: the plant, its clusters, and the links between them."""
