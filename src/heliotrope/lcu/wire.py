@@ -124,8 +124,8 @@ def _refusal(code: str, value: "Any") -> str:
         if not isinstance(value, (int, bool)):
             return f"{value!r} is not a whole number"
         return "" if low <= value <= high else f"{value} is not within {low} to {high}"
-    if not isinstance(value, (int, float)) or value != value:
-        return f"{value!r} is not a number"
+    if not isinstance(value, int) and not (isinstance(value, float) and math.isfinite(value)):
+        return f"{value!r} is not a finite number"
     limit = LARGEST_SINGLE if code == "f" else LARGEST_DOUBLE
     return "" if -limit <= value <= limit else f"{value} is not within {-limit} to {limit}"
 
@@ -170,6 +170,11 @@ def fits(number: int, size: int) -> bool:
     return size == struct.calcsize("<" + codes)
 
 
+def finite(values: "tuple[Any, ...]") -> bool:
+    """Return whether no number is infinite or none at all."""
+    return not any(isinstance(value, float) and not math.isfinite(value) for value in values)
+
+
 def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
     """Read a message's payload, head included.
 
@@ -187,10 +192,7 @@ def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
         head = struct.unpack("<" + codes[:-1], payload[:size])
         return tuple(head) + (bytes(payload[size:]),)
     values = struct.unpack("<" + codes, payload)
-    for value in values:
-        if isinstance(value, float) and not math.isfinite(value):
-            return None
-    return values
+    return values if finite(values) else None
 
 
 class Frame:

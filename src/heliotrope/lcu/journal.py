@@ -1,0 +1,451 @@
+"""What a local controller keeps through a loss of power.
+
+Two kinds of records lie in NOR flash, each with a counter and a CRC-32, each written once into
+erased flash and never touched again until its block is erased:
+
+*What is stored*, in two slots of a block each. A new record goes to the slot that does not hold
+the present one, so that one is whole at every instant. Armature, drives and the like are kept as
+the bytes in which they came: single precision cannot change them, and their checksum is the
+sender's.
+
+*What changes often*, in a ring of the other blocks: step counts, aim, state, boots. A record is
+appended where flash is blank; a full block is left for the next one, which was erased before, so
+wear is even and there is always room for a last record when the supply fails. The block with
+the newest record is never erased.
+
+A cut at any byte of a write or an erasure leaves the old or the new record: what was cut fails its
+checksum and is passed over (2^-32 aside).
+
+**Step counts.** Before the first step away from rest, and whenever the next steps would lead
+farther than ``STRIDE`` from the counts in flash, a record "moving" is written; at rest, a record
+"rest". If the newest one says "moving" after a reset, the true counts are within ``STRIDE`` of it;
+``doubt`` says so until ``zero``, and adds up over further cuts. A brown-out detector that calls
+``brown_out`` prevents that.
+
+The storage is injected::
+
+    block_size, blocks      bytes of a block, number of blocks: two, and two or more for the ring
+    read(offset, size)      -> bytes
+    write(offset, data)     clears bits, sets none; here each byte once after an erasure
+    erase(block)            to 0xFF
+"""
+
+import struct
+from binascii import crc32
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
+    from typing import Any, Protocol
+
+    class Storage(Protocol):
+        """NOR flash; see the head of this module."""
+
+        block_size: int
+        blocks: int
+
+        def read(self, offset: int, size: int) -> bytes:
+            """Return bytes."""
+
+        def write(self, offset: int, data: bytes) -> None:
+            """Clear the bits that are clear in ``data``."""
+
+        def erase(self, block: int) -> None:
+            """Set all bits of a block."""
+
+
+#: What is stored: name and ``struct`` codes, little-endian. The place in this table, from 1, is
+#: the item's number in QUERY_STORED; the order is part of the layout in flash.
+ITEMS = (
+    ("address", "H"),
+    ("key_id", "I"),
+    ("edition", "I"),
+    ("location", "ddd"),
+    ("armature", "18d"),
+    ("drive_primary", "B10d"),
+    ("drive_secondary", "B10d"),
+    ("limits_primary", "iiIIH"),
+    ("limits_secondary", "iiIIH"),
+    ("biases", "ff"),
+    ("stow", "ii"),
+    ("defocus", "ff"),
+    ("standby", "fff"),
+)
+SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
+CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
+
+#: Which item a message of class KEY sets; of two names, the one of its axis.
+TARGETS = {
+    "SET_ARMATURE": ("armature",),
+    "SET_DRIVES": ("drive_primary", "drive_secondary"),
+    "SET_BIAS": ("biases",),
+    "SET_POSITION": ("location",),
+    "SET_ADDRESS": ("address",),
+    "SET_STOW": ("stow",),
+    "SET_LIMITS": ("limits_primary", "limits_secondary"),
+    "SET_DEFOCUS": ("defocus",),
+    "ZERO": (),
+}
+
+MAGIC, LAYOUT = 0x48, 1
+SLOT_HEAD = "<BBHI"  # magic, layout, which items are there, counter
+SLOT_HEAD_SIZE = 8
+SLOT_SIZE = SLOT_HEAD_SIZE + sum(SIZE_OF.values()) + 4
+
+#: counter, primary, secondary, aim, state, flags, boots; then the CRC.
+RING_RECORD = "<Iii12sBBH"
+RING_SIZE = 32
+FIRST_RING_BLOCK = 2
+BLANK = b"\xff" * RING_SIZE
+REST, AIM = 0x80, 0x40  # flags; the lower bits: three of doubts, three of boots
+
+#: Greatest distance of the true step counts from those in flash, steps.
+STRIDE = 1000
+#: From so many unhealthy boots in a row on, the controller stays in FAULT.
+BOOT_LIMIT = 5
+#: A boot is healthy after this time, ms; the caller then says so.
+HEALTHY_MS = 60000
+MOST = 7
+
+
+def items_of(name: str, payload: bytes) -> "dict[str, bytes]":
+    """Return what a message of class KEY sets, its edition included.
+
+    Parameters
+    ----------
+    name
+        Name of the message.
+    payload
+        Its payload with head; of a length that fits, as ``wire`` makes sure.
+
+    Raises
+    ------
+    ValueError
+        A message that stores nothing, or an axis that is not 0 or 1.
+    """
+    if name not in TARGETS:
+        raise ValueError(f"{name}: stores nothing")
+    items = {"edition": payload[8:12]}
+    targets = TARGETS[name]
+    rest = payload[12:]
+    if len(targets) == 2:
+        axis = rest[0]
+        if axis > 1:
+            raise ValueError(f"{name}: axis {axis}: must be 0 (primary) or 1 (secondary)")
+        items[targets[axis]] = rest[1:]
+    elif name == "SET_ADDRESS":
+        items["address"] = rest[4:]
+    elif targets:
+        items[targets[0]] = rest
+    return items
+
+
+def _newer(counter: int, than: int) -> bool:
+    return 0 < ((counter - than) & 0xFFFFFFFF) < 0x80000000
+
+
+class Journal:
+    """The journal of one local controller. ``load`` comes first, then ``boot``.
+
+    Parameters
+    ----------
+    storage
+        NOR flash; see the head of this module.
+    stride
+        Greatest distance of the true step counts from those in flash, steps.
+
+    Attributes
+    ----------
+    items
+        What is stored, as bytes, by name; a name that was never stored is not there.
+    damaged
+        Whether flash held something but no whole record of what is stored.
+    primary, secondary
+        Step counts of the newest record.
+    rest
+        Whether the newest record says that nothing moved.
+    doubts
+        How often the counts may have gone wrong by up to ``stride``; 7 for 7 times or more, and
+        where there was no record of counts at all.
+    state
+        State of the newest record.
+    aim
+        Aim of the newest record as bytes (three ``f``), or None.
+    boots
+        Boots in all, modulo 65536.
+    unhealthy
+        Boots in a row of which none reached a healthy minute; 7 stands for 7 or more.
+    """
+
+    def __init__(self, storage: "Storage", stride: int = STRIDE) -> None:
+        if storage.blocks < FIRST_RING_BLOCK + 2 or storage.block_size < SLOT_SIZE:
+            raise ValueError(
+                f"journal: {storage.blocks} blocks of {storage.block_size} bytes: needs at least "
+                f"{FIRST_RING_BLOCK + 2} of {SLOT_SIZE}"
+            )
+        self.stride = stride
+        self._storage = storage
+        self._places = storage.block_size // RING_SIZE
+        self._clear()
+
+    def _clear(self) -> None:
+        self.items: dict[str, bytes] = {}
+        self.damaged = False
+        self.primary = self.secondary = 0
+        self.rest = True
+        self.doubts = MOST
+        self.state = 0
+        self.aim: bytes | None = None
+        self.boots = 0
+        self.unhealthy = 0
+        self._slot = 1  # so that the first record goes to slot 0
+        self._slot_counter = 0
+        self._counter = 0
+        self._newest = FIRST_RING_BLOCK  # block of the newest record
+        self._block = FIRST_RING_BLOCK
+        self._place = self._places  # of the next record; beyond the last: none left
+        self._next_ready = False
+
+    # What is stored.
+
+    def load(self) -> "dict[str, bytes]":
+        """Read the newest whole records, and return ``items``. Nothing is written."""
+        self._clear()
+        found = False
+        for slot in (0, 1):
+            data = self._storage.read(slot * self._storage.block_size, SLOT_SIZE)
+            magic, layout, mask, counter = struct.unpack(SLOT_HEAD, data[:SLOT_HEAD_SIZE])
+            whole = struct.unpack("<I", data[-4:])[0] == crc32(data[:-4])
+            if not whole or magic != MAGIC or layout != LAYOUT:
+                self.damaged = self.damaged or data != b"\xff" * SLOT_SIZE
+            elif not found or _newer(counter, self._slot_counter):
+                found = True
+                self._slot, self._slot_counter = slot, counter
+                self.items = self._split(mask, data)
+        self.damaged = self.damaged and not found
+        self._load_ring()
+        return self.items
+
+    def _split(self, mask: int, data: bytes) -> "dict[str, bytes]":
+        items = {}
+        start = SLOT_HEAD_SIZE
+        for place, (name, _) in enumerate(ITEMS):
+            if mask >> place & 1:
+                items[name] = bytes(data[start : start + SIZE_OF[name]])
+            start += SIZE_OF[name]
+        return items
+
+    def store(self, changes: "dict[str, bytes]") -> None:
+        """Store items, all of them or, at a cut, none; those not named stay as they are.
+
+        Raises
+        ------
+        ValueError
+            An unknown name, or a wrong length.
+        OSError
+            Flash does not hold what was written. The old record is then still whole.
+        """
+        for name in changes:
+            if name not in SIZE_OF or len(changes[name]) != SIZE_OF[name]:
+                raise ValueError(f"journal: {len(changes[name])} bytes for item {name!r}")
+        items = dict(self.items)
+        items.update(changes)
+        if items == self.items:
+            return
+        slot = 1 - self._slot
+        counter = (self._slot_counter + 1) & 0xFFFFFFFF
+        mask = 0
+        body = b""
+        for place, (name, _) in enumerate(ITEMS):
+            mask |= (name in items) << place
+            body += items.get(name, bytes(SIZE_OF[name]))
+        data = struct.pack(SLOT_HEAD, MAGIC, LAYOUT, mask, counter) + body
+        data += struct.pack("<I", crc32(data))
+        offset = slot * self._storage.block_size
+        self._storage.erase(slot)
+        self._storage.write(offset, data)
+        if self._storage.read(offset, len(data)) != data:
+            raise OSError(
+                f"journal: block {slot} does not hold what was written; replace the board"
+            )
+        self.items = items
+        self.damaged = False
+        self._slot, self._slot_counter = slot, counter
+
+    def numbers(self, name: str) -> "tuple[Any, ...] | None":
+        """Return an item's numbers, None if it was never stored."""
+        data = self.items.get(name)
+        return None if data is None else struct.unpack(CODES_OF[name], data)
+
+    def checksum(self, name: str) -> int:
+        """Return the CRC-32 of an item's bytes, 0 if it was never stored."""
+        data = self.items.get(name)
+        return 0 if data is None else crc32(data)
+
+    # What changes often.
+
+    @property
+    def doubt(self) -> int:
+        """By how many steps the counts may be wrong; -1 if nothing is known of them."""
+        return self.doubts * self.stride if self.doubts < MOST else -1
+
+    @property
+    def looping(self) -> bool:
+        """Whether the controller boots again and again without a healthy minute."""
+        return self.unhealthy >= BOOT_LIMIT
+
+    def boot(self) -> None:
+        """Count a boot, and a doubt if the last record says that something moved."""
+        if not self.rest:
+            self.doubts = min(self.doubts + 1, MOST)
+        self.boots = (self.boots + 1) & 0xFFFF
+        self.unhealthy = min(self.unhealthy + 1, MOST)
+        self._append(self.primary, self.secondary, True)
+
+    def healthy(self) -> None:
+        """Say that the controller ran well for ``HEALTHY_MS``."""
+        if self.unhealthy:
+            self.unhealthy = 0
+            self._append(self.primary, self.secondary, self.rest)
+
+    def before_steps(
+        self, primary: int, secondary: int, next_primary: int, next_secondary: int
+    ) -> None:
+        """Make sure, before steps are emitted, that flash will be right to within ``stride``.
+
+        Parameters
+        ----------
+        primary, secondary
+            Present counts.
+        next_primary, next_secondary
+            Counts after the steps that may now be emitted.
+
+        Raises
+        ------
+        ValueError
+            More than ``stride`` steps at once.
+        """
+        if self._far(next_primary, primary) or self._far(next_secondary, secondary):
+            raise ValueError(
+                f"journal: from {primary}, {secondary} to {next_primary}, {next_secondary}: "
+                f"at most {self.stride} steps at once"
+            )
+        far = self._far(next_primary, self.primary) or self._far(next_secondary, self.secondary)
+        if self.rest or far:
+            self._append(primary, secondary, False)
+
+    def _far(self, one: int, other: int) -> bool:
+        return abs(one - other) > self.stride
+
+    def at_rest(self, primary: int, secondary: int) -> None:
+        """Say that nothing moves, at these counts. Erases the next block in time."""
+        if not (self.rest and (primary, secondary) == (self.primary, self.secondary)):
+            self._append(primary, secondary, True)
+        if not self._next_ready and self._place > self._places // 2:
+            self._erase_next()
+
+    def brown_out(self, primary: int, secondary: int) -> bool:
+        """Write the last record while the supply falls: no erasure, one write of 32 bytes.
+
+        Returns whether it was written; after ``boot`` there always is room.
+        """
+        if self._place >= self._places and not self._next_ready:
+            return False
+        self._advance()
+        return self._write(primary, secondary, True)
+
+    def zero(self, primary: int, secondary: int) -> None:
+        """Declare the present counts: no doubt is left."""
+        self.doubts = 0
+        self._append(primary, secondary, True)
+
+    def note(self, state: int, aim: "bytes | None") -> None:
+        """Keep state and aim: a new state at once, a new aim with the next record."""
+        if aim is not None and len(aim) != 12:
+            raise ValueError(f"journal: {len(aim)} bytes for an aim, 12 needed")
+        changed = state != self.state
+        self.state, self.aim = state, aim
+        if changed:
+            self._append(self.primary, self.secondary, self.rest)
+
+    # The ring.
+
+    def _offset(self, block: int, place: int) -> int:
+        return block * self._storage.block_size + place * RING_SIZE
+
+    def _following(self, block: int) -> int:
+        return block + 1 if block + 1 < self._storage.blocks else FIRST_RING_BLOCK
+
+    def _load_ring(self) -> None:
+        newest = None
+        for block in range(FIRST_RING_BLOCK, self._storage.blocks):
+            for place in range(self._places):
+                data = self._storage.read(self._offset(block, place), RING_SIZE)
+                if data == BLANK or struct.unpack("<I", data[28:])[0] != crc32(data[:28]):
+                    continue
+                counter = struct.unpack("<I", data[:4])[0]
+                if newest is None or _newer(counter, self._counter):
+                    newest = data
+                    self._counter, self._block = counter, block
+        if newest is None:
+            return
+        _, self.primary, self.secondary, aim, self.state, flags, self.boots = struct.unpack(
+            RING_RECORD, newest[:28]
+        )
+        self._newest = self._block
+        self.rest = bool(flags & REST)
+        self.aim = aim if flags & AIM else None
+        self.doubts, self.unhealthy = flags >> 3 & MOST, flags & MOST
+        while self._place > 0 and self._blank(self._block, self._place - 1):
+            self._place -= 1
+
+    def _blank(self, block: int, place: int) -> bool:
+        return self._storage.read(self._offset(block, place), RING_SIZE) == BLANK
+
+    def _erase_next(self) -> None:
+        following = self._following(self._block)
+        if following == self._newest and following != self._block:
+            raise OSError("journal: the ring does not hold what was written; replace the board")
+        self._storage.erase(following)
+        self._next_ready = True
+
+    def _advance(self) -> None:
+        if self._place >= self._places:
+            self._block = self._following(self._block)
+            self._place = 0
+            self._next_ready = False
+
+    def _append(self, primary: int, secondary: int, rest: bool) -> None:
+        for _ in range(self._places):
+            if self._place >= self._places and not self._next_ready:
+                self._erase_next()
+            self._advance()
+            if self._write(primary, secondary, rest):
+                # Room for the next record must be there before it is needed in a hurry.
+                if self._place >= self._places and not self._next_ready:
+                    self._erase_next()
+                return
+        raise OSError("journal: the ring does not hold what was written; replace the board")
+
+    def _write(self, primary: int, secondary: int, rest: bool) -> bool:
+        """Write one record, and return whether flash holds it."""
+        self._counter = (self._counter + 1) & 0xFFFFFFFF
+        flags = (REST if rest else 0) | (AIM if self.aim is not None else 0)
+        flags |= self.doubts << 3 | self.unhealthy
+        data = struct.pack(
+            RING_RECORD, self._counter, primary, secondary, self.aim or bytes(12),
+            self.state, flags, self.boots,
+        )  # fmt: skip
+        data += struct.pack("<I", crc32(data))
+        offset = self._offset(self._block, self._place)
+        self._place += 1
+        self._storage.write(offset, data)
+        if self._storage.read(offset, RING_SIZE) != data:
+            return False
+        self.primary, self.secondary, self.rest = primary, secondary, rest
+        self._newest = self._block
+        return True
+
+
+def item_name(number: int) -> str:
+    """Return the name of an item by its number in QUERY_STORED, "" if there is none."""
+    return ITEMS[number - 1][0] if 1 <= number <= len(ITEMS) else ""
