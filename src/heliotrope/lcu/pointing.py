@@ -1,0 +1,411 @@
+"""Pointing: joint angles at which an armature sends sunlight to an aim point.
+
+The law is that of ``heliotrope.mechanism.tracking``, written for a board with 32-bit
+floats: R(a, θ₁) R(b, θ₂) n₀ = v is met where z = R(b, θ₂) n₀ has z·a = v·a and z·b = n₀·b
+(second Paden-Kahan subproblem; two such z, hence two branches). The vertex moves with the
+angles and v with the vertex: fixed point first, damped Gauss-Newton where it is slow.
+
+So that single precision keeps its digits, all points are taken relative to the primary
+axis's origin, lengths across an axis are computed from the part across and never as
+1 − cosine², and angles by atan2.
+"""
+
+import math
+
+from .vectors import about, across, add, cross, dot, finite, minus, norm, times, turn_between, unit
+
+#: How a solution ended: as in ``heliotrope.mechanism.tracking.Status``.
+OK, UNREACHABLE, STOPPED, NOT_CONVERGED, DEGENERATE = range(5)
+
+#: Largest miss of the beam at its aim, m, where precision allows it.
+TOLERANCE = 2e-10
+#: The fixed point is left for Newton when a step gains less than this factor.
+SLOW = 0.3
+STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
+#: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
+DEGENERATE_LIMIT = 1e-6
+#: Angles this far (rad) beyond a stop count as on it.
+STOP_SLACK = 1e-6
+
+
+def epsilon(one: float) -> float:
+    """Rounding of the numbers that ``one`` (1.0, of their type) belongs to."""
+    step = one
+    while one + 0.5 * step != one:
+        step = 0.5 * step
+    return step
+
+
+def into_stops(theta: float, low: float, high: float, near: float) -> tuple[float, bool]:
+    """(angle, inside): theta + 2πk within the stops nearest to ``near``, or the nearer stop."""
+    turn = 2.0 * math.pi
+    theta += turn * math.floor((near - theta) / turn + 0.5)
+    if theta < low - STOP_SLACK:
+        theta += turn * math.ceil((low - STOP_SLACK - theta) / turn)
+    elif theta > high + STOP_SLACK:
+        theta -= turn * math.ceil((theta - high - STOP_SLACK) / turn)
+    if low - STOP_SLACK <= theta <= high + STOP_SLACK:
+        return min(max(theta, low), high), True
+    above = theta - turn * math.floor((theta - high) / turn)
+    if above - high < low - (above - turn):
+        return high, False
+    return low, False
+
+
+class Pose:
+    """A solution of one branch.
+
+    ``status``; ``angles`` of the joints, rad; ``residual``, angle of the normal from where
+    it should be, rad; ``branch`` −1 or 1.
+    """
+
+    def __init__(self, branch: int) -> None:
+        self.branch = branch
+        self.status = DEGENERATE
+        self.angles = [0.0, 0.0]
+        self.residual = 0.0
+
+
+class Pointing:
+    """Tracking with one armature.
+
+    Parameters
+    ----------
+    numbers
+        18: primary axis, point on it, secondary axis, point on it, vertex, normal, at zero
+        joint angles; ENU, m. As of ``heliotrope.mechanism.armature``.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, a direction is zero, the axes are parallel or the normal
+        lies along the secondary axis.
+    """
+
+    def __init__(self, numbers: tuple[float, ...]) -> None:
+        if len(numbers) != 18 or not finite(numbers):
+            raise ValueError("armature: give 18 finite numbers")
+        vectors = [(numbers[i], numbers[i + 1], numbers[i + 2]) for i in range(0, 18, 3)]
+        for i in (0, 2, 5):
+            if abs(norm(vectors[i]) - 1.0) > 1e-3:
+                raise ValueError("armature: axes and normal must be of length 1")
+        self.origin = vectors[1]
+        self.one = numbers[0] * 0.0 + 1.0
+        self.eps = epsilon(self.one)
+        self.axis_1, self.axis_2, self.normal = unit(vectors[0]), unit(vectors[2]), unit(vectors[5])
+        self.elbow = minus(vectors[3], vectors[1])
+        self.arm = minus(vectors[4], vectors[3])
+        self.tolerance = max(TOLERANCE, 8.0 * self.eps * (norm(self.elbow) + norm(self.arm)))
+        a, b, u = self.axis_1, self.axis_2, self.normal
+        self.c = cross(a, b)
+        self.b_flat = across(b, a)
+        flat = across(u, b)
+        if not (norm(self.c) > 1e-3 and norm(flat) > 1e-6):
+            raise ValueError("armature: axes parallel, or normal along the secondary axis")
+        self.ab, self.ub = dot(a, b), dot(u, b)
+        self.inverse = 1.0 / dot(self.c, self.c)
+        scale = 1.0 / dot(flat, flat)
+        e, f = times(scale, cross(b, u)), times(scale, flat)
+        self.sines = (dot(e, a), dot(e, self.c))
+        self.cosines = (dot(f, a), dot(f, self.c))
+        self.found = (Pose(-1), Pose(1))
+
+    def turned(
+        self, turn: tuple[float, float, float, float], u: tuple[float, float, float]
+    ) -> tuple[float, float, float]:
+        """Vector ``u`` of the mirror at turn (sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
+        return about(self.axis_1, turn[0], turn[1], about(self.axis_2, turn[2], turn[3], u))
+
+    def vertex(self, turn: tuple[float, float, float, float]) -> tuple[float, float, float]:
+        """Vertex from the primary origin, m, at a turn."""
+        arm = add(self.elbow, about(self.axis_2, turn[2], turn[3], self.arm))
+        return about(self.axis_1, turn[0], turn[1], arm)
+
+    def solve(
+        self,
+        sun: tuple[float, float, float],
+        aim: tuple[float, float, float],
+        stops: list[list[float]],
+        near: list[float],
+    ) -> Pose:
+        """Return the pose that sends light from the sun to the aim.
+
+        Of the two branches the one within the stops that moves least; if none reaches the
+        aim, the nearest pose, whose status and residual say so. The pose is overwritten by
+        the next call.
+
+        Parameters
+        ----------
+        sun
+            To the sun, ENU; of length near 1.
+        aim
+            ENU, m.
+        stops
+            [[low, high] of θ₁, the same of θ₂], rad; may be infinite.
+        near
+            Joint angles now, rad.
+        """
+        self.solve_branch(self.found[0], sun, aim, stops, near)
+        self.solve_branch(self.found[1], sun, aim, stops, near)
+        first, second = self.found
+        if first.status == OK and second.status == OK:
+            return first if _motion(first, near) <= _motion(second, near) else second
+        if OK in (first.status, second.status):
+            return first if first.status == OK else second
+        if first.status == DEGENERATE or second.residual < first.residual:
+            return second
+        return first
+
+    def solve_branch(
+        self,
+        pose: Pose,
+        sun: tuple[float, float, float],
+        aim: tuple[float, float, float],
+        stops: list[list[float]],
+        near: list[float],
+    ) -> None:
+        """Solve one branch into ``pose``, within the stops."""
+        s, p = unit(sun), minus(aim, self.origin)
+        turn = self._fixed_point(pose, s, p)
+        if pose.status == DEGENERATE:
+            pose.residual = math.pi
+            return
+        one, inside_1 = into_stops(math.atan2(turn[0], turn[1]), stops[0][0], stops[0][1], near[0])
+        two, inside_2 = into_stops(math.atan2(turn[2], turn[3]), stops[1][0], stops[1][1], near[1])
+        if inside_1 and inside_2:
+            pose.angles[0], pose.angles[1] = one, two
+            pose.residual = self._residual(s, p, turn)
+            return
+        pose.status, pose.residual = STOPPED, math.pi
+        for axis in (0, 1):
+            for held in stops[axis]:
+                if math.isfinite(held):
+                    self._along_stop(pose, s, p, axis, held, stops, near)
+
+    def _wanted(
+        self,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        m: tuple[float, float, float],
+    ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+        """(bisector of s and the way from m to p, that way, its length); length 0 if none."""
+        way = minus(p, m)
+        distance = norm(way)
+        if not distance > DEGENERATE_LIMIT:
+            return way, way, 0.0
+        way = times(1.0 / distance, way)
+        v = add(s, way)
+        size = norm(v)
+        if not size > DEGENERATE_LIMIT:
+            return way, way, 0.0
+        return times(1.0 / size, v), way, distance
+
+    def _direction(
+        self, v: tuple[float, float, float], sign: float
+    ) -> tuple[bool, tuple[float, float, float, float]]:
+        """Turn the normal to v: (whether it got there, turn); in the dead cone the nearest."""
+        va = dot(v, self.axis_1)
+        v_flat = across(v, self.axis_1)
+        height = (self.ub - va * self.ab) * math.sqrt(self.inverse)
+        radius = norm(v_flat)
+        # γ²|a × b|² = (|v across a| − h)(|v across a| + h): exact near the axis too.
+        square = (radius - height) * (radius + height)
+        reached = square >= -4.0 * self.eps * (radius + abs(height) + self.eps)
+        wanted = va
+        if not reached:
+            # The nearest direction on the edge has the largest |z·a| on the circle z·b = u·b.
+            edge = math.sqrt(max(0.0, 1.0 - self.ub * self.ub) / self.inverse)
+            wanted = self.ab * self.ub
+            wanted += edge if va >= self.ab * self.ub else -edge
+        along_a = (wanted - self.ab * self.ub) * self.inverse
+        along_b = (self.ub - self.ab * wanted) * self.inverse
+        away = sign * math.sqrt(max(0.0, square) * self.inverse)
+        sine_2 = along_a * self.sines[0] + away * self.sines[1]
+        cosine_2 = along_a * self.cosines[0] + away * self.cosines[1]
+        z_flat = add(times(along_b, self.b_flat), times(away, self.c))
+        sine_1 = dot(self.axis_1, cross(z_flat, v_flat))
+        cosine_1 = dot(z_flat, v_flat)
+        size_1 = math.sqrt(sine_1 * sine_1 + cosine_1 * cosine_1)
+        size_2 = math.sqrt(sine_2 * sine_2 + cosine_2 * cosine_2)
+        if not size_1 > self.eps * self.eps:
+            return reached, (0.0, self.one, sine_2 / size_2, cosine_2 / size_2)
+        return reached, (sine_1 / size_1, cosine_1 / size_1, sine_2 / size_2, cosine_2 / size_2)
+
+    def _fixed_point(
+        self, pose: Pose, s: tuple[float, float, float], p: tuple[float, float, float]
+    ) -> tuple[float, float, float, float]:
+        """Solve without stops; sets the pose's status and returns the turn."""
+        turn = (0.0, self.one, 0.0, self.one)
+        m = self.vertex(turn)
+        before = math.inf
+        for step in range(STEPS):
+            v, way, distance = self._wanted(s, p, m)
+            if distance == 0.0:
+                pose.status = DEGENERATE
+                return turn
+            reached, turn = self._direction(v, pose.branch)
+            new = self.vertex(turn)
+            moved = minus(new, m)
+            if reached:
+                # The ray leaves parallel to the old way: motion along it misses nothing.
+                moved = across(moved, way)
+            m = new
+            size = norm(moved)
+            if size <= self.tolerance:
+                pose.status = OK if reached or self._strikes(s, p, turn) else UNREACHABLE
+                return turn
+            if step >= 1 and not size < SLOW * before:
+                return self._newton(pose, s, p, turn)
+            before = size
+        return self._newton(pose, s, p, turn)
+
+    def _gap(
+        self,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        turn: tuple[float, float, float, float],
+    ) -> tuple[tuple[float, float, float], tuple[float, float, float], float]:
+        """(normal − bisector, way, distance) at a turn."""
+        v, way, distance = self._wanted(s, p, self.vertex(turn))
+        return minus(self.turned(turn, self.normal), v), way, distance
+
+    def _residual(
+        self,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        turn: tuple[float, float, float, float],
+    ) -> float:
+        """Angle of the normal from the bisector at a turn, rad."""
+        gap, _, distance = self._gap(s, p, turn)
+        if distance == 0.0:
+            return math.pi
+        half = min(self.one, 0.5 * norm(gap))
+        return 2.0 * math.atan2(half, math.sqrt((1.0 - half) * (1.0 + half)))
+
+    def _strikes(
+        self,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        turn: tuple[float, float, float, float],
+    ) -> bool:
+        """Whether the beam at a turn passes the aim within tolerance and rounding."""
+        gap, _, distance = self._gap(s, p, turn)
+        # A normal that is off by x sends the beam off by 2x.
+        limit = self.tolerance + 16.0 * self.eps * distance
+        return distance > 0.0 and 2.0 * distance * norm(gap) <= limit
+
+    def _column(
+        self,
+        p: tuple[float, float, float],
+        s: tuple[float, float, float],
+        turn: tuple[float, float, float, float],
+        axis: int,
+    ) -> tuple[float, float, float]:
+        """d(normal − bisector) by a joint angle: the screw formula."""
+        m, n = self.vertex(turn), self.turned(turn, self.normal)
+        w, arm = self.axis_1, m
+        if axis == 1:
+            w = about(self.axis_1, turn[0], turn[1], self.axis_2)
+            arm = minus(m, about(self.axis_1, turn[0], turn[1], self.elbow))
+        v, way, distance = self._wanted(s, p, m)
+        change = times(-1.0 / distance, across(cross(w, arm), way))
+        # |s + t| = 2 v·t for unit vectors.
+        return minus(cross(w, n), times(0.5 / dot(v, way), across(change, v)))
+
+    def _newton(
+        self,
+        pose: Pose,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        turn: tuple[float, float, float, float],
+    ) -> tuple[float, float, float, float]:
+        """Levenberg-damped Gauss-Newton on |normal − bisector|² from a turn."""
+        damping = 16.0 * self.eps
+        gap, _, distance = self._gap(s, p, turn)
+        cost = dot(gap, gap) if distance > 0.0 else math.inf
+        pose.status = NOT_CONVERGED
+        for _ in range(NEWTON_STEPS):
+            if not math.isfinite(cost):
+                return turn
+            if self._strikes(s, p, turn):
+                pose.status = OK
+                return turn
+            first, second = self._column(p, s, turn, 0), self._column(p, s, turn, 1)
+            h00, h01, h11 = dot(first, first), dot(first, second), dot(second, second)
+            e0, e1 = dot(first, gap), dot(second, gap)
+            before = cost
+            for _ in range(TRIALS):
+                lift = damping * (h00 + h11)
+                d00, d11 = h00 + lift, h11 + lift
+                determinant = d00 * d11 - h01 * h01
+                if determinant > 0.0:
+                    one = (h01 * e1 - d11 * e0) / determinant
+                    two = (h01 * e0 - d00 * e1) / determinant
+                    trial = _advanced(turn, one, two)
+                    new, _, distance = self._gap(s, p, trial)
+                    if distance > 0.0 and dot(new, new) < cost:
+                        turn, gap, cost = trial, new, dot(new, new)
+                        break
+                damping = 10.0 * damping
+            damping = max(0.1 * damping, self.eps)
+            if not cost < before * (1.0 - 64.0 * self.eps):
+                # A minimum with a remainder: no pose near here sends the beam to p.
+                pose.status = OK if self._strikes(s, p, turn) else UNREACHABLE
+                return turn
+        return turn
+
+    def _along_stop(
+        self,
+        pose: Pose,
+        s: tuple[float, float, float],
+        p: tuple[float, float, float],
+        axis: int,
+        held: float,
+        stops: list[list[float]],
+        near: list[float],
+    ) -> None:
+        """Nearest pose with joint ``axis`` held at a stop; kept if better than the pose's."""
+        other = 1 - axis
+        low, high = stops[other]
+        free = min(max(near[other], low), high)
+        for _ in range(STEPS):
+            angles = (held, free) if axis == 0 else (free, held)
+            v, _, distance = self._wanted(s, p, self.vertex(turn_of(angles[0], angles[1])))
+            if distance == 0.0:
+                return
+            if axis == 0:
+                back = about(self.axis_1, -math.sin(held), math.cos(held), v)
+                found = turn_between(self.axis_2, self.normal, back)
+            else:
+                u = about(self.axis_2, math.sin(held), math.cos(held), self.normal)
+                found = turn_between(self.axis_1, u, v)
+            before, free = free, into_stops(found, low, high, near[other])[0]
+            if abs(free - before) <= 4.0 * self.eps:
+                break
+        angles = (held, free) if axis == 0 else (free, held)
+        residual = self._residual(s, p, turn_of(angles[0], angles[1]))
+        if residual < pose.residual:
+            pose.residual = residual
+            pose.angles[0], pose.angles[1] = angles
+
+
+def turn_of(one: float, two: float) -> tuple[float, float, float, float]:
+    """(sin θ₁, cos θ₁, sin θ₂, cos θ₂)."""
+    return math.sin(one), math.cos(one), math.sin(two), math.cos(two)
+
+
+def _advanced(
+    turn: tuple[float, float, float, float], one: float, two: float
+) -> tuple[float, float, float, float]:
+    """The turn moved on by two small angles, without going through the large ones."""
+    s1, c1, s2, c2 = turn_of(one, two)
+    return (
+        turn[0] * c1 + turn[1] * s1,
+        turn[1] * c1 - turn[0] * s1,
+        turn[2] * c2 + turn[3] * s2,
+        turn[3] * c2 - turn[2] * s2,
+    )
+
+
+def _motion(pose: Pose, near: list[float]) -> float:
+    return max(abs(pose.angles[0] - near[0]), abs(pose.angles[1] - near[1]))

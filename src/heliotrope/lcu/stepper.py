@@ -1,0 +1,225 @@
+"""Steps: goals of two axes become segments for a hardware timer.
+
+Time runs in slots of some tens of milliseconds. In each, an axis makes the steps of its
+present speed, which changes by no more than the acceleration allows and never exceeds what
+can still be stopped before the goal. Everything is in integers; speeds and phases are in
+steps per slot times ``SCALE``. A segment is (axis, direction, count, interval in µs): the
+hardware makes ``count`` pulses, waiting the interval after each. It plays the segments of an
+axis one after the other; no Python runs per step.
+
+Counts are of segments emitted. What is emitted is played, but for an emergency stop: then the
+hardware says how many steps it did not make, and :meth:`Stepper.undone` takes them back.
+"""
+
+SCALE = 1024
+
+#: Order of the two axes of a motion.
+BOTH, PRIMARY_FIRST, SECONDARY_FIRST = range(3)
+
+
+def root(square: int) -> int:
+    """Integer square root, rounded down."""
+    if square < 2:
+        return square
+    guess = 1
+    size = square
+    while size:
+        size >>= 2
+        guess <<= 1
+    while True:
+        better = (guess + square // guess) >> 1
+        if better >= guess:
+            return guess
+        guess = better
+
+
+def stopping(speed: int, change: int) -> int:
+    """Distance of a slot at ``speed`` and of the slots of slowing down after it."""
+    m = speed // change
+    return (m + 1) * speed - change * m * (m + 1) // 2
+
+
+def fastest(distance: int, change: int) -> int:
+    """The greatest speed whose :func:`stopping` distance is no more than ``distance``."""
+    m = (root(8 * distance // change + 1) - 1) >> 1
+    while change * m * (m + 1) // 2 > distance:
+        m -= 1
+    while change * (m + 1) * (m + 2) // 2 <= distance:
+        m += 1
+    return (distance + change * m * (m + 1) // 2) // (m + 1)
+
+
+class Axis:
+    """One axis: where it is, how fast, and where to.
+
+    Parameters
+    ----------
+    low, high
+        Range of the counts, steps. No goal beyond is taken.
+    rate, acceleration
+        steps/s, steps/s².
+    backlash
+        Steps by which a goal is passed when it is come to from above, so that it is always
+        reached from below.
+    slot_ms
+        Length of a slot.
+
+    Raises
+    ------
+    ValueError
+        If the range is empty or a limit is not above 0.
+    """
+
+    def __init__(
+        self, low: int, high: int, rate: int, acceleration: int, backlash: int, slot_ms: int
+    ) -> None:
+        if low >= high or backlash < 0 or backlash >= high - low:
+            raise ValueError("axis: the range is empty, or the backlash as large as the range")
+        if not (rate > 0 and acceleration > 0):
+            raise ValueError("axis: rate and acceleration must be above 0")
+        self.low, self.high, self.backlash = low, high, backlash
+        self.rate, self.acceleration = rate, acceleration
+        self.top = max(1, rate * slot_ms * SCALE // 1000)
+        self.change = max(1, acceleration * slot_ms * slot_ms * SCALE // 1_000_000)
+        self.slot_us = 1000 * slot_ms
+        self.shortest_us = -(-1_000_000 // rate)
+        self.count = self.goal = self.leg = 0
+        self.speed = self.phase = 0
+        self.direction = 1
+        #: Set ahead of a goal that goes down; see Stepper.follow.
+        self.led = False
+        self.braking = False
+
+    def still(self) -> bool:
+        """Whether it stands where it shall."""
+        return self.speed == 0 and (self.braking or self.count == self.leg == self.goal)
+
+    def aim(self, goal: int) -> bool:
+        """Set a goal to be reached from below; False if it was cut to the range."""
+        cut = min(max(goal, self.low), self.high)
+        self.goal = self.leg = cut
+        self.braking = self.led = False
+        if cut < self.count + (self.stop_distance() if self.direction > 0 else 0):
+            self.leg = max(self.low, cut - self.backlash)
+        return cut == goal
+
+    def stop_distance(self) -> int:
+        """Steps that slowing down from the present speed takes at most."""
+        if self.speed <= self.change:
+            return 0
+        return stopping(self.speed - self.change, self.change) // SCALE + 1
+
+    def brake(self) -> None:
+        """Slow down and stop, giving the goal up."""
+        self.braking = True
+
+    def slot(self, held: bool) -> int:
+        """Go on by one slot, or slow down if held; returns its steps, of sign ``direction``."""
+        if self.speed == 0:
+            self.phase = 0
+            if self.braking:
+                self.goal = self.leg = self.count
+                self.braking = False
+            if self.count == self.leg:
+                self.leg = self.goal
+            if held or self.count == self.leg:
+                return 0
+            self.direction = 1 if self.leg > self.count else -1
+        slower = max(0, self.speed - self.change)
+        distance = self.direction * (self.leg - self.count) * SCALE - self.phase
+        if held or self.braking or distance < stopping(slower, self.change):
+            self.speed = slower
+        else:
+            wanted = min(self.speed + self.change, self.top, fastest(distance, self.change))
+            self.speed = max(slower, wanted)
+        moved = self.phase + self.speed
+        steps = moved // SCALE
+        self.phase = moved % SCALE
+        self.count += self.direction * steps
+        return steps
+
+    def interval_us(self, steps: int) -> int:
+        """Time between the steps of the slot that has just been made, rounded up."""
+        return max(self.shortest_us, self.slot_us // steps)
+
+
+class Stepper:
+    """Two axes and the hardware's queue of segments.
+
+    Parameters
+    ----------
+    axes
+        Primary and secondary.
+    slot_ms, ahead_ms
+        Length of a slot, and how far ahead of the hardware segments are emitted: more than the
+        longest pause of the main loop.
+    """
+
+    def __init__(self, axes: list[Axis], slot_ms: int, ahead_ms: int) -> None:
+        self.axes = axes
+        self.slot_ms, self.ahead_ms = slot_ms, max(slot_ms, ahead_ms)
+        self.order = BOTH
+        self.rough = 0
+        self.queued_ms = 0
+
+    def go(self, primary: int, secondary: int, order: int) -> bool:
+        """Go to step counts, one axis after the other or both; False if one was cut."""
+        self.order = order
+        first = self.axes[0].aim(primary)
+        return self.axes[1].aim(secondary) and first
+
+    def follow(self, primary: int, secondary: int) -> bool:
+        """Stay on goals that move slowly, without passing them by the backlash every time.
+
+        An axis that must go down is set ahead by an eighth of its backlash and waits until the
+        goal has gone by as much. In rough stepping an axis waits for ``rough`` steps.
+        """
+        self.order = BOTH
+        inside = True
+        for axis, goal in zip(self.axes, (primary, secondary)):  # noqa: B905 - not in MicroPython
+            inside = axis.low <= goal <= axis.high and inside
+            lead = -(-axis.backlash // 8)
+            error = goal - axis.goal
+            if error >= max(1, self.rough, lead + 1 if axis.led else 0):
+                axis.aim(goal)
+            elif error <= -max(1, self.rough, lead):
+                axis.aim(goal - lead)
+                axis.led = True
+        return inside
+
+    def stop(self) -> None:
+        """Stop both axes within their acceleration."""
+        for axis in self.axes:
+            axis.brake()
+
+    def undone(self, primary: int, secondary: int) -> None:
+        """After an emergency stop: take back signed steps emitted but not made; all stands."""
+        for axis, steps in zip(self.axes, (primary, secondary)):  # noqa: B905
+            axis.count -= steps
+            axis.speed = axis.phase = 0
+            axis.goal = axis.leg = axis.count
+            axis.braking = False
+        self.queued_ms = 0
+
+    def still(self) -> bool:
+        """Whether both axes stand where they shall and the hardware has played everything."""
+        return self.queued_ms <= 0 and self.axes[0].still() and self.axes[1].still()
+
+    def advance(self, elapsed_ms: int, out: list[tuple[int, ...]], kind: int) -> None:
+        """Emit what ``elapsed_ms`` has made room for: (kind, axis, direction, count, µs)."""
+        self.queued_ms -= elapsed_ms
+        if self.queued_ms < 0:
+            for axis in self.axes:
+                # The hardware ran dry, so the motors stand: they start from rest.
+                axis.speed = axis.phase = 0
+            self.queued_ms = 0
+        while self.queued_ms < self.ahead_ms:
+            if self.axes[0].still() and self.axes[1].still():
+                return
+            for number in (0, 1):
+                axis, other = self.axes[number], self.axes[1 - number]
+                waits = self.order == (SECONDARY_FIRST if number == 0 else PRIMARY_FIRST)
+                steps = axis.slot(waits and not other.still())
+                if steps:
+                    out.append((kind, number, axis.direction, steps, axis.interval_us(steps)))
+            self.queued_ms += self.slot_ms
