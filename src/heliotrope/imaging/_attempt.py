@@ -1,17 +1,18 @@
 """One way of looking for a face: marks found about given places, a view fitted, and judged."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
+from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging import detection
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.marks import polygons
 from heliotrope.imaging.refinement import Refined, locate, refine
 from heliotrope.imaging.view import Face, View, fit_view, homography, unknown_lens
 
@@ -19,17 +20,25 @@ Pictures = Mapping[str, FloatArray]
 
 #: Survey and paint: standard deviation of a mark's place on its target, m.
 SURVEY = 0.005
+#: The same of a tag's corners among each other, m.
+PRINT = 0.001
 #: A mark must correlate so well where it is looked for, explain this much of what is around
 #: it there, and be darker than its surroundings.
-LIKE, EXPLAINED, CONTRAST = 0.45, 0.5, 0.93
+LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.5, 0.3, 0.93
 #: A mark farther from where the others put it than this many deviations is not used.
 STRAY = 5.0
-#: A mark may be so much longer, broader or more askew than drawn; all of them together this.
-MISSHAPEN, WRONG_SIZE = 0.35, 0.15
+#: A mark may be so much longer, broader or more askew than drawn; all of them may be so much
+#: larger, and are then alike to so much. Measured: 0.03 in photographs, 0.2 in clutter.
+MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.15, 0.08
+#: Where the marks are no more than a view has unknowns, each is alike to this, and explains this.
+ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.7
 #: Residuals that a view may have, as a part of the face's extent, and pixels on top.
 MISFIT, MISFIT_PIXELS = 0.005, 1.0
 #: Standard deviation, as a part of its extent, to which a target's centre must be known.
 VAGUE = 0.005
+#: A target's centre may be so far from the middle of what was seen, in its standard deviations:
+#: beyond, lens and perspective are guessed.
+FAR = 4.0
 #: Part of the paint between the marks that must be lighter than the print of the nearest.
 LIGHTER = 0.8
 #: A face is not seen flatter than this (least over greatest scale), and its far side not
@@ -108,6 +117,8 @@ class Attempt:
         What was measured of each mark.
     known
         Whether it was known beforehand about where the face is.
+    vague
+        Why of some targets it is not told where they are, by name.
     """
 
     view: View | None
@@ -117,6 +128,7 @@ class Attempt:
     text: str
     looks: dict[int, Refined]
     known: bool
+    vague: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -126,6 +138,8 @@ class _Seen:
     places: dict[int, tuple[FloatArray, FloatArray]]
     reasons: dict[int, str]
     looks: dict[int, Refined]
+    #: Corners of tags, (4, 2).
+    corners: dict[int, FloatArray]
 
 
 class Search:
@@ -148,23 +162,27 @@ class Search:
         view, used = self._fit(rough, pixels if known else None)
         if view is None:
             return self._failed(rough, used, known)
+        # What is refined may yet be found where it was not found roughly, but not by much.
+        if self._points_of(used) + 2 < self._needed(view, known) or self._impossible(view):
+            return self._failed(rough, used, known)
         fine = self._refine(view, used)
         view, used = self._fit(fine, pixels if known else None)
         if view is None:
             return self._failed(fine, used, known)
-        text = self._problem(view, used, fine, known)
+        text, vague = self._problem(view, used, fine, known), self._vague(view, used)
+        if not text and len(vague) == len(self.face.targets):
+            text = next(iter(vague.values()))
         return Attempt(
-            None if text else view, fine.places, tuple(used), fine.reasons, text, fine.looks, known
-        )
+            None if text else view,
+            fine.places, tuple(used), fine.reasons, text, fine.looks, known, vague,
+        )  # fmt: skip
 
     def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Seen:
-        seen = _Seen({}, {}, {})
+        seen = _Seen({}, {}, {}, {})
         for k, mark in enumerate(self.marks):
-            if mark.kind == "tag":
-                if k in self.tags:
-                    seen.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
-                else:
-                    seen.reasons[k] = "not seen, or its code is seen more than once"
+            if k in self.tags:
+                seen.corners[k] = self.tags[k]
+                seen.places[k] = _crossing(self.tags[k]), 0.3**2 * np.eye(2)
                 continue
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
@@ -173,31 +191,34 @@ class Search:
             found = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
             if found is None:
                 seen.reasons[k] = "beyond the frame or too small"
-            elif found[1] < 0.0 or found[2] < LIKE:
+            elif found[2] < LIKE:
                 seen.reasons[k] = f"covered or not there: a likeness of {found[2]:.2f}"
             else:
                 seen.places[k] = found[0], found[1] ** 2 * np.eye(2)
+                if mark.kind == "tag":
+                    seen.corners[k] = found[0] + _square(mark) @ scales[k].T
         return seen
 
     def _refine(self, view: View, used: list[int]) -> _Seen:
-        seen = _Seen({}, {}, {})
+        seen = _Seen({}, {}, {}, {})
         pixels, scales = view.to_pixels(self.plane), view.scale(self.plane)
         for k, mark in enumerate(self.marks):
-            if mark.kind == "tag" and k not in self.tags:
-                seen.reasons[k] = "not seen, or its code is seen more than once"
-                continue
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
                 seen.reasons[k] = f"its picture {mark.code} is not at hand"
                 continue
             search = 0.0 if k in used else 0.2
             refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture)
-            problem = _problem(refined, mark)
+            problem = _problem(refined, mark, k in self.tags)
             if refined is None or problem:
                 seen.reasons[k] = problem
-            else:
-                seen.places[k] = refined.pixel, refined.covariance
-                seen.looks[k] = refined
+                continue
+            seen.places[k] = refined.pixel, refined.covariance
+            seen.looks[k] = refined
+            if mark.kind == "tag":
+                # The view bends it by perspective and lens; what is left is affine.
+                box = _square(mark) @ (np.eye(2) + refined.shape).T
+                seen.corners[k] = view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
         return seen
 
     def _picture(self, mark: Mark) -> FloatArray | None:
@@ -240,22 +261,22 @@ class Search:
     def _points(
         self, used: list[int], seen: _Seen, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Points, pixels, covariances; a tag gives four corners, three marks four points."""
+        """Points, pixels, their covariance; a tag gives four corners, three marks four points."""
         plane, pixels, covariance = [], [], []
         per_metre = self._per_metre(used, seen)
         for k in used:
             mark, (pixel, spread) = self.marks[k], seen.places[k]
-            survey = (per_metre * SURVEY) ** 2 * np.eye(2)
+            common = spread + (per_metre * SURVEY) ** 2 * np.eye(2)
             if mark.kind == "tag":
                 plane += list(self.plane[k] + _square(mark))
-                corners = self.tags[k]
-                pixels += list(corners + pixel - _crossing(corners))
-                # Its corners share the survey; each is seen to a fifth of a pixel.
-                covariance += [spread + survey + 0.2**2 * np.eye(2)] * 4
+                pixels += list(seen.corners[k])
+                # Its corners share the survey and what moves it as a whole.
+                own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
+                covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
             else:
                 plane.append(self.plane[k])
                 pixels.append(pixel)
-                covariance.append(spread + survey)
+                covariance.append(common)
         if len(plane) < FEWEST:
             return None
         points, places = np.array(plane), np.array(pixels)
@@ -268,7 +289,7 @@ class Search:
             covariance.append(fourth[2] ** 2 * np.eye(2))
         elif np.linalg.matrix_rank(points - points.mean(axis=0), tol=0.1) < 2:
             return None
-        return points, places, np.array(covariance)
+        return points, places, np.asarray(block_diag(*covariance), dtype=np.float64)
 
     def _fourth(
         self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
@@ -276,8 +297,8 @@ class Search:
         """A fourth point of three, where it is seen, and its standard deviation, pixels.
 
         Three marks give an affine map. If it is known about where the marks are, that map
-        corrects the known places; otherwise perspective is unknown up to what a lens of
-        fifty degrees would have at this slant.
+        corrects the known places; otherwise perspective is unknown up to what the lens, or
+        one of fifty degrees, would have at this slant.
         """
         if np.linalg.matrix_rank(points - points[0], tol=0.1) < 2:
             return None
@@ -297,7 +318,7 @@ class Search:
         lengths = np.linalg.svd(affine[:2], compute_uv=False)
         slant = np.sqrt(max(1.0 - (lengths[1] / lengths[0]) ** 2, 0.02))
         extent = float(np.linalg.norm(np.ptp(places, axis=0)))
-        spread = 0.5 * slant * extent**2 / max(self.look.size)
+        spread = 0.5 * slant * extent**2 / float(self.look.lens.matrix[0, 0])
         return fourth, np.append(fourth, 1.0) @ affine, max(spread, 0.005 * extent)
 
     def _per_metre(self, used: list[int], seen: _Seen) -> float:
@@ -311,7 +332,7 @@ class Search:
     # -- judging -----------------------------------------------------------------------
 
     def _failed(self, seen: _Seen, used: list[int], known: bool) -> Attempt:
-        text = self._too_few(used, FEWEST)
+        text = self._too_few(used, FEWEST if known else min(ALONE, len(self.marks)))
         return Attempt(None, seen.places, tuple(used), seen.reasons, text, seen.looks, known)
 
     def _too_few(self, used: list[int], needed: int) -> str:
@@ -323,11 +344,8 @@ class Search:
 
     def _problem(self, view: View, used: list[int], seen: _Seen, known: bool) -> str:
         """Why a view cannot be believed; empty if it can."""
-        points = sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
-        expected = self.expected(view)
-        needed = max(FEWEST if known or len(self.marks) <= ALONE else ALONE,
-                     int(np.ceil(SHARE * len(expected))))  # fmt: skip
-        if points < needed:
+        needed = self._needed(view, known)
+        if self._points_of(used) < needed:
             return self._too_few(used, needed)
         scale = view.scale(self.plane[used])
         per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
@@ -336,13 +354,24 @@ class Search:
             return f"its marks do not fit together: {view.residual:.1f} px RMS, {limit:.1f} borne"
         if self._impossible(view):
             return "its marks lie as no camera sees a plane"
-        return self._misshapen(used, seen) or self._dark(view, used, seen) or self._vague(view)
+        return self._misshapen(used, seen, known) or self._dark(view, used, seen)
+
+    def _points_of(self, used: list[int]) -> int:
+        return sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
+
+    def _needed(self, view: View, known: bool) -> int:
+        """How many points a view must stand on."""
+        least = FEWEST if known or len(self.marks) <= ALONE else ALONE
+        return max(least, int(np.ceil(SHARE * len(self.expected(view)))))
 
     def expected(self, view: View) -> list[int]:
         """Marks that the frame should show."""
-        pixels = view.to_pixels(self.plane)
-        inside = ((pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)).all(axis=1)
-        return np.flatnonzero(inside).tolist()
+        return self.within(view.to_pixels(self.plane))
+
+    def within(self, pixels: FloatArray) -> list[int]:
+        """Which of some places (N, 2) are in the frame."""
+        inside = (pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)
+        return [int(k) for k in np.flatnonzero(inside.all(axis=-1))]
 
     def _impossible(self, view: View) -> bool:
         corners = np.concatenate([self.face.plane(t.corners) for t in self.face.targets])
@@ -354,25 +383,31 @@ class Search:
             return True
         return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
 
-    def _misshapen(self, used: list[int], seen: _Seen) -> str:
-        """Marks of another size show another target, or wrong sizes in the plant file."""
-        shapes = [
-            seen.looks[k].shape for k in used if k in seen.looks and self.marks[k].kind != "picture"
-        ]
-        if not shapes:
+    def _misshapen(self, used: list[int], seen: _Seen, known: bool) -> str:
+        """Marks of another size or shape show another target, or something else."""
+        drawn = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
+        if not drawn:
             return ""
-        middle = np.median(np.array(shapes), axis=0)
-        if np.abs(np.diag(middle)).max() <= WRONG_SIZE:
-            return ""
-        wide, high = 1.0 + np.diag(middle)
-        return (
-            f"its marks are seen {wide:.2f} times as wide and {high:.2f} times as high as they "
-            "should be: another target, or wrong sizes of the marks"
-        )
+        shapes = np.array([seen.looks[k].shape for k in drawn])
+        size = float(np.median(np.diagonal(shapes, axis1=1, axis2=2)))
+        if abs(size) > WRONG_SIZE:
+            return (
+                f"its marks are seen {1.0 + size:.2f} times as large as they should be: another "
+                "target, or wrong sizes of the marks"
+            )
+        unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
+        explained = min((seen.looks[k].explained for k in drawn if k not in self.tags), default=1.0)
+        few = len(used) <= ALONE and not known
+        if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
+            return f"what lies as its marks do is not of their shape: up to {unlike.max():.0%} off"
+        if few and explained < EXPLAINED_EACH:
+            return f"what lies as its marks do is not they: one explains {explained:.0%} only"
+        return ""
 
     def _dark(self, view: View, used: list[int], seen: _Seen) -> str:
         """What lies between marks is paint, which is lighter than print."""
-        shown = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
+        flat = ("corner", "tee", "square", "disc")
+        shown = [k for k in used if k in seen.looks and self.marks[k].kind in flat]
         if not shown:
             return ""
         print_, bare = self._levels(view, shown, seen)
@@ -398,14 +433,12 @@ class Search:
         """Brightness of marks' prints and of what is around them, (K,) each."""
         inner = []
         for k in shown:
-            box = polygons(self.marks[k])[0]
-            # Of an L and a T the first edge is an outer one; half a stroke within is print.
-            step = box[1] - box[0]
-            across = np.array([step[1], -step[0]]) / max(float(np.linalg.norm(step)), 1e-9)
-            depth = (
-                0.5 * self.marks[k].stroke if self.marks[k].stroke else 0.02 * self.marks[k].size
-            )
-            inner.append(self.plane[k] + 0.5 * (box[0] + box[1]) + depth * across)
+            mark = self.marks[k]
+            # The middle of an arm of an L and of a T's bar; of a disc and a square the centre.
+            across = {"corner": 0.5 * mark.size, "tee": 0.25 * mark.size}.get(mark.kind, 0.0)
+            cos, sin = np.cos(mark.turn), np.sin(mark.turn)
+            turn = np.array([[cos, -sin], [sin, cos]])
+            inner.append(self.plane[k] + turn @ [across, -0.5 * mark.stroke])
         dark = self._at(view.to_pixels(np.array(inner)))
         contrast = np.array([seen.looks[k].contrast for k in shown])
         dark = np.where(np.isfinite(dark), dark, 0.0)
@@ -419,24 +452,48 @@ class Search:
         values = self.look.grey[np.where(inside, row, 0), np.where(inside, column, 0)]
         return np.where(inside, values.astype(np.float64), np.nan)
 
-    def _vague(self, view: View) -> str:
+    def _vague(self, view: View, used: list[int]) -> dict[str, str]:
+        """Targets of which the marks that were seen tell too little, and why, by name."""
+        parts = [
+            self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
+            for k in used
+        ]
+        places = np.concatenate([np.reshape(part, (-1, 2)) for part in parts])
+        middle = places.mean(axis=0)
+        moments = np.cov((places - middle).T, bias=True) + 1e-6 * np.eye(2)
+        found = {}
         for target in self.face.targets:
-            covariance = view.covariance_at(self.face.plane(target.center))
-            deviation = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
-            limit = VAGUE * max(target.width, target.height)
-            if not deviation <= limit:
-                return (
-                    f"the marks that were seen tell where {target.name} is to {deviation:.3f} m "
-                    f"only; {limit:.3f} m is needed"
+            center, limit = self.face.plane(target.center), VAGUE * max(target.width, target.height)
+            off = center - middle
+            deviation = float(np.sqrt(np.linalg.eigvalsh(view.covariance_at(center))[-1]))
+            if not self._shown(view, target):
+                found[target.name] = "it lies beyond the frame"
+            elif float(off @ np.linalg.solve(moments, off)) > FAR**2:
+                names = ", ".join(self.marks[k].name for k in used)
+                found[target.name] = f"all marks that were seen lie on one side of it: {names}"
+            elif not deviation <= limit:
+                found[target.name] = (
+                    f"the marks that were seen tell where it is to {deviation:.3f} m only; "
+                    f"{limit:.3f} m is needed"
                 )
-        return ""
+        return found
+
+    def _shown(self, view: View, target: Target) -> bool:
+        """Whether the frame shows any of a target."""
+        part = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
+        corners = self.face.plane(target.corners)
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        return bool(self.within(view.to_pixels(low + part * (high - low))))
 
 
-def _problem(refined: Refined | None, mark: Mark) -> str:
-    """Why what was found about a mark's place is not the mark; empty if it is."""
+def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
+    """Why what was found about a mark's place is not the mark; empty if it is.
+
+    A tag whose code was ``read`` need not be explained as well: its cells may be small.
+    """
     if refined is None:
         return "beyond the frame or too small"
-    if refined.explained < EXPLAINED:
+    if refined.explained < (EXPLAINED_READ if read else EXPLAINED):
         return f"covered or not there: its drawing explains {100 * refined.explained:.0f} %"
     if mark.kind == "picture":
         return ""

@@ -252,10 +252,38 @@ class _Face:
             constellation.scales(H, search.plane),
         )
         attempt = search.attempt(pixels, scales, reach)
-        return attempt if attempt.view is None else self._most_upright(attempt, attempt.view)
+        if attempt.view is None:
+            return attempt
+        settled = self._settled(attempt, attempt.view)
+        text = "" if settled.view is None else self._elsewhere(settled, settled.view)
+        return replace(settled, view=None, text=text) if text else settled
 
-    def _most_upright(self, attempt: Attempt, view: View) -> Attempt:
-        """Take the turn that is most upright of those in which the marks look the same."""
+    def _elsewhere(self, attempt: Attempt, view: View) -> str:
+        """Whether what was seen may as well be another target of the face; empty if not."""
+        search = self.search
+        marks, plane, targets = search.marks, search.plane, search.face.targets
+        near = 0.05 * search.extent
+        centers = search.face.plane(np.array([t.center for t in targets]))
+        unseen = len(search.expected(view)) - len(attempt.used)
+        for a in range(len(targets)):
+            for b in range(len(targets)):
+                shift = centers[b] - centers[a]
+                apart = np.linalg.norm(plane[:, None] + shift - plane[None], axis=-1)
+                other = np.argmin(apart, axis=1)
+                if a == b or not all(
+                    apart[k, other[k]] < near and _alike(marks[k], marks[other[k]], 0.0)
+                    for k in attempt.used
+                ):
+                    continue
+                # Seen from there, marks that are not where they should be speak against it.
+                missing = len(search.within(view.to_pixels(plane - shift))) - len(attempt.used)
+                if missing <= unseen + 1:
+                    names = f"{targets[a].name} or {targets[b].name}"
+                    return f"what was seen may be {names}; name the targets that the camera sees"
+        return ""
+
+    def _settled(self, attempt: Attempt, view: View) -> Attempt:
+        """Take the turn, of those in which marks lie alike, that shows most, or is upright."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
         scale = view.scale(middle)
@@ -264,14 +292,19 @@ class _Face:
             seen = scale @ turn[:, 1]
             return -float(seen @ up) / float(np.linalg.norm(seen))
 
-        for turn in sorted([np.eye(2), *symmetries(search.marks, search.plane)], key=lean):
-            if np.allclose(turn, np.eye(2)):
-                return attempt
+        best, least = attempt, lean(np.eye(2))
+        whole = len(attempt.used) == len(search.expected(view))
+        for turn, share in symmetries(search.marks, search.plane):
+            # Marks that all look as they should do not look like others.
+            more_upright = lean(turn) < least - 0.01
+            if whole if share < 1.0 else not more_upright:
+                continue
             places = middle + (search.plane - middle) @ turn.T
             other = search.attempt(view.to_pixels(places), view.scale(places) @ turn, 0.3)
-            if other.view is not None and len(other.used) >= len(attempt.used):
-                return other
-        return attempt
+            more = len(other.used) - len(best.used)
+            if other.view is not None and (more > 0 or (more == 0 and more_upright)):
+                best, least = other, lean(turn)
+        return best
 
     def _outlined(self, reduction: int, ratio: float, upright: bool) -> Iterator[Attempt]:
         """Dark shapes that look like the marks and lie as they do."""
@@ -323,11 +356,13 @@ class _Face:
             return [FoundTarget(t, False, text) for t in targets]
         results = []
         for target in targets:
+            text = best.text or best.vague.get(target.name, "")
+            view = None if text else best.view
             own = tuple(
                 _found_mark(search, best, k) for k, mark in enumerate(search.marks)
                 if any(_one(mark, m) for m in target.marks)
             )  # fmt: skip
-            results.append(FoundTarget(target, best.view is not None, best.text, own, best.view))
+            results.append(FoundTarget(target, view is not None, text, own, view))
         return results
 
 
@@ -335,8 +370,10 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
     return attempt.view is not None, len(attempt.used)
 
 
-def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[FloatArray]:
-    """Return turns (2, 2) by quarters about their middle after which marks look the same.
+def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArray, float]]:
+    """Return turns (2, 2) by quarters about their middle after which marks lie as before.
+
+    Each with the share of the marks, half or more, that then also look as before.
 
     Parameters
     ----------
@@ -347,18 +384,20 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[FloatArray]:
     """
     found = []
     middle = plane.mean(axis=0)
-    for quarter in (1, 2, 3):
-        cos, sin = ((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[quarter - 1]
+    extent = float(np.ptp(plane, axis=0).max())
+    for quarter, (cos, sin) in enumerate(((0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)), start=1):
         turn = np.array([[cos, -sin], [sin, cos]])
         places = middle + (plane - middle) @ turn.T
         apart = np.linalg.norm(places[:, None] - plane[None], axis=-1)
         other = np.argmin(apart, axis=1)
+        near = apart[np.arange(len(marks)), other] < 0.05 * extent
         same = [
-            apart[k, j] < 0.5 * mark.size and _alike(mark, marks[j], 0.5 * np.pi * quarter)
+            bool(near[k]) and _alike(mark, marks[j], 0.5 * np.pi * quarter)
             for k, (mark, j) in enumerate(zip(marks, other, strict=True))
         ]
-        if all(same) and len(set(other.tolist())) == len(marks):
-            found.append(turn)
+        share = float(np.mean(same))
+        if share >= 0.5:
+            found.append((turn, share))
     return found
 
 
@@ -386,14 +425,16 @@ def _one_place_each(found: Sequence[_Face]) -> None:
             if a.known != b.known:
                 clear = 1.0 if a.known else -1.0
             names = [each.search.face.targets[0].name for each in (first, second)]
+            lost = [f"what was seen there is {name}" for name in reversed(names)]
+            if abs(clear) < _CLEARER:
+                lost = [
+                    f"what was seen may be {name} as well; name the targets that the camera sees"
+                    for name in reversed(names)
+                ]
             if clear < _CLEARER:
-                text = f"what was seen may be {names[1]} as well"
-                text += "; name the targets that the camera sees" if clear > -_CLEARER else ""
-                first.best = replace(a, view=None, text=text)
+                first.best = replace(a, view=None, text=lost[0])
             if clear > -_CLEARER:
-                text = f"what was seen may be {names[0]} as well"
-                text += "; name the targets that the camera sees" if clear < _CLEARER else ""
-                second.best = replace(b, view=None, text=text)
+                second.best = replace(b, view=None, text=lost[1])
 
 
 def _share(each: _Face, attempt: Attempt) -> float:

@@ -65,9 +65,8 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
         for group in groups:
             first = group[0]
             depth = np.abs((target.corners - first.center) @ first.normal)
-            # Two towers may show their targets in one plane by chance, far apart.
-            reach = 2.0 * max(first.width, first.height, target.width, target.height)
-            near = any(np.linalg.norm(target.center - g.center) < reach for g in group)
+            # Two towers may show their targets in one plane by chance, apart.
+            near = any(_meet(target, other) for other in group)
             if depth.max() < apart and near and float(target.normal @ first.normal) > 0.98:
                 group.append(target)
                 break
@@ -78,6 +77,15 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
         origin = np.mean([t.center for t in group], axis=0)
         found.append(Face(tuple(group), origin, group[0].axes))
     return found
+
+
+def _meet(a: Target, b: Target) -> bool:
+    """Whether the gap between two targets of one plane is less than a quarter of their size."""
+    corners, others = a.plane_coordinates(a.corners), a.plane_coordinates(b.corners)
+    gap = np.maximum(others.min(axis=0) - corners.max(axis=0),
+                     corners.min(axis=0) - others.max(axis=0))  # fmt: skip
+    size = max(a.width, a.height, b.width, b.height)
+    return float(np.linalg.norm(np.maximum(gap, 0.0))) < 0.25 * size
 
 
 @dataclass(frozen=True)
@@ -198,7 +206,7 @@ def fit_view(
     plane, pixels
         Points in the plane, m, and where they are seen, (N, 2), N ≥ 4.
     covariance
-        Of the pixels, survey included, (N, 2, 2).
+        Of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
     lens
         To begin with; without ``lens_known`` its k1 is estimated, with a prior of
         :data:`LENS_DEVIATION`.
@@ -215,7 +223,10 @@ def fit_view(
 
     def residuals(numbers: FloatArray) -> FloatArray:
         miss = _predict(face, lens, numbers, plane) - pixels
-        whitened = (white @ miss[..., None]).reshape(*miss.shape[:-2], -1)
+        if white.ndim == 2:
+            whitened = miss.reshape(*miss.shape[:-2], -1) @ white.T
+        else:
+            whitened = (white @ miss[..., None]).reshape(*miss.shape[:-2], -1)
         held = (numbers[..., 8:] - prior) / deviation
         return np.concatenate([whitened, held], axis=-1)
 
