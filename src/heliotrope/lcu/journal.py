@@ -162,7 +162,7 @@ class Journal:
     primary, secondary
         Step counts of the newest record.
     rest
-        Whether the newest record says that nothing moved.
+        Whether the newest record written since ``load`` says that nothing moves.
     doubts
         How often the counts may have gone wrong by up to ``stride``; 7 for 7 times or more, and
         where there was no record of counts at all.
@@ -294,9 +294,7 @@ class Journal:
         return self.unhealthy >= BOOT_LIMIT
 
     def boot(self) -> None:
-        """Count a boot, and a doubt if the last record says that something moved."""
-        if not self.rest:
-            self.doubts = min(self.doubts + 1, MOST)
+        """Count a boot. From here on there is room for a last record at all times."""
         self.boots = (self.boots + 1) & 0xFFFF
         self.unhealthy = min(self.unhealthy + 1, MOST)
         self._append(self.primary, self.secondary, True)
@@ -392,9 +390,10 @@ class Journal:
             RING_RECORD, newest[:28]
         )
         self._newest = self._block
-        self.rest = bool(flags & REST)
         self.aim = aim if flags & AIM else None
         self.doubts, self.unhealthy = flags >> 3 & MOST, flags & MOST
+        if not flags & REST:
+            self.doubts = min(self.doubts + 1, MOST)
         while self._place > 0 and self._blank(self._block, self._place - 1):
             self._place -= 1
 

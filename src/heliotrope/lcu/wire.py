@@ -22,9 +22,10 @@ but SESSION is taken first. Frames of before a sender's restart that are still u
 their token, which changes with the epoch. A sender whose commands are answered "duplicate" for
 any other reason starts a new epoch.
 
-What acts has a second and a third lock: it expires by the clock, and what is stored carries a MAC
-and an edition that only rises. DEFOCUS and STOW pass no lock at all; questions change nothing.
-This stops accidents. Against a person at the bus only the MAC protects, thus what is stored.
+What acts has a second and a third lock: it expires by the clock, within a time in which the
+sequence cannot come round, and what is stored carries a MAC and an edition that only rises.
+DEFOCUS and STOW pass no lock at all; questions change nothing. This stops accidents. Against a
+person at the bus only the MAC protects, thus what is stored.
 
 The hash is injected: ``sha256(data) -> 32 bytes``.
 """
@@ -52,14 +53,15 @@ HEADER_SIZE = 8
 CRC_SIZE = 4
 PAYLOAD_LIMIT = FRAME_LIMIT - 2 - HEADER_SIZE - CRC_SIZE
 
-#: A command that claims to be good for longer than this has another clock than ours, s.
-HORIZON_S = 3600
+#: Longest life of a command, s. It is short enough that fewer than half the sequence numbers
+#: are used in it on the fastest bus: a command of before then is old by its number or expired.
+HORIZON_S = 30
 #: After this silence of a sender its next frame must be a SESSION, ms.
 SILENCE_MS = 10000
 
 RANGES = {"B": (0, 255), "b": (-128, 127), "H": (0, 65535), "h": (-32768, 32767),
           "I": (0, 4294967295), "i": (-2147483648, 2147483647)}  # fmt: skip
-LARGEST_SINGLE = 3.4028234e38
+LARGEST_SINGLE = 3.4028234663852886e38
 LARGEST_DOUBLE = 1.7976931348623157e308
 
 

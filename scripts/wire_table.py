@@ -1,0 +1,120 @@
+"""Write docs/reference/wire.md from the table of messages."""
+
+import re
+from pathlib import Path
+
+from heliotrope.lcu import journal, messages, packet12, wire
+
+PAGE = Path(__file__).parents[1] / "docs" / "reference" / "wire.md"
+WHO = {
+    messages.ANYONE: "anyone, always",
+    messages.AUTHORITY: "the authority",
+    messages.KEY: "the authority, with a key",
+    messages.CLUSTER: "cluster",
+    messages.ASK: "cluster (question)",
+    messages.NODE: "local controller",
+}
+GROUPS = {
+    0x00: "Questions and answers", 0x10: "Time, sun and session", 0x20: "Safety",
+    0x30: "States", 0x40: "Aim and motion", 0x50: "What is stored",
+}  # fmt: skip
+FRAME = f"""# The wire, version 2
+
+This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages`, `packet12` and `journal`.
+
+## A frame
+
+Numbers are little-endian. COBS takes every zero out of the frame, and a zero ends it; with both it is at most {wire.FRAME_LIMIT} bytes long.
+
+| bytes | content |
+|---|---|
+| 1 | version, {wire.VERSION} |
+| 2 | to: address, 0xFFFF everybody, 0 the cluster controller |
+| 2 | from |
+| 2 | sequence |
+| 1 | type |
+| 0 to {wire.PAYLOAD_LIMIT} | payload |
+| {wire.MAC_SIZE} | MAC, in messages that store: HMAC-SHA256 over all before it, truncated |
+| 4 | CRC-32 over all before it (that of zlib) |
+
+A frame whose stuffing, checksum, version or length is wrong changes nothing but a counter. A type that is not in the table is handed on with its bytes. A frame whose payload holds a number that is not finite does not act.
+
+## What acts
+
+- DEFOCUS and STOW, from anyone, always.
+- Questions, always: they change nothing.
+- Everything else must be new. The sender counts its frames in 32 bits; the lower 16 are the sequence, and once a second it broadcasts SESSION with the upper ones, its epoch and the token of the authority. A SESSION is taken if its (epoch, count) is greater than the one held; any other frame, if its sequence is 1 to 32767 after the last one taken. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, a SESSION must come first. The epoch rises with every start of the sender: the GPS second of the start serves.
+- A command of the authority must carry the token of the last SESSION (0 is nobody's) and must not have expired: its last second is at most {wire.HORIZON_S} s ahead by the receiver's clock. Without a clock every command is void.
+- A message that stores must carry the MAC of the receiver's key besides, and an edition greater than the last one stored. The edition is kept in the journal with what was set, so a recorded message is void for ever.
+
+All but the MAC stops accidents, not a person at the bus.
+"""  # noqa: E501
+
+
+def meanings() -> dict[int, str]:
+    """Return the comment above each row of the table, by number."""
+    text = Path(messages.__file__).read_text(encoding="utf-8")
+    found = {}
+    for comment, number in re.findall(r"((?:^    # .*\n)+)^    \((0x[0-9A-F]{2}), ", text, re.M):
+        found[int(number, 16)] = " ".join(
+            line.strip().removeprefix("# ") for line in comment.splitlines()
+        )
+    return found
+
+
+def page() -> str:
+    """Return the page's text."""
+    lines = [FRAME, "## Messages", ""]
+    (plain, names), (keyed, keyed_names) = (
+        messages.HEADS[messages.AUTHORITY],
+        messages.HEADS[messages.KEY],
+    )
+    lines.append(
+        f"Payloads from the authority begin with `{names}` (`{plain}`), with a key "
+        f"`{keyed_names}` (`{keyed}`); the table leaves this head out. The 12-byte packet's types "
+        "stand in the last column."
+    )
+    said = meanings()
+    for number, name, who, codes, fields in messages.MESSAGES:
+        if number & 0xF0 in GROUPS and number == min(
+            row[0] for row in messages.MESSAGES if row[0] & 0xF0 == number & 0xF0
+        ):
+            lines += ["", f"### {GROUPS[number & 0xF0]}", ""]
+            lines += ["| type | name | from | payload | meaning | 12 bytes |"]
+            lines += ["|---|---|---|---|---|---|"]
+        payload = f"`{codes}`: {fields.replace(' ', ', ')}" if codes else ""
+        lines.append(
+            f"| 0x{number:02X} | `{name}` | {WHO[who]} | {payload} | {said[number]} "
+            f"| {packet_types(name)} |"
+        )
+    lines += ["", "## Results in ACK", "", "| number | meaning |", "|---|---|"]
+    lines += [f"| {number} | {text} |" for number, text in enumerate(messages.RESULTS)]
+    lines += ["", "## Stored items", "", "| item | name | `struct` codes |", "|---|---|---|"]
+    lines += [f"| {n} | `{name}` | `{codes}` |" for n, (name, codes) in enumerate(journal.ITEMS, 1)]
+    lines += ["", "## The 12-byte packet", "", PACKET]
+    return "\n".join(lines) + "\n"
+
+
+def packet_types(name: str) -> str:
+    """Return the types of the 12-byte packets that hold a message."""
+    if name in packet12.KINDS:
+        return f"0x{packet12.SEARCH_OR_DIAGNOSE:02X}"
+    row = packet12.ROW_OF_NAME.get(name)
+    if row is None:
+        return ""
+    types = [part[0] for part in row[1]]
+    return f"0x{types[0]:02X}" + (f" to 0x{types[-1]:02X}" if len(types) > 1 else "")
+
+
+PACKET = (
+    "Address (high, low), type, eight bytes of data, sum of the eleven bytes modulo 256. Of this, "
+    "the length, the 16-bit address, a type byte, 0xD8 for target search and motion detection, "
+    "data and a checksum are Malan's; the rest is ours, because the thesis's Table D.1 was not at "
+    "hand: compare it with the firmware of a board that was built to the thesis. Packets are told "
+    f"apart by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, so "
+    "nothing can be stored by them."
+)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
