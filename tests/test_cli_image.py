@@ -301,7 +301,7 @@ def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
 @pytest.mark.parametrize(
     ("source", "text"),
     [
-        (["nowhere"], "there is no such folder or file"),
+        (["nowhere"], "source nowhere: there is no such"),
         (["a", "b"], "--live follows one source, not 2"),
         (["usb:97"], "there is no such device"),
         (["http://127.0.0.1:9/x"], "127.0.0.1:9"),
