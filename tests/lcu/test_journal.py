@@ -397,6 +397,31 @@ def test_wear_is_even_and_spares_what_is_stored() -> None:
     assert flash.erased[:2] == [1, 0]
 
 
+def test_boots_wear_the_ring_little() -> None:
+    """A block erased before a reset is erased again: blank to the eye is not erased for sure."""
+    flash = Nor()
+    for _ in range(160):
+        started(flash)
+    records = flash.block_size // journal.RING_SIZE
+    assert sum(flash.erased) <= 2 * 160 / records + 1
+
+
+def test_blocks_are_erased_at_rest() -> None:
+    """Seven records of a movement after any rest: none of them waits for an erasure."""
+    flash = Nor()
+    book = started(flash)
+    book.zero(0, 0)
+    here = 0
+    for _ in range(200):
+        erased = list(flash.erased)
+        for _ in range(7):
+            book.before_steps(here, 0, here + 900, 0)
+            here += 900
+        assert flash.erased == erased
+        book.at_rest(here, 0)
+    assert sum(flash.erased) > 50
+
+
 def test_a_bad_place_in_the_ring_is_passed_over() -> None:
     flash = Nor()
     book = started(flash)

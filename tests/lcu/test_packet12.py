@@ -97,7 +97,8 @@ def test_damaged_unknown_and_infinite_packets_are_nothing() -> None:
     joiner = packet12.Joiner()
     assert joiner.feed(b"") is None
     assert joiner.feed(packet12.build(9, 0x7F, b"")) is None
-    assert joiner.feed(packet12.build(9, 0x95, struct.pack(">f", float("nan")))) is None
+    for kind, number in ((0x95, 1.0), (0x96, float("nan")), (0x97, 1.0)):
+        assert joiner.feed(packet12.build(9, kind, struct.pack(">f", number))) is None
     packet = packet12.to_packets(9, "GOTO", (1000, -2000))[0]
     for place in range(packet12.SIZE):
         for change in range(1, 256):
@@ -139,7 +140,7 @@ def test_silence_tells_packets_apart(start: int, seed: int) -> None:
     rng = random.Random(seed)
     line, sent = Line(start), packets(rng, 20)
     for packet in sent:
-        line.send(packet, rng.choice((4000, 10**6, 4 * 10**8)), rng)
+        line.send(packet, rng.choice((4000, 10**6, 4 * 10**8, 7 * 10**8)), rng)
     assert line.got == sent
     assert (line.splitter.good, line.splitter.bad) == (20, 0)
 
