@@ -1,0 +1,244 @@
+"""Mirrors and their beams: how strong they are along their axes, beside them, together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+
+#: Half of the angle under which the sun's disk is seen, rad.
+SUN_HALF_ANGLE = 4.65e-3
+#: How far beams are followed where nothing else is said, m.
+REACH = 3000.0
+#: Direct normal irradiance that irradiances count with where none is given, W/m².
+SUN = 1000.0
+
+
+@dataclass(frozen=True)
+class Mirrors:
+    """What a beam's shape depends on, for N mirrors.
+
+    Attributes
+    ----------
+    width, height
+        Of the mirror, m, (N,).
+    focus
+        Focal distance of canting and curvature together, m, (N,); infinite if flat.
+    error
+        Half angle added to the sun's: all that may turn or widen the beam (slope, tracking,
+        the sun's motion meanwhile), as a bound, rad, (N,).
+    reflectivity
+        (N,).
+    """
+
+    width: FloatArray
+    height: FloatArray
+    focus: FloatArray
+    error: FloatArray
+    reflectivity: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        width: npt.ArrayLike,
+        height: npt.ArrayLike,
+        *,
+        focus: npt.ArrayLike = np.inf,
+        error: npt.ArrayLike = 5e-3,
+        reflectivity: npt.ArrayLike = 1.0,
+    ) -> "Mirrors":
+        """Return mirrors from numbers or arrays that broadcast to (N,).
+
+        Raises
+        ------
+        InputError
+            If a number is out of range.
+        """
+        given = {"width": width, "height": height, "focus": focus, "error": error,
+                 "reflectivity": reflectivity}  # fmt: skip
+        arrays = np.broadcast_arrays(*(np.atleast_1d(as_float(v)) for v in given.values()))
+        values = dict(zip(given, (np.ascontiguousarray(a) for a in arrays), strict=True))
+        if values["width"].ndim != 1:
+            raise InputError(f"mirrors: shape {values['width'].shape}; give numbers or (N,)")
+        limits = {"width": (0.0, np.inf, "m"), "height": (0.0, np.inf, "m"),
+                  "reflectivity": (0.0, 1.0 + 1e-12, "")}  # fmt: skip
+        for name, (low, high, unit) in limits.items():
+            wrong = ~((values[name] > low) & (values[name] < high))
+            if wrong.any():
+                found = values[name][wrong][0]
+                raise InputError(
+                    f"mirrors: {name} {found} {unit} must be above 0"
+                    f"{' and at most 1' if name == 'reflectivity' else ' and finite'}"
+                )
+        if not (values["focus"] > 0.0).all():
+            raise InputError("mirrors: a focus must be above 0 m; infinite if the mirror is flat")
+        if not ((values["error"] >= 0.0) & (values["error"] < 0.5)).all():
+            raise InputError("mirrors: an error must be from 0 to 0.5 rad (500 mrad)")
+        return cls(**values)
+
+    def __len__(self) -> int:
+        return len(self.width)
+
+    @property
+    def area(self) -> FloatArray:
+        """Aperture, m², (N,)."""
+        return self.width * self.height
+
+    @property
+    def half_diagonal(self) -> FloatArray:
+        """m, (N,)."""
+        return as_float(0.5 * np.hypot(self.width, self.height))
+
+    @property
+    def spread(self) -> FloatArray:
+        """Half angle of the solid that holds the beam, rad, (N,)."""
+        return SUN_HALF_ANGLE + self.error
+
+    def broadcast(self, count: int) -> "Mirrors":
+        """Return ``count`` mirrors; one mirror stands for all."""
+        if len(self) not in (1, count):
+            raise InputError(f"mirrors: {len(self)} for {count} beams; give one, or one for each")
+        return Mirrors(
+            **{k: np.ascontiguousarray(np.broadcast_to(v, (count,))) for k, v in vars(self).items()}
+        )
+
+    def arrays(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return radius (m), inverse focus (1/m) and spread (rad) for the kernels."""
+        return self.half_diagonal, 1.0 / self.focus, self.spread
+
+
+@dataclass(frozen=True)
+class Beams:
+    """N beams: where they leave, whereto (unit), of which mirrors, followed how far (m)."""
+
+    origin: FloatArray
+    direction: FloatArray
+    mirrors: Mirrors
+    reach: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    def point(self, distance: npt.ArrayLike) -> FloatArray:
+        """Return points (N, ..., 3) on the axes at distances (N, ...), m."""
+        t = as_float(distance)[..., None]
+        extra = (slice(None), *(None,) * (t.ndim - 2), slice(None))
+        return self.origin[extra] + t * self.direction[extra]
+
+
+def beams(
+    vertex: npt.ArrayLike, aim: npt.ArrayLike, mirrors: Mirrors, *, reach: npt.ArrayLike = REACH
+) -> Beams:
+    """Return beams from vertices (N, 3) to aims (N, 3) or (3,), ENU metres.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, or an aim lies in its vertex.
+    """
+    origin = np.atleast_2d(as_vectors(vertex, "vertex"))
+    way = np.atleast_2d(as_vectors(aim, "aim")) - origin
+    origin = np.ascontiguousarray(np.broadcast_to(origin, way.shape))
+    if origin.ndim != 2:
+        raise InputError(f"beams: vertices and aims of shape {way.shape}; give (N, 3)")
+    return Beams(
+        origin, normalize(way, "aim - vertex"), mirrors.broadcast(len(origin)),
+        reaches(reach, len(origin)),
+    )  # fmt: skip
+
+
+def concentration(
+    distance: npt.ArrayLike,
+    area: npt.ArrayLike,
+    focus: npt.ArrayLike,
+    half_angle: npt.ArrayLike = SUN_HALF_ANGLE,
+) -> FloatArray:
+    """Return the irradiance on a beam's axis over that on the mirror times reflectivity.
+
+    The mirror is a disk of ``area`` with an ideal focus, hit head-on; the sun a uniform disk.
+    From a point at distance x the part of the mirror within √(area/π) and within
+    x β / |1 − x/b| of its centre shows the sun, at the sun's radiance, so C is the square of
+    min(√(area/π) / (x β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's section,
+    which is less everywhere (:func:`heliotrope.control.eye.mean_concentration`). An oblique
+    mirror may be up to that much stronger near its line foci as the radiance allows: the
+    first of the two terms bounds it.
+
+    Parameters
+    ----------
+    distance
+        m, above 0.
+    area
+        m².
+    focus
+        b, m; infinite if flat.
+    half_angle
+        β, rad.
+    """
+    x, b = as_float(distance), as_float(focus)
+    radius = np.sqrt(as_float(area) / np.pi)
+    gap = np.maximum(np.abs(1.0 - x / b), 1e-12)
+    return as_float(np.minimum(radius / (x * as_float(half_angle)), 1.0 / gap) ** 2)
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """What N beams do together at P points.
+
+    Attributes
+    ----------
+    concentration
+        Of each beam there, as :func:`concentration`, (P, N).
+    irradiance
+        Sum over the beams, W/m², on a surface that faces each of them, (P,).
+    count
+        How many beams are there, (P,).
+    """
+
+    concentration: FloatArray
+    irradiance: FloatArray
+    count: npt.NDArray[np.int64]
+
+
+def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = SUN) -> Crossing:
+    """Return the irradiance of all beams at points (P, 3), such as standby points.
+
+    Of a mirror that is a disk with an ideal focus the part is seen to shine that lies within
+    x β / |1 − x/b| of d / |1 − x/b|, d being the point's distance from the axis: two disks,
+    whose common area is known in closed form. On the axis it is :func:`concentration`.
+    """
+    p = np.atleast_2d(as_vectors(points, "points"))
+    to = p[:, None, :] - given.origin
+    along = np.einsum("pnk,nk->pn", to, given.direction)
+    off = np.sqrt(np.maximum(np.einsum("pnk,pnk->pn", to, to) - along**2, 0.0))
+    mirrors = given.mirrors
+    lit = (along > 0.0) & (along <= given.reach)
+    x = np.where(lit, along, 1.0)
+    # Closer to the focus the seen disk is so large that nothing changes any more.
+    gap = np.maximum(np.abs(1.0 - x / mirrors.focus), 1e-4)
+    radius = np.broadcast_to(np.sqrt(mirrors.area / np.pi), x.shape)
+    seen = _common_area(radius, x * SUN_HALF_ANGLE / gap, off / gap)
+    each = np.where(lit, seen / (np.pi * (x * SUN_HALF_ANGLE) ** 2), 0.0)
+    total = dni * (each @ mirrors.reflectivity)
+    return Crossing(each, total, np.count_nonzero(each > 0.0, axis=1))
+
+
+def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
+    """Return the area that disks of radii r and s share whose centres are d apart."""
+    small = np.minimum(r, s)
+    # Concentric disks take the branch of one inside the other.
+    safe = np.maximum(d, 1e-9)
+    a = np.clip((d * d + r * r - s * s) / (2.0 * safe * r), -1.0, 1.0)
+    b = np.clip((d * d + s * s - r * r) / (2.0 * safe * s), -1.0, 1.0)
+    kite = np.maximum((r + s - d) * (d + r - s) * (d - r + s) * (d + r + s), 0.0)
+    lens = r * r * np.arccos(a) + s * s * np.arccos(b) - 0.5 * np.sqrt(kite)
+    inside = np.where(d <= np.abs(r - s), np.pi * small * small, lens)
+    return as_float(np.where(d >= r + s, 0.0, np.clip(inside, 0.0, np.pi * small * small)))
+
+
+def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
+    given = as_float(reach)
+    if not (np.isfinite(given) & (given > 0.0)).all() or given.shape not in ((), (1,), (count,)):
+        raise InputError(f"reach {reach!r} m: give numbers above 0, one or one for each beam")
+    return np.ascontiguousarray(np.broadcast_to(given, (count,)))

@@ -1,0 +1,422 @@
+"""Beam paths: which beams enter keep-out volumes, at rest and in motion, and the safe way.
+
+A beam is followed as a solid of revolution about its axis that surely holds it: as wide as
+the mirror's diagonal, wider with the sun's half angle and a stated error, and wider again
+beyond the mirror's focus (see ``_beam_kernels``). "Clear" is therefore proven; "enters" means
+that this solid comes within a millimetre of the volume. The solid is made of balls, so it
+reaches half a mirror's diagonal behind and before its ends: what lies within the swing of a
+mirror counts as entered. Nothing shades a beam here: neither the ground nor other mirrors nor
+the tower.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control import _beam_kernels as kernels
+from heliotrope.control._beams import (
+    REACH,
+    SUN,
+    SUN_HALF_ANGLE,
+    Beams,
+    Crossing,
+    Mirrors,
+    beams,
+    concentration,
+    crossing,
+    reaches,
+)
+from heliotrope.control._volumes import Box, Cylinder, Prism, Sphere, Volume, packed
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import Status, track
+
+__all__ = [
+    "SUN_HALF_ANGLE", "Beams", "Box", "Crossing", "Cylinder", "Entries", "Mirrors", "Motion",
+    "Prism", "Sphere", "Volume", "Way", "beams", "clearance", "concentration", "crossing",
+    "enter", "ground_way", "move", "safe_way",
+]  # fmt: skip
+
+#: Finest turn of a beam that :func:`move` looks at, rad: half of the sun's disk.
+RESOLUTION = SUN_HALF_ANGLE
+#: Turn of the line of sight between two waypoints of a safe way, rad.
+WAY_STEP = 0.02
+
+
+def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
+    """Return signed distances (..., V) of points (..., 3) from volumes, m; negative inside."""
+    p = as_vectors(points, "points")
+    table, corners = packed(volumes)
+    flat = np.ascontiguousarray(p.reshape(-1, 3))
+    out = np.empty((len(flat), len(volumes)))
+    kernels.distances(table, corners, flat, out)
+    return out.reshape(*p.shape[:-1], len(volumes))
+
+
+@dataclass(frozen=True)
+class Entries:
+    """Where N beams enter V volumes; NaN where they are clear.
+
+    Attributes
+    ----------
+    volumes
+        Names, V of them.
+    first, last
+        Distances along the beam of the first and last contact, m, (N, V).
+    point
+        On the axis at the first contact, ENU, (N, V, 3).
+    irradiance
+        Largest on the axis from the first to the last contact, W/m², (N, V); 0 where clear.
+    """
+
+    volumes: tuple[str, ...]
+    first: FloatArray
+    last: FloatArray
+    point: FloatArray
+    irradiance: FloatArray
+
+    @property
+    def entered(self) -> npt.NDArray[np.bool_]:
+        """Whether the beam enters, (N, V)."""
+        return np.asarray(np.isfinite(self.first))
+
+
+def enter(given: Beams, volumes: Sequence[Volume], *, dni: float = SUN) -> Entries:
+    """Return where beams at rest enter volumes, and how strongly.
+
+    Parameters
+    ----------
+    given
+        N beams.
+    volumes
+        V volumes.
+    dni
+        Direct normal irradiance, W/m².
+    """
+    table, corners = packed(volumes)
+    shape = (len(given), len(volumes))
+    first, last = np.empty(shape), np.empty(shape)
+    radius, near, spread = given.mirrors.arrays()
+    kernels.enter(
+        table, corners, given.origin, given.direction, given.reach, radius, near, spread,
+        first, last,
+    )  # fmt: skip
+    strongest = _strongest(given.mirrors, first, last, dni)
+    names = tuple(v.name for v in volumes)
+    return Entries(names, first, last, given.point(first), strongest)
+
+
+def _strongest(mirrors: Mirrors, first: FloatArray, last: FloatArray, dni: float) -> FloatArray:
+    """Return the largest irradiance on the axis between two distances (N, V), W/m²."""
+    area, focus = mirrors.area[:, None], mirrors.focus[:, None]
+    radius = np.sqrt(area / np.pi)
+    # Up to here 1 / (1 − x/b) grows; from here on everything falls.
+    peak = radius / (SUN_HALF_ANGLE + radius / focus)
+    at = np.maximum(np.clip(peak, first, np.fmax(first, last)), 1e-6)
+    strength = dni * mirrors.reflectivity[:, None] * concentration(at, area, focus)
+    return as_float(np.where(np.isfinite(first), strength, 0.0))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the beams of N moving heliostats first enter V volumes; NaN where they are clear.
+
+    Attributes
+    ----------
+    volumes
+        Names, V of them.
+    at
+        Up to where the path is clear: index of its corner plus share of the leg behind it,
+        (N, V).
+    distance
+        Along the beam to the contact, m, (N, V).
+    point
+        On the axis at the contact, ENU, (N, V, 3).
+    irradiance
+        Largest on the axis within the volume in that pose, W/m², (N, V); 0 where clear.
+    poses
+        How many poses were tried for all pairs together.
+    """
+
+    volumes: tuple[str, ...]
+    at: FloatArray
+    distance: FloatArray
+    point: FloatArray
+    irradiance: FloatArray
+    poses: int
+
+    @property
+    def entered(self) -> npt.NDArray[np.bool_]:
+        """Whether the beam is not proven to stay clear, (N, V)."""
+        return np.asarray(np.isfinite(self.at))
+
+
+def move(
+    armatures: Armature,
+    path: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    mirrors: Mirrors,
+    volumes: Sequence[Volume],
+    *,
+    reach: npt.ArrayLike = REACH,
+    resolution: float = RESOLUTION,
+    dni: float = SUN,
+) -> Motion:
+    """Return where beams enter volumes while the joints move along a path.
+
+    The whole path is proven, not samples of it: see ``_beam_kernels``. Where nothing can be
+    proven at the given resolution, the beam counts as entering.
+
+    Parameters
+    ----------
+    armatures
+        (N,) or ().
+    path
+        Joint angles of the corners, rad, (N, K, 2) or (K, 2). On each leg both joints move
+        in proportion; where one arrives before the other, that is a corner.
+    sun
+        Unit vector to the sun, (3,) or (N, 3); its motion meanwhile is part of the mirrors'
+        ``error``.
+    mirrors, volumes
+        N or one; V.
+    reach
+        How far beams are followed, m.
+    resolution
+        Turn of the beam below which a span of the path is not split further, rad.
+    dni
+        W/m².
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit or a number is not finite.
+    """
+    rows = armatures.table.reshape(-1, 18)
+    joints = as_float(path)
+    if joints.ndim < 2 or joints.shape[-1] != 2 or not np.isfinite(joints).all():
+        raise InputError(f"path: shape {joints.shape}; give finite joint angles, (N, K, 2)")
+    joints = joints if joints.ndim == 3 else joints[None]
+    count = max(len(rows), len(joints))
+    if {len(rows), len(joints)} - {1, count}:
+        raise InputError(f"path: {len(joints)} paths for {len(rows)} heliostats")
+    if not (np.isfinite(resolution) and resolution > 0.0):
+        raise InputError(f"resolution {resolution} rad must be above 0")
+    s = np.ascontiguousarray(np.broadcast_to(normalize(sun, "sun"), (count, 3)))
+    table, corners = packed(volumes)
+    every = mirrors.broadcast(count)
+    found = np.empty((count, len(volumes), 8))
+    radius, near, spread = every.arrays()
+    poses = kernels.move(
+        table, corners, _rows(rows, count), _rows(joints, count), s, reaches(reach, count),
+        radius, near, spread, resolution, found,
+    )  # fmt: skip
+    first = found[..., 1]
+    last = _leaving(found, table, corners, every, reaches(reach, count))
+    return Motion(
+        tuple(v.name for v in volumes), found[..., 0], first,
+        found[..., 2:5] + first[..., None] * found[..., 5:8],
+        _strongest(every, first, last, dni), int(poses),
+    )  # fmt: skip
+
+
+def _leaving(
+    found: FloatArray, table: FloatArray, corners: FloatArray, mirrors: Mirrors, reach: FloatArray
+) -> FloatArray:
+    """Return the last contact in the pose of the entry, m, (N, V); at least the first."""
+    last = found[..., 1].copy()
+    radius, near, spread = mirrors.arrays()
+    for i, v in np.argwhere(np.isfinite(last)):
+        one, end = np.empty((1, 1)), np.empty((1, 1))
+        pose = found[i, v]
+        kernels.enter(
+            table[v : v + 1], corners, pose[None, 2:5], pose[None, 5:8], reach[i : i + 1],
+            radius[i : i + 1], near[i : i + 1], spread[i : i + 1], one, end,
+        )  # fmt: skip
+        last[i, v] = np.fmax(last[i, v], end[0, 0])
+    return last
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way of one heliostat from stow to its standby point.
+
+    Attributes
+    ----------
+    aims
+        Along the ground to the foot of the tower and up, ENU, m, (K, 3).
+    path
+        Joint angles, rad, (M, 2): stow; azimuth turned; elevation turned to the first aim;
+        then the aims.
+    clear
+        Whether every beam on it is proven to stay out of every volume, and every aim is
+        reachable.
+    motion
+        What the check found.
+    text
+        One line on it.
+    """
+
+    aims: FloatArray
+    path: FloatArray
+    clear: bool
+    motion: Motion
+    text: str
+
+    @property
+    def back(self) -> FloatArray:
+        """The same poses the other way, rad, (M, 2): down, away, elevation, azimuth last.
+
+        It is proven for the sun of the check; hours later a way must be made anew.
+        """
+        return self.path[::-1]
+
+
+def ground_way(
+    vertex: npt.ArrayLike, first: npt.ArrayLike, foot: npt.ArrayLike, standby: npt.ArrayLike
+) -> FloatArray:
+    """Return aims (K, 3) along straight lines from ``first`` to ``foot`` to ``standby``.
+
+    Neighbours are at most 20 mrad apart as seen from the vertex; all (3,), ENU metres.
+    """
+    m = as_vectors(vertex, "vertex")
+    corners = [as_vectors(p, "aim") for p in (first, foot, standby)]
+    aims = [corners[0]]
+    for begin, end in pairwise(corners):
+        share = np.linspace(0.0, 1.0, 2001)[:, None]
+        sight = normalize(begin + share * (end - begin) - m, "aim - vertex")
+        turned = np.cumsum(np.linalg.norm(np.diff(sight, axis=0), axis=1))
+        pieces = max(1, int(np.ceil(turned[-1] / WAY_STEP)))
+        wanted = turned[-1] * np.arange(1, pieces + 1) / pieces
+        at = np.interp(wanted, np.concatenate([[0.0], turned]), share[:, 0])
+        aims += list(begin + at[:, None] * (end - begin))
+    aims[-1] = corners[2]
+    return np.stack(aims)
+
+
+def safe_way(
+    armature: Armature,
+    stow: npt.ArrayLike,
+    sun: npt.ArrayLike,
+    foot: npt.ArrayLike,
+    standby: npt.ArrayLike,
+    mirrors: Mirrors,
+    volumes: Sequence[Volume],
+    *,
+    drives: Drive | None = None,
+    first_distance: float = 10.0,
+    reach: float = REACH,
+) -> Way:
+    """Return the way of one heliostat from stow to its standby point, verified.
+
+    From stow the azimuth turns first, then the elevation, until the beam meets the ground
+    ``first_distance`` away; it goes along the ground to the foot of the tower and up. The
+    first point is tried towards the foot and then ever further to both sides: the sweep of
+    the elevation draws the beam through the plane of that point, and to the side of the
+    tower it meets nothing of it. Of the ways tried the first clear one is returned, else
+    the one that gets furthest, with what is in its way.
+
+    Parameters
+    ----------
+    armature
+        Batch shape ().
+    stow
+        Joint angles, rad, (2,).
+    sun
+        Unit vector to the sun, (3,).
+    foot, standby
+        Where beams meet the ground before they rise, and where they end, ENU, m, (3,).
+    mirrors
+        One.
+    volumes
+        Where no beam may be.
+    drives
+        Of the two joints, for their stops; default none.
+    first_distance
+        m.
+    reach
+        How far beams are followed, m.
+    """
+    if armature.shape:
+        raise InputError(f"safe_way: armature of shape {armature.shape}; give one heliostat")
+    begin, foot_ = as_float(stow), as_vectors(foot, "foot")
+    if begin.shape != (2,) or not np.isfinite(begin).all():
+        raise InputError(f"stow: {stow!r}; give the 2 joint angles in rad")
+    if not (np.isfinite(first_distance) and first_distance > 0.0):
+        raise InputError(f"first_distance {first_distance} m must be above 0")
+    vertex = armature.pose(begin)[1]
+    away = foot_ - vertex
+    towards = float(np.arctan2(away[0], away[1]))
+    tried: list[Way] = []
+    for side in (0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180):
+        flat = first_distance * direction(towards + np.radians(side), 0.0)
+        first = np.array([vertex[0] + flat[0], vertex[1] + flat[1], foot_[2]])
+        aims = ground_way(vertex, first, foot_, standby)
+        way = _verified(armature, begin, aims, sun, mirrors, volumes, drives, reach)
+        if way.clear:
+            return way
+        tried.append(way)
+    return max(tried, key=lambda way: np.nanmin(way.motion.at, initial=np.inf))
+
+
+def _verified(
+    armature: Armature,
+    stow: FloatArray,
+    aims: FloatArray,
+    sun: npt.ArrayLike,
+    mirrors: Mirrors,
+    volumes: Sequence[Volume],
+    drives: Drive | None,
+    reach: float,
+) -> Way:
+    """Return the way over given aims with its check."""
+    poses, status = _angles(armature, stow, aims, sun, drives)
+    path = np.stack([stow, np.array([poses[0, 0], stow[1]]), *poses])
+    motion = move(armature, path, sun, mirrors, volumes, reach=reach)
+    blocked = np.flatnonzero(motion.entered[0])
+    lost = np.flatnonzero(status != Status.OK)
+    text = "every beam on the way is proven to stay out of every volume"
+    if blocked.size:
+        v = blocked[np.argmin(motion.at[0, blocked])]
+        k = int(motion.at[0, v])
+        leg = ("turning the azimuth", "turning the elevation")[k] if k < 2 else f"at aim {k - 1}"
+        text = (
+            f"the beam enters {motion.volumes[v]} {motion.distance[0, v]:.0f} m from the mirror "
+            f"while {leg}; choose another foot, standby point or time"
+        )
+    if lost.size:
+        k = int(lost[0])
+        text = f"aim {k + 1} of {len(aims)}: {Status(int(status[k])).text}"
+    return Way(aims, path, not blocked.size and not lost.size, motion, text)
+
+
+def _angles(
+    armature: Armature,
+    stow: FloatArray,
+    aims: FloatArray,
+    sun: npt.ArrayLike,
+    drives: Drive | None,
+) -> tuple[FloatArray, npt.NDArray[np.int8]]:
+    """Return joint angles (K, 2) for the aims, each the nearest to the one before, and status."""
+    s = normalize(sun, "sun")
+    found = track(armature, s, aims, drives=drives)
+    angles, status, before = np.empty((len(aims), 2)), np.empty(len(aims), np.int8), stow
+    for k in range(len(aims)):
+        # A whole turn of a joint is the same pose; without drives nothing stops it.
+        options = found.angles[k]
+        if drives is None:
+            options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi
+        ok = found.status[k] == Status.OK
+        cost = np.abs(options - before).max(axis=1) + np.where(ok, 0.0, 1e3)
+        best = int(np.argmin(cost))
+        before = angles[k] = options[best]
+        status[k] = found.status[k, best]
+    return angles, status
+
+
+def _rows(array: FloatArray, count: int) -> FloatArray:
+    return np.ascontiguousarray(np.broadcast_to(array, (count, *array.shape[1:])))
