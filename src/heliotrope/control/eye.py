@@ -1,0 +1,410 @@
+"""Glare: what a look into heliostats' beams does to an eye, and where standby points are safe.
+
+After Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare hazards from
+concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. The formulae and
+constants are written down from memory of the paper, hence without its equation numbers; the
+tests hold its anchor of looking at the bare sun. Inside, irradiances are in W/m² (the paper:
+W/cm², 1 W/cm² = 10⁴ W/m²).
+
+Limits. The thresholds are for a short look (0.15 s, the blink) through the naked eye in
+daylight: not for binoculars, telescopes or cameras, and not for a forced stare. The sun is a
+uniform disk; its centre is about a fifth brighter than its mean. Mirrors are disks with an
+ideal focus and no slope error, which errs to the safe side. Air takes nothing away.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control._beams import SUN, SUN_HALF_ANGLE, Beams, crossing
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
+
+#: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and
+#: the angle from which on the irradiance alone counts, rad; 1 W/cm² there.
+BURN, WIDE = 1180.0, 0.118
+#: Retinal irradiance that leaves an after-image at 1 rad, W/m² (3.59e-5 W/cm²), and the power
+#: of the angle that it falls with.
+FLASH, FLASH_POWER = 0.359, 1.77
+#: Sources smaller than this (rad) count as so large: far below the blur of any eye.
+SMALLEST = 1e-6
+
+
+@dataclass(frozen=True)
+class Eye:
+    """An eye: pupil (m; daylight adjusted), focal length (m), transmission of its media."""
+
+    pupil: float = 2e-3
+    focal_length: float = 17e-3
+    transmission: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("pupil", "focal_length"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"eye: {name} {value} m must be above 0 and finite")
+        if not 0.0 < self.transmission <= 1.0:
+            raise InputError(f"eye: transmission {self.transmission} must be above 0, at most 1")
+
+
+#: The eye of the paper.
+DAYLIGHT = Eye()
+
+
+class Hazard(IntEnum):
+    """What a short look does."""
+
+    LOW = 0
+    AFTER_IMAGE = 1
+    DAMAGE = 2
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        return _HAZARD_TEXTS[self]
+
+
+_HAZARD_TEXTS = {
+    Hazard.LOW: "low potential for a temporary after-image",
+    Hazard.AFTER_IMAGE: "potential for a temporary after-image",
+    Hazard.DAMAGE: "potential for permanent eye damage (burn of the retina)",
+}
+
+
+def retinal_irradiance(
+    corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT
+) -> FloatArray:
+    """Return the irradiance of the image on the retina, W/m², E_r = E_c d² τ / (f ω)².
+
+    Parameters
+    ----------
+    corneal
+        E_c, irradiance at the eye, W/m².
+    subtended
+        ω, full angle of the source as seen from the eye, rad, above 0.
+    eye
+        Its pupil d, focal length f and transmission τ.
+    """
+    e, w = _checked(corneal, subtended)
+    return as_float(e * eye.pupil**2 * eye.transmission / (eye.focal_length * w) ** 2)
+
+
+def burn_threshold(subtended: npt.ArrayLike) -> FloatArray:
+    """Return the retinal irradiance from which permanent damage is possible, W/m².
+
+    0.118 W/cm² / ω below ω = 0.118 rad, 1 W/cm² above.
+    """
+    _, w = _checked(0.0, subtended)
+    return as_float(BURN / np.minimum(w, WIDE))
+
+
+def flash_threshold(subtended: npt.ArrayLike) -> FloatArray:
+    """Return the retinal irradiance from which an after-image is possible, W/m².
+
+    3.59e-5 W/cm² / ω^1.77, ω in rad.
+    """
+    _, w = _checked(0.0, subtended)
+    return as_float(FLASH / w**FLASH_POWER)
+
+
+@dataclass(frozen=True)
+class Glare:
+    """What an eye gets at each place (...).
+
+    Attributes
+    ----------
+    burn, flash
+        Retinal irradiance over the thresholds of damage and of an after-image; 1 is at it.
+    corneal
+        Irradiance of all sources together at the eye, W/m².
+    subtended
+        Full angle of a disk as large as all sources together, rad; 0 if there is none.
+    """
+
+    burn: FloatArray
+    flash: FloatArray
+    corneal: FloatArray
+    subtended: FloatArray
+
+    @property
+    def hazard(self) -> npt.NDArray[np.int8]:
+        """:class:`Hazard` as integers; reaching a threshold counts as beyond it."""
+        worse = np.where(self.flash >= 1.0, Hazard.AFTER_IMAGE, Hazard.LOW)
+        return np.asarray(np.where(self.burn >= 1.0, Hazard.DAMAGE, worse), dtype=np.int8)
+
+
+def glare(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
+    """Return the hazard of one source: corneal irradiance (W/m²) and subtended angle (rad)."""
+    retinal = retinal_irradiance(corneal, subtended, eye)
+    w = np.broadcast_to(as_float(subtended), retinal.shape)
+    e = np.broadcast_to(as_float(corneal), retinal.shape)
+    return Glare(retinal / burn_threshold(w), retinal / flash_threshold(w), e, w)
+
+
+def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
+    """Return an upper bound of the hazard of several sources seen at once.
+
+    Images of sources that lie side by side may touch on the retina and heat it as one. Any
+    part of the sources may do so, and how they lie is not asked for: the worst selection
+    counts, as one disk of the solid angles' sum. A further source can only add.
+
+    Parameters
+    ----------
+    corneal, subtended
+        Of each source, W/m² and rad, (..., N); sources of 0 W/m² or 0 rad are dark.
+
+    Notes
+    -----
+    Of all selections with the solid angle W (in units of ω²) none has more irradiance than
+    g(W), that of the brightest first, a source's fraction included: concave and linear
+    between its corners. Both thresholds depend on g and W as g / W^a with a constant a from 0
+    to 1, which on a line has no maximum but at its ends; a changes at ω = 0.118 rad only. So
+    the corners and that point hold the maximum, in N log N.
+    """
+    e, w = np.broadcast_arrays(as_float(corneal), as_float(subtended))
+    if e.ndim == 0 or not (np.isfinite(e).all() and np.isfinite(w).all()):
+        raise InputError("glare of many: give finite irradiances and angles, (..., N)")
+    if (e < 0.0).any() or (w < 0.0).any():
+        raise InputError("glare of many: irradiances and angles must be 0 or more")
+    lit = (e > 0.0) & (w > 0.0)
+    e, size = np.where(lit, e, 0.0), np.where(lit, np.maximum(w, SMALLEST) ** 2, 0.0)
+    radiance = np.divide(e, size, out=np.zeros_like(e), where=lit)
+    order = np.argsort(-radiance, axis=-1)
+    light = np.cumsum(np.take_along_axis(e, order, axis=-1), axis=-1)
+    room = np.cumsum(np.take_along_axis(size, order, axis=-1), axis=-1)
+    corner_light, corner_room = _corner(light, room)
+    every_light = np.concatenate([light, corner_light[..., None]], axis=-1)
+    # More than the half space there is not; a smaller angle errs to the safe side.
+    angle = np.minimum(np.sqrt(np.concatenate([room, corner_room[..., None]], axis=-1)), math.pi)
+    dark = angle == 0.0
+    one = glare(every_light, np.where(dark, 1.0, angle), eye)
+    total = np.sqrt(room[..., -1]) if e.shape[-1] else np.zeros(e.shape[:-1])
+    return Glare(
+        np.max(np.where(dark, 0.0, one.burn), axis=-1),
+        np.max(np.where(dark, 0.0, one.flash), axis=-1),
+        np.sum(e, axis=-1), as_float(total),
+    )  # fmt: skip
+
+
+def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return g and W where ω = 0.118 rad is passed; 0 and 0 where it is not."""
+    wide = WIDE * WIDE
+    before = np.concatenate([np.zeros((*room.shape[:-1], 1)), room[..., :-1]], axis=-1)
+    below = np.concatenate([np.zeros((*light.shape[:-1], 1)), light[..., :-1]], axis=-1)
+    passes = (before < wide) & (room >= wide)
+    if not room.shape[-1]:
+        return np.zeros(room.shape[:-1]), np.zeros(room.shape[:-1])
+    share = np.divide(wide - before, room - before, out=np.zeros_like(room), where=passes)
+    at = np.sum(np.where(passes, below + share * (light - below), 0.0), axis=-1)
+    return as_float(at), as_float(np.where(passes.any(axis=-1), wide, 0.0))
+
+
+def mean_concentration(
+    distance: npt.ArrayLike,
+    area: npt.ArrayLike,
+    focus: npt.ArrayLike,
+    half_angle: npt.ArrayLike = SUN_HALF_ANGLE,
+) -> FloatArray:
+    """Return the mean over a beam's section of its irradiance over that on the mirror.
+
+    Ho et al.'s estimate for specular reflection by a focused mirror: mirror area over
+    beam area, C = (|1 − x/b| + x β / R)⁻², R being the radius of a disk of the mirror's area.
+    Eyes are judged by the irradiance on the axis, which is larger.
+
+    Parameters
+    ----------
+    distance, area, focus, half_angle
+        As of :func:`heliotrope.control.beam_paths.concentration`.
+    """
+    x = as_float(distance)
+    radius = np.sqrt(as_float(area) / np.pi)
+    return as_float((np.abs(1.0 - x / as_float(focus)) + x * as_float(half_angle) / radius) ** -2)
+
+
+def glare_at(
+    given: Beams, points: npt.ArrayLike, *, dni: float = SUN, eye: Eye = DAYLIGHT
+) -> Glare:
+    """Return the hazard to an eye at points (P, 3) that looks into the beams.
+
+    Each beam is a source as wide as the part of its mirror that shines: a mirror of
+    concentration C is seen under ω = 2 β √C, since it shows the sun at the sun's radiance.
+    """
+    _irradiance(dni)
+    seen = crossing(given, points, dni=dni).concentration
+    corneal = dni * given.mirrors.reflectivity * seen
+    return glare_of_many(corneal, 2.0 * SUN_HALF_ANGLE * np.sqrt(seen), eye)
+
+
+def safe_range(
+    area: float,
+    focus: float = math.inf,
+    *,
+    dni: float = SUN,
+    reflectivity: float = 1.0,
+    eye: Eye = DAYLIGHT,
+) -> tuple[float, float]:
+    """Return from and to which distance along one beam a look into it may burn, m.
+
+    (0, 0) if it never may. On the axis the ratio to the threshold is K ω with
+    K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x,
+    β / |1 − x/b|): it is reached where ω = 1 / K.
+
+    Parameters
+    ----------
+    area, focus
+        Of the mirror, m² and m.
+    dni, reflectivity
+        W/m²; of the mirror.
+    eye
+        Whose.
+    """
+    _irradiance(dni)
+    if not (area > 0.0 and math.isfinite(area) and focus > 0.0 and 0.0 < reflectivity <= 1.0):
+        raise InputError(
+            f"mirror of {area} m², focus {focus} m, reflectivity {reflectivity}: area and focus "
+            "must be above 0, reflectivity above 0 and at most 1"
+        )
+    image = reflectivity * dni * eye.pupil**2 * eye.transmission
+    gain = image / (4.0 * SUN_HALF_ANGLE**2 * eye.focal_length**2 * BURN)
+    if gain * WIDE < 1.0:
+        return 0.0, 0.0
+    wide = 1.0 / gain
+    # |1 − x/b| ≤ 2 β / ω bounds the distance from both sides, R / x ≥ ω / 2 from above.
+    slack = 2.0 * SUN_HALF_ANGLE / wide
+    near = 0.0 if slack >= 1.0 else focus * (1.0 - slack)
+    far = min(focus * (1.0 + slack), 2.0 * math.sqrt(area / math.pi) / wide)
+    return (near, far) if far > near else (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class GlareMap:
+    """Hazards on a flat grid through a standby point.
+
+    Attributes
+    ----------
+    right, up
+        From the point, to the right and upwards as seen from the side that the normal points
+        to (east and north in a horizontal plane), m, (W,) and (H,).
+    points
+        ENU, m, (H, W, 3).
+    glare
+        Arrays of shape (H, W).
+    """
+
+    right: FloatArray
+    up: FloatArray
+    points: FloatArray
+    glare: Glare
+
+    @property
+    def radius(self) -> float:
+        """Largest distance from the point at which a look may burn, m; 0 if nowhere."""
+        bad = self.glare.hazard == Hazard.DAMAGE
+        away = np.hypot(*np.meshgrid(self.right, self.up))
+        return float(np.max(np.where(bad, away, 0.0)))
+
+
+def glare_map(
+    given: Beams,
+    center: npt.ArrayLike,
+    size: float,
+    cells: int,
+    *,
+    normal: npt.ArrayLike = (0.0, 0.0, 1.0),
+    dni: float = SUN,
+    eye: Eye = DAYLIGHT,
+) -> GlareMap:
+    """Return the hazards on a square about a standby point.
+
+    Parameters
+    ----------
+    given
+        The beams that stand by there, and any others.
+    center
+        ENU, m, (3,).
+    size
+        Side of the square, m.
+    cells
+        Points on a side, at least 2.
+    normal
+        Of its plane, (3,).
+    dni
+        W/m².
+    eye
+        Whose.
+    """
+    middle = as_vectors(center, "center")
+    if not (math.isfinite(size) and size > 0.0 and cells >= 2):
+        raise InputError(f"map of {size} m and {cells} cells: give a size above 0, 2 cells or more")
+    # Seen against the normal: from above, east is to the right and north is up.
+    axes = tangent_axes(-normalize(normal, "normal"))
+    line = np.linspace(-0.5 * size, 0.5 * size, cells)
+    points = middle + line[:, None, None] * axes[1] + line[None, :, None] * axes[0]
+    rows = [glare_at(given, row, dni=dni, eye=eye) for row in points]
+    together = Glare(*(np.stack([getattr(r, n) for r in rows]) for n in
+                       ("burn", "flash", "corneal", "subtended")))  # fmt: skip
+    return GlareMap(line, line, points, together)
+
+
+def safe_distance(
+    given: Beams,
+    center: npt.ArrayLike,
+    *,
+    limit: Hazard = Hazard.DAMAGE,
+    reach: float = 200.0,
+    step: float = 0.5,
+    dni: float = SUN,
+    eye: Eye = DAYLIGHT,
+) -> float:
+    """Return the radius about a standby point beyond which no beam's axis reaches ``limit``.
+
+    The axes of all beams are sampled on both sides of the point: there a beam is strongest.
+    Points between the axes are not; :func:`glare_map` looks at those.
+
+    Parameters
+    ----------
+    given
+        The beams that stand by there.
+    center
+        ENU, m, (3,).
+    limit
+        What must not be reached outside.
+    reach, step
+        How far from the point to look, and how finely, m.
+    dni
+        W/m².
+    eye
+        Whose.
+
+    Returns
+    -------
+    A multiple of ``step``; infinite if the limit is still reached at ``reach``.
+    """
+    middle = as_vectors(center, "center")
+    if not (0.0 < step < reach and math.isfinite(reach)):
+        raise InputError(f"step {step} m and reach {reach} m: give 0 < step < reach")
+    to = np.einsum("nk,nk->n", middle - given.origin, given.direction)
+    distances = np.append(np.arange(step, reach, step), reach)
+    for away in distances[::-1]:
+        points = given.point(np.stack([to - away, to + away], axis=-1)).reshape(-1, 3)
+        found = glare_at(given, points, dni=dni, eye=eye)
+        if (found.hazard >= limit).any():
+            return math.inf if away == distances[-1] else float(away + step)
+    return 0.0 if not (glare_at(given, middle, dni=dni, eye=eye).hazard >= limit).any() else step
+
+
+def _checked(corneal: npt.ArrayLike, subtended: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    e, w = as_float(corneal), as_float(subtended)
+    if not ((e >= 0.0) & np.isfinite(e)).all():
+        raise InputError("corneal irradiance must be 0 W/m² or more and finite")
+    if not ((w > 0.0) & (w <= math.pi)).all():
+        raise InputError("subtended angle must be above 0 and at most π rad")
+    return e, w
+
+
+def _irradiance(dni: float) -> None:
+    if not (math.isfinite(dni) and dni >= 0.0):
+        raise InputError(f"direct normal irradiance {dni} W/m² must be 0 or more and finite")
