@@ -24,14 +24,16 @@ SURVEY = 0.005
 PRINT = 0.001
 #: A mark must correlate so well where it is looked for, explain this much of what is around
 #: it there, and be darker than its surroundings.
-LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.5, 0.3, 0.93
+LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
 #: A mark farther from where the others put it than this many deviations is not used.
 STRAY = 5.0
 #: A mark may be so much longer, broader or more askew than drawn; all of them may be so much
 #: larger, and are then alike to so much. Measured: 0.03 in photographs, 0.2 in clutter.
-MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.15, 0.08
+MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.08, 0.08
+#: All of them together are so much longer one way than the other, or askew. Measured: 0.01.
+ASKEW = 0.04
 #: Where the marks are no more than a view has unknowns, each is alike to this, and explains this.
-ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.7
+ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.75
 #: Residuals that a view may have, as a part of the face's extent, and pixels on top.
 MISFIT, MISFIT_PIXELS = 0.005, 1.0
 #: Standard deviation, as a part of its extent, to which a target's centre must be known.
@@ -208,7 +210,8 @@ class Search:
                 seen.reasons[k] = f"its picture {mark.code} is not at hand"
                 continue
             search = 0.0 if k in used else 0.2
-            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture)
+            around = self.face.span - self.plane[k]
+            refined = refine(self.look.grey, mark, pixels[k], scales[k], search, picture, around)
             problem = _problem(refined, mark, k in self.tags)
             if refined is None or problem:
                 seen.reasons[k] = problem
@@ -389,11 +392,18 @@ class Search:
         if not drawn:
             return ""
         shapes = np.array([seen.looks[k].shape for k in drawn])
-        size = float(np.median(np.diagonal(shapes, axis1=1, axis2=2)))
+        middle = np.median(shapes, axis=0)
+        size = 0.5 * float(np.trace(middle))
         if abs(size) > WRONG_SIZE:
             return (
                 f"its marks are seen {1.0 + size:.2f} times as large as they should be: another "
                 "target, or wrong sizes of the marks"
+            )
+        common = float(np.abs(middle - size * np.eye(2)).max())
+        if len(drawn) >= FEWEST and common > ASKEW:
+            return (
+                f"its marks are all {common:.0%} longer, broader or more askew than they should "
+                "be: another target, or wrong places of the marks"
             )
         unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
         explained = min((seen.looks[k].explained for k in drawn if k not in self.tags), default=1.0)

@@ -350,8 +350,8 @@ class _Face:
             text = self.text or (
                 f"none of its {total} marks was seen: not in the frame, or covered"
                 if self.shapes == 0
-                else f"no three of its {total} marks were seen together; {self.shapes} shapes in "
-                "the frame look like one of them"
+                else f"its {total} marks were not seen together; {self.shapes} shapes in the frame "
+                "look like one of them"
             )
             return [FoundTarget(t, False, text) for t in targets]
         results = []

@@ -29,6 +29,8 @@ _FLOOR = 0.1
 _SOFT = 0.8
 #: Samples are softened by this, so that they and the drawing can be told between samples.
 _SMOOTH = 0.7
+#: Gauss-Newton steps; from a tenth of a stroke two or three are enough.
+_STEPS = 6
 #: Around a drawing, in its own sizes.
 _MARGIN = 0.3
 #: An even light that explains less than this is worth a second look without the light.
@@ -101,6 +103,7 @@ def refine(
     scale: FloatArray,
     search: float = 0.5,
     picture: FloatArray | None = None,
+    within: FloatArray | None = None,
 ) -> Refined | None:
     """Return where a mark is, given where about.
 
@@ -119,6 +122,9 @@ def refine(
         How far off it may be, in sizes of the mark; 0 for no farther than a stroke.
     picture
         Of a taught mark: its picture, upright in the plane, (N, N).
+    within
+        Least and greatest place, from the mark's point, that the target's paint reaches to,
+        m, (2, 2); what is seen beyond is not looked at.
 
     Returns
     -------
@@ -135,9 +141,10 @@ def refine(
     if count < _FEWEST or not np.isfinite(start).all():
         return None
     template = _template(mark, count, picture)
-    found = _adjust(grey, template, start, scale, relit=False)
+    paint = _paint(template, within)
+    found = _adjust(grey, template, start, scale, paint, relit=False)
     if found is not None and found.explained < _CLEAR and picture is None:
-        other = _adjust(grey, template, start, scale, relit=True)
+        other = _adjust(grey, template, start, scale, paint, relit=True)
         if other is not None and other.explained > found.explained:
             return other
     return found
@@ -249,7 +256,8 @@ def coverage(shapes: list[FloatArray], size: tuple[int, int]) -> FloatArray:
     Green's theorem: each piece of an edge within a cell adds its height to all cells right
     of it, and in its own cell what lies right of the piece.
     """
-    out = np.zeros((size[0], size[1] + 1))
+    # One more each way for edges on the grid's own edge.
+    out = np.zeros((size[0] + 1, size[1] + 2))
     for shape in shapes:
         total = np.zeros_like(out)
         for a, b in zip(shape, np.roll(shape, -1, axis=0), strict=True):
@@ -267,7 +275,7 @@ def coverage(shapes: list[FloatArray], size: tuple[int, int]) -> FloatArray:
             np.add.at(total, (row, column), rise * (1.0 - within))
             np.add.at(total, (row, column + 1), rise * within)
         out += np.abs(np.cumsum(total, axis=1))
-    return np.clip(out[:, :-1], 0.0, 1.0)
+    return np.clip(out[:-1, :-2], 0.0, 1.0)
 
 
 def _basis(values: FloatArray, first: FloatArray, step: float) -> Values:
@@ -336,6 +344,19 @@ def _sample(
     return np.asarray(warped, dtype=np.float32), inside
 
 
+def _paint(template: _Template, within: FloatArray | None) -> Values:
+    """1 for cells of a template that lie within bounds, and 0 for others, (H · W,)."""
+    rows, columns = template.values.shape
+    if within is None:
+        return np.ones(rows * columns, dtype=np.float32)
+    # What is softened reaches over the bound.
+    low, high = within + 1.5 * template.step * np.array([[1.0], [-1.0]])
+    x = template.first[0] + template.step * np.arange(columns)
+    y = template.first[1] - template.step * np.arange(rows)
+    across, along = (x >= low[0]) & (x <= high[0]), (y >= low[1]) & (y <= high[1])
+    return np.asarray(np.outer(along, across), dtype=np.float32).ravel()
+
+
 def _relit(samples: Image, stroke: float) -> Image:
     """Return samples over the light on them, which is what is left when strokes are closed."""
     import cv2
@@ -346,26 +367,29 @@ def _relit(samples: Image, stroke: float) -> Image:
 
 
 def _adjust(
-    grey: Image, template: _Template, pixel: FloatArray, scale: FloatArray, relit: bool
+    grey: Image,
+    template: _Template,
+    pixel: FloatArray,
+    scale: FloatArray,
+    paint: Values,
+    relit: bool,
 ) -> Refined | None:
     """Gauss-Newton on the place, with everything else of the model solved at each step."""
     import cv2
 
     basis, step, shape = template.basis, template.step, template.values.shape
     shift = np.zeros(2)
-    numbers, weight = np.zeros(10), np.ones(len(basis), dtype=np.float32)
-    samples = residual = np.empty(0, dtype=np.float32)
-    information = np.eye(10)
-    for _ in range(6):
+    numbers, weight = np.zeros(10), paint
+    samples = residual = inside = paint
+    for _ in range(_STEPS):
         taken = _sample(grey, pixel + scale @ shift, scale, template.first, step, shape)
         if taken is None:
             return None
         seen = np.asarray(cv2.GaussianBlur(taken[0], (0, 0), _SMOOTH), dtype=np.float32)
         seen = _relit(seen, template.stroke) if relit else seen
         samples = seen.ravel()
-        if taken[1] is not None:
-            weight = weight * taken[1].ravel()
-        information, numbers = _solve(basis[:, :10], weight, samples)
+        inside = paint if taken[1] is None else paint * taken[1].ravel()
+        _, numbers = _solve(basis[:, :10], weight * inside, samples)
         residual = samples - basis[:, :10] @ numbers.astype(np.float32)
         off = np.abs(residual)
         spread = max(1.4826 * _quantile(off, 0.5), 0.1)
@@ -377,7 +401,7 @@ def _adjust(
         if float(np.abs(move).max()) < 0.01 * step:
             break
     place = pixel + scale @ shift
-    return _judged(template, samples, weight, residual, numbers, information, place, scale)
+    return _judged(template, samples, weight, inside, residual, numbers, place, scale)
 
 
 def _quantile(values: Values, share: float) -> float:
@@ -398,31 +422,34 @@ def _solve(basis: Values, weight: Values, samples: Values) -> tuple[FloatArray, 
 
 
 def _judged(
-    template: _Template, samples: Values, weight: Values, residual: Values,
-    numbers: FloatArray, information: FloatArray, place: FloatArray, scale: FloatArray,
+    template: _Template, samples: Values, weight: Values, inside: Values, residual: Values,
+    numbers: FloatArray, place: FloatArray, scale: FloatArray,
 ) -> Refined:  # fmt: skip
     """Covariance, contrast and the other measures of a mark that was found."""
-    basis, step = template.basis, template.step
-    depth = float(numbers[3])
+    step, depth = template.step, float(numbers[3])
+    weight = weight * inside
+    information, full = _solve(template.basis, weight, samples)
+    information = information[:10, :10]
     variance = float(np.sum(weight * residual**2) / max(float(weight.sum()), 1e-9))
     size = np.sqrt(np.maximum(np.diag(information), 1e-12))
-    covariance = np.linalg.pinv(information / np.outer(size, size), hermitian=True)
-    covariance = _SHARED * variance * covariance[4:6, 4:6] / np.outer(size[4:6], size[4:6])
+    inverse = np.linalg.inv(information / np.outer(size, size) + 1e-6 * np.eye(10))
+    covariance = _SHARED * variance * inverse[4:6, 4:6] / np.outer(size[4:6], size[4:6])
     plane = covariance / max(depth**2, 1e-12)
-    even = basis[:, :3]
-    plain = samples - even @ np.linalg.solve(even.T @ even, even.T @ samples)
+    even = template.basis[:, :3]
+    plain = samples - even @ _solve(even, inside, samples)[1].astype(np.float32)
+    shown = inside > 0.0
+    left = float(np.var(residual[shown])) / max(float(np.var(plain[shown])), 1e-9)
     # A soft step of height d has the slope d/(√2π σ) at its middle.
     down, right = np.gradient(samples.reshape(template.values.shape))
     steepest = np.array([_quantile(np.abs(slope), 0.985) for slope in (right, down)])
     blur = step * abs(depth) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
-    _, full = _solve(basis, weight, samples)
     # A drawing stretched by 1 + s is the drawing less s times the place times its slope.
     shape = -full[10:].reshape(2, 2) / (full[3] if abs(full[3]) > 1e-9 else 1e-9)
     return Refined(
         pixel=place,
         covariance=scale @ plane @ scale.T + _FLOOR**2 * np.eye(2),
         contrast=float((numbers[0] + depth) / max(float(numbers[0]), 1e-9)),
-        explained=1.0 - float(np.var(residual)) / max(float(np.var(plain)), 1e-9),
+        explained=1.0 - left,
         blur=blur,
         shape=shape,
     )
