@@ -1,0 +1,332 @@
+"""The one implementation of a link: it connects, beats, watches and reconnects over a carrier."""
+
+import asyncio
+import contextlib
+import math
+import random
+import secrets
+from collections.abc import Coroutine
+from typing import Protocol
+
+from heliotrope.control.clock import Clock, sleep_until
+from heliotrope.control.conversation import Conversation
+from heliotrope.control.link import (
+    Backoff,
+    Heartbeat,
+    Inbox,
+    LinkClosedError,
+    LinkError,
+    LinkLostError,
+    LinkSettings,
+    Outcome,
+    Statistics,
+)
+from heliotrope.errors import InputError
+
+
+class Carrier(Protocol):
+    """What carries envelopes: opened and closed again and again by one `CarriedLink`.
+
+    Only `LinkLostError` and OSError (and, while it opens, LinkError) come out of it.
+    """
+
+    async def open(self) -> bytes:
+        """Connect, and return the key of this connection; cancelled when it takes too long."""
+        ...
+
+    async def ready(self) -> None:
+        """Wait until what is written now goes out at once."""
+        ...
+
+    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+        """Hand an envelope to the transport; ``lifetime`` in s tells it what to throw away."""
+        ...
+
+    async def read(self) -> bytes:
+        """Wait for the next envelope."""
+        ...
+
+    async def close(self) -> None:
+        """Disconnect at once; what has not gone out is thrown away."""
+        ...
+
+
+class CarriedLink:
+    """A `Link` over a carrier.
+
+    Parameters
+    ----------
+    name
+        Whom it leads to, for people.
+    carrier
+        Made for this link alone.
+    clock
+        Its monotonic time decides everything; expiries are given in it.
+    settings
+        See `LinkSettings`.
+    statistics
+        Where to count, if the carrier counts too.
+    seed
+        Of the pauses and of the sessions' numbers, for simulation; None: from the system.
+    patient
+        The carrier waits for the other end to come: no limit of time, and no pauses.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        carrier: Carrier,
+        clock: Clock,
+        settings: LinkSettings | None = None,
+        statistics: Statistics | None = None,
+        seed: int | None = None,
+        *,
+        patient: bool = False,
+    ) -> None:
+        self._name = name
+        self._carrier = carrier
+        self._clock = clock
+        self._settings = settings or LinkSettings()
+        self._statistics = statistics or Statistics()
+        chance = random.Random(seed)
+        entropy = secrets.token_bytes if seed is None else chance.randbytes
+        self._talk = Conversation(clock, self._settings, self._statistics, entropy)
+        self._heart = Heartbeat(clock, self._settings.period, self._settings.deadline)
+        self._inbox = Inbox(clock, self._settings.capacity, self._statistics)
+        self._backoff = Backoff(self._settings.first_pause, self._settings.longest_pause, chance)
+        self._sending = asyncio.Lock()
+        self._up = asyncio.Event()
+        self._closing = asyncio.Event()
+        self._patient = patient
+        self._open = False
+        self._running = False
+        self._problem = "not connected yet"
+
+    @property
+    def name(self) -> str:
+        """Whom it leads to."""
+        return self._name
+
+    @property
+    def connected(self) -> bool:
+        """Whether the other end was alive, and heard us, within the deadline."""
+        return self._open and self._until(-math.inf) > self._clock.monotonic()
+
+    def _until(self, opened: float) -> float:
+        """Return when the connection ends unless something is heard."""
+        # What it has heard of us it tells with its own beat, up to a period later.
+        heard = max(opened, self._talk.heard_at) + self._settings.period
+        return min(max(opened, self._talk.alive_at), heard) + self._settings.deadline
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        return self._closing.is_set()
+
+    @property
+    def silent_for(self) -> float:
+        """How long ago the other end was surely alive, in s; infinite if it never was."""
+        return self._heart.silent_for
+
+    @property
+    def problem(self) -> str:
+        """Why it is not connected, "" if it is."""
+        return "" if self.connected else self._problem
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts since it was made."""
+        return self._statistics
+
+    async def close(self) -> None:
+        """Close it for good: what waits in it is dropped, and ``run`` ends."""
+        self._closing.set()
+        self._inbox.close()
+        self._up.set()
+        self._problem = "closed"
+
+    async def receive(self) -> bytes:
+        """Wait for the next message.
+
+        Raises
+        ------
+        LinkClosedError
+            When the link is closed.
+        """
+        return await self._inbox.get()
+
+    async def established(self) -> None:
+        """Wait until it is connected.
+
+        Raises
+        ------
+        LinkClosedError
+            When the link is closed.
+        """
+        while not self.connected:
+            if self.closed:
+                raise LinkClosedError(f"link to {self._name}: it is closed")
+            self._up.clear()
+            await self._up.wait()
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        """Send a message.
+
+        Parameters
+        ----------
+        data
+            At most `LinkSettings.largest` bytes.
+        expires
+            By the monotonic clock: it is delivered before that or not at all. Every motion
+            command has one. None: it does not expire, but waits for nothing either.
+        hold
+            Wait for a connection until it expires. Nothing is held unless the caller says so,
+            and what is held is held by the caller's own waiting, in no queue.
+
+        Raises
+        ------
+        InputError
+            A message that is too large, held without an expiry, or whose expiry is too far ahead.
+        LinkClosedError
+            When the link is closed.
+        """
+        self._check(data, expires, hold)
+        # Who waits longer than the deadline waits for a transport that is no more.
+        patience = self._settings.deadline
+        if expires is not None:
+            patience = max(0.0, expires - self._clock.monotonic())
+        try:
+            async with asyncio.timeout(patience):
+                if hold:
+                    await self.established()
+                async with self._sending:
+                    return await self._send_now(data, expires)
+        except TimeoutError:
+            self._statistics.expired += 1
+            return Outcome.EXPIRED
+        except (LinkLostError, OSError):
+            self._statistics.dropped += 1
+            return Outcome.DISCONNECTED
+
+    def _check(self, data: bytes, expires: float | None, hold: bool) -> None:
+        if self.closed:
+            raise LinkClosedError(f"link to {self._name}: it is closed")
+        if len(data) > self._settings.largest:
+            raise InputError(
+                f"link to {self._name}: a message of {len(data)} bytes; at most "
+                f"{self._settings.largest} are sent"
+            )
+        if expires is None:
+            if hold:
+                raise InputError(f"link to {self._name}: only a message with an expiry can be held")
+            return
+        ahead = expires - self._clock.monotonic()
+        if not ahead <= self._settings.horizon:
+            raise InputError(
+                f"link to {self._name}: an expiry {ahead:.0f} s ahead is above the horizon of "
+                f"{self._settings.horizon:.0f} s; expiries are in s of the monotonic clock"
+            )
+
+    async def _send_now(self, data: bytes, expires: float | None) -> Outcome:
+        if not self.connected:
+            raise LinkLostError(self._problem)
+        await self._carrier.ready()
+        envelope = self._talk.data(data, expires)
+        lifetime = None if expires is None else expires - self._clock.monotonic()
+        await self._carrier.write(envelope, lifetime, confirmed=True)
+        self._statistics.sent += 1
+        return Outcome.SENT
+
+    async def run(self) -> None:
+        """Keep the link connected until it is closed.
+
+        Raises
+        ------
+        LinkError
+            If it runs already.
+        """
+        if self._running:
+            raise LinkError(f"link to {self._name}: it runs already")
+        self._running = True
+        try:
+            async with asyncio.TaskGroup() as group:
+                keeping = group.create_task(self._keep())
+                await self._closing.wait()
+                keeping.cancel()
+        finally:
+            self._running = False
+
+    async def _keep(self) -> None:
+        while True:
+            try:
+                async with asyncio.timeout(None if self._patient else self._settings.open_limit):
+                    key = await self._carrier.open()
+            except TimeoutError:
+                self._failed(f"no connection within {self._settings.open_limit:g} s")
+            except (LinkError, OSError) as error:
+                self._failed(str(error) or type(error).__name__)
+            else:
+                await self._converse(key)
+            await asyncio.sleep(0.0 if self._patient else self._backoff.next())
+
+    def _failed(self, problem: str) -> None:
+        self._statistics.failures += 1
+        self._problem = problem
+
+    async def _converse(self, key: bytes) -> None:
+        self._statistics.opened += 1
+        self._statistics.reconnects = self._statistics.opened - 1
+        self._talk.restart(key)
+        lost = asyncio.Event()
+        parts = (self._read(), self._heart.run(self._beat), self._watch(self._clock.monotonic()))
+        self._open = True
+        try:
+            async with asyncio.TaskGroup() as group:
+                tasks = [group.create_task(self._until_lost(part, lost)) for part in parts]
+                await lost.wait()
+                for task in tasks:
+                    task.cancel()
+        finally:
+            self._open = False
+            await self._carrier.close()
+
+    async def _until_lost(self, part: Coroutine[None, None, None], lost: asyncio.Event) -> None:
+        # It raises nothing: a TaskGroup that fails in the instant in which it is cancelled
+        # forgets the latter (before Python 3.13), and the link would not close.
+        try:
+            await part
+        except (LinkLostError, OSError) as error:
+            if not lost.is_set():
+                self._problem = str(error) or type(error).__name__
+            lost.set()
+
+    async def _read(self) -> None:
+        while True:
+            arrival, prompt = self._talk.feed(await self._carrier.read())
+            if self._talk.alive_at > -math.inf:
+                self._heart.heard(self._talk.alive_at)
+            if arrival is not None:
+                self._inbox.put(*arrival)
+            if prompt:
+                self._heart.prompt()
+            if self.connected:
+                self._backoff.reset()
+                self._up.set()
+
+    async def _beat(self) -> None:
+        # What cannot go out within a period is not made up for; the watch ends such a line.
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(self._settings.period), self._sending:
+                await self._carrier.ready()
+                for envelope in self._talk.beats():
+                    await self._carrier.write(envelope, self._settings.deadline, confirmed=False)
+
+    async def _watch(self, opened: float) -> None:
+        while (until := self._until(opened)) > self._clock.monotonic():
+            await sleep_until(self._clock, until)
+        limit = f"for {self._settings.deadline:g} s"
+        if self._talk.alive_at + self._settings.deadline > self._clock.monotonic():
+            raise LinkLostError(f"the other end has not heard us {limit}")
+        raise LinkLostError(f"no heartbeat of the other end {limit}")

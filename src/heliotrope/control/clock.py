@@ -1,0 +1,324 @@
+"""Clocks: real, by hand and virtual; and the GPS scale of seconds, which no leap second bends.
+
+Everything in `control` that judges time is given a `Clock`. Its `monotonic` decides (leases,
+deadlines, expiries); its `utc` only tells. Waiting is asyncio's business: a wait may end early
+or late, so whoever waited reads the clock again (`sleep_until`).
+
+`VirtualLoop` is an event loop whose time runs only when nothing is left to do now. It takes its
+ready callbacks in an order drawn by its seed, since no code may depend on an order that asyncio
+happens to keep; the same seed gives the same run.
+"""
+
+import asyncio
+import random
+import selectors
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine
+from datetime import UTC, datetime, timedelta
+from typing import Any, Protocol, TypeVar
+
+from heliotrope.errors import InputError, TimeError
+
+T = TypeVar("T")
+
+GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
+WEEK = 604800
+
+#: GPS minus UTC in s, from a date on. IERS Bulletin C announces changes half a year ahead.
+LEAP_SECONDS = (
+    (datetime(1980, 1, 6, tzinfo=UTC), 0), (datetime(1981, 7, 1, tzinfo=UTC), 1),
+    (datetime(1982, 7, 1, tzinfo=UTC), 2), (datetime(1983, 7, 1, tzinfo=UTC), 3),
+    (datetime(1985, 7, 1, tzinfo=UTC), 4), (datetime(1988, 1, 1, tzinfo=UTC), 5),
+    (datetime(1990, 1, 1, tzinfo=UTC), 6), (datetime(1991, 1, 1, tzinfo=UTC), 7),
+    (datetime(1992, 7, 1, tzinfo=UTC), 8), (datetime(1993, 7, 1, tzinfo=UTC), 9),
+    (datetime(1994, 7, 1, tzinfo=UTC), 10), (datetime(1996, 1, 1, tzinfo=UTC), 11),
+    (datetime(1997, 7, 1, tzinfo=UTC), 12), (datetime(1999, 1, 1, tzinfo=UTC), 13),
+    (datetime(2006, 1, 1, tzinfo=UTC), 14), (datetime(2009, 1, 1, tzinfo=UTC), 15),
+    (datetime(2012, 7, 1, tzinfo=UTC), 16), (datetime(2015, 7, 1, tzinfo=UTC), 17),
+    (datetime(2017, 1, 1, tzinfo=UTC), 18),
+)  # fmt: skip
+#: Up to this date the table is known to be complete (IERS leap-seconds.list); after it, a leap
+#: second may have come that it lacks.
+LEAP_SECONDS_VALID_UNTIL = datetime(2027, 6, 28, tzinfo=UTC)
+
+
+class Clock(Protocol):
+    """What tells the time."""
+
+    def monotonic(self) -> float:
+        """Return seconds since some instant; it never runs backwards and knows no jumps."""
+        ...
+
+    def utc(self) -> datetime:
+        """Return what the system takes for the time, in UTC; it may be wrong, and may jump."""
+        ...
+
+
+class SystemClock:
+    """The clocks of this machine.
+
+    Notes
+    -----
+    On Linux the monotonic time is CLOCK_BOOTTIME, which goes on while the machine sleeps:
+    CLOCK_MONOTONIC does not, and would stretch a lease by the length of the sleep.
+    """
+
+    def __init__(self) -> None:
+        self._clock = getattr(time, "CLOCK_BOOTTIME", None)
+
+    def monotonic(self) -> float:
+        """Return seconds since the machine started."""
+        return time.monotonic() if self._clock is None else time.clock_gettime(self._clock)
+
+    def utc(self) -> datetime:
+        """Return the system's time."""
+        return datetime.now(UTC)
+
+
+class VirtualClock:
+    """A clock whose time comes from elsewhere, for simulation and tests.
+
+    Parameters
+    ----------
+    source
+        Gives the monotonic seconds: the `time` of a `VirtualLoop`; None: a clock that
+        stands until `advance` is called.
+    start
+        UTC at the moment of making.
+    rate
+        Seconds of this clock for each second of the source: an oscillator that is off.
+    """
+
+    def __init__(
+        self,
+        source: Callable[[], float] | None = None,
+        start: datetime = datetime(2026, 6, 21, 10, tzinfo=UTC),
+        *,
+        rate: float = 1.0,
+    ) -> None:
+        self._by_hand = 0.0
+        self._source = source if source is not None else self._hand
+        self._begin = self._source()
+        self._start = start
+        self._rate = rate
+        self._jumped = 0.0
+
+    def _hand(self) -> float:
+        return self._by_hand
+
+    def monotonic(self) -> float:
+        """Return the source's seconds, at this clock's rate."""
+        return self._begin + self._rate * (self._source() - self._begin)
+
+    def utc(self) -> datetime:
+        """Return UTC: the start, what has passed since, and what was jumped."""
+        return self._start + timedelta(seconds=self.monotonic() - self._begin + self._jumped)
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass, where the clock has no source of its own.
+
+        Raises
+        ------
+        InputError
+            A negative time.
+        """
+        if not seconds >= 0.0:
+            raise InputError(f"advance of {seconds} s: time only goes forward; use jump")
+        self._by_hand += seconds
+
+    def jump(self, seconds: float) -> None:
+        """Set UTC forward (or back) without any time passing, as somebody at the keyboard may."""
+        self._jumped += seconds
+
+
+async def sleep_until(clock: Clock, instant: float) -> None:
+    """Wait until `clock` has reached `instant`, in s of its monotonic time."""
+    while (left := instant - clock.monotonic()) > 0.0:
+        # What rounding leaves over would not move a virtual clock on.
+        await asyncio.sleep(max(left, 1e-6))
+
+
+# -- the GPS scale ---------------------------------------------------------------------
+
+
+def leap_seconds(utc: datetime) -> int:
+    """Return GPS minus UTC at a time, in s.
+
+    Raises
+    ------
+    TimeError
+        A time without a zone, or before the GPS scale began.
+    """
+    if utc.tzinfo is None:
+        raise TimeError(f"{utc} has no time zone; give UTC")
+    for since, count in reversed(LEAP_SECONDS):
+        if utc >= since:
+            return count
+    raise TimeError(f"{utc} lies before the beginning of GPS time, 6 January 1980")
+
+
+def gps_seconds(utc: datetime) -> float:
+    """Return seconds of the GPS scale since 6 January 1980.
+
+    Parameters
+    ----------
+    utc
+        After 1980, with a time zone. Right within the validity of the table of leap seconds
+        (`LEAP_SECONDS_VALID_UNTIL`); later it may be late by a second or more.
+    """
+    count = leap_seconds(utc)
+    return (utc - GPS_EPOCH).total_seconds() + count
+
+
+def utc_of_gps(seconds: float) -> datetime:
+    """Return UTC of GPS seconds: the inverse of `gps_seconds`.
+
+    A leap second itself (23:59:60), which a datetime cannot hold, gives the last microsecond
+    before it.
+    """
+    for since, count in reversed(LEAP_SECONDS):
+        begin = (since - GPS_EPOCH).total_seconds() + count
+        if seconds >= begin:
+            return GPS_EPOCH + timedelta(seconds=seconds - count)
+        if seconds >= begin - 1.0 and count > 0:
+            return since - timedelta(microseconds=1)
+    raise TimeError(f"{seconds} s lies before the beginning of GPS time, 6 January 1980")
+
+
+def gps_week(utc: datetime) -> tuple[int, int]:
+    """Return the full GPS week and the time of the week in ms."""
+    milliseconds = round(gps_seconds(utc) * 1000.0)
+    return milliseconds // (WEEK * 1000), milliseconds % (WEEK * 1000)
+
+
+def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> datetime:
+    """Return UTC of a GPS week, which may have lost its upper bits.
+
+    Parameters
+    ----------
+    week
+        As sent: full, or modulo 1024 (the signal's 10 bits, which roll over every 19.6 years).
+    time_of_week_ms
+        0 to 604,799,999.
+    not_before
+        A time known to be past; the first week that fits and is not older is taken.
+
+    Raises
+    ------
+    InputError
+        A negative week, or a time outside the week.
+    """
+    if week < 0 or not 0 <= time_of_week_ms < WEEK * 1000:
+        raise InputError(
+            f"GPS week {week}, {time_of_week_ms} ms: the week must not be negative, and the "
+            f"time of week must be 0 to {WEEK * 1000 - 1} ms"
+        )
+    seconds = week * WEEK + time_of_week_ms / 1000.0
+    floor = gps_seconds(not_before)
+    if seconds < floor:
+        seconds += -(-(floor - seconds) // (1024 * WEEK)) * 1024 * WEEK
+    return utc_of_gps(seconds)
+
+
+# -- virtual time ----------------------------------------------------------------------
+
+
+class _Drawn(deque[asyncio.Handle]):
+    """Ready callbacks, taken in an order drawn by chance."""
+
+    def __init__(self, chance: random.Random) -> None:
+        super().__init__()
+        self._chance = chance
+
+    def popleft(self) -> asyncio.Handle:
+        if len(self) > 1:
+            self.rotate(-self._chance.randrange(len(self)))
+        return super().popleft()
+
+
+class _NoWait(selectors.SelectSelector):
+    """Waits for nothing: when asked to, it lets the loop's time run instead."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now = 0.0
+
+    def register(self, fileobj: Any, events: int, data: Any = None) -> selectors.SelectorKey:
+        if self.get_map():  # the first one is the loop's own pipe for signals and threads
+            raise RuntimeError(
+                "virtual time has no sockets, files or processes: use memory links, or the real "
+                "loop"
+            )
+        return super().register(fileobj, events, data)
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        found = super().select(0.0)
+        if not found and timeout is None:
+            raise RuntimeError(
+                "virtual time stands still: every task waits for something that nothing is left "
+                "to bring about"
+            )
+        if not found and timeout is not None:
+            self.now += max(0.0, timeout)
+        return found
+
+
+class VirtualLoop(asyncio.SelectorEventLoop):
+    """An event loop in virtual time; see the head of this module.
+
+    Parameters
+    ----------
+    seed
+        Of the order of ready callbacks; None: first in, first out, as asyncio does it.
+    start
+        Of `time`, in s.
+
+    Raises
+    ------
+    RuntimeError
+        When a socket or a thread is used, or when every task waits and no timer runs.
+    """
+
+    def __init__(self, seed: int | None = None, start: float = 1000.0) -> None:
+        self._no_wait = _NoWait()
+        self._no_wait.now = start
+        super().__init__(self._no_wait)
+        if seed is not None:
+            # asyncio offers no public way to order callbacks; a test holds that this one works.
+            self._ready = _Drawn(random.Random(seed))
+
+    def time(self) -> float:
+        """Return the virtual time in s."""
+        return self._no_wait.now
+
+    def run_in_executor(  # type: ignore[override]
+        self, executor: Any, func: Callable[..., Any], *args: Any
+    ) -> asyncio.Future[Any]:
+        """Refuse: a thread runs in real time."""
+        raise RuntimeError(
+            f"virtual time has no threads: {func!r} with {len(args)} arguments cannot be run in "
+            f"one (executor {executor!r})"
+        )
+
+
+def run_virtual(
+    main: Callable[[VirtualClock], Coroutine[Any, Any, T]],
+    seed: int | None = 0,
+    *,
+    start: datetime = datetime(2026, 6, 21, 10, tzinfo=UTC),
+) -> T:
+    """Run a coroutine to its end in virtual time, and return what it gives.
+
+    Parameters
+    ----------
+    main
+        Called with the loop's clock.
+    seed
+        As in `VirtualLoop`.
+    start
+        UTC at the beginning.
+    """
+    with asyncio.Runner(loop_factory=lambda: VirtualLoop(seed)) as runner:
+        clock = VirtualClock(runner.get_loop().time, start)
+        return runner.run(main(clock))

@@ -1,0 +1,206 @@
+"""Envelopes of a link: order, freshness and authenticity, without any transport.
+
+How a receiver knows the age of a message without a common clock: every envelope tells the
+sender's monotonic time, and which of the *receiver's* times the sender heard last, and how long
+ago. It was therefore sent after that time of the receiver's own clock: an upper limit of its
+age, good to a path's delay, whatever the wall clocks say. Between two such proofs the best of
+them is carried on with the sender's own times, less what two clocks may drift apart.
+
+Liveness is judged by the same limit: heartbeats that were held up and come in a bunch renew
+nothing. A copy, a message of an earlier connection and one's own message come back carry the
+wrong count or the wrong session, and are refused.
+"""
+
+import hmac
+import math
+import secrets
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import LinkSettings, Statistics
+
+_BEAT, _DATA = 0x11, 0x12
+#: Kind; sender's session; the session it has heard; count; sender's time; the time it has heard
+#: last, and how long ago; time to live (0: no expiry). Times in µs.
+_HEADER = struct.Struct("<BQQQQQII")
+_MAC_SIZE = 16
+_LONGEST = 0xFFFFFFFF
+#: Bytes that an envelope adds to a message.
+OVERHEAD = _HEADER.size + _MAC_SIZE
+#: Two clocks are believed to run alike within this: twice what NTP slews at most.
+_DRIFT = 1e-3
+
+
+@dataclass(slots=True)
+class _Peer:
+    """The other end of a conversation, as last heard."""
+
+    session: int
+    stamp: int = 0  # its time, in µs
+    at: float = 0.0  # when that came, by our clock
+    count: int = 0
+    bound: float = -math.inf  # our time minus its time is at least this
+    bound_at: float = 0.0
+
+
+class Conversation:
+    """Envelopes in and out, without any transport: order, freshness, authenticity.
+
+    Parameters
+    ----------
+    clock
+        Only its monotonic time is used. The other end has another.
+    settings
+        `LinkSettings.horizon` and `largest` are used here.
+    statistics
+        Where to count.
+    entropy
+        Gives random bytes, for the numbers of sessions.
+
+    Attributes
+    ----------
+    alive_at
+        A time at which the other end was surely alive, by our clock.
+    heard_at
+        A time of ours that the other end surely heard.
+
+    Notes
+    -----
+    The MAC is HMAC-SHA256 cut to 16 bytes. Without a key it still detects damage.
+    A session is made anew for each connection, so that nothing of an older one is taken.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        settings: LinkSettings,
+        statistics: Statistics,
+        entropy: Callable[[int], bytes] = secrets.token_bytes,
+    ) -> None:
+        self._clock = clock
+        self._settings = settings
+        self._statistics = statistics
+        self._entropy = entropy
+        self.restart(b"")
+
+    def restart(self, key: bytes) -> None:
+        """Begin a new session under a key; nothing of the old one counts any more."""
+        self._key = key
+        self._session = int.from_bytes(self._entropy(8), "little") or 1
+        self._count = 0
+        self._peer: _Peer | None = None
+        self._candidate: _Peer | None = None
+        self.alive_at = -math.inf
+        self.heard_at = -math.inf
+
+    def beats(self) -> list[bytes]:
+        """Return heartbeats to send: one, or two while somebody new asks to be heard."""
+        known = [peer for peer in (self._peer, self._candidate) if peer is not None]
+        self._candidate = None
+        ends: list[_Peer | None] = [*known] or [None]
+        return [self._seal(_BEAT, peer, 0, b"") for peer in ends]
+
+    def data(self, message: bytes, expires: float | None) -> bytes:
+        """Return the envelope of a message that goes out now.
+
+        Raises
+        ------
+        TimeoutError
+            If it has expired.
+        """
+        lifetime = 0
+        if expires is not None:
+            lifetime = math.floor((expires - self._clock.monotonic()) * 1e6)
+            if lifetime <= 0:
+                raise TimeoutError
+        return self._seal(_DATA, self._peer, lifetime, message)
+
+    def _seal(self, kind: int, peer: _Peer | None, lifetime: int, message: bytes) -> bytes:
+        now = self._clock.monotonic()
+        self._count += 1
+        session, echo, held = 0, 0, 0
+        if peer is not None:
+            session, echo = peer.session, peer.stamp
+            held = min(_LONGEST, math.floor((now - peer.at) * 1e6))
+        header = _HEADER.pack(
+            kind, self._session, session, self._count, math.floor(now * 1e6), echo, held, lifetime
+        )
+        mac = hmac.digest(self._key, header + message, "sha256")[:_MAC_SIZE]
+        return header + message + mac
+
+    def feed(self, envelope: bytes) -> tuple[tuple[bytes, float] | None, bool]:
+        """Take an envelope as it came.
+
+        Returns
+        -------
+        arrival
+            The message and its expiry by our clock (infinite for none); None for a heartbeat,
+            and for whatever is not to be delivered, which is counted.
+        prompt
+            Whether a heartbeat should go out at once, since the other end waits for it.
+        """
+        now = self._clock.monotonic()
+        self._statistics.last_received = now
+        body, mac = envelope[:-_MAC_SIZE], envelope[-_MAC_SIZE:]
+        if len(body) < _HEADER.size or not hmac.compare_digest(
+            mac, hmac.digest(self._key, body, "sha256")[:_MAC_SIZE]
+        ):
+            self._statistics.refused += 1
+            return None, False
+        kind, session, heard, count, stamp, echo, held, lifetime = _HEADER.unpack_from(body)
+        if kind not in (_BEAT, _DATA) or session == self._session:
+            self._statistics.refused += 1
+            return None, False
+        if heard != self._session or held == _LONGEST:
+            return None, self._unproved(kind, session, stamp, count, now)
+        proof = echo / 1e6 + held / 1e6 * (1.0 - _DRIFT)
+        peer = self._take(session, count, proof, now)
+        if peer is None:
+            return None, False
+        first = peer.bound == -math.inf
+        sent_at = self._learn(peer, stamp, count, proof, now)
+        self.heard_at = max(self.heard_at, echo / 1e6)
+        if kind == _BEAT:
+            return None, first
+        expires = math.inf if lifetime == 0 else sent_at + lifetime / 1e6
+        if expires <= now or lifetime / 1e6 > self._settings.horizon:
+            self._statistics.late += 1
+            return None, first
+        return (body[_HEADER.size :], expires), first
+
+    def _unproved(self, kind: int, session: int, stamp: int, count: int, now: float) -> bool:
+        """Take what does not show that its sender has heard us: it may be of any age."""
+        if kind == _DATA:
+            self._statistics.refused += 1
+            return False
+        if self._peer is not None and self._peer.session == session:
+            return False
+        new = self._candidate is None or self._candidate.session != session
+        self._candidate = _Peer(session, stamp, now, count)
+        return new
+
+    def _take(self, session: int, count: int, proof: float, now: float) -> _Peer | None:
+        """Return whom an envelope comes from, None if it is not to be taken."""
+        peer = self._peer
+        if peer is not None and peer.session == session:
+            if count > peer.count:
+                return peer
+            self._statistics.repeated += 1
+            return None
+        # Somebody new is believed if it heard us later than the old one was alive.
+        if proof > now or (peer is not None and proof <= self.alive_at):
+            self._statistics.refused += 1
+            return None
+        self._peer = _Peer(session)
+        return self._peer
+
+    def _learn(self, peer: _Peer, stamp: int, count: int, proof: float, now: float) -> float:
+        """Note an envelope that is taken, and return when it was sent at the earliest."""
+        kept = peer.bound - _DRIFT * (now - peer.bound_at)
+        peer.bound, peer.bound_at = max(proof - stamp / 1e6, kept), now
+        peer.stamp, peer.at, peer.count = stamp, now, count
+        sent_at = min(now, stamp / 1e6 + peer.bound)
+        self.alive_at = max(self.alive_at, sent_at)
+        return sent_at

@@ -1,0 +1,413 @@
+"""Links between the plant and its clusters: messages of bytes, fresh or not at all.
+
+A `Link` carries datagrams between two ends. What it promises:
+
+- A message arrives whole, unaltered, in order, at most once, or not at all.
+- A message with an expiry is never delivered after it: not from a queue, not from a broker that
+  was frozen, not from a socket's buffer. Nothing is kept for an end that is not there.
+- `connected` means: the other end was alive within the deadline, and heard this one within the
+  deadline and a period. It rests on heartbeats of our own alone, whatever the transport beneath
+  believes.
+
+`CarriedLink` (carried.py) is the one implementation; what differs (memory, TCP, MQTT) is its
+`Carrier`. How a receiver knows a message's age without a common clock stands in conversation.py.
+A bus is no link: it has one master, and what answers, answers at once (`Bus`, serial_bus.py).
+
+::
+
+    HeliotropeError
+    └── LinkError             a link that cannot be had, or is no more
+        ├── LinkLostError     a connection is gone; the link makes another by itself
+        └── LinkClosedError   the link was closed for good
+"""
+
+import asyncio
+import contextlib
+import enum
+import math
+import random
+from collections import deque
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from heliotrope.control.clock import Clock
+from heliotrope.errors import HeliotropeError, InputError
+
+
+class LinkError(HeliotropeError):
+    """A link that cannot be had, or is no more."""
+
+
+class LinkLostError(LinkError):
+    """One connection is gone; the link makes another by itself."""
+
+
+class LinkClosedError(LinkError):
+    """The link was closed for good."""
+
+
+class Outcome(enum.Enum):
+    """What became of a message at its sender; the receiver's judgement comes on top.
+
+    SENT says that the transport took it in time (with MQTT: that the broker confirmed it).
+    After anything else the caller may send anew; the old message will not be delivered late.
+    """
+
+    SENT = "sent"
+    DISCONNECTED = "dropped: not connected"
+    EXPIRED = "dropped: it could not go out before it expired"
+
+
+@dataclass(slots=True)
+class Statistics:
+    """Counts of a link since it was made.
+
+    Attributes
+    ----------
+    sent, received
+        Messages handed to the transport; messages handed to the caller.
+    dropped, expired
+        Not sent: not connected; could not go out in time.
+    late, overflowed
+        Not delivered: older than their expiry; the oldest of a full queue.
+    repeated, refused, retained
+        Not delivered: duplicates and what was overtaken; what is damaged, forged or not of this
+        conversation; kept by a broker from before.
+    opened, failures, reconnects
+        Connections made; attempts that failed; connections made after the first.
+    last_received
+        When the last envelope of any kind came, in s of the monotonic clock.
+    """
+
+    sent: int = 0
+    received: int = 0
+    dropped: int = 0
+    expired: int = 0
+    late: int = 0
+    overflowed: int = 0
+    repeated: int = 0
+    refused: int = 0
+    retained: int = 0
+    opened: int = 0
+    failures: int = 0
+    reconnects: int = 0
+    last_received: float | None = None
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """Times and sizes of a link; both ends should have the same.
+
+    Parameters
+    ----------
+    period
+        Between heartbeats, in s.
+    deadline
+        Of silence, after which the other end counts as gone, in s; at least twice the period.
+        The plant's lease to a cluster is 3 s, so the default leaves half of it.
+    capacity
+        Messages received that may wait for the caller; beyond it the oldest is dropped.
+    largest
+        Bytes of a message.
+    horizon
+        Longest time to an expiry that is believed, in s.
+    open_limit
+        For making a connection, in s.
+    first_pause, longest_pause
+        Between attempts to connect, in s: doubled each time, and drawn between half of it and all
+        of it, so that a field of clusters does not come back in step.
+
+    Raises
+    ------
+    InputError
+        Values that contradict each other.
+    """
+
+    period: float = 0.5
+    deadline: float = 1.5
+    capacity: int = 256
+    largest: int = 65536
+    horizon: float = 3600.0
+    open_limit: float = 3.0
+    first_pause: float = 0.1
+    longest_pause: float = 2.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < 2.0 * self.period <= self.deadline < math.inf:
+            raise InputError(
+                f"link: a deadline of {self.deadline} s with heartbeats every {self.period} s; it "
+                "must be at least twice the period, so that one may be lost"
+            )
+        if not 0.0 < self.first_pause <= self.longest_pause < math.inf:
+            raise InputError(
+                f"link: pauses of {self.first_pause} s to {self.longest_pause} s between attempts; "
+                "the first must be above 0 and not above the longest"
+            )
+        if self.capacity < 1 or self.largest < 1 or not 0.0 < self.horizon <= 4000.0:
+            raise InputError(
+                f"link: capacity {self.capacity}, largest message {self.largest} bytes, horizon "
+                f"{self.horizon} s: give at least 1, 1, and 0 to 4000 s"
+            )
+
+
+class Link(Protocol):
+    """One end of a link; see the head of this module for what it promises.
+
+    ``run`` belongs into a TaskGroup of the owner (or use `running`); it ends when the link is
+    closed. ``receive`` has one caller at a time.
+    """
+
+    @property
+    def name(self) -> str:
+        """Whom it leads to."""
+        ...
+
+    @property
+    def connected(self) -> bool:
+        """Whether the other end was alive, and heard us, within the deadline."""
+        ...
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        ...
+
+    @property
+    def silent_for(self) -> float:
+        """How long ago the other end was surely alive, in s; infinite if it never was."""
+        ...
+
+    @property
+    def problem(self) -> str:
+        """Why it is not connected, "" if it is."""
+        ...
+
+    @property
+    def statistics(self) -> Statistics:
+        """Counts since it was made."""
+        ...
+
+    async def run(self) -> None:
+        """Keep the link connected until it is closed."""
+        ...
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        """Send a message, by ``expires`` of the monotonic clock or not at all."""
+        ...
+
+    async def receive(self) -> bytes:
+        """Wait for the next message."""
+        ...
+
+    async def close(self) -> None:
+        """Close it for good."""
+        ...
+
+
+class Bus(Protocol):
+    """A bus with one master, this one: a frame out, what answers in."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open; who is alive on the bus only answers tell."""
+        ...
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        ...
+
+    async def run(self) -> None:
+        """Keep the port open until the bus is closed."""
+        ...
+
+    async def transact(
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
+        complete: Callable[[bytes], bool] | None = None,
+    ) -> bytes:
+        """Send a frame and return what is answered, b"" if nothing is."""
+        ...
+
+    async def transmit(
+        self, frame: bytes, *, expires: float | None = None, urgent: bool = False
+    ) -> Outcome:
+        """Send a frame that nobody answers."""
+        ...
+
+    async def close(self) -> None:
+        """Close it for good."""
+        ...
+
+
+# -- parts -----------------------------------------------------------------------------
+
+
+class Backoff:
+    """Pauses between attempts: doubled each time, bounded, drawn by chance.
+
+    Parameters
+    ----------
+    first, longest
+        In s.
+    chance
+        Draws between half of a pause and all of it.
+    """
+
+    def __init__(self, first: float, longest: float, chance: random.Random) -> None:
+        self._first = first
+        self._longest = longest
+        self._chance = chance
+        self._pause = first
+
+    def reset(self) -> None:
+        """Begin anew, after a success."""
+        self._pause = self._first
+
+    def next(self) -> float:
+        """Return the next pause in s."""
+        pause = self._pause
+        self._pause = min(self._longest, 2.0 * pause)
+        return pause * self._chance.uniform(0.5, 1.0)
+
+
+class Heartbeat:
+    """Sends in a steady rhythm, and knows how long the other side was silent.
+
+    Parameters
+    ----------
+    clock
+        Its monotonic time decides.
+    period, deadline
+        Between beats; of silence; in s.
+    """
+
+    def __init__(self, clock: Clock, period: float, deadline: float) -> None:
+        self._clock = clock
+        self._period = period
+        self._deadline = deadline
+        self._heard = -math.inf
+        self._now = asyncio.Event()
+
+    def heard(self, at: float | None = None) -> None:
+        """Note that the other side was alive, now or at an instant of the clock.
+
+        Time never goes back here: news older than what is known renews nothing.
+        """
+        now = self._clock.monotonic()
+        self._heard = max(self._heard, now if at is None else min(at, now))
+
+    @property
+    def silent_for(self) -> float:
+        """How long ago the other side was alive, in s; infinite if it never was."""
+        return self._clock.monotonic() - self._heard
+
+    @property
+    def alive(self) -> bool:
+        """Whether it was alive within the deadline."""
+        return self.silent_for <= self._deadline
+
+    def prompt(self) -> None:
+        """Beat at once, and go on from there."""
+        self._now.set()
+
+    async def run(self, beat: Callable[[], Awaitable[object]]) -> None:
+        """Call ``beat`` every period until cancelled; beats that were missed are not made up."""
+        while True:
+            self._now.clear()
+            due = self._clock.monotonic() + self._period
+            await beat()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(max(0.0, due - self._clock.monotonic())):
+                    await self._now.wait()
+
+
+class Inbox:
+    """What was received and not yet taken: bounded, and nothing in it outlives its expiry."""
+
+    def __init__(self, clock: Clock, capacity: int, statistics: Statistics) -> None:
+        self._clock = clock
+        self._capacity = capacity
+        self._statistics = statistics
+        self._items: deque[tuple[bytes, float]] = deque()
+        self._news = asyncio.Event()
+        self._closed = False
+
+    def put(self, data: bytes, expires: float) -> None:
+        """Add a message; if the box is full, its oldest is dropped and counted."""
+        if len(self._items) >= self._capacity:
+            self._items.popleft()
+            self._statistics.overflowed += 1
+        self._items.append((data, expires))
+        self._news.set()
+
+    def close(self) -> None:
+        """Wake up who waits."""
+        self._closed = True
+        self._news.set()
+
+    async def get(self) -> bytes:
+        """Wait for a message.
+
+        Raises
+        ------
+        LinkClosedError
+            When the box is closed; what is left in it is not delivered.
+        """
+        while not self._closed:
+            while self._items:
+                data, expires = self._items.popleft()
+                if self._clock.monotonic() < expires:
+                    self._statistics.received += 1
+                    return data
+                self._statistics.late += 1
+            self._news.clear()
+            await self._news.wait()
+        raise LinkClosedError("the link is closed: nothing more will come")
+
+
+# -- running ---------------------------------------------------------------------------
+
+
+async def messages(link: Link) -> AsyncIterator[bytes]:
+    """Give a link's messages one after the other, until it is closed."""
+    with contextlib.suppress(LinkClosedError):
+        while True:
+            yield await link.receive()
+
+
+class Runs(Protocol):
+    """What is run and closed: a `Link`, a `Bus`, a server."""
+
+    async def run(self) -> None:
+        """Run until closed."""
+        ...
+
+    async def close(self) -> None:
+        """End ``run``."""
+        ...
+
+
+@contextlib.asynccontextmanager
+async def running(*parts: Runs) -> AsyncIterator[None]:
+    """Run links, buses and servers beside a block, and close them at its end."""
+    failure: Exception | None = None
+    async with asyncio.TaskGroup() as group:
+        for part in parts:
+            group.create_task(part.run())
+        try:
+            yield
+        except Exception as error:  # noqa: BLE001 (it goes on as it came, not in a group)
+            failure = error
+        finally:
+            for part in parts:
+                await part.close()
+    if failure is not None:
+        raise failure

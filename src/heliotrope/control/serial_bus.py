@@ -1,0 +1,454 @@
+"""The bus of a cluster: RS485 through serialx, with this side as its one master.
+
+One transaction at a time: wait until the bus has been quiet for a gap, send, hear the answer.
+What the answer is, the caller's codec says (`complete`); here it is bytes. Urgent frames
+(defocus, stow) go next, before all that waits. A frame whose turn comes after its expiry is
+dropped.
+
+The adapter turns its driver on and off by itself. Some hear their own frames: with ``echo`` the
+frame is taken back out of what came, and one that came back altered (two spoke at once) spoils
+its transaction. Bytes that nobody asked for are thrown away before each frame.
+
+Ports: a device ("/dev/ttyUSB0"), or a serial server in the network ("socket://10.0.0.7:4001").
+"""
+
+import asyncio
+import contextlib
+import heapq
+import itertools
+import random
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+
+import serialx
+
+from heliotrope.control.clock import Clock, sleep_until
+from heliotrope.control.link import Backoff, LinkClosedError, LinkError, Outcome
+from heliotrope.errors import InputError
+
+#: Start, eight data bits, stop.
+_BITS = 10
+_BAUD_RATES = (1200, 4_000_000)
+#: An echo may be this late, in s: USB adapters collect bytes for up to 16 ms.
+_ECHO_LIMIT = 0.05
+
+
+@dataclass(frozen=True)
+class BusSettings:
+    """How a bus is driven.
+
+    Parameters
+    ----------
+    baud_rate
+        Bits in a second; a character has ten.
+    gap
+        Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
+    gap_ends
+        A gap after its bytes ends an answer: for the thesis's packets of 12 bytes. Needs a port
+        without a network in between, which makes gaps of its own.
+    echo
+        The adapter hears its own frames.
+    first_pause, longest_pause
+        Between attempts to open the port, in s.
+    open_limit
+        For opening it, in s.
+
+    Raises
+    ------
+    InputError
+        A rate or a gap that no bus has.
+    """
+
+    baud_rate: int = 115200
+    gap: float | None = None
+    gap_ends: bool = False
+    echo: bool = False
+    first_pause: float = 0.2
+    longest_pause: float = 2.0
+    open_limit: float = 3.0
+
+    def __post_init__(self) -> None:
+        low, high = _BAUD_RATES
+        if not low <= self.baud_rate <= high:
+            raise InputError(f"bus: {self.baud_rate} baud; give {low} to {high}")
+        if self.gap is not None and not 0.0 <= self.gap <= 1.0:
+            raise InputError(f"bus: a gap of {self.gap} s; give 0 to 1 s, or none")
+        if not 0.0 < self.first_pause <= self.longest_pause:
+            raise InputError(
+                f"bus: pauses of {self.first_pause} s to {self.longest_pause} s between attempts; "
+                "the first must be above 0 and not above the longest"
+            )
+
+    def duration(self, size: int) -> float:
+        """Return how long ``size`` bytes take on the wire, in s."""
+        return size * _BITS / self.baud_rate
+
+    @property
+    def quiet(self) -> float:
+        """The gap in s."""
+        return max(self.duration(1) * 3.5, 0.00175) if self.gap is None else self.gap
+
+
+@dataclass(slots=True)
+class BusStatistics:
+    """Counts of a bus since it was made.
+
+    Attributes
+    ----------
+    sent, answered, silent
+        Frames sent; of those with an answer asked for: bytes came, none did.
+    dropped, expired
+        Not sent: no port; the turn came too late.
+    stray
+        Bytes that nobody asked for.
+    spoilt
+        Frames whose echo came back altered or not at all.
+    opened, failures, reconnects
+        Ports opened; attempts that failed; ports opened after the first.
+    last_received
+        When the last byte came, in s of the monotonic clock.
+    """
+
+    sent: int = 0
+    answered: int = 0
+    silent: int = 0
+    dropped: int = 0
+    expired: int = 0
+    stray: int = 0
+    spoilt: int = 0
+    opened: int = 0
+    failures: int = 0
+    reconnects: int = 0
+    last_received: float | None = None
+
+
+def ends_in_zero(data: bytes) -> bool:
+    """Return whether bytes hold a whole frame of the wire: something, then a zero."""
+    return data.endswith(b"\0") and bool(data.strip(b"\0"))
+
+
+def _never(data: bytes) -> bool:
+    """Leave it to the gap."""
+    del data
+    return False
+
+
+class _Port(asyncio.Protocol):
+    """What came from a port, and when; what the adapter heard of itself is taken out."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.data = bytearray()
+        self.echo = b""  # that is still to come
+        self.spoilt = False
+        self.last_at = clock.monotonic()
+        self.news = asyncio.Event()
+        self.lost = asyncio.Event()
+        self.problem = ""
+
+    def data_received(self, data: bytes) -> None:
+        """Keep what came."""
+        self.last_at = self._clock.monotonic()
+        mine = min(len(data), len(self.echo))
+        if data[:mine] == self.echo[:mine]:
+            self.echo = self.echo[mine:]
+            self.data += data[mine:]
+        else:
+            self.spoilt = True
+            self.echo = b""
+        self.news.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Note that the port is gone."""
+        self.problem = str(exc) if exc else "the port closed"
+        self.lost.set()
+        self.news.set()
+
+    async def hear(self, until: float) -> None:
+        """Wait for the next bytes, or until an instant of the clock."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(until - self._clock.monotonic()):
+                await self.news.wait()
+        self.news.clear()
+
+
+class _Turns:
+    """Whose turn it is: first come, first served, but the urgent before all others."""
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._waiting: list[tuple[bool, int, asyncio.Future[None]]] = []
+        self._number = itertools.count()
+
+    @contextlib.asynccontextmanager
+    async def turn(self, *, urgent: bool) -> AsyncIterator[None]:
+        if self._busy:
+            mine = asyncio.get_running_loop().create_future()
+            heapq.heappush(self._waiting, (not urgent, next(self._number), mine))
+            try:
+                await mine
+            except asyncio.CancelledError:
+                if mine.done() and not mine.cancelled():
+                    self._next()
+                raise
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._next()
+
+    def _next(self) -> None:
+        while self._waiting:
+            _, _, other = heapq.heappop(self._waiting)
+            if not other.done():
+                other.set_result(None)
+                return
+        self._busy = False
+
+
+class SerialBus:
+    """A `Bus` over a serial port.
+
+    Parameters
+    ----------
+    url
+        Of the port; see the head of this module.
+    clock
+        Its monotonic time measures gaps and expiries.
+    settings
+        See `BusSettings`.
+
+    Attributes
+    ----------
+    statistics
+        See `BusStatistics`.
+    problem
+        Why the port is not open, "" if it is.
+    """
+
+    def __init__(self, url: str, clock: Clock, settings: BusSettings | None = None) -> None:
+        self._url = url
+        self._clock = clock
+        self._settings = settings or BusSettings()
+        self._turns = _Turns()
+        self._port: _Port | None = None
+        self._transport: serialx.BaseSerialTransport | None = None
+        self._free_at = 0.0
+        self._running = False
+        self._closing = asyncio.Event()
+        self._opened = asyncio.Event()
+        self.statistics = BusStatistics()
+        self.problem = "not opened yet"
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open; who is alive on the bus only answers tell."""
+        return self._port is not None
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        return self._closing.is_set()
+
+    async def opened(self) -> None:
+        """Wait until the port is open."""
+        while self._port is None:
+            if self.closed:
+                raise LinkClosedError(f"bus {self._url}: it is closed")
+            self._opened.clear()
+            await self._opened.wait()
+
+    async def close(self) -> None:
+        """Close it for good."""
+        self._closing.set()
+        self._opened.set()
+
+    # -- the port ----------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Keep the port open until the bus is closed.
+
+        Raises
+        ------
+        LinkError
+            If it runs already.
+        """
+        if self._running:
+            raise LinkError(f"bus {self._url}: it runs already")
+        self._running = True
+        try:
+            async with asyncio.TaskGroup() as group:
+                keeping = group.create_task(self._keep())
+                await self._closing.wait()
+                keeping.cancel()
+        finally:
+            self._running = False
+
+    async def _keep(self) -> None:
+        backoff = Backoff(self._settings.first_pause, self._settings.longest_pause, random.Random())
+        while True:
+            try:
+                async with asyncio.timeout(self._settings.open_limit):
+                    port, transport = await self._open_port()
+            except (OSError, ValueError, serialx.SerialException) as error:
+                self.statistics.failures += 1
+                self.problem = f"{self._url} cannot be opened ({str(error) or 'it takes too long'})"
+            else:
+                backoff.reset()
+                await self._hold(port, transport)
+            await asyncio.sleep(backoff.next())
+
+    async def _open_port(self) -> tuple[_Port, serialx.BaseSerialTransport]:
+        port = _Port(self._clock)
+        transport, _ = await serialx.create_serial_connection(
+            asyncio.get_running_loop(), lambda: port, self._url, self._settings.baud_rate
+        )
+        return port, transport
+
+    async def _hold(self, port: _Port, transport: serialx.BaseSerialTransport) -> None:
+        self.statistics.opened += 1
+        self.statistics.reconnects = self.statistics.opened - 1
+        self._port, self._transport = port, transport
+        self.problem = ""
+        self._free_at = self._clock.monotonic() + self._settings.quiet
+        self._opened.set()
+        try:
+            await port.lost.wait()
+            self.problem = f"{self._url}: {port.problem}"
+        finally:
+            self._port = self._transport = None
+            port.lost.set()
+            port.news.set()
+            transport.abort()  # what has not gone out is not to go out later
+            await transport.wait_closed()
+
+    # -- transactions ------------------------------------------------------------------
+
+    async def transmit(
+        self, frame: bytes, *, expires: float | None = None, urgent: bool = False
+    ) -> Outcome:
+        """Send a frame that nobody answers, and wait until it is out.
+
+        Parameters
+        ----------
+        frame
+            With whatever ends it.
+        expires
+            By the monotonic clock; if its turn comes later, it is dropped.
+        urgent
+            Next, before all that waits.
+
+        Raises
+        ------
+        LinkClosedError
+            When the bus is closed.
+        """
+        async with self._turns.turn(urgent=urgent):
+            port, outcome = await self._put(frame, expires)
+            if port is not None:
+                end = self._clock.monotonic() + self._settings.duration(len(frame))
+                await sleep_until(self._clock, end)
+                while port.echo and self._clock.monotonic() < end + _ECHO_LIMIT:
+                    await port.hear(end + _ECHO_LIMIT)
+                self._judge_echo(port)
+            return outcome
+
+    async def transact(
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
+        complete: Callable[[bytes], bool] | None = None,
+    ) -> bytes:
+        """Send a frame and return what is answered.
+
+        Parameters
+        ----------
+        frame
+            With whatever ends it.
+        timeout
+            For the whole answer, from the end of the frame, in s.
+        expires, urgent
+            As in `transmit`.
+        complete
+            Says of the bytes that have come so far whether they are the answer; None: of the
+            wire, `ends_in_zero`, unless gaps end an answer.
+
+        Returns
+        -------
+        bytes
+            What came, whole or not; b"" if nothing did or the frame was not sent (see
+            ``statistics``). Only the codec can tell whether it is an answer.
+
+        Raises
+        ------
+        InputError
+            A timeout that is not above 0.
+        LinkClosedError
+            When the bus is closed.
+        """
+        if not timeout > 0.0:
+            raise InputError(f"bus {self._url}: a timeout of {timeout} s; it must be above 0")
+        if complete is None:
+            complete = _never if self._settings.gap_ends else ends_in_zero
+        async with self._turns.turn(urgent=urgent):
+            port, _ = await self._put(frame, expires)
+            if port is None:
+                return b""
+            end = self._clock.monotonic() + self._settings.duration(len(frame)) + timeout
+            answer = await self._hear(port, end, complete)
+            self._free_at = max(self._free_at, port.last_at + self._settings.quiet)
+            if self._judge_echo(port) and answer:
+                self.statistics.answered += 1
+                self.statistics.last_received = port.last_at
+                return answer
+            self.statistics.silent += 1
+            return b""
+
+    async def _put(self, frame: bytes, expires: float | None) -> tuple[_Port | None, Outcome]:
+        if self.closed:
+            raise LinkClosedError(f"bus {self._url}: it is closed")
+        await sleep_until(self._clock, self._free_at)
+        port, transport = self._port, self._transport
+        if port is None or transport is None:
+            self.statistics.dropped += 1
+            return None, Outcome.DISCONNECTED
+        now = self._clock.monotonic()
+        if expires is not None and now >= expires:
+            self.statistics.expired += 1
+            return None, Outcome.EXPIRED
+        self.statistics.stray += len(port.data)
+        port.data.clear()
+        port.spoilt = False
+        port.echo = frame if self._settings.echo else b""
+        try:
+            transport.write(frame)
+        except (OSError, serialx.SerialException) as error:
+            port.connection_lost(error)
+            self.statistics.dropped += 1
+            return None, Outcome.DISCONNECTED
+        self.statistics.sent += 1
+        self._free_at = now + self._settings.duration(len(frame)) + self._settings.quiet
+        return port, Outcome.SENT
+
+    def _judge_echo(self, port: _Port) -> bool:
+        if not port.spoilt and not port.echo:
+            return True
+        port.echo = b""
+        self.statistics.spoilt += 1
+        return False
+
+    async def _hear(self, port: _Port, end: float, complete: Callable[[bytes], bool]) -> bytes:
+        """Return what comes until it is complete, until a gap, or until ``end``."""
+        while True:
+            answer = bytes(port.data)
+            until = end
+            if answer and self._settings.gap_ends:
+                until = min(end, port.last_at + self._settings.quiet)
+            over = port.lost.is_set() or port.spoilt or self._clock.monotonic() >= until
+            if over or (answer and complete(answer)):
+                port.data.clear()
+                return answer
+            await port.hear(until)

@@ -1,0 +1,541 @@
+"""Links over TCP: a server for the plant, a client for each cluster.
+
+Frames are a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the
+next frame after lost bytes, which TCP does not have; a length is refused before anything of the
+frame is kept. A length above the limit ends the connection.
+
+Handshake, each step one frame: server, 32 random bytes; client, 32 random bytes, its proof and
+its name; server, its proof. A proof is HMAC-SHA256 of a label, both random numbers and the name
+under the key that both share, so neither a recording nor a reflection passes. The envelopes that
+follow are sealed with a key derived in the same way. It proves who speaks and that nothing was
+altered; it hides nothing: for that there is TLS.
+
+Nothing may be delivered late, so no data waits in this process: an envelope is made when the
+transport has nothing left to write, and a closed connection throws away what it holds. What the
+kernel holds meanwhile is the receiver's to judge (conversation.py).
+"""
+
+import asyncio
+import contextlib
+import hmac
+import secrets
+import socket
+import ssl
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from heliotrope.control.carried import CarriedLink
+from heliotrope.control.clock import Clock
+from heliotrope.control.conversation import OVERHEAD
+from heliotrope.control.link import LinkError, LinkLostError, LinkSettings
+from heliotrope.errors import InputError
+
+_NONCE, _PROOF = 32, 32
+_LONGEST_NAME = 64
+#: Longest frame that is taken from somebody who has not proved anything yet.
+_GREETING = _NONCE + _PROOF + _LONGEST_NAME
+_SHORTEST_KEY = 16
+_LENGTH = 4
+#: Frames that may wait in a connection before it stops reading its socket.
+_WAITING = 64
+#: Kernel's send buffer, bytes: small, since what lies in it can no longer be taken back.
+_SEND_BUFFER = 65536
+#: Connections that may be in their handshake at a time.
+_NEWCOMERS = 64
+
+
+class _Pipe(asyncio.Protocol):
+    """A connection as frames: bytes in, frames out, nothing else."""
+
+    def __init__(self, largest: int, arrived: "asyncio.Queue[_Pipe] | None" = None) -> None:
+        self.largest = largest
+        self._arrived = arrived
+        self._transport: asyncio.Transport | None = None
+        self._buffer = bytearray()
+        self._frames: deque[bytes] = deque()
+        self._lost = ""
+        self._paused = False
+        self._readable = asyncio.Event()
+        self._writable = asyncio.Event()
+        self._gone = asyncio.Event()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Set the socket up, and report to the server, if there is one."""
+        assert isinstance(transport, asyncio.Transport)
+        self._transport = transport
+        transport.set_write_buffer_limits(high=0)
+        link = transport.get_extra_info("socket")
+        if link is not None and link.family in (socket.AF_INET, socket.AF_INET6):
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        self._writable.set()
+        if self._arrived is not None:
+            try:
+                self._arrived.put_nowait(self)
+            except asyncio.QueueFull:
+                self.lose("too many connections at once are in their handshake")
+
+    def data_received(self, data: bytes) -> None:
+        """Cut what came into frames."""
+        self._buffer += data
+        while not self._lost and len(self._buffer) >= _LENGTH:
+            size = int.from_bytes(self._buffer[:_LENGTH], "big")
+            if size > self.largest:
+                self.lose(f"a frame of {size} bytes came; at most {self.largest} are taken")
+                return
+            if len(self._buffer) < _LENGTH + size:
+                break
+            self._frames.append(bytes(self._buffer[_LENGTH : _LENGTH + size]))
+            del self._buffer[: _LENGTH + size]
+        if self._frames:
+            self._readable.set()
+        if len(self._frames) > _WAITING and not self._paused and self._transport is not None:
+            self._paused = True
+            self._transport.pause_reading()
+
+    def pause_writing(self) -> None:
+        """Called by the transport: the socket takes no more."""
+        self._writable.clear()
+
+    def resume_writing(self) -> None:
+        """Called by the transport: everything has gone out."""
+        self._writable.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Called by the transport: that was all."""
+        self._lost = self._lost or (str(exc) if exc else "the other end closed the connection")
+        self._transport = None
+        self._gone.set()
+        self._readable.set()
+        self._writable.set()
+
+    def lose(self, why: str) -> None:
+        """End the connection at once."""
+        self._lost = self._lost or why
+        self._frames.clear()
+        self._readable.set()
+        self._writable.set()
+        if self._transport is not None:
+            self._transport.abort()
+
+    async def close(self) -> None:
+        """End the connection at once, and wait until it is gone."""
+        self.lose("closed")
+        if self._transport is not None:
+            await self._gone.wait()
+
+    async def read(self) -> bytes:
+        while not self._frames:
+            if self._lost:
+                raise LinkLostError(self._lost)
+            self._readable.clear()
+            await self._readable.wait()
+        frame = self._frames.popleft()
+        if self._paused and not self._frames and self._transport is not None:
+            self._paused = False
+            self._transport.resume_reading()
+        return frame
+
+    async def ready(self) -> None:
+        await self._writable.wait()
+        if self._lost:
+            raise LinkLostError(self._lost)
+
+    def write(self, frame: bytes) -> None:
+        if self._lost or self._transport is None:
+            raise LinkLostError(self._lost)
+        self._transport.write(len(frame).to_bytes(_LENGTH, "big") + frame)
+
+
+# -- handshake -------------------------------------------------------------------------
+
+
+def _proof(key: bytes, label: bytes, server: bytes, client: bytes, name: bytes) -> bytes:
+    return hmac.digest(key, b"heliotrope link 1 " + label + server + client + name, "sha256")
+
+
+def check_key(name: str, key: bytes) -> None:
+    """Refuse a key or a name that cannot be used.
+
+    Raises
+    ------
+    InputError
+        A key of less than 16 bytes, or a name that is empty or longer than 64 bytes.
+    """
+    if len(key) < _SHORTEST_KEY:
+        raise InputError(
+            f"cluster {name}: a key of {len(key)} bytes; give at least {_SHORTEST_KEY} random ones"
+        )
+    if not 0 < len(name.encode()) <= _LONGEST_NAME:
+        raise InputError(f"cluster {name!r}: a name has 1 to {_LONGEST_NAME} bytes")
+
+
+async def _introduce(pipe: _Pipe, name: str, key: bytes) -> bytes:
+    """Say who we are, and return the key of the connection: the client's side."""
+    server, client, title = await pipe.read(), secrets.token_bytes(_NONCE), name.encode()
+    if len(server) != _NONCE:
+        raise LinkError("what answers there does not speak this protocol")
+    pipe.write(client + _proof(key, b"client", server, client, title) + title)
+    try:
+        answer = await pipe.read()
+    except LinkLostError as lost:
+        raise LinkError(
+            f"the server does not take cluster {name} ({lost}); compare name and key on both sides"
+        ) from None
+    if not hmac.compare_digest(answer, _proof(key, b"server", server, client, title)):
+        raise LinkError(f"the server does not know the key of cluster {name}; it is not ours")
+    return _proof(key, b"session", server, client, title)
+
+
+async def _greet(pipe: _Pipe, keys: Mapping[str, bytes], largest: int) -> tuple[str, bytes]:
+    """Find out who comes, and return its name and the key of the connection: the server's side."""
+    server = secrets.token_bytes(_NONCE)
+    pipe.write(server)
+    frame = await pipe.read()
+    client, proof, title = frame[:_NONCE], frame[_NONCE : _NONCE + _PROOF], frame[_NONCE + _PROOF :]
+    name = title.decode(errors="replace")
+    # An unknown name is computed like a known one, so that the time taken tells nothing.
+    key = keys.get(name, b"")
+    right = hmac.compare_digest(
+        proof, _proof(key or bytes(_SHORTEST_KEY), b"client", server, client, title)
+    )
+    if not (key and right):
+        raise LinkError(f"{name!r} could not prove that it is a cluster of this plant")
+    pipe.largest = largest
+    pipe.write(_proof(key, b"server", server, client, title))
+    return name, _proof(key, b"session", server, client, title)
+
+
+# -- both sides ------------------------------------------------------------------------
+
+
+class _TcpCarrier:
+    """Carries envelopes over pipes that somebody else connects."""
+
+    def __init__(self, connect: Callable[[], Awaitable[tuple[_Pipe, bytes]]]) -> None:
+        self._connect = connect
+        self._pipe: _Pipe | None = None
+
+    async def open(self) -> bytes:
+        """Get a pipe whose other end has proved who it is, and its key."""
+        self._pipe, key = await self._connect()
+        return key
+
+    def _connected(self) -> _Pipe:
+        if self._pipe is None:
+            raise LinkLostError("closed")
+        return self._pipe
+
+    async def ready(self) -> None:
+        """Wait until everything written has left this process."""
+        await self._connected().ready()
+
+    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+        """Write an envelope; TCP knows neither lifetimes nor confirmations."""
+        del lifetime, confirmed
+        self._connected().write(envelope)
+
+    async def read(self) -> bytes:
+        """Wait for the next envelope."""
+        return await self._connected().read()
+
+    async def close(self) -> None:
+        """Disconnect at once."""
+        pipe, self._pipe = self._pipe, None
+        if pipe is not None:
+            await pipe.close()
+
+
+@dataclass(frozen=True)
+class _Client:
+    """Connects to the server."""
+
+    host: str
+    port: int
+    name: str
+    key: bytes
+    largest: int
+    tls: ssl.SSLContext | None
+
+    async def connect(self) -> tuple[_Pipe, bytes]:
+        pipe = _Pipe(self.largest)
+        try:
+            await asyncio.get_running_loop().create_connection(
+                lambda: pipe, self.host, self.port, ssl=self.tls
+            )
+            return pipe, await _introduce(pipe, self.name, self.key)
+        except BaseException:
+            await pipe.close()
+            raise
+
+
+class _Slot:
+    """Where a cluster's connection waits for its link; a new one ends the one before."""
+
+    def __init__(self) -> None:
+        self._offer: tuple[_Pipe, bytes] | None = None
+        self._last: _Pipe | None = None
+        self._offered = asyncio.Event()
+
+    def offer(self, pipe: _Pipe, key: bytes) -> None:
+        """Take over a connection that has proved to be this cluster's."""
+        if self._last is not None:
+            self._last.lose("the cluster connected anew")
+        self._last = pipe
+        self._offer = (pipe, key)
+        self._offered.set()
+
+    async def take(self) -> tuple[_Pipe, bytes]:
+        """Wait for the cluster."""
+        while self._offer is None:
+            self._offered.clear()
+            await self._offered.wait()
+        offer, self._offer = self._offer, None
+        return offer
+
+    async def clear(self) -> None:
+        """Close what was not taken."""
+        if self._offer is not None:
+            await self._offer[0].close()
+            self._offer = None
+
+
+def tcp_link(
+    host: str,
+    port: int,
+    name: str,
+    key: bytes,
+    clock: Clock,
+    settings: LinkSettings | None = None,
+    *,
+    tls: ssl.SSLContext | None = None,
+) -> CarriedLink:
+    """Return a cluster's link to its plant.
+
+    Parameters
+    ----------
+    host, port
+        Of the plant's server.
+    name, key
+        Of this cluster, as the plant knows them.
+    clock, settings
+        As in `CarriedLink`.
+    tls
+        See `client_tls`; None: in clear, authenticated but not hidden.
+
+    Raises
+    ------
+    InputError
+        A name or key that cannot be used.
+    """
+    check_key(name, key)
+    settings = settings or LinkSettings()
+    client = _Client(host, port, name, key, settings.largest + OVERHEAD, tls)
+    return CarriedLink(f"plant at {host}:{port}", _TcpCarrier(client.connect), clock, settings)
+
+
+class TcpServer:
+    """The plant's side: one link for each cluster that it knows.
+
+    Parameters
+    ----------
+    host, port
+        Where to listen; port 0: a free one, see ``port``.
+    keys
+        Name and key of each cluster; at least 16 bytes each.
+    clock, settings
+        As in `CarriedLink`; `LinkSettings.open_limit` is the time for the handshake.
+    tls
+        See `server_tls`.
+
+    Attributes
+    ----------
+    links
+        By name of the cluster; ``run`` runs them.
+    port
+        Where it listens, 0 before it does.
+    refused
+        Connections that did not pass the handshake.
+    last_refusal
+        Why the last of them did not.
+
+    Raises
+    ------
+    InputError
+        A name or key that cannot be used.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        keys: Mapping[str, bytes],
+        clock: Clock,
+        settings: LinkSettings | None = None,
+        *,
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        for name, key in keys.items():
+            check_key(name, key)
+        self._host, self._wanted = host, port
+        self._keys = dict(keys)
+        self._settings = settings or LinkSettings()
+        self._tls = tls
+        self._slots = {name: _Slot() for name in keys}
+        self.links: Mapping[str, CarriedLink] = {
+            name: CarriedLink(
+                f"cluster {name}", _TcpCarrier(slot.take), clock, self._settings, patient=True
+            )
+            for name, slot in self._slots.items()
+        }
+        self.port = 0
+        self.refused = 0
+        self.last_refusal = ""
+        self._arrived: asyncio.Queue[_Pipe] = asyncio.Queue(_NEWCOMERS)
+        self._room = asyncio.Semaphore(_NEWCOMERS)
+        self._listening = asyncio.Event()
+        self._closing = asyncio.Event()
+
+    async def listening(self) -> None:
+        """Wait until it listens."""
+        await self._listening.wait()
+
+    async def close(self) -> None:
+        """Close all links and stop listening."""
+        self._closing.set()
+        for link in self.links.values():
+            await link.close()
+
+    async def run(self) -> None:
+        """Listen, and run the links, until closed.
+
+        Raises
+        ------
+        LinkError
+            If it cannot listen there.
+        """
+        try:
+            server = await asyncio.get_running_loop().create_server(
+                lambda: _Pipe(_GREETING, self._arrived), self._host, self._wanted, ssl=self._tls
+            )
+        except OSError as error:
+            raise LinkError(
+                f"cannot listen on {self._host}:{self._wanted} ({error.strerror or error}); is "
+                "another plant running there?"
+            ) from None
+        self.port = server.sockets[0].getsockname()[1]
+        self._listening.set()
+        try:
+            async with asyncio.TaskGroup() as group:
+                for link in self.links.values():
+                    group.create_task(link.run())
+                welcoming = group.create_task(self._welcome())
+                await self._closing.wait()
+                welcoming.cancel()
+        finally:
+            server.close()
+            while not self._arrived.empty():
+                await self._arrived.get_nowait().close()
+            for slot in self._slots.values():
+                await slot.clear()
+
+    async def _welcome(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            while True:
+                await self._room.acquire()
+                group.create_task(self._admit(await self._arrived.get()))
+
+    async def _admit(self, pipe: _Pipe) -> None:
+        admitted = False
+        try:
+            async with asyncio.timeout(self._settings.open_limit):
+                name, key = await _greet(pipe, self._keys, self._settings.largest + OVERHEAD)
+            self._slots[name].offer(pipe, key)
+            admitted = True
+        except (LinkError, OSError) as error:
+            self.refused += 1
+            self.last_refusal = str(error) or "the handshake took too long"
+        finally:
+            self._room.release()
+            if not admitted:
+                with contextlib.suppress(OSError):
+                    await pipe.close()
+
+
+# -- TLS -------------------------------------------------------------------------------
+
+
+def _load(context: ssl.SSLContext, certificate: str | Path, key: str | Path) -> None:
+    try:
+        context.load_cert_chain(certificate, key)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(
+            f"TLS: certificate {certificate} and key {key} cannot be used ({error}); give two PEM "
+            "files that belong together"
+        ) from None
+
+
+def _trust(context: ssl.SSLContext, authority: str | Path) -> None:
+    try:
+        context.load_verify_locations(authority)
+    except (OSError, ssl.SSLError) as error:
+        raise InputError(
+            f"TLS: authority {authority} cannot be used ({error}); give a PEM file"
+        ) from None
+
+
+def server_tls(
+    certificate: str | Path, key: str | Path, authority: str | Path | None = None
+) -> ssl.SSLContext:
+    """Return the server's TLS from PEM files.
+
+    Parameters
+    ----------
+    certificate, key
+        The server's own.
+    authority
+        Who signed the clusters' certificates; None: clusters need none (they have their keys).
+
+    Raises
+    ------
+    InputError
+        Files that cannot be used.
+    """
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    _load(context, certificate, key)
+    if authority is not None:
+        _trust(context, authority)
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
+
+
+def client_tls(
+    authority: str | Path,
+    certificate: str | Path | None = None,
+    key: str | Path | None = None,
+) -> ssl.SSLContext:
+    """Return a cluster's TLS from PEM files.
+
+    Parameters
+    ----------
+    authority
+        Who signed the server's certificate; nobody else is trusted.
+    certificate, key
+        The cluster's own, both or neither.
+
+    Raises
+    ------
+    InputError
+        Files that cannot be used.
+    """
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    _trust(context, authority)
+    if (certificate is None) != (key is None):
+        raise InputError("TLS: a certificate needs its key, and a key its certificate; give both")
+    if certificate is not None and key is not None:
+        _load(context, certificate, key)
+    return context
