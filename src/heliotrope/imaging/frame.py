@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -66,11 +67,11 @@ class Frame:
         """The greatest value that a pixel can have."""
         return float(np.iinfo(self.pixels.dtype).max)
 
-    @property
+    @cached_property
     def grey(self) -> Image:
         """Brightness (H, W) in the frame's own type: the weights of Rec. 601."""
         import cv2
 
         if self.pixels.ndim == 2:
-            return self.pixels
+            return np.ascontiguousarray(self.pixels)
         return cv2.cvtColor(self.pixels, cv2.COLOR_BGR2GRAY)
