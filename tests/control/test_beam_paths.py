@@ -252,6 +252,19 @@ def test_a_mirror_that_shows_its_back_sends_no_beam() -> None:
     assert bp.move(mechanism.armature, -down, noon, mirrors, everything).entered.all()
 
 
+def test_a_grazing_beam_at_the_end_of_a_turn_is_found() -> None:
+    """The mirror shows its back for most of the turn; at its end light grazes the front."""
+    mechanism = kinds.azimuth_elevation((0.0, 0.0, 100.0))
+    noon = direction(0.0, math.radians(60.0))
+    behind = [Sphere("behind", tuple(np.array([0.0, 0.0, 100.0]) - 60.0 * noon), 6.0)]
+    # The normal passes the plane across the sun's direction at an elevation of −30°.
+    turn = np.radians([[0.0, -33.4], [0.0, -27.7]])
+    mirrors = Mirrors.of(2.0, 2.0)
+    assert bp.move(mechanism.armature, turn, noon, mirrors, behind).entered.all()
+    back = np.radians([[0.0, -36.0], [0.0, -30.5]])
+    assert not bp.move(mechanism.armature, back, noon, mirrors, behind).entered.any()
+
+
 def test_a_path_of_one_pose_is_that_pose() -> None:
     field, start, _ = _field(40, seed=9)
     mirrors = Mirrors.of(3.0, 2.0)

@@ -84,6 +84,18 @@ def test_many_sources_are_bounded_by_their_worst_selection(
     assert found.flash >= worst[1] * (1.0 - 1e-9)
 
 
+def test_the_worst_selection_may_leave_out_a_brighter_one() -> None:
+    """A and C together are worse than A, than A and B, and than all: they just fill 0.118 rad."""
+    angle = np.array([0.1, math.sqrt(0.02), math.sqrt(0.118**2 - 0.01)])
+    corneal = 1e4 * np.array([1.0, 0.5, 0.49]) * angle**2
+    found = float(eye.glare_of_many(corneal, angle).burn)
+    pair = float(eye.glare(corneal[0] + corneal[2], 0.118).burn)
+    for others in ([0], [0, 1], [0, 1, 2]):
+        together = math.sqrt(float((angle[others] ** 2).sum()))
+        assert float(eye.glare(corneal[others].sum(), together).burn) < pair
+    assert pair <= found < 1.01 * pair
+
+
 @given(SOURCES, SOURCE)
 def test_a_further_source_is_never_milder(
     sources: list[tuple[float, float]], further: tuple[float, float]
@@ -199,10 +211,10 @@ def test_fewer_beams_are_safe_nearer() -> None:
     radii = []
     for count in (1, 5, 25):
         given_, center = _standby(count)
-        radii.append(eye.safe_distance(given_, center))
+        radii.append(eye.safe_distance(given_, center, step=2.0))
     assert radii == sorted(radii)
     given_, center = _standby(25)
-    assert eye.safe_distance(given_, center, dni=1.0) == 0.0
+    assert eye.safe_distance(given_, center, dni=1.0, step=2.0) == 0.0
     assert eye.safe_distance(given_, center, limit=Hazard.AFTER_IMAGE) == math.inf
 
 
