@@ -1,8 +1,12 @@
-"""What the tests of the local controller share: single precision, drives and armatures."""
+"""What the tests of the local controller share: single precision, a heliostat, a bench."""
 
+import copy
+import functools
+import hashlib
 import importlib
 import importlib.util
 import math
+import struct
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -10,9 +14,15 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 
 import heliotrope.lcu
-from heliotrope.lcu import drives
+from heliotrope.geometry import direction
+from heliotrope.lcu import controller, drives, messages, states, ticks, wire
+from heliotrope.lcu.config import Config
+from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.mechanism import _slots as slot
-from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive, rotary
+from machines import imperfect
 
 
 def single(name: str) -> ModuleType:
@@ -63,3 +73,286 @@ def numbers_of(known: Drive) -> tuple[int, tuple[float, ...], float]:
     numbers = tuple(float(table[i]) for i in ORDER)
     phase = float(table[slot.SAG_PHASE])
     return (kind, *drives.reduced(kind, numbers, float(table[slot.BIAS]), phase))
+
+
+@functools.cache
+def _tracking() -> "Bench":
+    bench = Bench()
+    bench.to_tracking()
+    return bench
+
+
+def tracking() -> "Bench":
+    """A bench whose heliostat tracks."""
+    return copy.deepcopy(_tracking())
+
+
+@functools.cache
+def _standing_by() -> "Bench":
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.order("AIM", *AIM) == bench.order("APPROACH") == messages.DONE
+    bench.run(240, until="IDLE")
+    return bench
+
+
+def standing_by() -> "Bench":
+    """A bench whose heliostat has come to standby."""
+    return copy.deepcopy(_standing_by())
+
+
+ADDRESS, TOKEN, KEY, START_S = 17, 0xABCD, b"k" * 32, 1_400_000_000
+AIM, STANDBY = (0.0, 0.0, 50.0), (12.0, 0.0, 40.0)
+#: Counts of stow: looking up, azimuth east.
+STOW = (480_000, 470_000)
+#: 1.92 million steps a turn: 3.3 µrad a step; 1.5°/s.
+GEAR = {"steps_per_turn": 200, "gear_ratio": 2400, "microsteps": 4}
+LIMITS = (8000, 16_000, 40)
+
+
+def sha256(data: bytes) -> bytes:
+    """The hash."""
+    return hashlib.sha256(data).digest()
+
+
+def heliostat() -> Mechanism:
+    """An imperfect azimuth-elevation heliostat, 90 m from the tower."""
+    return imperfect(
+        kinds.azimuth_elevation(
+            (40.0, 80.0, 0.0), pivot_height=2.0, pivot_offset=0.2,
+            drives=(rotary(**GEAR), rotary(**GEAR)),
+        ),
+        seed=3, size=4e-3,
+    )  # fmt: skip
+
+
+def items_of_heliostat(machine: Mechanism) -> dict[str, bytes]:
+    """What the journal of a complete controller holds."""
+    made = [numbers_of(machine.drives[i]) for i in (0, 1)]
+    limits = [(-100_000, 1_950_000, *LIMITS), (-20_000, 500_000, *LIMITS)]
+    numbers: dict[str, tuple[object, ...]] = {
+        "address": (ADDRESS,), "location": tuple(machine.position),
+        "armature": tuple(machine.armature.table), "stow": STOW, "standby": STANDBY,
+        "biases": (made[0][2], made[1][2]), "defocus": (0.1, 0.05),
+    }  # fmt: skip
+    for i, end in enumerate(("primary", "secondary")):
+        numbers[f"drive_{end}"] = (made[i][0], *made[i][1])
+        numbers[f"limits_{end}"] = limits[i]
+    return {name: struct.pack(CODES_OF[name], *values) for name, values in numbers.items()}
+
+
+class Flash:
+    """NOR flash in memory."""
+
+    block_size, blocks = 4096, 6
+
+    def __init__(self) -> None:
+        self.data = bytearray(b"\xff" * self.block_size * self.blocks)
+
+    def read(self, offset: int, size: int) -> bytes:
+        return bytes(self.data[offset : offset + size])
+
+    def write(self, offset: int, data: bytes) -> None:
+        for i, value in enumerate(data, offset):
+            self.data[i] &= value
+
+    def erase(self, block: int) -> None:
+        start = block * self.block_size
+        self.data[start : start + self.block_size] = b"\xff" * self.block_size
+
+
+class Bench:
+    """A board with its controller, a cluster controller that talks to it, and a sun.
+
+    Invariants are checked after every call; ``made`` counts the steps of the motors.
+    """
+
+    def __init__(self, flash: Flash | None = None, tick: int = 0) -> None:
+        self.machine = heliostat()
+        self.made, self.slip = list(STOW), [0, 0]
+        self.now, self.true_ms = tick, 0
+        self.sender = wire.Sender(0, START_S, sha256)
+        self.sends_sun = self.sends_time = True
+        self.clock_error_ms = 0
+        self.tilt: tuple[float, float] | None = None
+        self.answers: list[tuple[int, tuple[object, ...]]] = []
+        self.halts = 0
+        self.edition = 0
+        self.fed = False
+        self.last_sun_ms = -(10**9)
+        self.start(flash)
+
+    def start(self, flash: Flash | None = None) -> None:
+        """Switch the board on, with an empty or a given flash."""
+        self.flash = Flash() if flash is None else flash
+        self.journal = Journal(self.flash)
+        items = self.journal.load()
+        if not items:
+            self.journal.store(items_of_heliostat(self.machine))
+            self.journal.zero(*STOW)
+        self.journal.boot()
+        config = Config()
+        config.serial = 4711
+        assert config.load(self.journal.items)
+        gate = wire.Gate(sha256, KEY, self.edition)
+        self.controller = controller.Controller(config, self.now, gate, self.read_tilt)
+        journal = self.journal
+        # Where the journal's counts are not those of the motors, it slips for good.
+        counts = [journal.primary, journal.secondary]
+        self.slip = [s + m - c for s, m, c in zip(self.slip, self.made, counts, strict=True)]
+        self.made[:] = counts
+        self.do(
+            self.controller.boot(
+                journal.primary, journal.secondary, journal.doubt, journal.state, journal.aim,
+                journal.boots, journal.looping,
+            )
+        )  # fmt: skip
+
+    def read_tilt(self) -> tuple[float, float] | None:
+        """The accelerometer."""
+        return self.tilt
+
+    @property
+    def state(self) -> str:
+        return states.STATES[self.controller.state]
+
+    def do(self, actions: list[tuple[object, ...]]) -> None:
+        """Obey the controller's actions."""
+        for action in list(actions):
+            kind, *rest = action
+            if kind == controller.SEGMENT:
+                axis, direction, count, interval = rest
+                assert interval * LIMITS[0] >= 1_000_000
+                self.made[axis] += direction * count
+                limits = self.controller.config.axes[axis]
+                assert limits.low <= self.made[axis] <= limits.high
+                assert not self.journal.rest
+            elif kind == controller.ANSWER:
+                wire.pack(messages.name_of(rest[0]), *rest[1])
+                self.answers.append((rest[0], rest[1]))
+            elif kind == controller.STORE:
+                self.journal.store(rest[0])
+            elif kind == controller.BEFORE_STEPS:
+                self.journal.before_steps(*rest)
+            elif kind == controller.AT_REST:
+                assert rest == self.made
+                self.journal.at_rest(*rest)
+            elif kind == controller.NOTE:
+                self.journal.note(*rest)
+            elif kind == controller.ZEROED:
+                slip = zip(self.slip, self.made, rest, strict=True)
+                self.slip = [s + m - c for s, m, c in slip]
+                self.made[:] = rest
+                self.journal.zero(*rest)
+            elif kind == controller.HALT:
+                self.halts += 1
+            elif kind == controller.FEED:
+                self.fed = True
+        self.check()
+
+    def check(self) -> None:
+        """What must hold after every event."""
+        own = self.controller
+        if own.motion.stepper is not None:
+            assert [axis.count for axis in own.motion.stepper.axes] == self.made
+        if own.state in states.NEED_SUN:
+            assert own.sun.fresh()
+            assert own.sun.age_ms() <= own.config.lease_ms
+            assert self.true_ms - self.last_sun_ms <= own.config.lease_ms
+        if own.state == states.TRACKING:
+            assert own.motion.ready
+            assert own.fault == controller.NO_FAULT
+
+    # The cluster controller.
+
+    def gps_ms(self) -> int:
+        return START_S * 1000 + self.true_ms + self.clock_error_ms
+
+    def sun(self, second: float) -> np.ndarray:
+        """A sun in the south that goes west."""
+        hour = 7.27e-5 * (second - START_S)
+        return np.array(direction(np.pi + hour, 0.7 + 0.2 * np.sin(hour)))
+
+    def send(self, name: str, *values: object, to: int = ADDRESS) -> None:
+        """Send a message."""
+        key = KEY if messages.who_of(messages.NUMBER_OF[name]) == messages.KEY else b""
+        self.deliver(self.sender.frame(to, name, *values, key=key))
+
+    def deliver(self, data: bytes) -> None:
+        """Bring bytes to the board."""
+        for frame in wire.Reader().feed(data):
+            self.do(self.controller.on_frame(frame, self.now))
+
+    def order(self, name: str, *values: object, life_s: int = 5, token: int = TOKEN) -> int:
+        """Give a command and return the result in the ACK."""
+        head: tuple[object, ...] = (token, self.gps_ms() // 1000 + life_s)
+        if messages.who_of(messages.NUMBER_OF[name]) == messages.KEY:
+            self.edition += 1
+            head = (*head, self.edition)
+        if messages.who_of(messages.NUMBER_OF[name]) == messages.ANYONE:
+            head = ()
+        self.answers.clear()
+        self.send(name, *head, *values)
+        number, (_, of, result) = self.answers[-1]
+        assert (number, of) == (0x0D, messages.NUMBER_OF[name])
+        return result  # type: ignore[return-value]
+
+    def second(self) -> None:
+        """What the cluster sends each second."""
+        if self.sends_time:
+            seconds, ms = divmod(self.gps_ms(), 1000)
+            self.deliver(self.sender.session(TOKEN))
+            self.send("TIME", seconds // 604_800, seconds % 604_800 * 1000 + ms, 1, to=0xFFFF)
+        if self.sends_sun:
+            self.last_sun_ms = self.true_ms
+            self.send("SUN", *self.sun_values(self.gps_ms() // 1000), to=0xFFFF)
+
+    def sun_values(self, second: int) -> tuple[int, ...]:
+        here, there = self.sun(second), self.sun(second + 1)
+        return (second, *(round(x * 2**30) for x in here),
+                *(round(x * 2**28) for x in there - here))  # fmt: skip
+
+    # Time.
+
+    def tick(self, ms: int = 50) -> None:
+        self.now = ticks.add(self.now, ms)
+        self.true_ms += ms
+        self.fed = False
+        self.do(self.controller.on_tick(self.now))
+
+    def run(self, seconds: float, *, until: str = "") -> float:
+        """Let time pass, at most until a state is reached; returns how long that took, s."""
+        begin = self.true_ms
+        while self.true_ms - begin < 1000 * seconds:
+            part = 0
+            if self.true_ms % 1000 == 0:
+                # Messages come between ticks.
+                part = 20
+                self.now, self.true_ms = ticks.add(self.now, part), self.true_ms + part
+                self.second()
+            self.tick(50 - part)
+            if until and self.state == until:
+                break
+        return (self.true_ms - begin) / 1000
+
+    def to_tracking(self) -> None:
+        """From stow to tracking by the authority's commands."""
+        self.run(1.5)
+        assert self.order("AIM", *AIM) == messages.DONE
+        assert self.order("APPROACH") == messages.DONE
+        self.run(240, until="IDLE")
+        assert self.order("TRACK") == messages.DONE
+        self.run(20)
+        assert self.state == "TRACKING"
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Normal and vertex of the mirror, by the mechanism."""
+        return self.machine.armature.pose(self.machine.drives.angles(np.add(self.made, self.slip)))
+
+    def miss(self, aim: tuple[float, float, float]) -> float:
+        """Distance by which the true beam passes a point, m; infinite if it goes away from it."""
+        normal, vertex = self.pose()
+        sun = self.sun(self.gps_ms() / 1000)
+        ray = 2.0 * (normal @ sun) * normal - sun
+        way = np.array(aim) - vertex
+        return float(np.linalg.norm(np.cross(way, ray))) if way @ ray > 0 else math.inf

@@ -24,6 +24,8 @@ SLOW = 0.3
 STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
 #: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
 DEGENERATE_LIMIT = 1e-6
+#: A pose on the branch of the last one that moves less than this (rad) is taken at once.
+CLOSE = 0.05
 #: Angles this far (rad) beyond a stop count as on it.
 STOP_SLACK = 1e-6
 
@@ -109,6 +111,7 @@ class Pointing:
         self.sines = (dot(e, a), dot(e, self.c))
         self.cosines = (dot(f, a), dot(f, self.c))
         self.found = (Pose(-1), Pose(1))
+        self.last = self.found[0]
 
     def turned(
         self, turn: tuple[float, float, float, float], u: tuple[float, float, float]
@@ -145,9 +148,21 @@ class Pointing:
         near
             Joint angles now, rad.
         """
-        self.solve_branch(self.found[0], sun, aim, stops, near)
-        self.solve_branch(self.found[1], sun, aim, stops, near)
+        last = self.last
+        self.solve_branch(last, sun, aim, stops, near)
+        if last.status == OK and _motion(last, near) < CLOSE:
+            return last
         first, second = self.found
+        other = second if last is first else first
+        self.solve_branch(other, sun, aim, stops, near)
+        if OK not in (first.status, second.status):
+            for pose in self.found:
+                if pose.status == STOPPED:
+                    self._nearest_at_stops(pose, sun, aim, stops, near)
+        self.last = self._better(first, second, near)
+        return self.last
+
+    def _better(self, first: Pose, second: Pose, near: list[float]) -> Pose:
         if first.status == OK and second.status == OK:
             return first if _motion(first, near) <= _motion(second, near) else second
         if OK in (first.status, second.status):
@@ -164,7 +179,7 @@ class Pointing:
         stops: list[list[float]],
         near: list[float],
     ) -> None:
-        """Solve one branch into ``pose``, within the stops."""
+        """Solve one branch into ``pose``; beyond the stops it is STOPPED, without angles."""
         s, p = unit(sun), minus(aim, self.origin)
         turn = self._fixed_point(pose, s, p)
         if pose.status == DEGENERATE:
@@ -177,6 +192,17 @@ class Pointing:
             pose.residual = self._residual(s, p, turn)
             return
         pose.status, pose.residual = STOPPED, math.pi
+
+    def _nearest_at_stops(
+        self,
+        pose: Pose,
+        sun: tuple[float, float, float],
+        aim: tuple[float, float, float],
+        stops: list[list[float]],
+        near: list[float],
+    ) -> None:
+        """Nearest pose on the border of the stops' rectangle."""
+        s, p = unit(sun), minus(aim, self.origin)
         for axis in (0, 1):
             for held in stops[axis]:
                 if math.isfinite(held):

@@ -1,0 +1,514 @@
+"""The controller of one heliostat: messages and time in, actions out; no input or output.
+
+Safety rests on three things here: the state table, the sun's lease, and that DEFOCUS and STOW
+pass every check. Who may command, and what is new, is decided by ``wire.Gate``.
+
+Every call returns the same list of actions, good until the next call:
+
+SEGMENT       axis, direction, count, interval_us: for the step timer
+ANSWER        number, values: send it to the cluster controller
+STORE         items by name: for ``Journal.store``
+RECALL        item number: answer STORED from the journal
+BEFORE_STEPS  counts now (2) and after (2): ``Journal.before_steps``, ere the segments are played
+AT_REST       counts (2): ``Journal.at_rest``
+NOTE          state, aim as bytes or None: ``Journal.note``
+ZEROED        counts (2): ``Journal.zero``
+HALT          stop the step timer at once; then call ``halted``
+FEED          the watchdog may be fed
+"""
+
+import struct
+
+from . import messages, states, ticks
+from .config import Config, is_place
+from .journal import ITEMS, items_of
+from .lease import Clock, SunLease
+from .motion import APPROACH, DIAGNOSE, HOLD, MOVE, RETURN, ROUGH_STEPS, STANDBY, STOW, Motion
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+    from collections.abc import Callable
+    from typing import Any
+
+    from .wire import Frame, Gate
+
+(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT,
+ FEED) = range(10)  # fmt: skip
+
+#: Faults; their texts, and the names of the flags' bits, stand in ``names``.
+(NO_FAULT, STUCK_PRIMARY, STUCK_SECONDARY, LIMIT_SWITCH, SUPPLY, TEMPERATURE, SENSOR, COUNTS,
+ BOOTS, JOURNAL, LATCHED) = range(11)  # fmt: skip
+
+#: Where settings may change: those of the calibration, and those of the machine.
+CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT, states.IDLE,
+               states.DEFOCUSED)  # fmt: skip
+MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT, states.IDLE)
+STATES_OF = {
+    "SET_ARMATURE": CALIBRATION, "SET_BIAS": CALIBRATION, "SET_POSITION": CALIBRATION,
+    "SET_DEFOCUS": CALIBRATION, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
+    "SET_STOW": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": CALIBRATION,
+}  # fmt: skip
+
+#: A clock set differently by more than this (ms) has jumped.
+CLOCK_JUMP_MS = 2000
+MOST_STEPS = 1 << 29
+
+
+class Controller:
+    """One heliostat.
+
+    Parameters
+    ----------
+    config
+        Settings, as from the journal.
+    now_ms
+        The present tick; see ``ticks``.
+    gate
+        Decides which frames may act; None where :meth:`on_message` is called directly.
+    sensor
+        Tilt of the mirror; see ``Motion``.
+
+    Attributes
+    ----------
+    state, fault
+        Of ``states.STATES`` and ``names.FAULTS``.
+    supply_mv, temperature_degc
+        For STATUS; set by the caller.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        now_ms: int,
+        gate: "Gate | None" = None,
+        sensor: "Callable[[], tuple[float, float] | None]" = lambda: None,
+    ) -> None:
+        self.config, self.gate = config, gate
+        self.clock, self.sun = Clock(), SunLease(config.lease_ms)
+        self.motion = Motion(config, self.sun, sensor)
+        self.state, self.fault = states.UNCONFIGURED, NO_FAULT
+        self.supply_mv, self.temperature_degc, self.boots = 0, 0, 0
+        self.out: list[tuple[Any, ...]] = []
+        self._seen = now_ms
+        self._owed_ms = 0  # time that messages have charged and the motion has not yet had
+        self._uptime_s = self._uptime_ms = 0
+        self._dark, self._heard = ticks.Deadline(), ticks.Deadline()
+        self._dark.start(now_ms, config.stow_wait_ms)
+        self._heard.start(now_ms, config.silence_ms)
+        self._present = 0
+        self._doubtful = self._aim_locked = False
+        self._clock_jumped = self._ticks_jumped = False
+        self._moving = False
+
+    # Beginning.
+
+    def boot(
+        self, primary: int, secondary: int, doubt: int, state: int, aim: "bytes | None",
+        boots: int, looping: bool,
+    ) -> "list[tuple[Any, ...]]":  # fmt: skip
+        """Start with what the journal holds: ``primary, secondary, doubt, state, aim, boots,
+        looping`` of ``Journal``, its items being in the configuration already.
+        """  # noqa: D205 - the names are the summary
+        self.out.clear()
+        motion = self.motion
+        motion.declare(primary, secondary, doubt >= 0)
+        self._doubtful = doubt != 0
+        self.boots = boots
+        if aim is not None:
+            point = struct.unpack("<fff", aim)
+            if is_place(point):
+                motion.aim = point
+        if not self.config.complete():
+            return self.out
+        if looping or not motion.known:
+            self.fault = BOOTS if looping else COUNTS
+        elif state == states.FAULT:
+            self.fault = LATCHED
+        if state == states.LOCKED:
+            self._event("BOOT_LOCKED")
+        elif self.fault != NO_FAULT:
+            self._event("BOOT_FAULT")
+        else:
+            self._event("BOOT_STOWED" if motion.at_stow() else "BOOT_AWAY")
+        return self.out
+
+    # Time.
+
+    def _time(self, now_ms: int) -> None:
+        """Charge the time since the last call to everything that ends."""
+        elapsed = ticks.diff(now_ms, self._seen)
+        self._seen = now_ms
+        if elapsed < 0:
+            # No clock goes on after that, and no lease outlives it.
+            self._ticks_jumped = True
+            self.clock.lose()
+            self.sun.end()
+            elapsed = 0
+        self._owed_ms = min(self._owed_ms + elapsed, 1_000_000)
+        self.clock.elapse(elapsed)
+        self._uptime_ms += elapsed
+        self._uptime_s = (self._uptime_s + self._uptime_ms // 1000) & 0xFFFFFFFF
+        self._uptime_ms %= 1000
+        fresh = self.sun.look(now_ms, elapsed)
+        silent = self._heard.over(now_ms)
+        goes_on = self.motion.following() and self.state != states.FAULT
+        if fresh and (goes_on or self.state in states.NEED_SUN):
+            self._dark.start(now_ms, self.config.stow_wait_ms)
+        dark = self._dark.over(now_ms)
+        self._lapses(fresh, silent, dark)
+
+    def _lapses(self, fresh: bool, silent: bool, dark: bool) -> None:
+        """What the state table says of time that has run out."""
+        state, kind = self.state, self.motion.kind
+        if state in states.NEED_SUN and not fresh:
+            self._event("LAPSED")
+        elif state == states.IDLE:
+            if silent or (kind == STANDBY and not fresh):
+                self._event("LAPSED")
+        elif state == states.STOWING and kind == RETURN and not fresh:
+            self._event("LAPSED")
+        elif state == states.DEFOCUSED and dark:
+            self._event("SILENT")
+        elif (
+            state == states.FAULT and dark and kind != STOW and self.motion.known
+            and not self.motion.at_stow()
+        ):  # fmt: skip
+            self._event("SILENT")
+
+    def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
+        """Go on; to be called more often than every ``ahead_ms`` while something moves."""
+        self.out.clear()
+        self._time(now_ms)
+        elapsed, self._owed_ms = self._owed_ms, 0
+        motion = self.motion
+        before = motion.kind
+        event = motion.tick(elapsed)
+        if event:
+            self._event(event)
+        if before == DIAGNOSE and motion.kind == MOVE:
+            self._judge()
+        stepper = motion.stepper
+        if stepper is not None:
+            one, two, place = motion.place(0), motion.place(1), len(self.out)
+            stepper.advance(elapsed, self.out, SEGMENT)
+            if len(self.out) > place:
+                steps = (BEFORE_STEPS, one, two, motion.place(0), motion.place(1))
+                self.out.insert(place, steps)
+                self._moving = True
+            elif self._moving and motion.still():
+                self._moving = False
+                self.out.append((AT_REST, one, two))
+        if self.state != states.TRACKING or self.sun.fresh():
+            self.out.append((FEED,))
+        return self.out
+
+    # Events.
+
+    def _event(self, name: str) -> bool:
+        """Pass an event to the state table; False if it is refused, and nothing has changed."""
+        found = states.transition(self.state, name)
+        if found is None:
+            return False
+        before, self.state = self.state, found[0]
+        if found[1]:
+            getattr(self.motion, found[1])()
+        if self.state in (states.DEFOCUSED, states.FAULT) and before != self.state:
+            self._dark.start(self._seen, self.config.stow_wait_ms)
+        if self.state != before:
+            self._note()
+        return True
+
+    def _note(self) -> None:
+        aim = self.motion.aim
+        data = None if aim is None else struct.pack("<fff", aim[0], aim[1], aim[2])
+        self.out.append((NOTE, self.state, data))
+
+    def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
+        """Latch a fault that the caller found; ``halt`` stops the motors at once."""
+        self.out.clear()
+        self._time(now_ms)
+        self._latch(number)
+        self._present |= 1 << number
+        if halt:
+            self.motion.hold()
+            self.out.append((HALT,))
+        return self.out
+
+    def _latch(self, number: int) -> None:
+        if self.fault == NO_FAULT:
+            self.fault = number
+        self._event("FAULTED")
+
+    def fault_gone(self, number: int) -> None:
+        """The cause of a fault is gone; the fault itself stays until CLEAR_FAULT."""
+        self._present &= ~(1 << number)
+
+    def halted(self, primary: int, secondary: int) -> "list[tuple[Any, ...]]":
+        """After HALT: signed steps that were emitted and not made."""
+        self.out.clear()
+        self.motion.halted(primary, secondary)
+        self._moving = False
+        self.out.append((AT_REST, self.motion.place(0), self.motion.place(1)))
+        return self.out
+
+    def _judge(self) -> None:
+        """Latch a fault if the diagnosis found a drive stuck."""
+        result = self.motion.diagnosis[0]
+        for i in (0, 1):
+            if result & (4 << i):
+                self._present &= ~(1 << (STUCK_PRIMARY + i))
+                self._latch(STUCK_PRIMARY + i)
+
+    # Messages.
+
+    def on_frame(self, frame: "Frame", now_ms: int) -> "list[tuple[Any, ...]]":
+        """Take a frame that came whole."""
+        self.out.clear()
+        if not frame.for_address(self.config.address):
+            return self.out
+        self._time(now_ms)
+        assert self.gate is not None
+        verdict = self.gate.judge(frame, now_ms, self.clock.second)
+        values = frame.values()
+        reply = frame.to == self.config.address
+        self._message(frame.number, frame.sequence, values, frame.payload, verdict, now_ms, reply)
+        return self.out
+
+    def on_message(
+        self, number: int, sequence: int, values: "tuple[Any, ...]", payload: bytes,
+        verdict: int, now_ms: int, reply: bool,
+    ) -> "list[tuple[Any, ...]]":  # fmt: skip
+        """Take a message.
+
+        Parameters
+        ----------
+        number, sequence
+            Of the message.
+        values, payload
+            Its numbers, and the bytes they came in; both with the head.
+        verdict
+            Of the gate: ``messages.DONE`` if it may act.
+        now_ms
+            The present tick.
+        reply
+            Whether it came to this address alone, so that an ACK is wanted.
+        """
+        self.out.clear()
+        self._time(now_ms)
+        self._message(number, sequence, values, payload, verdict, now_ms, reply)
+        return self.out
+
+    def _message(
+        self, number: int, sequence: int, values: "tuple[Any, ...] | None", payload: bytes,
+        verdict: int, now_ms: int, reply: bool,
+    ) -> None:  # fmt: skip
+        who, name = messages.who_of(number), messages.name_of(number)
+        if who == messages.ANYONE:
+            # Never refused, whatever the verdict.
+            self._event(name)
+            result = messages.DONE
+        elif who < 0 or who == messages.NODE:
+            return
+        elif verdict != messages.DONE:
+            result = verdict
+        elif values is None:
+            result = messages.BAD_VALUE
+        else:
+            self._heard.start(now_ms, self.config.silence_ms)
+            if who == messages.ASK:
+                self._answer(name, values)
+                return
+            if who == messages.CLUSTER:
+                self._hear(name, values, now_ms)
+                return
+            if who == messages.KEY:
+                result = self._set(name, values[3:], payload)
+            else:
+                result = self._command(name, values[2:], payload)
+        if reply and who in (messages.ANYONE, messages.AUTHORITY, messages.KEY):
+            self.out.append((ANSWER, 0x0D, (sequence, number, result)))
+
+    def _hear(self, name: str, values: "tuple[Any, ...]", now_ms: int) -> None:
+        """Time and sun."""
+        if name == "TIME":
+            if abs(self.clock.set(values[0], values[1])) > CLOCK_JUMP_MS:
+                self._clock_jumped = True
+        elif name == "SUN":
+            self.sun.take(values, self.clock, now_ms)
+
+    def _answer(self, name: str, values: "tuple[Any, ...]") -> None:
+        motion = self.motion
+        answer: tuple[Any, ...] = ()
+        if name == "QUERY_STEPS":
+            answer = 0x02, (motion.place(0), motion.place(1), motion.goal(0), motion.goal(1))
+        elif name == "QUERY_STATUS":
+            answer = 0x04, self.status()
+        elif name == "QUERY_POSITION" and self.config.location is not None:
+            answer = 0x06, self.config.location
+        elif name == "QUERY_DIAGNOSIS":
+            answer = 0x08, motion.diagnosis
+        elif name == "DISCOVER" and values[0] <= self.config.serial <= values[1]:
+            answer = 0x0C, (self.config.serial, self.config.firmware, self.config.address)
+        elif name == "QUERY_STORED" and 1 <= values[0] <= len(ITEMS):
+            if ITEMS[values[0] - 1][0] != "key_id":
+                self.out.append((RECALL, values[0]))
+            return
+        if answer:
+            self.out.append((ANSWER, answer[0], answer[1]))
+
+    def status(self) -> "tuple[Any, ...]":
+        """The numbers of STATUS."""
+        return (
+            self.state, self.flags(), self.fault, self._uptime_s, self.sun.age_ms(),
+            self.supply_mv, self.temperature_degc, self.config.armature_crc, self.boots,
+        )  # fmt: skip
+
+    def flags(self) -> int:
+        """Bits of ``names.FLAGS``."""
+        motion = self.motion
+        bits = 0
+        for i, value in enumerate((
+            not motion.still(), self.sun.fresh(), self.clock.second is not None,
+            self.config.complete(), motion.ready, motion.at_stow(), self._aim_locked, motion.rough,
+            self._doubtful, not motion.known, motion.unreachable, motion.cut,
+            self._clock_jumped, self._ticks_jumped, self._present != 0, motion.kind == DIAGNOSE,
+        )):  # fmt: skip
+            bits |= bool(value) << i
+        return bits
+
+    # Commands.
+
+    def _command(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
+        """Obey a fresh command of the authority; returns the result for ACK."""
+        if name in ("AIM", "LOCK_AIM", "ROUGH", "STANDBY"):
+            return self._adjust(name, values, payload)
+        motion = self.motion
+        if name in ("UNLOCK", "CLEAR_FAULT"):
+            return self._release(name)
+        if states.transition(self.state, name) is None:
+            return messages.REFUSED_STATE
+        if motion.kind == DIAGNOSE and name not in ("LOCK", "IDLE"):
+            return messages.BUSY
+        result = messages.DONE
+        if name in ("TRACK", "REFOCUS", "SEARCH"):
+            result = self._may_track()
+            if name == "SEARCH" and not motion.prepare_search(values[0], values[1]):
+                return messages.BAD_VALUE
+        elif name == "APPROACH":
+            result = self._may_approach()
+        elif name in ("JOG", "GOTO", "DIAGNOSE"):
+            result = self._may_move(name, values)
+        if result != messages.DONE:
+            return result
+        return messages.DONE if self._event(name) else messages.REFUSED_STATE
+
+    def _release(self, name: str) -> int:
+        """Leave LOCKED or FAULT."""
+        if name == "UNLOCK":
+            if self.fault != NO_FAULT:
+                name = "UNLOCK_FAULT"
+            elif self.motion.at_stow():
+                name = "UNLOCK_STOWED"
+        else:
+            if self._present or (self.fault == COUNTS and not self.motion.known):
+                return messages.REFUSED_STATE
+            if self.motion.at_stow():
+                name = "CLEAR_FAULT_STOWED"
+        if not self._event(name):
+            return messages.REFUSED_STATE
+        if name.startswith("CLEAR"):
+            self.fault = NO_FAULT
+        return messages.DONE
+
+    def _may_track(self) -> int:
+        """Whether the mirror may go from where it is straight to its aim."""
+        motion = self.motion
+        if not (motion.ready and motion.known and self.sun.fresh() and self.fault == NO_FAULT):
+            return messages.REFUSED_STATE
+        if motion.aim is None or not motion.reaches([motion.aim]):
+            return messages.BAD_VALUE
+        return messages.DONE
+
+    def _may_approach(self) -> int:
+        motion = self.motion
+        if not (motion.known and self.sun.fresh() and self.fault == NO_FAULT):
+            return messages.REFUSED_STATE
+        if self.config.standby is None or not motion.reaches(motion.way()):
+            return messages.BAD_VALUE
+        return messages.DONE
+
+    def _may_move(self, name: str, values: "tuple[Any, ...]") -> int:
+        motion = self.motion
+        if not motion.known:
+            return messages.REFUSED_STATE
+        if name == "JOG":
+            if values[0] > 1 or abs(values[1]) > MOST_STEPS:
+                return messages.BAD_VALUE
+            steps = [motion.goal(0), motion.goal(1)]
+            steps[values[0]] += values[1]
+            values = tuple(steps)
+        if name != "DIAGNOSE" and not motion.prepare_move(values[0], values[1]):
+            return messages.BAD_VALUE
+        return messages.DONE
+
+    def _adjust(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
+        """Aim, standby point and stepping: no change of state."""
+        motion, config = self.motion, self.config
+        if name in ("LOCK_AIM", "ROUGH"):
+            if values[0] > 1:
+                return messages.BAD_VALUE
+            if name == "LOCK_AIM":
+                self._aim_locked = values[0] == 1
+            else:
+                motion.set_rough(ROUGH_STEPS if values[0] else 0)
+            return messages.DONE
+        if name == "AIM" and self._aim_locked:
+            return messages.REFUSED_STATE
+        if self.state == states.SEARCHING or motion.kind in (APPROACH, RETURN):
+            return messages.BUSY
+        follows = self.state == states.TRACKING if name == "AIM" else motion.kind == STANDBY
+        if not is_place(values) or (follows and not motion.reaches([values])):
+            return messages.BAD_VALUE
+        if name == "AIM":
+            motion.aim = values[0], values[1], values[2]
+            self._note()
+        else:
+            config.standby = values[0], values[1], values[2]
+            self.out.append((STORE, {"standby": payload[8:]}))
+        motion.renew()
+        return messages.DONE
+
+    # What is stored.
+
+    def _set(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
+        """Take a setting, in a safe state and at rest; returns the result for ACK."""
+        allowed = STATES_OF.get(name)
+        if allowed is None or self.state not in allowed:
+            return messages.REFUSED_STATE
+        motion, config = self.motion, self.config
+        if allowed is MACHINE and (motion.kind not in (HOLD, MOVE, STOW) or not motion.still()):
+            return messages.REFUSED_STATE
+        if name == "ZERO":
+            if max(abs(values[0]), abs(values[1])) > MOST_STEPS:
+                return messages.BAD_VALUE
+            motion.hold()
+            motion.declare(values[0], values[1], True)
+            self._doubtful, motion.ready = False, False
+            self.out.append((ZEROED, values[0], values[1]))
+            self.out.append((STORE, items_of(name, payload)))
+            return messages.DONE
+        if name == "SET_ADDRESS" and values[0] != config.serial:
+            return messages.BAD_VALUE
+        try:
+            items = items_of(name, payload)
+        except ValueError:
+            return messages.BAD_VALUE
+        for item in items:
+            if item != "edition" and not config.take(item, items[item]):
+                return messages.BAD_VALUE
+        if name != "SET_ADDRESS":
+            motion.rebuild()
+        self.out.append((STORE, items))
+        if self.state == states.UNCONFIGURED and config.complete():
+            self._event("CONFIGURED")
+        return messages.DONE

@@ -1,0 +1,90 @@
+"""Diagnosis of movement: whether the mirror's tilt follows when an axis moves a little."""
+
+import math
+
+from .config import Config
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
+    from typing import Any
+
+#: Angle that an axis is moved, and least change of tilt that the sensor tells, rad.
+NUDGE, NOTICED = 0.02, 0.002
+
+#: Results, bits.
+MOVED_PRIMARY, MOVED_SECONDARY, STUCK_PRIMARY, STUCK_SECONDARY, NO_SENSOR = 1, 2, 4, 8, 16
+
+
+class Diagnosis:
+    """One diagnosis: before, with the primary axis moved, with the secondary axis moved, back.
+
+    An accelerometer sees an axis turn but for its part about the plumb line: where less than
+    ``NOTICED`` is to be expected, neither MOVED nor STUCK is said.
+
+    Parameters
+    ----------
+    config
+        A complete configuration.
+    home
+        Counts where the mirror stands.
+
+    Attributes
+    ----------
+    over
+        Whether the last motion is the one back.
+    result
+        (bits, steps moved of the two axes, last change of tilt x, y in rad).
+    """
+
+    def __init__(self, config: Config, home: "list[int]") -> None:
+        self.config, self.home = config, home
+        self.over = False
+        self.result: tuple[Any, ...] = (0, 0, 0, 0.0, 0.0)
+        self._tilts: list[tuple[float, float] | None] = []
+
+    def advance(self, tilt: "tuple[float, float] | None") -> "list[int]":
+        """Take the tilt at rest; returns the counts to go to next."""
+        self._tilts.append(tilt)
+        stage = len(self._tilts)
+        steps = [self.home[0], self.home[1]]
+        if stage <= 2:
+            steps[stage - 1] = self._nudged(stage - 1)
+        else:
+            self.over = True
+            self.result = self._judged()
+        return steps
+
+    def _nudged(self, i: int) -> int:
+        """Counts of an axis after a nudge, within its limits."""
+        drive, axis = self.config.drives[i], self.config.axes[i]
+        assert drive is not None
+        assert axis is not None
+        angle = drive.angle(self.home[i])
+        for offset in (NUDGE, -NUDGE):
+            steps = drive.nearest(angle + offset)
+            if axis.low <= steps <= axis.high:
+                return steps
+        return self.home[i]
+
+    def _judged(self) -> "tuple[Any, ...]":
+        pointing, drives = self.config.pointing, self.config.drives
+        assert pointing is not None
+        bits, moved, seen = 0, [0, 0], (0.0, 0.0)
+        axis = pointing.axis_1
+        for i in (0, 1):
+            drive, before, after = drives[i], self._tilts[0], self._tilts[i + 1]
+            assert drive is not None
+            if before is None or after is None:
+                bits |= NO_SENSOR
+                continue
+            moved[i] = self._nudged(i) - self.home[i]
+            angle = drive.angle(self.home[i])
+            turn = abs(drive.angle(self.home[i] + moved[i]) - angle)
+            # Gravity, seen from the mirror, turns with it, but for the part along the axis.
+            expected = turn * math.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
+            seen = after[0] - before[0], after[1] - before[1]
+            if expected > NOTICED:
+                good = math.sqrt(seen[0] * seen[0] + seen[1] * seen[1]) > 0.5 * expected
+                bits |= (MOVED_PRIMARY if good else STUCK_PRIMARY) << i
+            axis = pointing.turned((math.sin(angle), math.cos(angle), 0.0, 1.0), pointing.axis_2)
+        return bits, moved[0], moved[1], seen[0], seen[1]

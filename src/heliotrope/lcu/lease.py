@@ -1,0 +1,108 @@
+"""The sun as last heard, and how long it may be trusted."""
+
+from . import ticks
+
+#: The sun's components come in 2^-30, its rate in 2^-28 a second.
+UNIT, RATE_FACTOR = 1 << 30, 4
+#: A vector may be this far (ms) ahead of the clock: the cluster sends it for a full second.
+AHEAD_MS = 2000
+#: Below this height (2^-30) there is no sun to reflect.
+NIGHT = -UNIT // 50
+MODULO = 1 << 32
+
+
+class Clock:
+    """GPS time between two TIME messages, carried by ticks.
+
+    ``second`` is None until TIME has come, and again after the ticks ran backwards.
+    """
+
+    def __init__(self) -> None:
+        self.second: int | None = None
+        self.ms = 0
+
+    def set(self, week: int, time_of_week_ms: int) -> int:
+        """Take TIME; returns the jump in ms, 0 at the first."""
+        second, ms = week * 604_800 + time_of_week_ms // 1000, time_of_week_ms % 1000
+        jump = 0 if self.second is None else 1000 * (second - self.second) + ms - self.ms
+        self.second, self.ms = second % MODULO, ms
+        return jump
+
+    def elapse(self, ms: int) -> None:
+        """Go on by the ticks that have passed."""
+        if self.second is not None:
+            self.ms += ms
+            self.second = (self.second + self.ms // 1000) % MODULO
+            self.ms %= 1000
+
+    def lose(self) -> None:
+        """Forget the time."""
+        self.second = None
+
+    def since(self, second: int) -> int:
+        """Milliseconds since a GPS second, negative before it; the clock must be set."""
+        now = self.second or 0
+        seconds = (now - second + MODULO // 2) % MODULO - MODULO // 2
+        return 1000 * max(-1_000_000, min(1_000_000, seconds)) + self.ms
+
+
+class SunLease:
+    """The sun's direction and the lease that it gives.
+
+    Only a vector for a later second than any before renews the lease; one that was under way
+    for some time gives so much less. The lease ends early, never late, if ticks jump.
+    """
+
+    def __init__(self, span_ms: int) -> None:
+        self.span_ms = span_ms
+        self._left = ticks.Deadline()
+        self._second = -1
+        self._sun = [0, 0, 0]
+        self._rate = [0, 0, 0]
+        self._since_ms = 0
+        self.bad = 0
+
+    def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
+        """Take SUN; False, and the lease is not renewed, if it is stale, repeated or no sun."""
+        second = values[0]
+        delay = 0 if clock.second is None else clock.since(second)
+        lapsed = self._left.over(now)
+        ahead = (second - self._second) % MODULO
+        # After a lapse the cluster's clock may have been set back; the same second never counts.
+        newer = self._second < 0 or 0 < ahead < MODULO // 2 or (lapsed and ahead != 0)
+        size = 0.0
+        for value in values[1:4]:
+            size += (value / UNIT) * (value / UNIT)
+        good = clock.second is not None and newer and -AHEAD_MS <= delay < self.span_ms
+        if not (good and abs(size - 1.0) < 1e-3 and values[3] > NIGHT):
+            self.bad += 1
+            return False
+        self._second = second
+        for i in (0, 1, 2):
+            self._sun[i], self._rate[i] = values[1 + i], values[4 + i] * RATE_FACTOR
+        self._since_ms = delay
+        self._left.start(now, self.span_ms - max(0, delay))
+        return True
+
+    def look(self, now: int, elapsed: int) -> bool:
+        """Charge the time that has passed, and return whether the lease runs."""
+        self._since_ms = min(self._since_ms + elapsed, 1_000_000)
+        return not self._left.over(now)
+
+    def fresh(self) -> bool:
+        """Whether the lease ran at the last look."""
+        return self._left.left > 0
+
+    def age_ms(self) -> int:
+        """Age of the vector; the greatest number if there is none fresh."""
+        return self.span_ms - self._left.left if self._left.left > 0 else 0xFFFFFFFF
+
+    def end(self) -> None:
+        """End the lease."""
+        self._left.end()
+
+    def vector(self, ahead_ms: int) -> tuple[float, float, float]:
+        """Direction to the sun, of length near 1, some time from now."""
+        ms = self._since_ms + ahead_ms
+        east, north, up = [self._sun[i] + self._rate[i] * ms // 1000 for i in (0, 1, 2)]
+        return east / UNIT, north / UNIT, up / UNIT

@@ -1,0 +1,489 @@
+"""Motion: what the actions of the state table do to the two axes.
+
+One motion runs at a time; starting another replaces it. Beams leave stow with azimuth first
+and elevation last, go along the ground to the foot of the tower and up to standby, and come
+back the same way.
+"""
+
+import math
+
+from .config import Config
+from .lease import SunLease
+from .pointing import OK, Pose
+from .search import Spiral, displaced
+from .stepper import BOTH, PRIMARY_FIRST, SECONDARY_FIRST, Stepper
+from .vectors import cross, minus, norm
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+    from collections.abc import Callable
+    from typing import Any
+
+    from .diagnosis import Diagnosis
+
+#: Motions.
+HOLD, MOVE, DEFOCUS, APPROACH, RETURN, STOW, STANDBY, TRACK, SEARCH, DIAGNOSE = range(10)
+
+#: Goals are renewed so often, ms; poses are computed so far apart and between them interpolated,
+#: while the angles change by no more than this (rad; the chord is then 1e-6 rad off at most).
+RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
+#: A path is followed by poses whose beams are no more than this apart, rad.
+PIECE = 0.1
+#: The spiral rests so long on a point, ms.
+DWELL_MS = 2000
+#: Rough stepping waits for so many steps.
+ROUGH_STEPS = 16
+#: A diagnosis rests so long before the sensor is read, ms.
+SETTLE_MS = 500
+
+
+class Motion:
+    """The two axes of a heliostat.
+
+    Parameters
+    ----------
+    config
+        Settings; :meth:`rebuild` after they change.
+    sun
+        The lease.
+    sensor
+        Gives the mirror's tilt by an accelerometer as (x, y), rad, or None.
+
+    Attributes
+    ----------
+    kind
+        The motion that runs.
+    aim
+        ENU, m, or None before the first.
+    ready
+        Whether the standby point was reached by the safe way since stow was left.
+    known
+        Whether the step counts are known.
+    cut, unreachable
+        Whether the last goals were beyond the limits, or the last aim beyond the axes.
+    diagnosis
+        (result, steps moved of the two axes, change of tilt x, y) of the last one.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        sun: SunLease,
+        sensor: "Callable[[], tuple[float, float] | None]",
+    ) -> None:
+        self.config, self.sun, self.sensor = config, sun, sensor
+        self.counts = [0, 0]
+        self.stepper: Stepper | None = None
+        self.kind = HOLD
+        self.aim: tuple[float, float, float] | None = None
+        self.ready = self.known = self.cut = self.unreachable = False
+        self.rough = 0
+        self.diagnosis: tuple[Any, ...] = (0, 0, 0, 0.0, 0.0)
+        self._stops = [[0.0, 0.0], [0.0, 0.0]]
+        self._near = [0.0, 0.0]
+        self._start, self._slope = [0.0, 0.0], [0.0, 0.0]
+        self._knot_ms = self._renew_ms = self._since_ms = 0
+        self._base = HOLD  # what a defocus turns away from
+        self._path: list[tuple[float, float, float]] = []
+        self._place = 0
+        self._spiral: Spiral | None = None
+        self._target: tuple[float, float, float] | None = None
+        self._wait_ms = 0
+        self._diagnosis: Diagnosis | None = None
+        self._home = [0, 0]
+        self.rebuild()
+
+    # The axes.
+
+    def rebuild(self) -> None:
+        """Take the settings over; other limits only at rest."""
+        config = self.config
+        first, second = config.axes
+        if first is None or second is None:
+            return
+        if self.stepper is None or self.stepper.axes != [first, second]:
+            self.counts = [self.place(0), self.place(1)]
+            self.stepper = Stepper([first, second], config.slot_ms, config.ahead_ms)
+            self.stepper.rough = self.rough
+            self.declare(self.counts[0], self.counts[1], self.known)
+        for i in (0, 1):
+            drive, axis = config.drives[i], self.stepper.axes[i]
+            if drive is not None:
+                low, high = drive.angle(axis.low), drive.angle(axis.high)
+                self._stops[i][0], self._stops[i][1] = min(low, high), max(low, high)
+        self._knot_ms = 0
+
+    def declare(self, primary: int, secondary: int, known: bool) -> None:
+        """Declare the present step counts; only at rest."""
+        self.counts[0], self.counts[1] = primary, secondary
+        self.known = known
+        if self.stepper is not None:
+            for axis, count in zip(self.stepper.axes, self.counts):  # noqa: B905
+                axis.count = axis.goal = axis.leg = count
+
+    def place(self, i: int) -> int:
+        """Step count of an axis."""
+        return self.counts[i] if self.stepper is None else self.stepper.axes[i].count
+
+    def goal(self, i: int) -> int:
+        """Where an axis is going."""
+        return self.counts[i] if self.stepper is None else self.stepper.axes[i].goal
+
+    def still(self) -> bool:
+        """Whether nothing moves."""
+        return self.stepper is None or self.stepper.still()
+
+    def following(self) -> bool:
+        """Whether the mirror goes with the sun, so that its beam stays where it is."""
+        kind = self._base if self.kind == DEFOCUS else self.kind
+        return kind in (STANDBY, TRACK, SEARCH) and self.sun.fresh()
+
+    def at_stow(self) -> bool:
+        """Whether it stands at stow."""
+        stow = self.config.stow
+        return (
+            self.known and self.still() and stow is not None
+            and self.place(0) == stow[0] and self.place(1) == stow[1]
+        )  # fmt: skip
+
+    def halted(self, primary: int, secondary: int) -> None:
+        """The hardware was stopped at once, with these signed steps emitted but not made."""
+        self.kind = HOLD
+        if self.stepper is not None:
+            self.stepper.undone(primary, secondary)
+
+    # Poses.
+
+    def pose(self, aim: tuple[float, float, float], ahead_ms: int) -> "Pose | None":
+        """Pose for an aim, some time from now; None if no pose within the stops reaches it."""
+        pointing = self.config.pointing
+        if pointing is None or self.stepper is None:
+            return None
+        for i in (0, 1):
+            drive = self.config.drives[i]
+            if drive is None:
+                return None
+            self._near[i] = drive.angle(self.place(i))
+        found = pointing.solve(self.sun.vector(ahead_ms), aim, self._stops, self._near)
+        self.unreachable = found.status != OK
+        return found if found.status == OK else None
+
+    def reaches(self, points: "list[tuple[float, float, float]]") -> bool:
+        """Whether the beam can be sent to all these points now."""
+        for point in points:  # noqa: SIM110 - a generator would allocate
+            if self.pose(point, 0) is None:
+                return False
+        return True
+
+    def _go_angles(self, angles: "list[float]", order: int) -> None:
+        """Go to joint angles, by ``follow`` where order is −1."""
+        stepper, steps = self.stepper, [0, 0]
+        if stepper is None:
+            return
+        for i in (0, 1):
+            drive = self.config.drives[i]
+            if drive is None:
+                return
+            steps[i] = drive.nearest(angles[i])
+        inside = (
+            stepper.follow(steps[0], steps[1]) if order < 0
+            else stepper.go(steps[0], steps[1], order)
+        )  # fmt: skip
+        self.cut = not inside
+
+    def _follow(self, aim: tuple[float, float, float]) -> bool:
+        """Keep the beam on an aim while time goes on; False if no pose reaches it."""
+        if self._knot_ms <= 0:
+            # Goals hold until the next renewal: they are right at its middle.
+            here = self.pose(aim, RENEW_MS // 2)
+            if here is None:
+                return False
+            self._start[:] = here.angles
+            self._slope[0] = self._slope[1] = 0.0
+            self._knot_ms = RENEW_MS
+            there = self.pose(aim, RENEW_MS // 2 + KNOT_MS)
+            if there is not None:
+                one, two = [there.angles[i] - self._start[i] for i in (0, 1)]
+                if max(abs(one), abs(two)) <= KNOT_LIMIT:
+                    self._slope[0], self._slope[1] = one / KNOT_MS, two / KNOT_MS
+                    self._knot_ms = KNOT_MS
+            self._since_ms = 0
+        angles = [self._start[i] + self._slope[i] * self._since_ms for i in (0, 1)]
+        if self.kind == DEFOCUS:
+            for i in (0, 1):
+                angles[i] = self._away(i, angles[i])
+        self._go_angles(angles, -1)
+        return True
+
+    def _away(self, i: int, angle: float) -> float:
+        """An angle turned away by the defocus; the other way where a stop is near."""
+        offset = self.config.defocus[i]
+        low, high = self._stops[i]
+        if low <= angle + offset <= high:
+            return angle + offset
+        if low <= angle - offset <= high:
+            return angle - offset
+        return low if angle - low > high - angle else high
+
+    # Actions of the state table.
+
+    def hold(self) -> None:
+        """Slow down and stop."""
+        self.kind = HOLD
+        if self.stepper is not None:
+            self.stepper.stop()
+
+    def defocus(self) -> None:
+        """Turn away from wherever the mirror is."""
+        if self.kind in (DEFOCUS, STOW) or self.at_stow():
+            return
+        if not self.known or self.stepper is None or None in self.config.drives:
+            self.hold()
+            return
+        self._base = self.kind
+        self.kind = DEFOCUS
+        self._knot_ms = self._renew_ms = 0
+        angles = [0.0, 0.0]
+        for i in (0, 1):
+            drive = self.config.drives[i]
+            assert drive is not None
+            angles[i] = self._away(i, drive.angle(self.place(i)))
+        self._go_angles(angles, BOTH)
+
+    def stow(self) -> None:
+        """Back by the way of the approach, as far as the sun allows, and to stow."""
+        if not (self.sun.fresh() and self.config.complete()):
+            self.stow_directly()
+            return
+        if self.kind == APPROACH:
+            self._path = self._path[: self._place][::-1]
+        elif self.ready and self.config.standby is not None:
+            way = self.way()[::-1]
+            on_aim = self.kind in (TRACK, SEARCH) and self.aim is not None
+            if on_aim and self.aim is not None:
+                way = self._pieces([self.aim] + way)[1:]
+            elif self.kind == DEFOCUS:
+                # Beside the receiver: down from there, not across it.
+                way = [point for point in way if point[2] < self.config.standby[2]]
+            self._path = way
+        else:
+            self._path = []
+        self.kind, self.ready = RETURN, False
+        self._place = -1
+        self._wait_ms = 0
+        if self.stepper is not None:
+            self.stepper.stop()
+
+    def stow_directly(self) -> None:
+        """To stow at once, azimuth last."""
+        self.ready = False
+        stow = self.config.stow
+        if self.stepper is None or stow is None or not (self.known and self.config.fits()):
+            self.hold()
+            return
+        self.kind = STOW
+        order = SECONDARY_FIRST if self.config.azimuth_axis == 0 else PRIMARY_FIRST
+        self.stepper.go(stow[0], stow[1], order)
+
+    def approach(self) -> None:
+        """Leave stow for standby."""
+        self.kind, self.ready = APPROACH, False
+        self._path, self._place = self.way(), -1
+
+    def standby(self) -> None:
+        """Keep the beam on the standby point; hold where it was not reached."""
+        if self.kind == APPROACH:
+            self.ready = True
+        if self.ready and self.config.standby is not None and self.sun.fresh():
+            self._begin(STANDBY, self.config.standby)
+        else:
+            self.hold()
+
+    def track(self) -> None:
+        """Keep the beam on the aim."""
+        if self.aim is not None:
+            self._begin(TRACK, self.aim)
+
+    def search(self) -> None:
+        """Keep the beam on a spiral about the aim, set by :meth:`prepare_search`."""
+        if self.aim is not None:
+            self._begin(SEARCH, self.aim)
+            self._wait_ms = 0
+
+    def prepare_search(self, pitch: float, radius: float) -> bool:
+        """Make the spiral ready; False if it cannot be."""
+        try:
+            self._spiral = Spiral(pitch, radius)
+        except ValueError:
+            return False
+        return True
+
+    def prepare_move(self, primary: int, secondary: int) -> bool:
+        """Make a motion to step counts ready; False if it leaves the limits."""
+        self._home[0], self._home[1] = primary, secondary
+        if self.stepper is None:
+            return False
+        first, second = self.stepper.axes
+        return first.low <= primary <= first.high and second.low <= secondary <= second.high
+
+    def move(self) -> None:
+        """Go to the prepared step counts."""
+        self.kind = MOVE
+        if self.stepper is not None:
+            self.stepper.go(self._home[0], self._home[1], BOTH)
+
+    def diagnose(self) -> None:
+        """Move each axis a little and back, and ask the sensor whether it moved."""
+        self.hold()
+        if self.stepper is not None and self.config.complete():
+            self.kind, self._wait_ms = DIAGNOSE, SETTLE_MS
+            self._diagnosis = None
+
+    def renew(self) -> None:
+        """The aim, the armature or the standby point has changed."""
+        self._knot_ms = self._renew_ms = 0
+        if self.kind == TRACK:
+            self._target = self.aim
+        elif self.kind == STANDBY:
+            self._target = self.config.standby
+
+    def set_rough(self, steps: int) -> None:
+        """Wait for so many steps before following; 0 is fine stepping."""
+        self.rough = steps
+        if self.stepper is not None:
+            self.stepper.rough = steps
+
+    def _begin(self, kind: int, target: tuple[float, float, float]) -> None:
+        self.kind, self._target = kind, target
+        self._knot_ms = self._renew_ms = 0
+
+    # The safe way.
+
+    def way(self) -> "list[tuple[float, float, float]]":
+        """Points from the ground to standby, close enough to each other."""
+        config = self.config
+        standby = config.standby
+        if standby is None or config.pointing is None:
+            return []
+        points = list(config.path)
+        if not points:
+            # Aside of the tower on the ground, half-way to its foot, then the foot.
+            here = config.location if config.location is not None else config.pointing.origin
+            east, north = 0.5 * (standby[0] - here[0]), 0.5 * (standby[1] - here[1])
+            sine, cosine = 0.5, 0.866
+            aside = (
+                here[0] + cosine * east - sine * north, here[1] + sine * east + cosine * north,
+                here[2],
+            )  # fmt: skip
+            points = [aside, (standby[0], standby[1], here[2])]
+        return self._pieces(points + [standby])
+
+    def _pieces(
+        self, points: "list[tuple[float, float, float]]"
+    ) -> "list[tuple[float, float, float]]":
+        """The points, with others between where the beam would turn by more than ``PIECE``."""
+        pointing = self.config.pointing
+        assert pointing is not None
+        found = [points[0]]
+        for i in range(1, len(points)):
+            a, b = points[i - 1], points[i]
+            u, v = minus(a, pointing.origin), minus(b, pointing.origin)
+            cosine = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+            turn = math.atan2(norm(cross(u, v)), cosine)
+            parts = 1 + int(turn / PIECE)
+            for k in range(1, parts):
+                way = minus(b, a)
+                found.append(
+                    (
+                        a[0] + way[0] * k / parts,
+                        a[1] + way[1] * k / parts,
+                        a[2] + way[2] * k / parts,
+                    )
+                )
+            found.append(b)
+        return found
+
+    def _on_path(self) -> str:
+        """Go on along the path; the event when it is at its end or leads nowhere."""
+        if not self.still():
+            return ""
+        self._place += 1
+        if self._place < len(self._path):
+            pose = self.pose(self._path[self._place], 0)
+            if pose is None:
+                return "UNREACHABLE"
+            order = BOTH
+            if self.kind == APPROACH and self._place == 0:
+                order = PRIMARY_FIRST if self.config.azimuth_axis == 0 else SECONDARY_FIRST
+            self._go_angles(pose.angles, order)
+            return ""
+        if self.kind == APPROACH:
+            return "ARRIVED"
+        self.stow_directly()
+        return ""
+
+    # Time.
+
+    def tick(self, elapsed_ms: int) -> str:
+        """Go on with the motion; returns an event of the state table, or ""."""
+        self._knot_ms = max(0, self._knot_ms - elapsed_ms)
+        self._renew_ms = max(0, self._renew_ms - elapsed_ms)
+        self._since_ms = min(self._since_ms + elapsed_ms, KNOT_MS)
+        kind = self.kind
+        if kind == STOW:
+            if not self.at_stow():
+                return ""
+            self.kind = HOLD
+            return "ARRIVED"
+        if kind in (APPROACH, RETURN):
+            return self._on_path()
+        if kind == DIAGNOSE:
+            self._diagnose(elapsed_ms)
+        if kind == SEARCH:
+            event = self._spin(elapsed_ms)
+            if event:
+                return event
+        if self._renew_ms <= 0:
+            self._renew_ms = RENEW_MS
+            if kind in (STANDBY, TRACK, SEARCH) and self._target is not None:
+                return "" if self._follow(self._target) else "UNREACHABLE"
+            follows = kind == DEFOCUS and self._target is not None and self.following()
+            if follows and self._target is not None and not self._follow(self._target):
+                # It stands now, and a beam that stands does not stay where it is.
+                self._base = HOLD
+        return ""
+
+    def _spin(self, elapsed_ms: int) -> str:
+        """The search: from point to point."""
+        self._wait_ms -= elapsed_ms
+        if self._wait_ms > 0 or self._spiral is None or self.aim is None:
+            return ""
+        self._wait_ms = DWELL_MS
+        if not self._spiral.advance():
+            return "SEARCHED"
+        pointing = self.config.pointing
+        assert pointing is not None
+        right, up = self._spiral.offset
+        self._target = displaced(self.aim, pointing.origin, right, up)
+        self._knot_ms = self._renew_ms = 0
+        return ""
+
+    def _diagnose(self, elapsed_ms: int) -> None:
+        """The diagnosis: a motion, a rest, the next motion."""
+        stepper = self.stepper
+        if stepper is None:
+            return
+        self._wait_ms = self._wait_ms - elapsed_ms if self.still() else SETTLE_MS
+        if self._wait_ms > 0:
+            return
+        self._wait_ms = SETTLE_MS
+        diagnosis = self._diagnosis
+        if diagnosis is None:
+            from .diagnosis import Diagnosis  # rare: it need not always fill a board's memory
+
+            diagnosis = self._diagnosis = Diagnosis(self.config, [self.place(0), self.place(1)])
+        steps = diagnosis.advance(self.sensor())
+        stepper.go(steps[0], steps[1], BOTH)
+        if diagnosis.over:
+            self.kind, self._diagnosis = MOVE, None
+            self.diagnosis = diagnosis.result

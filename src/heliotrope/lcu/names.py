@@ -1,0 +1,73 @@
+"""Meanings of the state table and of STATUS: for those who read them, not needed on a board."""
+
+from . import states
+
+#: Who causes an event: anyone at any time; the command authority, fresh; the controller itself.
+SAFE, COMMAND, INTERNAL = range(3)
+
+#: Event: kind, meaning.
+EVENTS = {
+    "DEFOCUS": (SAFE, "beams off the receiver, now"),
+    "STOW": (SAFE, "go to the stow position"),
+    "LOCK": (COMMAND, "stop and hold position"),
+    "APPROACH": (COMMAND, "leave stow for standby"),
+    "IDLE": (COMMAND, "go to standby; where none was reached yet, hold"),
+    "TRACK": (COMMAND, "track the sun onto the aim"),
+    "REFOCUS": (COMMAND, "back from defocus to the aim"),
+    "SEARCH": (COMMAND, "move the beam in a spiral about its aim"),
+    "JOG": (COMMAND, "move one axis by hand"),
+    "GOTO": (COMMAND, "move to step counts"),
+    "DIAGNOSE": (COMMAND, "move a little and back"),
+    "UNLOCK": (COMMAND, "release a lock, away from stow"),
+    "UNLOCK_STOWED": (COMMAND, "release a lock, at stow"),
+    "UNLOCK_FAULT": (COMMAND, "release a lock, a fault being latched"),
+    "CLEAR_FAULT": (COMMAND, "the cause being gone, away from stow"),
+    "CLEAR_FAULT_STOWED": (COMMAND, "the cause being gone, at stow"),
+    "CONFIGURED": (INTERNAL, "the last setting that was missing has come"),
+    "BOOT_STOWED": (INTERNAL, "started complete, at stow"),
+    "BOOT_AWAY": (INTERNAL, "started complete, away from stow"),
+    "BOOT_LOCKED": (INTERNAL, "started complete, locked before the reset"),
+    "BOOT_FAULT": (INTERNAL, "started complete, a fault latched before the reset"),
+    "ARRIVED": (INTERNAL, "the motion is at its end"),
+    "SEARCHED": (INTERNAL, "the spiral is at its end"),
+    "LAPSED": (INTERNAL, "the sun is older than its lease"),
+    "SILENT": (INTERNAL, "no fresh sun for the stow delay beyond the lease"),
+    "UNREACHABLE": (INTERNAL, "no pose sends the beam to the aim"),
+    "FAULTED": (INTERNAL, "a fault has been found"),
+}
+
+#: Motion: meaning.
+MOTIONS = {
+    "hold": "slow down and stop",
+    "defocus": "turn away by the defocus angles, without needing the sun",
+    "stow": "back by the way of the approach, then to stow, azimuth last",
+    "stow_directly": "to stow at once: elevation first, azimuth last",
+    "approach": "azimuth first, elevation last, along the ground to the tower and up",
+    "standby": "follow the sun onto the standby point; hold where none was reached yet",
+    "track": "follow the sun onto the aim",
+    "search": "follow the sun onto a spiral about the aim",
+    "move": "go to ordered step counts",
+    "diagnose": "move each axis a little and back, and ask the sensor",
+}
+
+
+def transitions() -> list[tuple[int, str, int, str]]:
+    """Return all transitions: state, event, new state, motion or ""."""
+    found = []
+    for line in states.TABLE.split("\n"):
+        if line:
+            words = line.split(" ") + [""]
+            start, end = states.STATES.index(words[0]), states.STATES.index(words[2])
+            found.append((start, words[1], end, words[3]))
+    return found
+
+
+#: Bits of the flags.
+FLAGS = ("MOVING", "SUN_FRESH", "CLOCK_SET", "CONFIGURED", "READY", "AT_STOW", "AIM_LOCKED",
+         "ROUGH", "COUNTS_DOUBTFUL", "COUNTS_UNKNOWN", "UNREACHABLE", "CUT", "CLOCK_JUMPED",
+         "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING")  # fmt: skip
+
+#: Faults.
+FAULTS = ("none", "primary drive stuck", "secondary drive stuck", "limit switch", "supply",
+          "temperature", "sensor", "step counts unknown", "boots again and again", "journal",
+          "latched before the reset")  # fmt: skip

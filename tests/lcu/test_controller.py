@@ -1,0 +1,789 @@
+"""The controller of one heliostat, on a bench with a journal, motors, a cluster and a sun."""
+
+import math
+import struct
+from binascii import crc32
+
+import numpy as np
+import pytest
+
+from heliotrope.lcu import controller, messages, names, ticks, wire
+from heliotrope.lcu.messages import (
+    BAD_VALUE,
+    BUSY,
+    DONE,
+    DUPLICATE,
+    EXPIRED,
+    REFUSED_AUTHORITY,
+    REFUSED_KEY,
+    REFUSED_STATE,
+)
+from lcu_machines import (
+    ADDRESS,
+    AIM,
+    KEY,
+    STANDBY,
+    STOW,
+    TOKEN,
+    Bench,
+    Flash,
+    heliostat,
+    items_of_heliostat,
+    standing_by,
+    tracking,
+)
+
+#: A beam this far from the aim (m) is off the receiver.
+OFF = 5.0
+
+
+def flags(bench: Bench) -> set[str]:
+    bits = bench.controller.flags()
+    return {name for i, name in enumerate(names.FLAGS) if bits >> i & 1}
+
+
+# The way of the beam.
+
+
+def test_the_beam_comes_along_the_ground_and_up_and_then_stays_on_the_aim() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.state == "STOWED"
+    assert bench.order("AIM", *AIM) == DONE
+    assert bench.order("APPROACH") == DONE
+    nearest, places = math.inf, []
+    while bench.state == "APPROACHING":
+        bench.run(0.05)
+        nearest = min(nearest, bench.miss(AIM))
+        places.append(tuple(bench.made))
+    assert nearest > OFF
+    # Azimuth first: elevation stays until it stands.
+    azimuths = [place[0] for place in places if place[1] == STOW[1]]
+    first_moved = next(place for place in places if place[1] != STOW[1])
+    assert azimuths[0] != azimuths[-1]
+    assert abs(azimuths[-1] - first_moved[0]) <= 1
+    bench.run(3)
+    assert bench.miss(STANDBY) < 0.01
+    assert bench.order("TRACK") == DONE
+    bench.run(15)
+    assert {"READY", "SUN_FRESH", "CONFIGURED", "CLOCK_SET"} <= flags(bench)
+
+
+def test_tracking_is_accurate_to_the_lead_of_the_backlash() -> None:
+    bench = tracking()
+    for _ in range(120):
+        bench.run(1)
+        # Five steps of 3.3 µrad on each axis, doubled by the mirror, at 103 m.
+        assert bench.miss(AIM) < 2 * 103 * 6 * 3.3e-6
+    calm = tracking()
+    for axis in calm.controller.motion.stepper.axes:  # type: ignore[union-attr]
+        axis.backlash = 0
+    calm.run(5)
+    for _ in range(60):
+        calm.run(1)
+        assert calm.miss(AIM) < 2 * 103 * 1.5 * 3.3e-6
+
+
+def test_stow_leads_back_the_same_way() -> None:
+    bench = tracking()
+    assert bench.order("STOW") == DONE
+    assert bench.state == "STOWING"
+    nearest = 0.0
+    for _ in range(400):
+        bench.run(0.5, until="STOWED")
+        miss = bench.miss(AIM)
+        assert miss > 0.9 * nearest or miss > OFF  # away from the aim, and not back to it
+        nearest = max(nearest, min(miss, OFF))
+        if bench.state == "STOWED":
+            break
+        if bench.made[0] == STOW[0] and bench.controller.motion.kind == controller.STOW:
+            assert bench.made[1] == STOW[1]  # azimuth last
+    assert bench.state == "STOWED"
+    assert tuple(bench.made) == STOW
+    assert bench.journal.rest
+
+
+def test_a_sun_that_cannot_be_served_leaves_the_receiver() -> None:
+    bench = tracking()
+    bench.controller.motion.aim = tuple(bench.machine.position - [0.0, 0.0, 50.0])  # type: ignore[assignment]
+    bench.controller.motion.renew()
+    bench.run(5)
+    assert bench.state == "DEFOCUSED"
+    assert "UNREACHABLE" in flags(bench)
+
+
+# The lease.
+
+
+def test_without_sun_it_defocuses_and_stows_by_itself() -> None:
+    for loss in ("sun", "everything"):
+        bench = tracking()
+        bench.sends_sun, bench.sends_time = False, loss == "sun"
+        last = bench.last_sun_ms
+        bench.run(10, until="DEFOCUSED")
+        assert bench.true_ms - last <= 6050
+        while bench.miss(AIM) < OFF:
+            bench.run(0.5)
+        assert bench.true_ms - last < 30_000
+        bench.run(300, until="STOWED")
+        assert bench.true_ms - last < 300_000
+        assert tuple(bench.made) == STOW
+
+
+def test_nothing_but_the_sun_renews_the_lease() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    while bench.state == "TRACKING":
+        bench.second()
+        bench.order("TRACK")
+        bench.order("AIM", *AIM)
+        bench.send("QUERY_STATUS")
+        bench.tick()
+        assert bench.true_ms - bench.last_sun_ms <= 6050
+    assert bench.order("TRACK") == REFUSED_STATE
+
+
+def test_an_old_or_repeated_sun_gives_nothing() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    bench.run(4)
+    taken = bench.last_sun_ms
+    second = bench.gps_ms() // 1000
+    for age in (4, 7, 60, -10, -3):
+        bench.send("SUN", *bench.sun_values(second - age), to=0xFFFF)  # repeated, old, future
+    bench.send("SUN", second, 0, 0, 0, 0, 0, 0)  # no sun
+    bench.send("SUN", second, 0, 2**30, -(2**29), 0, 0, 0)
+    bench.send("SUN", second, 0, int(0.9 * 2**30), -int(0.4359 * 2**30), 0, 0, 0)  # night
+    assert bench.controller.sun.bad == 8
+    bench.run(5, until="DEFOCUSED")
+    assert bench.true_ms - taken <= 6050
+
+
+def test_a_sun_that_was_under_way_gives_so_much_less() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    bench.run(4)
+    bench.send("SUN", *bench.sun_values(bench.gps_ms() // 1000 - 3))
+    bench.last_sun_ms = bench.true_ms - 3000
+    assert 2900 <= bench.controller.sun.age_ms() <= 4000
+    bench.run(5, until="DEFOCUSED")
+    assert bench.state == "DEFOCUSED"
+
+
+@pytest.mark.parametrize("jump", [-3600_000, -2000, -100, 100, 2500, 3600_000, 1 << 29, -(1 << 29)])
+def test_a_jump_of_ticks_never_extends_the_lease(jump: int) -> None:
+    bench = tracking()
+    bench.sends_sun = bench.sends_time = False
+    last = bench.last_sun_ms
+    bench.run(2)
+    bench.now = ticks.add(bench.now, jump)
+    bench.do(bench.controller.on_tick(bench.now))
+    bench.run(6, until="DEFOCUSED")
+    assert bench.state == "DEFOCUSED"
+    assert bench.true_ms - last <= 6050
+
+
+@pytest.mark.parametrize("error_ms", [-3600_000, -5000, 5000, 3600_000, 604_800_000])
+def test_a_jump_of_gps_time_never_extends_the_lease(error_ms: int) -> None:
+    bench = tracking()
+    last = bench.last_sun_ms
+    bench.clock_error_ms = error_ms
+    bench.sends_sun = False
+    bench.run(7, until="DEFOCUSED")
+    assert bench.true_ms - last <= 6050
+    assert "CLOCK_JUMPED" in flags(bench)
+    # A cluster whose clock was set is believed again after the lapse.
+    bench.sends_sun = True
+    bench.run(3)
+    assert "SUN_FRESH" in flags(bench)
+    assert bench.state == "DEFOCUSED"
+
+
+def test_ticks_may_wrap_while_tracking() -> None:
+    bench = Bench(tick=ticks.PERIOD - 60_000)
+    bench.to_tracking()
+    assert bench.now < 200_000
+    assert bench.miss(AIM) < 0.01
+
+
+# Commands.
+
+
+def test_defocus_turns_the_beam_away_and_refocus_brings_it_back() -> None:
+    bench = tracking()
+    assert bench.order("DEFOCUS") == DONE
+    begin = bench.true_ms
+    while bench.miss(AIM) < OFF:
+        bench.run(0.5)
+    assert bench.true_ms - begin < 10_000
+    bench.run(20)
+    for _ in range(3):
+        bench.send("DEFOCUS", to=0xFFFF)  # broadcast three times: it does not add up
+    before = list(bench.made)
+    bench.run(5)
+    assert np.abs(np.subtract(bench.made, before)).max() < 300
+    assert bench.order("REFOCUS") == DONE
+    bench.run(20)
+    assert bench.state == "TRACKING"
+    assert bench.miss(AIM) < 0.01
+
+
+def test_a_defocused_mirror_goes_with_the_sun() -> None:
+    bench = tracking()
+    bench.order("DEFOCUS")
+    bench.run(20)
+    normal, _ = bench.pose()
+    first = 2.0 * (normal @ bench.sun(bench.gps_ms() / 1000)) * normal
+    first = first - bench.sun(bench.gps_ms() / 1000)
+    bench.run(300)
+    assert bench.state == "DEFOCUSED"
+    normal, _ = bench.pose()
+    sun = bench.sun(bench.gps_ms() / 1000)
+    # The sun has gone 22 mrad, the beam stands still.
+    assert np.linalg.norm(2.0 * (normal @ sun) * normal - sun - first) < 5e-3
+
+
+def test_a_defocused_mirror_that_can_no_longer_go_with_the_sun_stows() -> None:
+    bench = tracking()
+    bench.order("DEFOCUS")
+    bench.run(5)
+    bench.controller.motion._target = tuple(bench.machine.position - [0.0, 0.0, 50.0])
+    bench.controller.motion.renew()
+    bench.run(40, until="STOWING")
+    assert bench.state == "STOWING"
+
+
+STATES_TO_TRY = ("UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING",
+                 "DEFOCUSED", "LOCKED", "SEARCHING", "FAULT")  # fmt: skip
+
+
+def brought_to(state: str) -> Bench:
+    """A bench in a state."""
+    if state == "UNCONFIGURED":
+        return empty()
+    if state in ("STOWED", "APPROACHING"):
+        bench = Bench()
+        bench.run(1.5)
+        if state == "APPROACHING":
+            assert bench.order("APPROACH") == DONE
+            bench.run(70)
+    elif state == "IDLE":
+        bench = standing_by()
+    else:
+        bench = tracking()
+        if state == "SEARCHING":
+            assert bench.order("SEARCH", 2e-3, 0.02) == DONE
+        elif state == "FAULT":
+            bench.do(bench.controller.on_fault(controller.SUPPLY, bench.now, False))
+            bench.run(0.5)
+        elif state != "TRACKING":
+            order = {"STOWING": "STOW", "DEFOCUSED": "DEFOCUS", "LOCKED": "LOCK"}[state]
+            assert bench.order(order) == DONE
+            bench.run(3)
+    assert bench.state == state
+    return bench
+
+
+@pytest.mark.parametrize("state", STATES_TO_TRY)
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_defocus_and_stow_work_in_every_state_from_anyone(state: str, name: str) -> None:
+    bench = brought_to(state)
+    stranger = wire.Sender(99, 1)
+    bench.answers.clear()
+    bench.deliver(stranger.frame(ADDRESS, name))
+    assert bench.answers == [(0x0D, (1, messages.NUMBER_OF[name], DONE))]
+    bench.sends_sun = False
+    bench.run(30)
+    assert bench.miss(AIM) > OFF
+    if name == "STOW" and state != "UNCONFIGURED":
+        bench.run(260)
+        assert tuple(bench.made) == STOW
+        latched = state in ("LOCKED", "FAULT")
+        assert bench.state == (state if latched else "STOWED")
+
+
+def test_a_stow_replaces_a_defocus_and_is_not_undone_by_one() -> None:
+    bench = tracking()
+    bench.order("DEFOCUS")
+    bench.run(1)
+    bench.order("STOW")
+    bench.run(2)
+    for _ in range(3):
+        bench.send("DEFOCUS")
+    bench.run(300, until="STOWED")
+    assert bench.state == "STOWED"
+
+
+def test_commands_need_the_authority_and_to_be_fresh() -> None:
+    """Invariants 4 and 5: whatever is refused moves nothing."""
+    bench = standing_by()
+    before = bench.state, bench.controller.motion.kind
+    assert bench.order("TRACK", token=TOKEN + 1) == REFUSED_AUTHORITY
+    assert bench.order("TRACK", life_s=-1) == EXPIRED
+    assert bench.order("TRACK", life_s=9000) == EXPIRED
+    stranger = wire.Sender(99, 1)
+    life = bench.gps_ms() // 1000 + 5
+    bench.deliver(stranger.frame(ADDRESS, "TRACK", TOKEN, life))
+    assert bench.answers[-1][1][-1] == REFUSED_AUTHORITY
+    data = bench.sender.frame(ADDRESS, "JOG", TOKEN, life, 0, 100)
+    bench.deliver(data)
+    assert bench.answers[-1][1][-1] == DONE
+    goal = bench.controller.motion.goal(0)
+    bench.deliver(data)
+    assert bench.answers[-1][1][-1] == DUPLICATE
+    assert bench.controller.motion.goal(0) == goal
+    broken = bytearray(bench.sender.frame(ADDRESS, "TRACK", TOKEN, life))
+    broken[7] ^= 4
+    bench.deliver(bytes(broken))
+    assert (bench.state, before[0]) == ("IDLE", "IDLE")
+
+
+def test_tracking_needs_the_safe_way_first() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    bench.order("AIM", *AIM)
+    for name in ("TRACK", "REFOCUS"):
+        assert bench.order(name) == REFUSED_STATE
+    assert bench.order("IDLE") == DONE
+    assert bench.state == "IDLE"
+    assert bench.order("TRACK") == REFUSED_STATE
+    assert bench.order("SEARCH", 1e-3, 0.01) == REFUSED_STATE
+    assert bench.state == "IDLE"
+    halfway = brought_to("APPROACHING")
+    halfway.order("AIM", *AIM)
+    assert halfway.order("TRACK") == REFUSED_STATE
+    halfway.order("DEFOCUS")
+    assert halfway.order("REFOCUS") == REFUSED_STATE
+    halfway.run(120, until="STOWED")  # a beam that does not go with the sun is not left there
+    assert halfway.state == "STOWED"
+
+
+def test_approach_needs_sun_and_a_way() -> None:
+    bench = Bench()
+    bench.sends_sun = False
+    bench.run(2)
+    assert bench.order("APPROACH") == REFUSED_STATE
+    bench.sends_sun = True
+    bench.run(2)
+    assert bench.order("STANDBY", 40.0, 80.0, -50.0) == DONE
+    assert bench.order("APPROACH") == BAD_VALUE
+    assert bench.order("STANDBY", *STANDBY) == DONE
+    assert bench.order("APPROACH") == DONE
+
+
+def test_a_lock_holds_until_it_is_released() -> None:
+    bench = tracking()
+    assert bench.order("LOCK") == DONE
+    bench.run(2)
+    held = list(bench.made)
+    for name in ("TRACK", "APPROACH", "IDLE", "REFOCUS"):
+        assert bench.order(name) == REFUSED_STATE
+    assert bench.order("JOG", 0, 5) == REFUSED_STATE
+    bench.sends_sun = bench.sends_time = False
+    bench.run(400)  # somebody may stand at the mirror: no timer moves it
+    assert bench.made == held
+    bench.start(bench.flash)
+    assert bench.state == "LOCKED"  # nor a reset
+    bench.sends_sun = bench.sends_time = True
+    bench.run(12)
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(12)
+    assert bench.state == "LOCKED"
+    assert bench.made != held
+    assert bench.order("UNLOCK") == DONE
+    assert bench.state == "IDLE"
+    assert bench.order("UNLOCK") == REFUSED_STATE
+
+
+def test_a_fault_stays_until_it_is_cleared() -> None:
+    bench = tracking()
+    bench.do(bench.controller.on_fault(controller.TEMPERATURE, bench.now, False))
+    assert bench.state == "FAULT"
+    bench.run(20)
+    assert bench.miss(AIM) > OFF
+    assert bench.order("CLEAR_FAULT") == REFUSED_STATE
+    assert bench.order("TRACK") == REFUSED_STATE
+    bench.run(400)  # not following the sun, so it stows by itself, the fault staying
+    assert tuple(bench.made) == STOW
+    assert bench.state == "FAULT"
+    bench.start(bench.flash)
+    assert bench.state == "FAULT"
+    assert bench.controller.fault == controller.LATCHED
+    bench.run(2)
+    assert bench.order("CLEAR_FAULT") == DONE
+    assert bench.state == "STOWED"
+    assert bench.controller.fault == controller.NO_FAULT
+
+
+def test_an_emergency_stop_takes_steps_back() -> None:
+    bench = tracking()
+    bench.order("STOW")
+    bench.run(6)
+    assert not bench.controller.motion.still()
+    bench.do(bench.controller.on_fault(controller.LIMIT_SWITCH, bench.now, True))
+    assert bench.halts == 1
+    assert bench.state == "FAULT"
+    undone = [37, -11]
+    bench.made = [made - rest for made, rest in zip(bench.made, undone, strict=True)]
+    bench.do(bench.controller.halted(*undone))
+    held = list(bench.made)
+    bench.run(10)
+    assert bench.made == held
+    bench.controller.fault_gone(controller.LIMIT_SWITCH)
+    assert bench.order("CLEAR_FAULT") == DONE
+    assert bench.order("STOW") == DONE
+    bench.run(300, until="STOWED")
+    assert tuple(bench.made) == STOW
+
+
+def test_moves_by_hand() -> None:
+    bench = standing_by()
+    bench.run(5)
+    start = list(bench.made)
+    assert bench.order("JOG", 1, -500) == DONE
+    bench.run(3)
+    assert bench.made[1] == bench.controller.motion.goal(1)
+    assert abs(bench.made[1] - start[1] + 500) < 40
+    assert bench.order("GOTO", 1_000_000, 200_000) == DONE
+    bench.run(20)
+    assert bench.made == [1_000_000, 200_000]
+    for values in ((2, 5), (0, 2_000_000), (1, -(2**31))):
+        assert bench.order("JOG", *values) == BAD_VALUE
+    assert bench.order("GOTO", 1_000_000, 600_000) == BAD_VALUE
+    bench.run(2)
+    assert bench.made == [1_000_000, 200_000]
+    bench.sends_sun = bench.sends_time = False
+    bench.run(25, until="DEFOCUSED")  # left alone it does not stay
+    assert bench.state == "DEFOCUSED"
+
+
+def test_the_aim_moves_and_can_be_locked() -> None:
+    bench = tracking()
+    other = (3.0, 0.0, 52.0)
+    assert bench.order("LOCK_AIM", 1) == DONE
+    assert bench.order("AIM", *other) == REFUSED_STATE
+    assert bench.order("LOCK_AIM", 0) == DONE
+    for bad in ((1e6, 0.0, 0.0), (40.0, 80.0, -60.0)):
+        assert bench.order("AIM", *bad) == BAD_VALUE
+    assert bench.order("LOCK_AIM", 2) == bench.order("ROUGH", 7) == BAD_VALUE
+    assert bench.controller.motion.aim == AIM
+    assert bench.order("AIM", *other) == DONE
+    bench.run(10)
+    assert bench.miss(other) < 0.01
+    bench.run(1)
+    assert struct.unpack("<fff", bench.journal.aim or b"") == other
+    assert bench.order("ROUGH", 1) == DONE
+    misses = []
+    for _ in range(30):
+        bench.run(1)
+        misses.append(bench.miss(other))
+    # Up to sixteen steps of 3.3 µrad, doubled, at 103 m.
+    assert 4e-3 < max(misses) < 20e-3
+    assert bench.order("ROUGH", 0) == DONE
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_numbers_that_are_none_do_nothing(bad: float) -> None:
+    bench = tracking()
+    payload = struct.pack("<IIfff", TOKEN, bench.gps_ms() // 1000 + 5, bad, 0.0, 1.0)
+    frame = wire.Frame(ADDRESS, 0, (bench.sender.count + 1) & 0xFFFF, 0x40, payload)
+    bench.deliver(wire.encode(frame))
+    assert bench.answers[-1][1][-1] == BAD_VALUE
+    # And past the gate, too.
+    values = (TOKEN, 0, bad, 0.0, 1.0)
+    bench.do(bench.controller.on_message(0x40, 9, values, payload, DONE, bench.now, True))
+    assert bench.answers[-1][1][-1] == BAD_VALUE
+    assert bench.controller.motion.aim == AIM
+
+
+def test_a_search_goes_round_the_aim_and_ends() -> None:
+    bench = tracking()
+    assert bench.order("SEARCH", math.pi, -1.0) == BAD_VALUE
+    assert bench.order("SEARCH", 5e-3, 0.02) == DONE
+    misses = []
+    while bench.state == "SEARCHING":
+        assert bench.order("AIM", 1.0, 1.0, 50.0) in (BUSY, REFUSED_STATE)
+        bench.run(1, until="IDLE")
+        misses.append(bench.miss(AIM))
+    slant = float(np.linalg.norm(np.subtract(AIM, bench.machine.position)))
+    assert max(misses) == pytest.approx(0.02 * slant, rel=0.3)
+    assert len(misses) > 60
+    assert bench.state == "IDLE"
+    bench.run(10)
+    assert bench.miss(STANDBY) < 0.02
+
+
+# Movement.
+
+
+def watch(bench: Bench, stuck: tuple[float, float] = (1.0, 1.0)) -> None:
+    """Let time pass while the accelerometer sees the axes move by so much of what they should."""
+    home = list(bench.made)
+    while bench.controller.motion.kind == 9:
+        true = [h + f * (m - h) for h, f, m in zip(home, stuck, bench.made, strict=True)]
+        angles = bench.machine.drives.angles(np.array(true))
+        # The mirror's frame: gravity's direction along its normal and its secondary axis.
+        normal, _ = bench.machine.armature.pose(angles)
+        bench.tilt = float(np.arcsin(normal[2])), 0.0
+        bench.tick()
+
+
+def test_a_diagnosis_sees_the_elevation_move() -> None:
+    bench = standing_by()
+    bench.run(3)
+    assert bench.order("DIAGNOSE") == DONE
+    assert bench.order("JOG", 0, 5) == BUSY
+    watch(bench)
+    result, moved_1, moved_2, tilt, _ = bench.controller.motion.diagnosis
+    assert result == 2  # the azimuth turns about the plumb line: no accelerometer sees it
+    assert moved_1 > 5000
+    assert moved_2 > 5000
+    assert tilt == pytest.approx(0.02, rel=0.05)
+    bench.answers.clear()
+    bench.send("QUERY_DIAGNOSIS")
+    assert bench.answers == [(0x08, bench.controller.motion.diagnosis)]
+    assert bench.state == "IDLE"
+
+
+def test_a_diagnosis_finds_a_stuck_drive() -> None:
+    bench = standing_by()
+    bench.run(3)
+    assert bench.order("DIAGNOSE") == DONE
+    watch(bench, stuck=(1.0, 0.1))
+    assert bench.state == "FAULT"
+    assert bench.controller.fault == controller.STUCK_SECONDARY
+
+
+def test_a_diagnosis_without_a_sensor_says_so() -> None:
+    bench = standing_by()
+    bench.run(3)
+    bench.order("DIAGNOSE")
+    bench.run(10)
+    assert bench.controller.motion.diagnosis[0] == 16
+    assert bench.state == "IDLE"
+
+
+# What is stored.
+
+
+def empty() -> Bench:
+    """A bench whose journal is empty but for the address."""
+    full = items_of_heliostat(heliostat())
+    flash = Flash()
+    journal = controller_journal(flash)
+    journal.store({"address": full["address"]})
+    return Bench(flash)
+
+
+def controller_journal(flash: Flash):  # type: ignore[no-untyped-def]
+    from heliotrope.lcu.journal import Journal
+
+    journal = Journal(flash)
+    journal.load()
+    return journal
+
+
+def settings(bench: Bench) -> list[tuple[str, tuple[object, ...]]]:
+    """The messages that make a controller complete."""
+    items = items_of_heliostat(bench.machine)
+    codes = {row[0]: row[1] for row in wire_items()}
+    values = {name: struct.unpack("<" + codes[name], data) for name, data in items.items()}
+    return [
+        ("SET_ARMATURE", values["armature"]), ("SET_BIAS", values["biases"]),
+        ("SET_DRIVES", (0, *values["drive_primary"])),
+        ("SET_DRIVES", (1, *values["drive_secondary"])),
+        ("SET_LIMITS", (0, *values["limits_primary"])),
+        ("SET_LIMITS", (1, *values["limits_secondary"])),
+        ("SET_DEFOCUS", values["defocus"]), ("SET_POSITION", values["location"]),
+        ("ZERO", STOW), ("SET_STOW", STOW),
+    ]  # fmt: skip
+
+
+def wire_items():  # type: ignore[no-untyped-def]
+    from heliotrope.lcu.journal import ITEMS
+
+    return ITEMS
+
+
+def test_a_new_controller_is_told_everything_and_then_works() -> None:
+    bench = empty()
+    bench.run(2)
+    assert bench.state == "UNCONFIGURED"
+    assert bench.order("APPROACH") == bench.order("IDLE") == REFUSED_STATE
+    for name, values in settings(bench):
+        assert bench.state == "UNCONFIGURED"
+        assert bench.order(name, *values) == DONE
+    assert bench.state == "LOCKED"  # somebody stands beside it
+    assert bench.order("UNLOCK") == DONE
+    assert bench.state == "STOWED"
+    assert bench.order("STANDBY", *STANDBY) == DONE
+    bench.to_tracking()
+    assert bench.miss(AIM) < 0.01
+    again = controller_journal(bench.flash)
+    assert again.numbers("standby") == STANDBY
+    assert again.checksum("armature") == bench.controller.config.armature_crc
+
+
+def test_settings_change_in_safe_states_alone() -> None:
+    bench = tracking()
+    for name, values in settings(bench):
+        before = dict(bench.journal.items)
+        assert bench.order(name, *values) == REFUSED_STATE
+        assert bench.journal.items == before
+    bench.order("IDLE")
+    bench.run(5)
+    for name, values in settings(bench):
+        calibration = name in ("SET_ARMATURE", "SET_BIAS", "SET_DEFOCUS", "SET_POSITION")
+        # At standby the mirror goes with the sun: nothing of the machine may change.
+        assert bench.order(name, *values) == (DONE if calibration else REFUSED_STATE)
+
+
+def test_a_better_armature_makes_a_better_beam() -> None:
+    bench = standing_by()
+    table = bench.machine.armature.table.copy()
+    rough = table.copy()
+    rough[15:18] = rough[15:18] + [0.0, 0.0, 3e-3]
+    rough[15:18] /= np.linalg.norm(rough[15:18])
+    assert bench.order("SET_ARMATURE", *rough) == DONE
+    bench.run(5)
+    assert 0.3 < bench.miss(STANDBY) < 1.0
+    assert bench.order("SET_ARMATURE", *table) == DONE
+    bench.run(5)
+    assert bench.miss(STANDBY) < 0.01
+    assert bench.controller.status()[7] == crc32(struct.pack("<18d", *table))
+
+
+def test_a_message_that_stores_needs_key_and_edition() -> None:
+    bench = standing_by()
+    table = tuple(bench.machine.armature.table)
+    life = bench.gps_ms() // 1000 + 5
+    data = bench.sender.frame(ADDRESS, "SET_ARMATURE", TOKEN, life, 1, *table, key=b"x" * 32)
+    bench.deliver(data)
+    assert bench.answers[-1][1][-1] == REFUSED_KEY
+    assert bench.order("SET_ARMATURE", *table) == DONE
+    data = bench.sender.frame(ADDRESS, "SET_ARMATURE", TOKEN, life, bench.edition, *table, key=KEY)
+    bench.deliver(data)
+    assert bench.answers[-1][1][-1] == DUPLICATE
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("SET_ARMATURE", (0.0,) * 18), ("SET_ARMATURE", (*(0.0, 0.0, 1.0) * 5, 1.0, 0.0, 0.0)),
+        ("SET_BIAS", (9.0, 0.0)), ("SET_DEFOCUS", (0.0, 0.001)), ("SET_DEFOCUS", (3.0, 0.0)),
+        ("SET_POSITION", (1e7, 0.0, 0.0)), ("SET_DRIVES", (0, 0, *(0.0,) * 10)),
+        ("SET_DRIVES", (2, 0, *(1e-6,) * 10)), ("SET_DRIVES", (0, 9, *(1e-6,) * 10)),
+        ("SET_LIMITS", (0, 5, 5, 1, 1, 0)), 
+        ("SET_LIMITS", (0, 0, 2**20, 10_001, 10, 0)), ("SET_LIMITS", (1, 0, 100, 10, 10, 0)),
+        ("SET_LIMITS", (0, -(2**31), 2**31 - 1, 10, 10, 0)), ("SET_STOW", (0, 2**30)),
+        ("ZERO", (2**31 - 1, 0)), ("SET_ADDRESS", (4711, 0)), ("SET_ADDRESS", (5, 3)),
+    ],
+)  # fmt: skip
+def test_settings_out_of_range_change_nothing(name: str, values: tuple[object, ...]) -> None:
+    bench = brought_to("LOCKED")
+    before, config = dict(bench.journal.items), bench.controller.config
+    kept = config.pointing, list(config.drives), list(config.axes), config.stow, config.defocus
+    assert bench.order(name, *values) == BAD_VALUE
+    assert bench.journal.items == before
+    assert kept == (
+        config.pointing, list(config.drives), list(config.axes), config.stow, config.defocus,
+    )  # fmt: skip
+
+
+def test_zero_declares_the_counts_and_asks_for_the_safe_way_again() -> None:
+    bench = standing_by()
+    assert bench.order("LOCK") == DONE
+    bench.run(2)
+    assert bench.order("ZERO", 123, -45) == DONE
+    assert bench.made == [123, -45]
+    assert (bench.journal.primary, bench.journal.secondary) == (123, -45)
+    assert bench.order("UNLOCK") == DONE
+    assert bench.order("TRACK") == REFUSED_STATE
+
+
+# Resets.
+
+
+@pytest.mark.parametrize("instant_ms", [50, 300, 2000, 30_000, 90_000])
+def test_after_a_reset_it_defocuses_stows_and_does_not_track(instant_ms: int) -> None:
+    bench = tracking()
+    if instant_ms > 2000:
+        bench.order("STOW")
+    bench.run(instant_ms / 1000)
+    bench.start(bench.flash)
+    assert np.abs(bench.slip).max() <= bench.journal.stride
+    assert ("COUNTS_DOUBTFUL" in flags(bench)) or bench.slip == [0, 0]
+    assert bench.state == "DEFOCUSED"
+    assert bench.controller.motion.aim == AIM
+    begin = bench.true_ms
+    while bench.miss(AIM) < OFF:
+        bench.run(0.5)
+    assert bench.true_ms - begin < 30_000
+    bench.run(2)
+    assert bench.order("TRACK") == bench.order("REFOCUS") == REFUSED_STATE
+    bench.run(300, until="STOWED")  # although the sun goes on
+    assert bench.true_ms - begin < 300_000
+
+
+def test_unknown_counts_are_a_fault_and_move_nothing() -> None:
+    bench = tracking()
+    bench.flash.data[2 * bench.flash.block_size :] = b"\xff" * (4 * bench.flash.block_size)
+    bench.start(bench.flash)
+    assert bench.state == "FAULT"
+    assert {"COUNTS_UNKNOWN", "COUNTS_DOUBTFUL"} <= flags(bench)
+    bench.run(2)
+    assert bench.order("STOW") == bench.order("DEFOCUS") == DONE
+    bench.run(60)
+    assert bench.made == [0, 0]
+    assert bench.order("CLEAR_FAULT") == REFUSED_STATE
+    assert bench.order("ZERO", *STOW) == DONE
+    assert bench.order("CLEAR_FAULT") == DONE
+    assert bench.state == "STOWED"
+
+
+def test_a_controller_that_boots_again_and_again_stays_in_fault() -> None:
+    bench = tracking()
+    for _ in range(6):
+        bench.start(bench.flash)
+    assert bench.state == "FAULT"
+    assert bench.controller.fault == controller.BOOTS
+
+
+# Questions.
+
+
+def test_questions_are_answered() -> None:
+    bench = tracking()
+    for name in ("QUERY_STEPS", "QUERY_STATUS", "QUERY_POSITION", "QUERY_DIAGNOSIS"):
+        bench.answers.clear()
+        bench.send(name)
+        (number, values), = bench.answers  # fmt: skip
+        assert messages.name_of(number) == name.replace("QUERY_", "").replace("STEPS", "STEPS")
+        if name == "QUERY_STEPS":
+            assert values[:2] == tuple(bench.made)
+        elif name == "QUERY_STATUS":
+            assert values[0] == bench.controller.state
+            assert values[3] == pytest.approx(bench.true_ms / 1000, abs=1.5)
+            assert values[4] <= 1050  # type: ignore[operator]
+    bench.answers.clear()
+    bench.send("DISCOVER", 5000, 6000, to=0xFFFF)
+    assert bench.answers == []
+    bench.send("DISCOVER", 4000, 5000, to=0xFFFF)
+    assert bench.answers == [(0x0C, (4711, 0, ADDRESS))]
+    out = bench.controller.on_message(0x09, 1, (5,), b"", DONE, bench.now, True)
+    assert (controller.RECALL, 5) in out
+    out = bench.controller.on_message(0x09, 1, (2,), b"", DONE, bench.now, True)
+    assert not any(action[0] == controller.RECALL for action in out)  # never the key's number
+    bench.send("DEFOCUS", to=0xFFFF)
+    assert len(bench.answers) == 1  # a broadcast is not acknowledged
+
+
+def test_the_watchdog_is_fed_by_whole_ticks() -> None:
+    bench = tracking()
+    bench.tick()
+    assert bench.fed
+    bench.controller.motion.tick = None  # type: ignore[assignment, method-assign]
+    bench.fed = False
+    with pytest.raises(TypeError):
+        bench.tick()
+    assert not bench.fed
