@@ -673,7 +673,7 @@ def test_a_message_that_stores_needs_key_and_edition() -> None:
         ("SET_BIAS", (9.0, 0.0)), ("SET_DEFOCUS", (0.0, 0.001)), ("SET_DEFOCUS", (3.0, 0.0)),
         ("SET_POSITION", (1e7, 0.0, 0.0)), ("SET_DRIVES", (0, 0, *(0.0,) * 10)),
         ("SET_DRIVES", (2, 0, *(1e-6,) * 10)), ("SET_DRIVES", (0, 9, *(1e-6,) * 10)),
-        ("SET_LIMITS", (0, 5, 5, 1, 1, 0)), 
+        ("SET_LIMITS", (0, 5, 5, 1, 1, 0)),
         ("SET_LIMITS", (0, 0, 2**20, 10_001, 10, 0)), ("SET_LIMITS", (1, 0, 100, 10, 10, 0)),
         ("SET_LIMITS", (0, -(2**31), 2**31 - 1, 10, 10, 0)), ("SET_STOW", (0, 2**30)),
         ("ZERO", (2**31 - 1, 0)), ("SET_ADDRESS", (4711, 0)), ("SET_ADDRESS", (5, 3)),
