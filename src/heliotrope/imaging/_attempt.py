@@ -29,7 +29,7 @@ LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
 STRAY = 5.0
 #: A mark may be so much longer, broader or more askew than drawn; all of them may be so much
 #: larger, and are then alike to so much. Measured: 0.03 in photographs, 0.2 in clutter.
-MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.08, 0.08
+MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.12, 0.08
 #: All of them together are so much longer one way than the other, or askew. Measured: 0.01.
 ASKEW = 0.04
 #: Where the marks are no more than a view has unknowns, each is alike to this, and explains this.
@@ -46,9 +46,9 @@ LIGHTER = 0.8
 #: A face is not seen flatter than this (least over greatest scale), and its far side not
 #: this much smaller than its near side.
 FLATTEST, NEAREST = 0.2, 3.0
-#: Of points that make a view: fewest if it is known beforehand about where they are, fewest
-#: otherwise, and part of those in the frame.
-FEWEST, ALONE, SHARE = 3, 4, 0.5
+#: Of points that make a view: fewest if it is known beforehand about where they are, and fewest
+#: otherwise; and part of those in the frame, likewise.
+FEWEST, ALONE, SHARE, SHARE_ALONE = 3, 4, 0.5, 0.7
 
 
 class Look:
@@ -365,7 +365,8 @@ class Search:
     def _needed(self, view: View, known: bool) -> int:
         """How many points a view must stand on."""
         least = FEWEST if known or len(self.marks) <= ALONE else ALONE
-        return max(least, int(np.ceil(SHARE * len(self.expected(view)))))
+        share = SHARE if known else SHARE_ALONE
+        return max(least, int(np.ceil(share * len(self.expected(view)))))
 
     def expected(self, view: View) -> list[int]:
         """Marks that the frame should show."""

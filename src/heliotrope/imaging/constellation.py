@@ -18,6 +18,8 @@ _LOOSE = 0.25
 _TIGHT = 0.5
 #: Second moments over those that a guess predicts: so much more or less is the same mark.
 _SPREAD = 2.6
+#: The same of all marks together, and along one axis over the other. Measured: 1.1 at most.
+_SIZED, _ASKEW = 1.6, 1.4
 #: A camera is upright if the face's up is so near the frame's, rad.
 _UPRIGHT = 0.3
 #: Least correlation of what is found where a mark should be.
@@ -206,11 +208,25 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
             break
         taken = again
     held = np.flatnonzero(taken >= 0)
-    if len(held) < 3:
+    if len(held) < 3 or not _in_shape(seen, marks, H, held, taken[held]):
         return None
     lean = float(_lean(scales(H, marks.plane.mean(axis=0)[None]), up)[0])
     likeness = float(seen.likeness[taken[held], marks.which[held]].sum())
     return Match(held, taken[held], H, (len(held), -round(lean, 1), likeness))
+
+
+def _in_shape(
+    seen: Candidates, marks: Constellation, H: FloatArray, held: Places, taken: Places
+) -> bool:
+    """Whether marks are as broad and as high as the distances between them say.
+
+    Those of another target, with other distances, are not: one map does not fit both.
+    """
+    back = np.linalg.inv(scales(H, marks.middle[held]))
+    found = (back @ seen.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)
+    root = np.linalg.inv(np.linalg.cholesky(marks.covariance[held].sum(axis=0)))
+    least, most = np.linalg.eigvalsh(root @ found @ root.T)
+    return bool(most < _ASKEW * least and 1.0 / _SIZED < np.sqrt(least * most) < _SIZED)
 
 
 def _affine(plane: FloatArray, pixels: FloatArray) -> FloatArray:
