@@ -1,12 +1,18 @@
 """What the target would look like without a beam."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
-from heliotrope.errors import InputError
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._textfile import check_file, write_file
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging._shadow import Edge, border, find_edges, places
+from heliotrope.imaging._shadow import prior as edge_prior
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.rectify import Mask, Rectified
 
@@ -22,6 +28,28 @@ _UNEVEN = 0.1
 _PATCH = 0.4
 #: Brighter than the background by this many deviations: a beam.
 _HOT = 3.0
+#: And by at least this part of it.
+_HOT_PART = 0.002
+#: A model that stands on so many frames says more of the paint than one frame does.
+_KNOWN = 3.0
+#: How uneven the light of a frame is, over that: held by so many numbers' worth, and between.
+_EVEN = (0.01, 0.05, 1.5)
+#: The face is softened by this many grid pixels before the fit looks at it.
+_SOFT = 2.0
+#: A shadow leaves this many places at a face's border unexplained, or more.
+_BORDER = 4
+#: Unexplained is what is off by three deviations, within these bounds of the brightness.
+_ODD = (0.015, 0.03)
+#: An edge explains this part of the paint besides, and its height is this many deviations.
+_GAIN, _CERTAIN = 0.02, 4.5
+#: Paint is as it should be within so many deviations, or this part of the brightness.
+_PLAIN, _PLAIN_PART = 4.0, 0.02
+#: What is off over less than this is paint, m.
+BROAD = 0.3
+#: With less of the paint free of beams than this, no more is left out.
+_FEWEST = 0.06
+#: Turns of the fit in which a shadow's edge is moved to its place.
+_SETTLING = 6
 #: What is near a beam holds its tails: pixels of the fit's grid.
 _NEAR = 3
 
@@ -50,6 +78,9 @@ class Background:
         "frame", "difference" or "model".
     seen
         Part of the paint that was free of beams.
+    reflectance
+        Of the paint over its usual one, (H, W), if it is known: light divided by it is what
+        falls on the face.
     """
 
     values: Image
@@ -61,6 +92,7 @@ class Background:
     stride: int
     method: str
     seen: float
+    reflectance: Image | None = None
 
 
 def from_frame(picture: Rectified) -> Background:
@@ -103,17 +135,21 @@ class EmptyTarget:
         Frames that each pixel stands on, forgotten ones less, (H, W).
     memory
         Frames after which a frame counts a third.
+    targets
+        Names of the face's targets.
     """
 
     reflectance: Image
     weight: Image
     memory: float = 50.0
+    targets: tuple[str, ...] = ()
 
     @staticmethod
     def of(picture: Rectified, memory: float = 50.0) -> "EmptyTarget":
         """Return a model that has seen nothing yet."""
         ones = np.ones(picture.shape, dtype=np.float32)
-        return EmptyTarget(ones, np.zeros_like(ones), memory)
+        names = tuple(target.name for target in picture.face.targets)
+        return EmptyTarget(ones, np.zeros_like(ones), memory, names)
 
     def learn(self, picture: Rectified, spots: Mask | None = None) -> "EmptyTarget":
         """Return the model after another frame.
@@ -126,14 +162,13 @@ class EmptyTarget:
             Where beams are in it, (H, W): nothing is learnt there. By default they are
             looked for.
         """
-        if picture.shape != self.reflectance.shape:
-            raise InputError(
-                f"the model is of {self.reflectance.shape} pixels, the frame of {picture.shape}"
-            )
-        light = from_frame(picture)
-        lit = beams(picture, light) if spots is None else spots
-        good = picture.surface & ~lit & (light.values > 0.02)
-        ratio = np.where(good, picture.values / np.maximum(light.values, 0.02), 1.0)
+        self._check(picture)
+        known = float(np.median(self.weight)) >= _KNOWN
+        background = from_model(picture, self) if known else from_frame(picture)
+        light = background.values / self.reflectance if known else background.values
+        lit = beams(picture, background) if spots is None else spots
+        good = picture.surface & ~lit & (light > 0.02)
+        ratio = np.where(good, picture.values / np.maximum(light, 0.02), 1.0)
         kept = self.weight * np.float32(np.exp(-1.0 / self.memory))
         weight = np.where(good, kept + 1.0, self.weight)
         change = (ratio - self.reflectance) / np.maximum(weight, 1.0)
@@ -142,21 +177,81 @@ class EmptyTarget:
             self, reflectance=reflectance.astype(np.float32), weight=weight.astype(np.float32)
         )
 
+    def save(self, path: str | Path) -> None:
+        """Write the model to a file (.npz), whole or not at all.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
+        write_file(
+            path,
+            lambda stream: np.savez_compressed(
+                stream, reflectance=self.reflectance, weight=self.weight,
+                memory=np.float64(self.memory), targets=np.array(self.targets, dtype=np.str_),
+            ),
+        )  # fmt: skip
+
+    @staticmethod
+    def load(path: str | Path) -> "EmptyTarget":
+        """Return a model that :meth:`save` wrote.
+
+        Raises
+        ------
+        InputError
+            If there is no such file.
+        FormatError
+            If it is not one of ours.
+        """
+        file = check_file(path, "model of an empty target")
+        try:
+            with np.load(file, allow_pickle=False) as held:
+                reflectance, weight = held["reflectance"], held["weight"]
+                memory, names = float(held["memory"]), tuple(str(n) for n in held["targets"])
+        except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
+            raise FormatError(
+                file, f"no model of an empty target ({error}); learn one anew from empty frames"
+            ) from None
+        good = reflectance.ndim == 2 and reflectance.shape == weight.shape and memory > 0.0
+        if not good or not (np.isfinite(reflectance).all() and np.isfinite(weight).all()):
+            raise FormatError(
+                file,
+                f"reflectance {reflectance.shape} and weight {weight.shape} must be finite, and "
+                f"memory {memory} above 0; learn a model anew from empty frames",
+            )
+        return EmptyTarget(reflectance.astype(np.float32), weight.astype(np.float32), memory, names)
+
+    def _check(self, picture: Rectified) -> None:
+        names = tuple(target.name for target in picture.face.targets)
+        if self.targets and set(self.targets) != set(names):
+            raise InputError(
+                f"the model is of {', '.join(self.targets)}, the frame shows {', '.join(names)}; "
+                "give the model of this target"
+            )
+        if picture.shape != self.reflectance.shape:
+            raise InputError(
+                f"the model is of {self.reflectance.shape} pixels, the frame of {picture.shape}; "
+                "learn a model of this target anew"
+            )
+
 
 def from_model(picture: Rectified, model: EmptyTarget) -> Background:
     """Return the background of a frame from what the empty target is known to look like.
 
+    Light that falls on stained paint is divided by its reflectance afterwards.
+
     Raises
     ------
     InputError
-        If the model is of another grid.
+        If the model is of another grid or target.
     """
-    if picture.shape != model.reflectance.shape:
-        raise InputError(
-            f"the model is of {model.reflectance.shape} pixels, the frame of {picture.shape}"
-        )
+    model._check(picture)  # noqa: SLF001 (its own module)
     columns, rows = _orders(picture)
-    return _fit(picture, model.reflectance, (max(columns // 3, 1), max(rows // 3, 1)), "model")
+    orders = (max(columns // 3, 1), max(rows // 3, 1))
+    # A pixel that was always in a beam is as bright as others, for all that is known.
+    known = np.where(model.weight > 0.0, model.reflectance, np.float32(1.0))
+    return _fit(picture, known, orders, "model", known)
 
 
 def beams(picture: Rectified, background: Background) -> Mask:
@@ -167,6 +262,28 @@ def beams(picture: Rectified, background: Background) -> Mask:
     hot = (above > _HOT * background.deviation) & picture.paint
     reach = 2 * _NEAR * _STRIDE + 1
     return cv2.dilate(hot.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+
+
+def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask]) -> float:
+    """Return the part of the paint beside the spots that is brighter or darker than it should be.
+
+    Shadows, stray light and what stands before a target make it. Single pixels, joints and
+    stains do not count: what counts is broader than :data:`BROAD` metres.
+    """
+    import cv2
+
+    beside = picture.paint.copy()
+    reach = 2 * _NEAR * _STRIDE + 1
+    for region in spots:
+        beside &= cv2.dilate(region.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0
+    if not beside.any():
+        return 0.0
+    left = np.abs(smooth(picture, picture.values - background.values, 2.0))
+    level = float(np.median(background.values[picture.paint]))
+    odd = beside & (left > max(_PLAIN * background.deviation, _PLAIN_PART * level))
+    size = max(round(BROAD / picture.step), 1)
+    broad = cv2.morphologyEx(odd.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    return float((broad[beside] > 0).sum() / picture.paint.sum())
 
 
 def smooth(picture: Rectified, values: Image, sigma: float) -> Image:
@@ -221,13 +338,60 @@ def _polynomials(shape: tuple[int, int], orders: tuple[int, int]) -> tuple[Float
 
 
 def _ridge(
-    A: FloatArray, b: FloatArray, variance: float, prior: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Numbers of greatest posterior probability and their covariance."""
-    information = A.T @ A / variance + np.diag(prior)
-    covariance = np.linalg.inv(information)
-    numbers = np.asarray(covariance @ (A.T @ b) / variance, dtype=np.float64)
-    return numbers, np.asarray(covariance, dtype=np.float64)
+    A: FloatArray, b: FloatArray, variance: float, prior: FloatArray, evenness: int,
+    scale: float = 1.0, turns: int = 8,
+) -> tuple[FloatArray, FloatArray, float]:  # fmt: skip
+    """Numbers of greatest posterior probability and their covariance.
+
+    The first numbers, up to ``evenness``, are those of smooth light. How smooth it is differs
+    from frame to frame: their prior deviations are scaled by what they turn out to be,
+    the expectation-maximisation of a variance, held by one number's worth of a small one.
+    """
+    G, r = A.T @ A / variance, A.T @ b / variance
+    numbers, covariance = np.zeros(len(prior)), np.zeros((len(prior), len(prior)))
+    for _ in range(turns):
+        held = prior.copy()
+        held[1:evenness] /= scale
+        covariance = np.asarray(np.linalg.inv(G + np.diag(held)))
+        numbers = covariance @ r
+        spread = (numbers**2 + np.diag(covariance))[1:evenness]
+        total = float(prior[1:evenness] @ spread) + _EVEN[0]
+        new = float(np.clip(total / evenness, _EVEN[1] ** 2, _EVEN[2] ** 2))
+        if abs(np.log(new / scale)) < 0.05:
+            break
+        scale = new
+    return numbers, covariance, scale
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """What a fit looks at: paint on its grid, and the functions of smooth light there."""
+
+    soft: FloatArray
+    paint: Mask
+    multiplier: FloatArray
+    basis: FloatArray
+    prior: FloatArray
+    patch: float
+
+    @property
+    def level(self) -> float:
+        return float(np.median(self.soft[self.paint]))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What came of it."""
+
+    basis: FloatArray
+    prior: FloatArray
+    numbers: FloatArray
+    spread: float
+    free: Mask
+    edge: Edge | None
+
+    def left(self, grid: _Grid) -> FloatArray:
+        return np.asarray(grid.soft - self.basis @ self.numbers)
 
 
 def _fit(
@@ -235,58 +399,124 @@ def _fit(
     pattern: Image,
     orders: tuple[int, int],
     method: str,
+    reflectance: Image | None = None,
 ) -> Background:
-    """Fit pattern × polynomial to the paint that no beam lights."""
-    import cv2
-
-    part = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
-    soft = smooth(picture, picture.values, 2.0)[part].astype(np.float64)
-    paint = picture.paint[part]
-    multiplier = smooth(picture, pattern, 2.0)[part].astype(np.float64)
-    table, order = _polynomials((soft.shape[0], soft.shape[1]), orders)
-    small = table * multiplier[..., None]
-    A, b = small[paint], soft[paint]
-    if len(b) < 4 * A.shape[1]:
-        raise InputError(
-            f"only {len(b)} places of bare paint are seen: too few for a background; the target "
-            "is too small in the frame or covered"
-        )
-    level = float(np.median(b))
-    prior = np.full(A.shape[1], (0.1 / max(level, 0.01)) ** 2)
-    prior[order > 0.0] = (order[order > 0.0] ** 1.5 / (_UNEVEN * max(level, 0.01))) ** 2
+    """Fit pattern × polynomial, and a shadow's edge if there is one, to what no beam lights."""
+    grid = _grid(picture, pattern, orders)
+    found = _converged(grid, None)
+    even, odd = grid.soft / np.maximum(grid.multiplier, 0.05), _odd(found, grid)
+    # A shadow's edge is not explained where it meets the face's border.
+    for edge in find_edges(even, grid.paint) if odd[border(grid.paint)].sum() > _BORDER else []:
+        if not edge.crosses(odd, grid.paint):
+            continue
+        other = _converged(grid, edge)
+        if _better(other, found, grid):
+            found = other
+    left = found.left(grid)
     area = (picture.step * _STRIDE) ** 2
-    patch, free = max(_PATCH / area, 1.0), b <= np.percentile(b, 60.0)
-    numbers, spread = np.zeros(A.shape[1]), 1.0 / 255.0
-    cross = np.ones((3, 3), np.uint8)
-    reach = np.ones((2 * _NEAR + 1, 2 * _NEAR + 1), np.uint8)
-    for _ in range(15):
-        numbers = _ridge(A[free], b[free], patch * spread**2, prior)[0]
-        left = b - A @ numbers
-        middle = np.median(left[free])
-        spread = 1.4826 * float(np.median(np.abs(left[free] - middle))) + 0.15 / 255.0
-        hot: Image = np.zeros(paint.shape, dtype=np.uint8)
-        hot[paint] = left > _HOT * spread
-        hot = cv2.dilate(cv2.morphologyEx(hot, cv2.MORPH_OPEN, cross), reach)
-        now = hot[paint] == 0
-        if now.sum() < 0.1 * len(b) or (now == free).all():
-            break
-        free = now
-    held = np.zeros(paint.shape, dtype=bool)
-    held[paint] = free
-    patch = _patch(np.where(paint, soft - small @ numbers, 0.0), held)
-    deviation = max(spread, float(np.sqrt(np.mean((b - A @ numbers)[free] ** 2))))
-    numbers, covariance = _ridge(A[free], b[free], patch * deviation**2, prior)
-    values = _upscaled(picture.shape, orders, numbers) * pattern
+    patch = _patch(np.where(grid.paint, left, 0.0), found.free)
+    deviation = max(found.spread, float(np.sqrt(np.mean(left[found.free] ** 2))))
+    numbers, covariance, _ = _ridge(
+        found.basis[found.free], grid.soft[found.free], patch * deviation**2, found.prior,
+        grid.basis.shape[-1],
+    )  # fmt: skip
+    values = _upscaled(picture.shape, orders, numbers, found.edge) * pattern
     rough = picture.values - smooth(picture, picture.values, 1.0)
     noise = 1.4826 * float(np.median(np.abs(rough[picture.paint]))) * 1.05
     return Background(
-        values.astype(np.float32), deviation, noise, patch * area, small, covariance, _STRIDE,
-        method, float(free.mean()),
+        values.astype(np.float32), deviation, noise, patch * area, found.basis, covariance,
+        _STRIDE, method, float(found.free.sum() / grid.paint.sum()), reflectance,
     )  # fmt: skip
 
 
-def _upscaled(shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArray) -> FloatArray:
-    """The polynomial on the whole grid; the fit's grid lies evenly in it."""
+def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
+    part = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
+    soft = smooth(picture, picture.values, _SOFT)[part].astype(np.float64)
+    paint = picture.paint[part]
+    multiplier = smooth(picture, pattern, _SOFT)[part].astype(np.float64)
+    table, order = _polynomials((soft.shape[0], soft.shape[1]), orders)
+    count = int(paint.sum())
+    if count < 4 * table.shape[-1]:
+        raise InputError(
+            f"only {count} places of bare paint are seen: too few for a background; the target "
+            "is too small in the frame or covered"
+        )
+    level = float(np.median(soft[paint]))
+    prior = np.full(len(order), (0.1 / max(level, 0.01)) ** 2)
+    prior[order > 0.0] = (order[order > 0.0] ** 1.5 / (_UNEVEN * max(level, 0.01))) ** 2
+    patch = max(_PATCH / (picture.step * _STRIDE) ** 2, 1.0)
+    return _Grid(soft, paint, multiplier, table * multiplier[..., None], prior, patch)
+
+
+def _better(other: _Fit, found: _Fit, grid: _Grid) -> bool:
+    """Whether a fit with an edge is to be believed rather than one without, or with another.
+
+    It must explain more of the paint to the same accuracy, and the height of its edge must be
+    certain from what no beam lights.
+    """
+    limit = _HOT * min(found.spread, other.spread)
+    explained = [float((np.abs(f.left(grid))[grid.paint] < limit).mean()) for f in (found, other)]
+    if other.edge is None or explained[1] < explained[0] + _GAIN:
+        return False
+    variance = 3.0 * other.spread**2
+    size = grid.basis.shape[-1]
+    _, covariance, _ = _ridge(
+        other.basis[other.free], grid.soft[other.free], variance, other.prior, size
+    )
+    return bool(abs(other.numbers[size]) > _CERTAIN * np.sqrt(covariance[size, size]))
+
+
+def _odd(found: _Fit, grid: _Grid) -> Mask:
+    """Where smooth light does not explain the paint, single places aside."""
+    import cv2
+
+    limit = float(np.clip(_HOT * found.spread, _ODD[0] * grid.level, _ODD[1] * grid.level))
+    odd = (np.abs(found.left(grid)) > limit) & grid.paint
+    return cv2.morphologyEx(odd.astype(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8)) > 0
+
+
+def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
+    """Fit, leave out what stands out and its surroundings, and again until nothing changes."""
+    import cv2
+
+    paint, soft, basis, prior = grid.paint, grid.soft, grid.basis, grid.prior
+    x, y = places((soft.shape[0], soft.shape[1]))
+    even = soft
+    if edge is not None:
+        even = soft - edge.height * grid.multiplier * edge.step(x, y)
+        prior = np.concatenate([prior, edge_prior(grid.level)])
+    free = paint & (even <= np.percentile(even[paint], 60.0))
+    numbers, spread, scale = np.zeros(len(prior)), 1.0 / 255.0, 1.0
+    cross = np.ones((3, 3), np.uint8)
+    reach = np.ones((2 * _NEAR + 1, 2 * _NEAR + 1), np.uint8)
+    for turn in range(15):
+        if edge is not None:
+            columns = edge.columns(x, y) * grid.multiplier[..., None]
+            basis = np.concatenate([grid.basis, columns], axis=-1)
+        numbers, _, scale = _ridge(
+            basis[free], soft[free], grid.patch * spread**2, prior, grid.basis.shape[-1], scale, 1
+        )
+        left = soft - basis @ numbers
+        middle = np.median(left[free])
+        spread = 1.4826 * float(np.median(np.abs(left[free] - middle))) + 0.15 / 255.0
+        hot = paint & (left > max(_HOT * spread, _HOT_PART * grid.level))
+        if edge is not None and turn < _SETTLING:
+            # What is off because the edge is not yet where it belongs is no beam.
+            hot &= np.abs(edge.distance(x, y)) > 2.0 * edge.breadth + 2.0
+        grown = cv2.dilate(cv2.morphologyEx(hot.astype(np.uint8), cv2.MORPH_OPEN, cross), reach)
+        now = paint & (grown == 0)
+        if edge is not None and turn < _SETTLING:
+            edge = edge.moved(numbers[-6:])
+        elif now.sum() < _FEWEST * paint.sum() or (now == free).all():
+            break
+        free = now if now.sum() >= _FEWEST * paint.sum() else free
+    return _Fit(basis, prior, numbers, spread, free, edge)
+
+
+def _upscaled(
+    shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArray, edge: Edge | None
+) -> FloatArray:
+    """The light on the whole grid; the fit's grid lies evenly in it."""
     rows = len(np.arange(_STRIDE // 2, shape[0], _STRIDE))
     columns = len(np.arange(_STRIDE // 2, shape[1], _STRIDE))
 
@@ -297,9 +527,20 @@ def _upscaled(shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArr
     x = np.polynomial.legendre.legvander(place(shape[1], columns), orders[0])
     y = np.polynomial.legendre.legvander(place(shape[0], rows), orders[1])
     table = np.zeros((orders[1] + 1, orders[0] + 1))
-    for (i, j, _), number in zip(_terms(orders), numbers, strict=True):
+    terms = _terms(orders)
+    for (i, j, _), number in zip(terms, numbers, strict=False):
         table[j, i] = number
-    return np.asarray(y @ table @ x.T)
+    light = np.asarray(y @ table @ x.T)
+    if edge is None:
+        return light
+    u = (np.arange(shape[1]) - _STRIDE // 2) / _STRIDE - 0.5 * (columns - 1)
+    v = (np.arange(shape[0]) - _STRIDE // 2) / _STRIDE - 0.5 * (rows - 1)
+    # The fit saw the face softened.
+    sharp = float(np.sqrt(max(edge.breadth**2 - (_SOFT / _STRIDE) ** 2, 0.1**2)))
+    step = edge.step(u[None, :], v[:, None], sharp)
+    height, right, down = numbers[len(terms) : len(terms) + 3]
+    half = 0.5 * max(columns - 1, 1)
+    return np.asarray(light + step * (height + (right * u[None, :] + down * v[:, None]) / half))
 
 
 def _patch(left: FloatArray, held: Mask) -> float:

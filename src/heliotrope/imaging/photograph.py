@@ -1,7 +1,7 @@
 """A photograph read: its targets, their spots in metres with covariance, and what is wrong."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Literal
 
@@ -16,12 +16,16 @@ from heliotrope.imaging.background import Background, EmptyTarget
 from heliotrope.imaging.finding import FoundTarget, Pictures, find_targets
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.quality import Expectation, Limits, Reason, judge
-from heliotrope.imaging.rectify import Rectified, from_crop, rectify
+from heliotrope.imaging.rectify import ACROSS, Rectified, from_crop, rectify
 from heliotrope.imaging.spot import Spot, find_spots
 from heliotrope.imaging.view import Face, View
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
+
+#: Pixels at a target's border that show part of what is beyond it: at least so many, or this
+#: times the softness of the marks' edges, and at most so many.
+_LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,9 @@ class PlacedSpot:
         Of the point, m², (3, 3): nothing across the plane.
     pixel
         Where it is in the frame, (2,).
+    flux
+        Its light over the frame's exposure and gain, full scales m² per second at gain 1:
+        frames of one camera can be compared by it. NaN if they are not known.
     """
 
     spot: Spot
@@ -54,6 +61,7 @@ class PlacedSpot:
     point: FloatArray
     covariance_enu: FloatArray
     pixel: FloatArray
+    flux: float = float("nan")
 
     @property
     def deviation(self) -> float:
@@ -95,10 +103,13 @@ class LookedAt:
         The face on a grid of metres.
     background
         Without its beams.
+    unexplained
+        Part of its paint beside the spots that is brighter or darker than that.
     """
 
     picture: Rectified
     background: Background
+    unexplained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -158,6 +169,9 @@ class Settings:
         By target.
     pictures
         Of taught marks, by their code.
+    gamma
+        Of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2
+        comes near to sRGB. It is undone before anything is measured.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -165,6 +179,7 @@ class Settings:
     empty: Mapping[str, EmptyTarget] = field(default_factory=dict)
     expectations: Mapping[str, Expectation] = field(default_factory=dict)
     pictures: Pictures = field(default_factory=dict)
+    gamma: float = 1.0
 
 
 def read_photograph(
@@ -209,24 +224,27 @@ def _read(
     frame: Frame, targets: Sequence[Target], camera: Camera | None, chosen: Settings,
     previous: Sequence[View], without: Frame | None,
 ) -> Photograph:  # fmt: skip
+    given, frame = frame, linear(frame, chosen.gamma)
     found = find_targets(frame, targets, camera, previous, chosen.pictures)
     readings = {f.target.name: Reading(f, (), (_missing(f),)) for f in found if not f.found}
     beside: list[PlacedSpot] = []
     faces: list[LookedAt] = []
     grey = np.ascontiguousarray(frame.grey)
     for view in _views(found):
-        picture = rectify(frame, view, grey)
+        own = [f for f in found if f.view is view]
+        rim = _rim(own)
+        picture = _trimmed(rectify(frame, view, grey), rim)
         empty = None
         if without is not None:
-            empty = _empty_picture(without, view, camera, chosen)
-        seen, on_face = _read_face(picture, chosen, empty)
+            known = linear(without, chosen.gamma)
+            empty = _trimmed(_empty_picture(known, view, camera, chosen), rim)
+        seen, on_face = _read_face(picture, chosen, empty, frame.exposure * frame.gain)
         faces.append(seen)
-        own = [f for f in found if f.view is view]
         for result in own:
             readings[result.target.name] = _reading(result, on_face, seen, chosen)
         beside += [s for s in on_face if s.target is None]
     ordered = tuple(readings[t.name] for t in targets)
-    return Photograph(frame, ordered, tuple(beside), tuple(faces))
+    return Photograph(given, ordered, tuple(beside), tuple(faces))
 
 
 def read_crop(frame: Frame, target: Target, settings: Settings | None = None) -> Photograph:
@@ -242,14 +260,58 @@ def read_crop(frame: Frame, target: Target, settings: Settings | None = None) ->
         How to read.
     """
     chosen = settings or Settings()
-    picture = from_crop(frame, target)
+    picture = _trimmed(from_crop(linear(frame, chosen.gamma), target), _LEAST_RIM)
     with _one_thread().limit(limits=1, user_api="blas"):
-        seen, spots = _read_face(picture, chosen, None)
+        seen, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
     found = FoundTarget(target, True, "")
     return Photograph(
         frame, (_reading(found, spots, seen, chosen),),
         tuple(s for s in spots if s.target is None), (seen,),
     )  # fmt: skip
+
+
+def linear(frame: Frame, gamma: float) -> Frame:
+    """Return a frame whose pixels are proportional to light, 16 bit, if they are not yet.
+
+    Parameters
+    ----------
+    frame
+        As the camera gives it.
+    gamma
+        Its pixels are light to the power 1/gamma.
+
+    Raises
+    ------
+    InputError
+        If gamma is not from 0.2 to 5.
+    """
+    if gamma == 1.0:
+        return frame
+    if not 0.2 <= gamma <= 5.0:
+        raise InputError(f"gamma {gamma} must be from 0.2 to 5; 1 is linear, 2.2 is usual")
+    top = int(frame.full_scale)
+    table = np.round(65535.0 * (np.arange(top + 1) / top) ** gamma).astype(np.uint16)
+    return replace(frame, pixels=table[frame.pixels])
+
+
+def _rim(found: Sequence[FoundTarget]) -> int:
+    """How many grid pixels at a target's border show what is beyond it, by the marks' blur."""
+    soft = [m.blur.max() for f in found for m in f.marks if m.used and np.isfinite(m.blur).all()]
+    if not soft:
+        return _LEAST_RIM
+    side = min(min(f.target.width, f.target.height) for f in found)
+    return int(np.clip(np.ceil(_SOFT_RIM * np.median(soft) / side * ACROSS), _LEAST_RIM, _MOST_RIM))
+
+
+def _trimmed(picture: Rectified, rim: int) -> Rectified:
+    """Return a face without the rim of its surface, which shows what is beyond it in part."""
+    import cv2
+
+    inner = cv2.erode(
+        picture.surface.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8),
+        borderType=cv2.BORDER_CONSTANT, borderValue=0,
+    )  # fmt: skip
+    return replace(picture, surface=inner > 0)
 
 
 def _missing(found: FoundTarget) -> Reason:
@@ -279,11 +341,16 @@ def _empty_picture(
 
 
 def _read_face(
-    picture: Rectified, chosen: Settings, empty: Rectified | None
+    picture: Rectified, chosen: Settings, empty: Rectified | None, gathered: float
 ) -> tuple[LookedAt, list[PlacedSpot]]:
+    """Read one face; ``gathered`` is exposure times gain, s."""
     background = _background(picture, chosen, empty)
-    spots = [_placed(picture, spot) for spot in find_spots(picture, background)]
-    return LookedAt(picture, background), spots
+    spots = [
+        replace(_placed(picture, spot), flux=spot.light / gathered if gathered > 0.0 else np.nan)
+        for spot in find_spots(picture, background)
+    ]
+    odd = backgrounds.unexplained(picture, background, [s.spot.region for s in spots])
+    return LookedAt(picture, background, odd), spots
 
 
 def _background(picture: Rectified, chosen: Settings, empty: Rectified | None) -> Background:
@@ -355,5 +422,7 @@ def _reading(
         seen.background.seen,
         chosen.limits,
         expected,
+        own[0].flux if own else float("nan"),
+        seen.unexplained,
     )
     return Reading(found, tuple(own), tuple(reasons))

@@ -13,17 +13,20 @@ from heliotrope.imaging.spot import Spot
 REASONS: dict[str, str] = {
     "target not found": "the target's marks were not seen in the frame",
     "no spot": "nothing on the target stands out of its background",
-    "several spots": "the second spot's power over the first one's",
-    "cut at the edge": "brightness of the spot at the target's border over its peak",
+    "several spots": "the second spot's power over the first one's, or power over what is expected",
+    "lopsided": "third moments of the spot in units of its standard deviations",
+    "cut at the edge": "brightness of the spot at the target's border over its peak, or by how "
+    "much what the border cuts off moves its centroid, m",
     "saturated": "part of the spot's light in clipped pixels",
     "flare": "brightness of the target's marks over that of its paint: stray light fills them",
     "cloud": "power of the spot over what is expected, or its peak over the background",
     "moved": "blur of the marks in one direction over that in the other",
     "out of focus": "blur of the marks, m",
-    "smeared": "length of the spot over what is expected",
+    "smeared": "length or breadth of the spot over what is expected",
     "covered": "part of the spot that marks cover",
     "uncertain": "standard deviation of the centroid, m",
-    "background": "part of the target that no spot lights",
+    "background": "part of the target that no spot lights, or that is brighter or darker than "
+    "light on its paint explains",
 }
 
 
@@ -36,41 +39,54 @@ class Limits:
     second_spot
         Power of another spot on the same target, of the first one's.
     edge
-        Brightness at the target's border, of the peak.
+        Brightness at the target's border, of the peak. What the border cuts off is estimated,
+        to about a third of the shift that it makes while this holds.
+    cut
+        That shift, m.
     clipped
         Part of the light in clipped pixels.
     mark_contrast
         Brightness of the marks, of their surroundings.
     power
-        Of the expected power.
+        Least power, of the expected one.
+    surprise
+        By how many of an expectation's deviations a beam may be more powerful, longer or
+        broader than expected.
+    skewness
+        Lopsidedness: two beams that overlap are more lopsided than the beam of one heliostat
+        (98 % of the measured beams of Jülich are below 0.28).
     contrast
         Peak over background, if nothing is expected.
     motion
         Blur of the marks in one direction over that in the other.
     blur
         Of the marks, m.
-    length
-        Of the expected length.
     covered
         Part of a spot under marks.
     deviation
         Standard deviation of the centroid along its worse axis, m.
     free
         Part of the face that must be free of light.
+    unexplained
+        Part of the face, beside its spots, that is brighter or darker than it should be:
+        shadows with more than one edge, stray light, things in the way.
     """
 
     second_spot: float = 0.15
-    edge: float = 0.12
+    edge: float = 0.4
+    cut: float = 0.15
     clipped: float = 0.35
     mark_contrast: float = 0.8
     power: float = 0.5
+    surprise: float = 3.0
+    skewness: float = 0.45
     contrast: float = 0.08
     motion: float = 2.5
     blur: float = 0.12
-    length: float = 1.5
     covered: float = 0.15
     deviation: float = 0.1
-    free: float = 0.15
+    free: float = 0.06
+    unexplained: float = 0.03
 
 
 @dataclass(frozen=True)
@@ -80,9 +96,16 @@ class Expectation:
     Attributes
     ----------
     power
-        As :class:`heliotrope.imaging.spot.Spot` has it, m²; NaN if unknown.
-    length
-        Standard deviation along its major axis, m; NaN if unknown.
+        As :class:`heliotrope.imaging.spot.Spot` has it, over the ambient light, m²; NaN if
+        unknown.
+    flux
+        As :class:`heliotrope.imaging.photograph.PlacedSpot` has it, full scales m²/s at gain
+        1: it depends on the sun alone, and is used before ``power`` where a frame's exposure
+        and gain are known. NaN if unknown.
+    length, width
+        Standard deviations along its major and minor axis, m; NaN if unknown.
+    deviation
+        Relative standard deviation of power, flux, length and width.
     place
         Where it should be, metres right of and above the target's centre, (2,): of several
         spots the nearest one is taken. None if unknown.
@@ -91,6 +114,13 @@ class Expectation:
     power: float = float("nan")
     length: float = float("nan")
     place: FloatArray | None = None
+    flux: float = float("nan")
+    width: float = float("nan")
+    deviation: float = 0.15
+
+    def most(self, limits: Limits) -> float:
+        """Return how many times what is expected is borne."""
+        return float(np.exp(limits.surprise * self.deviation))
 
 
 @dataclass(frozen=True)
@@ -120,6 +150,8 @@ def judge(
     free: float,
     limits: Limits,
     expectation: Expectation,
+    flux: float = float("nan"),
+    unexplained: float = 0.0,
 ) -> list[Reason]:
     """Return what speaks against the first of the spots on one target.
 
@@ -137,6 +169,10 @@ def judge(
         What is borne.
     expectation
         What is known beforehand.
+    flux
+        Of the first spot, full scales m²/s at gain 1; NaN if unknown.
+    unexplained
+        Part of the face beside its spots that is not as it should be.
     """
     reasons = [] if found is None else _of_frame(found, limits)
     if not spots:
@@ -145,34 +181,57 @@ def judge(
             Reason("no spot", nothing, nothing, "no spot stands out of the background"),
             *reasons,
         ]
-    first, nan = spots[0], float("nan")
+    first = spots[0]
     second = max((s.power for s in spots[1:]), default=0.0) / max(first.power, 1e-12)
     checks = [
         ("several spots", second, limits.second_spot, "another spot on it has {:.0%} of its power"),
         ("cut at the edge", first.edge, limits.edge, "at the border it has {:.0%} of its peak"),
+        ("cut at the edge", first.cut, limits.cut, "what the border cuts off moves it by {:.2f} m"),
         ("saturated", first.clipped, limits.clipped, "{:.0%} of its light is clipped"),
         ("covered", first.covered, limits.covered, "marks cover {:.0%} of it"),
         ("uncertain", deviation, limits.deviation, "its centroid is certain to {:.3f} m only"),
     ]
     for name, value, limit, text in checks:
-        if not value <= limit:
+        if not value <= limit and name not in {r.name for r in reasons}:
             reasons.append(Reason(name, float(value), limit, text.format(value)))
     if free < limits.free:
         text = f"only {free:.0%} of the target are free of light"
         reasons.append(Reason("background", free, limits.free, text))
-    if np.isfinite(expectation.power):
-        share = first.power / expectation.power
-        if not share >= limits.power:
-            text = f"it has {share:.0%} of the expected power: a cloud"
-            reasons.append(Reason("cloud", float(share), limits.power, text))
-    elif not first.contrast >= limits.contrast:
-        text = f"its peak is {first.contrast:.0%} of the background: a cloud, or no sun"
-        reasons.append(Reason("cloud", first.contrast, limits.contrast, text))
-    length = first.axes[0] / expectation.length if np.isfinite(expectation.length) else nan
-    if length > limits.length:
-        text = f"it is {length:.1f} times as long as expected: it moved during exposure"
-        reasons.append(Reason("smeared", float(length), limits.length, text))
+    elif unexplained > limits.unexplained:
+        text = f"{unexplained:.0%} of the target are brighter or darker than its light explains"
+        reasons.append(Reason("background", unexplained, limits.unexplained, text))
+    reasons += _of_power(first, flux, limits, expectation)
+    if first.skewness > limits.skewness:
+        text = f"its third moments are {first.skewness:.2f}: two beams, or one with a part missing"
+        reasons.append(Reason("lopsided", first.skewness, limits.skewness, text))
+    most = expectation.most(limits)
+    sizes = {"long": expectation.length, "broad": expectation.width}
+    for (word, size), axis in zip(sizes.items(), first.axes, strict=False):
+        if axis / size > most:
+            text = f"it is {axis / size:.1f} times as {word} as expected: it moved, or is two"
+            reasons.append(Reason("smeared", float(axis / size), most, text))
+            break
     return reasons
+
+
+def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation) -> list[Reason]:
+    """What a spot's power says: less than expected is a cloud, more is another beam."""
+    share = flux / expectation.flux
+    if not np.isfinite(share):
+        share = spot.power / expectation.power
+    if not np.isfinite(share):
+        if spot.contrast >= limits.contrast:
+            return []
+        text = f"its peak is {spot.contrast:.0%} of the background: a cloud, or no sun"
+        return [Reason("cloud", spot.contrast, limits.contrast, text)]
+    most = expectation.most(limits)
+    if share > most:
+        text = f"it has {share:.1f} times the expected power: more than one beam"
+        return [Reason("several spots", float(share), most, text)]
+    if not share >= limits.power:
+        text = f"it has {share:.0%} of the expected power: a cloud"
+        return [Reason("cloud", float(share), limits.power, text)]
+    return []
 
 
 def _of_frame(found: FoundTarget, limits: Limits) -> list[Reason]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.geometry import FloatArray
+from heliotrope.imaging._border import NOTHING, beyond
+from heliotrope.imaging._top_kernels import number_tops
 from heliotrope.imaging.background import Background, smooth
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.rectify import Mask, Rectified
@@ -19,8 +21,15 @@ _FOOT_PART = 0.03
 _NECK = 0.3
 #: Beyond its foot it has tails: grown by this part of its radius.
 _TAIL = 0.15
-#: Two tops are two beams if between them brightness falls by this part of the lower one.
-_DIP = 0.4
+#: Paint that is darker than this part of the usual one is no measure of light.
+_DARKEST = 0.4
+#: Two tops are two beams if between them brightness falls by this part of the lower one:
+#: facets of one heliostat make 0.16 at most on a hundred measured beams of Jülich.
+_DIP = 0.18
+#: And by this many deviations of the background's remains.
+_DIP_LEAST = 4.0
+#: Its lopsidedness is that of what is brighter than this part of its peak.
+_BODY = 0.1
 #: The smallest beam, m²; the sun's image at 20 m is 0.03.
 _SMALLEST = 0.03
 #: A centroid over the foot and one over the tails differ by what the tails may hide.
@@ -29,7 +38,9 @@ _TAIL_SHARE = 0.5
 #: centroid by about this times φ^1.5 deviations of the beam: measured on 400 simulated
 #: beams over photographs of empty targets, where it holds for peaks of 0.25 to 2 times
 #: the background.
-_HIDDEN = 0.75
+_HIDDEN = 0.6
+#: What the border cuts off is known to this part of the shift that it makes at most.
+_CUT_SHARE = 0.4
 #: Of the radius: what clipping the brightest part may move a centroid by.
 _CLIP_SHARE = 0.15
 
@@ -41,11 +52,12 @@ class Spot:
     Attributes
     ----------
     centroid
-        Of its light, plane coordinates of the face, m, (2,).
+        Of its light, plane coordinates of the face, m, (2,): of what the target's border cuts
+        off too, as far as that can be told.
     covariance
-        Of the centroid, m², (2, 2): background, noise, tails and clipping.
+        Of the centroid, m², (2, 2): background, noise, tails, border and clipping.
     second_moments
-        Of its light about the centroid, m², (2, 2).
+        Of its light on the target about the centre of that, m², (2, 2).
     power
         Sum of its brightness over the background's, m².
     peak
@@ -66,6 +78,14 @@ class Spot:
         Steepest slope of its flank, peaks per metre.
     region
         Its pixels, (H, W), tails included.
+    cut
+        By how much the light that the border cuts off moves the centroid, m: ``centroid`` is
+        moved by it.
+    light
+        Sum of its brightness, full scales m².
+    skewness
+        Norm of the third moments of its body, in units of its standard deviations: 0 of what
+        is even about its centre.
     """
 
     centroid: FloatArray
@@ -81,6 +101,9 @@ class Spot:
     area: float
     sharpness: float
     region: Mask
+    cut: float = 0.0
+    light: float = float("nan")
+    skewness: float = 0.0
 
     @property
     def axes(self) -> tuple[float, float, float]:
@@ -107,12 +130,15 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
     level = float(np.median(background.values[picture.paint]))
     seed = max(_SEED * background.deviation, _SEED_PART * level)
     # Tops are broad: every third pixel shows them.
-    coarse = _tops(soft[::3, ::3], picture.surface[::3, ::3], foot, seed)
-    if coarse is None:
-        return []
+    small = np.ascontiguousarray(soft[::3, ::3])
+    coarse = np.zeros(small.shape, dtype=np.int32)
+    least = _DIP_LEAST * background.deviation
+    count = number_tops(
+        small, np.ascontiguousarray(picture.surface[::3, ::3]), foot, seed, _DIP, least, coarse
+    )
     tops = np.repeat(np.repeat(coarse, 3, axis=0), 3, axis=1)[: soft.shape[0], : soft.shape[1]]
     spots = []
-    for number in range(1, int(tops.max()) + 1):
+    for number in range(1, count + 1):
         core = _core(soft, tops == number, foot)
         if core.sum() * picture.step**2 < _SMALLEST:
             continue
@@ -145,102 +171,17 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
 
 
 def _light(picture: Rectified, background: Background) -> Image:
-    """What beams add; where a mark covers the paint, what is around it says."""
+    """What beams add, as paint of the usual reflectance would show it.
+
+    Where a mark covers the paint, what is around it says.
+    """
     added = picture.values - background.values
+    if background.reflectance is not None:
+        added = added / np.maximum(background.reflectance, _DARKEST)
     if not picture.marks.any():
         return added
     around = smooth(picture, added, max(0.1 / picture.step, 1.5))
     return np.where(picture.marks, around, added).astype(np.float32)
-
-
-def _tops(soft: Image, inside: Mask, foot: float, seed: float) -> Image | None:
-    """Number the beams: falling levels show tops appear, grow and meet."""
-    import cv2
-
-    highest = float(soft[inside].max(initial=0.0))
-    if highest < seed:
-        return None
-    levels = np.geomspace(max(0.97 * highest, foot), foot, 24)
-    peaks: dict[int, float] = {}
-    owner = np.zeros(soft.shape, dtype=np.int32)
-    # A pixel of each top stands for it: where its light is greatest.
-    places: dict[int, tuple[int, int]] = {}
-    for level in levels:
-        _, labels = cv2.connectedComponents(((soft > level) & inside).astype(np.uint8))
-        held: dict[int, list[int]] = {}
-        for top, (row, column) in places.items():
-            held.setdefault(int(labels[row, column]), []).append(top)
-        for top, other in _meeting(held, peaks, float(level)):
-            owner[owner == other] = top
-            del peaks[other], places[other]
-        fresh = np.unique(labels[(labels > 0) & (owner == 0)])
-        for label in fresh:
-            if label in held:
-                continue
-            part = labels == label
-            height = float(soft[part].max())
-            if height < seed:
-                continue
-            number = max(peaks, default=0) + 1
-            while number in peaks or (owner == number).any():
-                number += 1
-            at = int(np.argmax(np.where(part, soft, -1.0)))
-            peaks[number] = height
-            places[number] = (at // soft.shape[1], at % soft.shape[1])
-            held[int(label)] = [number]
-        owner = _spread(owner, labels, held, places)
-    return _renumbered(owner, peaks)
-
-
-def _meeting(
-    held: dict[int, list[int]], peaks: dict[int, float], level: float
-) -> list[tuple[int, int]]:
-    """Tops that have met without a dip between them: (the higher one, the lower one)."""
-    gone = []
-    for label, tops in held.items():
-        if label == 0 or len(tops) < 2:
-            continue
-        highest = max(tops, key=lambda t: peaks[t])
-        gone += [
-            (highest, top) for top in tops if top != highest and level > (1.0 - _DIP) * peaks[top]
-        ]
-        held[label] = [t for t in tops if t == highest or level <= (1.0 - _DIP) * peaks[t]]
-    return gone
-
-
-def _spread(
-    owner: Image, labels: Image, held: dict[int, list[int]],
-    places: dict[int, tuple[int, int]],
-) -> Image:  # fmt: skip
-    """Give the pixels of this level to their tops; where several share, to the nearest."""
-    from scipy.ndimage import distance_transform_edt
-
-    grown = owner.copy()
-    for label, tops in held.items():
-        if label == 0:
-            continue
-        part = (labels == label) & (owner == 0)
-        if len(tops) == 1:
-            grown[part] = tops[0]
-        elif part.any():
-            mine = np.isin(owner, tops)
-            for top in tops:
-                mine[places[top]] = True
-                if owner[places[top]] == 0:
-                    owner[places[top]] = top
-            nearest = distance_transform_edt(~mine, return_distances=False, return_indices=True)
-            grown[part] = owner[nearest[0], nearest[1]][part]
-    return grown
-
-
-def _renumbered(owner: Image, peaks: dict[int, float]) -> Image | None:
-    if not peaks:
-        return None
-    table = np.zeros(int(owner.max()) + 1, dtype=np.int32)
-    for k, number in enumerate(sorted(peaks), start=1):
-        if number < len(table):
-            table[number] = k
-    return np.asarray(table[owner], dtype=np.int32)
 
 
 def _measure(
@@ -265,30 +206,41 @@ def _measure(
     dx, dy = x - centroid[0], y - centroid[1]
     moments = _second(np.maximum(weight, 0.0), dx, dy)
     peak = float(soft[core].max())
+    edge = _edge(picture, soft, region)
+    outside = NOTHING
+    if edge > 0.0:
+        outside = beyond(picture, soft, region, total * step**2, peak, centroid, moments)
     top = np.unravel_index(int(np.argmax(np.where(core, soft, -1.0))), soft.shape)
     under = float(background.values[top])
-    clipped = float(np.sum(weight * picture.clipped[box])) / max(total, 1e-12)
+    clipped = max(float(np.sum(weight * picture.clipped[box])) / max(total, 1e-12), 0.0)
     slopes = np.hypot(*np.gradient(soft[box].astype(np.float64), step))
     covariance = _from_background(picture, background, region, box, dx, dy, total)
     hidden = min(max(_FOOT * background.deviation / max(peak, 1e-9), _FOOT_PART), 1.0)
-    covariance = covariance + _HIDDEN**2 * hidden**3 * moments
     shift = narrow - centroid
-    covariance = covariance + _TAIL_SHARE**2 * np.outer(shift, shift)
-    covariance = covariance + max(clipped, 0.0) * _CLIP_SHARE**2 * moments
+    covariance = (
+        covariance
+        + _HIDDEN**2 * hidden**3 * moments
+        + _TAIL_SHARE**2 * np.outer(shift, shift)
+        + _CUT_SHARE**2 * np.outer(outside.most, outside.most)
+        + clipped * _CLIP_SHARE**2 * moments
+    )
     return Spot(
-        centroid=centroid,
+        centroid=centroid + outside.shift,
         covariance=covariance,
         second_moments=moments,
         power=total * step**2 / max(under, 1e-6),
         peak=peak,
         contrast=peak / max(under, 1e-6),
         deviation=background.deviation,
-        clipped=max(clipped, 0.0),
-        edge=_edge(picture, soft, region) / max(peak, 1e-9),
+        clipped=clipped,
+        edge=edge / max(peak, 1e-9),
         covered=float((picture.marks & core).sum() / core.sum()),
         area=float(core.sum()) * step**2,
         sharpness=float(slopes[core[box]].max(initial=0.0)) / max(peak, 1e-9),
         region=region,
+        cut=float(np.hypot(*outside.shift)),
+        light=total * step**2,
+        skewness=_skewness(np.where(core[box] & (soft[box] > _BODY * peak), soft[box], 0.0), x, y),
     )
 
 
@@ -308,6 +260,23 @@ def _second(weight: FloatArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
     xx, yy = weight.sum(axis=0) @ dx**2, weight.sum(axis=1) @ dy**2
     xy = dy @ weight @ dx
     return np.array([[xx, xy], [xy, yy]]) / total
+
+
+def _skewness(weight: FloatArray, x: FloatArray, y: FloatArray) -> float:
+    """Norm of the third moments of light with unit second moments."""
+    total, centre = _centroid(weight, x, y)
+    dx, dy = x - centre[0], y - centre[1]
+    moments = _second(weight, dx, dy)
+    if total <= 0.0 or np.linalg.det(moments) <= 0.0:
+        return 0.0
+    xx, yy = weight @ dx**2, (dy**2) @ weight
+    third = np.empty((2, 2, 2))
+    third[0, 0, 0] = weight.sum(axis=0) @ dx**3
+    third[0, 0, 1] = third[0, 1, 0] = third[1, 0, 0] = dy @ xx
+    third[0, 1, 1] = third[1, 0, 1] = third[1, 1, 0] = yy @ dx
+    third[1, 1, 1] = weight.sum(axis=1) @ dy**3
+    white = np.linalg.inv(np.linalg.cholesky(moments))
+    return float(np.linalg.norm(np.einsum("ijk,ai,bj,ck->abc", third / total, white, white, white)))
 
 
 def _from_background(

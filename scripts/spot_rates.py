@@ -1,0 +1,677 @@
+"""How well spots are found and judged, on rendered frames whose truth is known.
+
+``python scripts/spot_rates.py [FRAMES] [SEED]`` draws frames of an 8 m target seen from 200 m
+over the whole range of conditions, reads each one twice, with a model of the empty target learnt
+from a dozen earlier frames and from the frame alone, and prints a table for each: bias and scatter
+of the centroid, coverage of its ellipses, and which frames were accepted.
+
+A frame is *clean* if it shows exactly one beam, with 99 % of its energy on the target, a
+contrast of 0.25 or more, at most 5 % of its light clipped, marks and beam not smeared, and no
+flare. A clean frame that is refused is a wrong reject. A frame that is accepted though its
+centroid is off by more than 0.1 m (0.5 mrad at 200 m), or though it shows no beam, is a wrong
+accept. Two beams so near together that they are one to the eye ("merged beams") are no fault
+of one frame alone; what becomes of them is counted apart.
+"""
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from heliotrope.field.camera import Camera
+from heliotrope.geometry import FloatArray, direction
+from heliotrope.imaging.background import EmptyTarget
+from heliotrope.imaging.beams import Beam, reflected_beam
+from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.quality import Expectation
+from heliotrope.imaging.rendering import (
+    Lens,
+    Paint,
+    Rendered,
+    Scene,
+    Sensor,
+    Shadow,
+    Surroundings,
+    Thrown,
+    example_camera,
+    example_target,
+    exposed,
+    render,
+)
+
+TARGET = example_target(8.0)
+#: Off by more than this is wrong, m.
+WRONG = 0.1
+#: Brightness of the ambient light on white paint, W/m².
+AMBIENT = 150.0
+#: Cameras with targets, and beams to draw from.
+WORLDS, BEAMS = 16, 160
+
+Rng = np.random.Generator
+
+
+@dataclass(frozen=True)
+class World:
+    """What stays from frame to frame, and what is known of it.
+
+    Attributes
+    ----------
+    number
+        Which.
+    paint_kind
+        "even", "stained", "jointed" or "patched".
+    camera
+        As it is.
+    known
+        What the reader is told of it.
+    paint, surroundings
+        As they are.
+    """
+
+    number: int
+    paint_kind: str
+    camera: Camera
+    known: Camera | None
+    paint: Paint
+    surroundings: Surroundings
+
+
+@dataclass(frozen=True)
+class Case:
+    """A frame to be rendered and read.
+
+    Attributes
+    ----------
+    condition
+        What is special about it.
+    scene
+        What there is to see.
+    main
+        Index of the beam that is meant; None if there is none.
+    clean
+        Whether nothing is wrong with it as far as the scene tells.
+    expected
+        What the reader is told of the beam.
+    gamma
+        What the reader is told of the camera's response.
+    fault
+        Reasons of which one should be named; empty if none.
+    """
+
+    condition: str
+    scene: Scene
+    main: int | None
+    clean: bool = True
+    expected: Expectation = field(default_factory=Expectation)
+    gamma: float = 1.0
+    fault: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a frame.
+
+    Attributes
+    ----------
+    condition
+        See :class:`Case`.
+    seed
+        Of the frame: ``case(world, rng)`` with it gives the frame again.
+    clean, accepted, named
+        Whether it is clean, was accepted, and a right reason was named.
+    error
+        Of the centroid, east and up, m; NaN if there is none.
+    mahalanobis
+        Square of the error over its covariance; NaN if there is none.
+    reasons
+        That were named.
+    faint
+        Contrast below 0.25.
+    """
+
+    condition: str
+    seed: tuple[int, int, int]
+    clean: bool
+    accepted: bool
+    named: bool
+    error: tuple[float, float]
+    mahalanobis: float
+    reasons: tuple[str, ...]
+    faulty: bool = False
+
+    @property
+    def off(self) -> float:
+        """Of the centroid, m; NaN if there is none."""
+        return float(np.hypot(*self.error))
+
+    @property
+    def wrong_accept(self) -> bool:
+        """Accepted, though it should not have been."""
+        return self.accepted and not self.off <= WRONG
+
+    @property
+    def wrong_reject(self) -> bool:
+        """Refused, though nothing is wrong with it."""
+        return self.clean and not self.accepted
+
+
+# -- worlds ----------------------------------------------------------------------------
+
+
+def world(number: int, seed: int, size: tuple[int, int] = (1600, 1200)) -> World:
+    """Return a camera, and a target as it has aged."""
+    rng = np.random.default_rng([seed, number])
+    kind = ("even", "stained", "jointed", "patched")[number % 4]
+    camera = example_camera(
+        TARGET, 200.0, size, side=rng.uniform(-0.35, 0.35), below=rng.uniform(0.05, 0.3),
+        roll=rng.normal(0.0, 0.02), fill=rng.uniform(0.55, 0.8), distortion=rng.uniform(0.0, 0.01),
+    )  # fmt: skip
+    known = (camera, replace(camera, position=None, R_camera_enu=None), None)[number % 3]
+    paint = Paint(
+        wear=rng.uniform(0.003, 0.012), stains=0, panels=(1, 1),
+        seam_width=rng.uniform(0.004, 0.012), seed=int(rng.integers(1_000_000)),
+    )  # fmt: skip
+    if kind == "stained":
+        paint = replace(paint, stains=int(rng.integers(3, 9)), stain=rng.uniform(0.04, 0.15))
+    if kind == "jointed":
+        paint = replace(
+            paint, panels=(int(rng.integers(2, 7)), int(rng.integers(2, 7))),
+            seam=rng.uniform(0.3, 0.7), stains=3, stain=0.05,
+        )  # fmt: skip
+    if kind == "patched":
+        paint = replace(paint, patch=rng.uniform(0.7, 0.84), stains=3, stain=0.05)
+    around = Surroundings(sky=rng.uniform(80.0, 400.0), seed=int(rng.integers(1_000_000)))
+    return World(number, kind, camera, known, paint, around)
+
+
+def draw_beam(rng: Rng) -> Beam:
+    """Return the beam of one of many heliostats 50 to 400 m away, centred on the target."""
+    return stored_beam(int(rng.integers(BEAMS)))
+
+
+@lru_cache(maxsize=BEAMS)
+def stored_beam(number: int) -> Beam:
+    """Return the beam of a heliostat by its number, centred on the target."""
+    rng = np.random.default_rng([7, number])
+    while True:
+        distance, bearing = rng.uniform(50.0, 400.0), rng.uniform(-0.9, 0.9)
+        mirror = (distance * np.sin(bearing), distance * np.cos(bearing), rng.uniform(1.0, 6.0))
+        slant = float(np.linalg.norm(TARGET.center - mirror))
+        sun = direction(rng.uniform(1.6, 4.7), rng.uniform(0.2, 1.1))
+        width, height = rng.uniform(1.2, 3.6, 2)
+        focal = slant * np.exp(rng.normal(0.0, 0.2)) if rng.random() < 0.7 else np.inf
+        beam = reflected_beam(
+            TARGET, mirror, sun, width, height,
+            facets=tuple(rng.integers(1, 4, 2).tolist()), focal=focal,
+            facet_focal=focal if rng.random() < 0.5 else np.inf,
+            slope_error=rng.uniform(0.4e-3, 1.8e-3),
+            sun_shape=("limb", "pillbox", "buie")[rng.integers(3)],
+            circumsolar=rng.uniform(0.01, 0.05), step=0.04, elements=10,
+        )  # fmt: skip
+        beam = beam.shifted(-beam.centroid)
+        if beam.on_target(TARGET)[0] > 0.995:
+            return beam
+
+
+def placed(rng: Rng, beam: Beam, share: tuple[float, float] = (0.99, 1.0)) -> Beam:
+    """Return the beam where a share of its energy between two bounds falls on the target."""
+    reach = 3.7 if share[1] == 1.0 else 5.0
+    for _ in range(400):
+        moved = beam.shifted(rng.uniform(-reach, reach, 2))
+        if share[0] <= moved.on_target(TARGET)[0] <= share[1]:
+            return moved
+        reach = max(0.98 * reach, 0.02) if share[1] == 1.0 else reach
+    return beam
+
+
+def lit(beam: Beam, contrast: float, motion: tuple[float, float] = (0.0, 0.0)) -> Thrown:
+    """Return a beam whose peak is so many times the ambient light."""
+    return Thrown("target", beam, contrast * AMBIENT / beam.peak, motion)
+
+
+def expectation(rng: Rng, thrown: Thrown, place: World, sensor: Sensor) -> Expectation:
+    """Return what a plant knows of a beam beforehand: power to a tenth, length to a tenth.
+
+    The power is told over the ambient light, or over exposure and gain.
+    """
+    width, length = np.sqrt(np.linalg.eigvalsh(thrown.beam.second_moments)) * np.exp(
+        rng.normal(0.0, 0.1, 2)
+    )
+    watts = thrown.beam.power * thrown.strength * float(np.exp(rng.normal(0.0, 0.1)))
+    told = Expectation(length=float(length), width=float(width), deviation=0.1)
+    if rng.random() < 0.5:
+        return replace(told, power=watts / AMBIENT)
+    per_watt = place.paint.reflectance * sensor.sensitivity / sensor.electrons
+    return replace(told, flux=watts * per_watt)
+
+
+# -- conditions ------------------------------------------------------------------------
+
+
+def plain(rng: Rng, place: World) -> Case:
+    """One beam on a target under even light."""
+    thrown = lit(placed(rng, draw_beam(rng)), float(np.exp(rng.uniform(np.log(0.25), np.log(3.0)))))
+    sensor = Sensor(
+        electrons=rng.uniform(5e3, 2e4), read_noise=rng.uniform(3.0, 12.0),
+        offset=rng.uniform(0.0, 0.02), bits=int(rng.choice([8, 12])),
+        colour=bool(rng.random() < 0.3),
+    )  # fmt: skip
+    lens = Lens(defocus=rng.uniform(0.6, 1.5), veil=rng.uniform(0.0, 0.04))
+    scene = Scene(
+        place.camera, (TARGET,), (thrown,), ambient=AMBIENT,
+        gradient=tuple(rng.normal(0.0, 0.006, 2).tolist()), paint=place.paint,
+        surroundings=place.surroundings, lens=lens, sensor=sensor,
+    )  # fmt: skip
+    scene = exposed(scene, rng.uniform(0.35, 0.8))
+    told = expectation(rng, thrown, place, scene.sensor) if rng.random() < 0.6 else Expectation()
+    return Case("plain: " + place.paint_kind, scene, 0, expected=told)
+
+
+def faint(rng: Rng, place: World) -> Case:
+    """A beam that is a quarter to a fifth as bright as the ambient light."""
+    base = plain(rng, place)
+    (thrown,) = base.scene.beams
+    contrast = rng.uniform(0.2, 0.35)
+    thrown = lit(thrown.beam, contrast)
+    scene = exposed(replace(base.scene, beams=(thrown,)), rng.uniform(0.35, 0.8))
+    told = expectation(rng, thrown, place, scene.sensor) if rng.random() < 0.6 else Expectation()
+    return replace(base, condition="faint", scene=scene, expected=told, clean=contrast >= 0.25)
+
+
+def gradient(rng: Rng, place: World) -> Case:
+    """Light that falls off by up to half across the target."""
+    base = plain(rng, place)
+    slope = rng.uniform(0.02, 0.06)
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    scene = replace(base.scene, gradient=(slope * np.cos(turn), slope * np.sin(turn)))
+    return replace(base, condition="gradient", scene=scene, expected=Expectation())
+
+
+def shadow(rng: Rng, place: World) -> Case:
+    """An edge of shadow across the target."""
+    base = plain(rng, place)
+    edge = Shadow(
+        tuple(rng.uniform(-3.5, 3.5, 2).tolist()), rng.uniform(0.0, 2.0 * np.pi),
+        softness=float(np.exp(rng.uniform(np.log(0.05), np.log(1.5)))),
+        left=rng.uniform(0.3, 0.9),
+    )  # fmt: skip
+    scene = replace(base.scene, shadow=edge)
+    return replace(base, condition="shadow", scene=scene, expected=Expectation())
+
+
+def soft(rng: Rng, place: World) -> Case:
+    """Out of focus, a little or beyond use."""
+    base = plain(rng, place)
+    per_metre = pixels_per_metre(place.camera)
+    defocus = float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))) * per_metre
+    scene = replace(base.scene, lens=replace(base.scene.lens, defocus=max(defocus, 0.6)))
+    blurred = defocus / per_metre
+    return replace(
+        base, condition="out of focus", scene=scene, clean=blurred < 0.08,
+        fault=("out of focus", "target not found") if blurred > 0.18 else (),
+    )  # fmt: skip
+
+
+def shaken(rng: Rng, place: World) -> Case:
+    """The camera moved during the exposure."""
+    base = plain(rng, place)
+    per_metre = pixels_per_metre(place.camera)
+    length = min(float(np.exp(rng.uniform(np.log(0.02), np.log(0.8)))) * per_metre, 99.0)
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    shake = (length * np.cos(turn), length * np.sin(turn))
+    scene = replace(base.scene, lens=replace(base.scene.lens, shake=shake))
+    moved = length / per_metre
+    fault = ("moved", "out of focus", "target not found") if moved > 0.45 else ()
+    return replace(base, condition="camera moved", scene=scene, clean=moved < 0.12, fault=fault)
+
+
+def moving(rng: Rng, place: World) -> Case:
+    """The beam moved during the exposure."""
+    base = plain(rng, place)
+    (thrown,) = base.scene.beams
+    told = expectation(rng, thrown, place, base.scene.sensor)
+    way = rng.uniform(0.0, 3.0)
+    turn = rng.uniform(0.0, 2.0 * np.pi)
+    thrown = replace(thrown, motion=(way * np.cos(turn), way * np.sin(turn)))
+    moments = thrown.beam.swept(thrown.motion).second_moments
+    longer = float(np.sqrt(np.linalg.eigvalsh(moments)[-1])) / told.length
+    scene = replace(base.scene, beams=(thrown,))
+    return replace(
+        base, condition="beam moved", scene=scene, expected=told, clean=longer < 1.3,
+        fault=("smeared", "cloud", "cut at the edge", "several spots") if longer > 1.7 else (),
+    )  # fmt: skip
+
+
+def flare(rng: Rng, place: World) -> Case:
+    """Stray light over the whole frame."""
+    base = plain(rng, place)
+    veil = float(np.exp(rng.uniform(np.log(0.05), np.log(1.0)))) * 4.0
+    scene = replace(base.scene, lens=replace(base.scene.lens, veil=min(veil, 1.0)))
+    return replace(base, condition="flare", scene=scene, expected=Expectation(), clean=False)
+
+
+def ghost(rng: Rng, place: World) -> Case:
+    """A reflection in the lens."""
+    base = plain(rng, place)
+    size = np.array(place.camera.size)
+    lens = replace(
+        base.scene.lens, ghost=rng.uniform(0.05, 0.4), ghost_at=tuple(rng.uniform(0, 1, 2) * size),
+        ghost_radius=rng.uniform(0.2, 2.0) * pixels_per_metre(place.camera),
+    )  # fmt: skip
+    return replace(base, condition="ghost", scene=replace(base.scene, lens=lens), clean=False)
+
+
+def cloud(rng: Rng, place: World) -> Case:
+    """Clouds before the sun; what the beam should be is known."""
+    base = plain(rng, place)
+    told = expectation(rng, base.scene.beams[0], place, base.scene.sensor)
+    left = rng.uniform(0.05, 1.0)
+    scene = exposed(replace(base.scene, cloud=left), rng.uniform(0.35, 0.8))
+    contrast = left * base.scene.beams[0].strength * base.scene.beams[0].beam.peak / AMBIENT
+    return replace(
+        base, condition="cloud", scene=scene, expected=told, clean=left > 0.75 and contrast >= 0.25,
+        fault=("cloud", "no spot") if left < 0.35 else (),
+    )  # fmt: skip
+
+
+def clipped(rng: Rng, place: World) -> Case:
+    """Exposed for too long."""
+    base = plain(rng, place)
+    scene = exposed(base.scene, float(np.exp(rng.uniform(np.log(0.95), np.log(3.0)))))
+    return replace(base, condition="clipped", scene=scene)
+
+
+def two(rng: Rng, place: World) -> Case:
+    """Two beams on the target, farther apart than their mean diameters at half their height."""
+    base = plain(rng, place)
+    while True:
+        beam, second = placed(rng, draw_beam(rng)), placed(rng, draw_beam(rng))
+        way = second.centroid - beam.centroid
+        apart = float(np.linalg.norm(way))
+        spread = [float(np.sqrt(way @ b.second_moments @ way)) / apart for b in (beam, second)]
+        if apart > 1.18 * sum(spread):
+            return _with_second(rng, place, replace(base, condition="two beams"), beam, second)
+
+
+def merged(rng: Rng, place: World) -> Case:
+    """Two beams on the target, nearer together than that."""
+    base = plain(rng, place)
+    (thrown,) = base.scene.beams
+    beam = thrown.beam
+    for _ in range(50):
+        second = placed(rng, draw_beam(rng))
+        way = second.centroid - beam.centroid
+        apart = float(np.linalg.norm(way))
+        spread = [float(np.sqrt(way @ b.second_moments @ way)) / apart for b in (beam, second)]
+        if apart <= 1.18 * sum(spread):
+            break
+    return _with_second(rng, place, replace(base, condition="merged beams"), beam, second)
+
+
+def _with_second(rng: Rng, place: World, base: Case, beam: Beam, second: Beam) -> Case:
+    share = float(np.exp(rng.uniform(np.log(0.15), np.log(1.0))))
+    first = lit(beam, base.scene.beams[0].strength * base.scene.beams[0].beam.peak / AMBIENT)
+    other = Thrown("target", second.of_power(share * beam.power), first.strength)
+    scene = exposed(replace(base.scene, beams=(first, other)), rng.uniform(0.35, 0.8))
+    return replace(
+        base, scene=scene, expected=expectation(rng, first, place, scene.sensor), clean=False,
+        fault=("several spots", "lopsided", "smeared"),
+    )  # fmt: skip
+
+
+def beside(rng: Rng, place: World) -> Case:
+    """One beam on the target, another one beside it."""
+    base = plain(rng, place)
+    (thrown,) = base.scene.beams
+    second = draw_beam(rng)
+    while True:
+        moved = second.shifted(rng.uniform(-8.0, 8.0, 2))
+        if moved.on_target(TARGET)[0] < 0.03:
+            break
+    other = lit(moved, rng.uniform(0.3, 3.0))
+    scene = exposed(replace(base.scene, beams=(thrown, other)), rng.uniform(0.35, 0.8))
+    return replace(base, condition="beam beside", scene=scene, clean=False)
+
+
+def cut(rng: Rng, place: World) -> Case:
+    """A beam that misses the target in part."""
+    base = plain(rng, place)
+    beam = placed(rng, draw_beam(rng), (0.4, 0.99))
+    thrown = lit(beam, rng.uniform(0.25, 3.0))
+    scene = exposed(replace(base.scene, beams=(thrown,)), rng.uniform(0.35, 0.8))
+    fault = ("cut at the edge", "no spot") if beam.on_target(TARGET)[0] < 0.8 else ()
+    return replace(
+        base, condition="cut", scene=scene, expected=Expectation(), clean=False, fault=fault
+    )
+
+
+def empty(rng: Rng, place: World) -> Case:
+    """No beam; every third time with a shadow, every third time with strong gradients."""
+    base = (plain, gradient, shadow)[rng.integers(3)](rng, place)
+    scene = exposed(replace(base.scene, beams=()), rng.uniform(0.2, 0.8))
+    return Case("no beam", scene, None, clean=False, fault=("no spot",))
+
+
+def dark(rng: Rng, place: World) -> Case:
+    """Next to no ambient light, with a beam or without."""
+    base = plain(rng, place)
+    (thrown,) = base.scene.beams
+    with_beam = rng.random() < 0.6
+    scene = replace(
+        base.scene, beams=(replace(thrown, strength=5.0 * thrown.strength),) if with_beam else (),
+        ambient=float(np.exp(rng.uniform(np.log(0.05), np.log(50.0)))),
+    )  # fmt: skip
+    scene = exposed(scene, rng.uniform(0.35, 0.8)) if with_beam else scene
+    fault = () if with_beam else ("no spot", "target not found")
+    return Case("dark", scene, 0 if with_beam else None, clean=False, fault=fault)
+
+
+def on_marks(rng: Rng, place: World) -> Case:
+    """A beam that lights marks."""
+    base = plain(rng, place)
+    thrown = base.scene.beams[0]
+    best = thrown.beam
+    for _ in range(30):
+        moved = placed(rng, best)
+        if np.abs(moved.centroid).max() > np.abs(best.centroid).max():
+            best = moved
+    thrown = lit(best, rng.uniform(0.25, 3.0))
+    scene = exposed(replace(base.scene, beams=(thrown,)), rng.uniform(0.35, 0.8))
+    return replace(base, condition="lit marks", scene=scene, expected=Expectation())
+
+
+def curved(rng: Rng, place: World) -> Case:
+    """A camera that encodes by sRGB, read with a gamma of 2.2."""
+    base = plain(rng, place)
+    sensor = replace(base.scene.sensor, srgb=True)
+    return replace(base, condition="gamma", scene=replace(base.scene, sensor=sensor), gamma=2.2)
+
+
+def noisy(rng: Rng, place: World) -> Case:
+    """Few electrons."""
+    base = plain(rng, place)
+    before = base.scene.sensor
+    electrons = rng.uniform(300.0, 3000.0)
+    sensor = replace(before, electrons=electrons, read_noise=rng.uniform(5.0, 20.0))
+    scene = exposed(replace(base.scene, sensor=sensor), rng.uniform(0.35, 0.8))
+    told = replace(base.expected, flux=base.expected.flux * before.electrons / electrons)
+    return replace(base, condition="noise", scene=scene, expected=told)
+
+
+CONDITIONS: dict[Callable[[Rng, World], Case], float] = {
+    plain: 32, faint: 5, gradient: 4, shadow: 5, soft: 4, shaken: 4, moving: 4, flare: 4, ghost: 4,
+    cloud: 5, clipped: 4, two: 4, merged: 2, beside: 4, cut: 5, empty: 6, dark: 3, on_marks: 4, curved: 4,
+    noisy: 4,
+}  # fmt: skip
+
+
+def pixels_per_metre(camera: Camera) -> float:
+    """Return the scale at the target."""
+    assert camera.position is not None
+    return float(camera.matrix[0, 0] / np.linalg.norm(TARGET.center - camera.position))
+
+
+# -- reading ---------------------------------------------------------------------------
+
+
+def case(place: World, seed: tuple[int, int, int]) -> Case:
+    """Return the frame of a world that a seed draws."""
+    rng = np.random.default_rng(seed)
+    kinds = list(CONDITIONS)
+    weights = np.array(list(CONDITIONS.values()))
+    return kinds[rng.choice(len(kinds), p=weights / weights.sum())](rng, place)
+
+
+def learn(place: World, seed: int, frames: int = 12) -> EmptyTarget | None:
+    """Return what a dozen earlier frames without a beam say of the empty target."""
+    model = None
+    for k in range(frames):
+        rng = np.random.default_rng((seed, place.number, 10_000 + k))
+        scene = (plain, gradient)[k % 2](rng, place).scene
+        rendered = render(exposed(replace(scene, beams=()), rng.uniform(0.4, 0.8)), k)
+        for face in read_photograph(rendered.frame, [TARGET], place.known).faces:
+            model = (EmptyTarget.of(face.picture) if model is None else model).learn(face.picture)
+    return model
+
+
+def look(
+    place: World, drawn: Case, rendered: Rendered, model: EmptyTarget | None = None
+) -> Photograph:
+    """Read a frame."""
+    settings = Settings(
+        expectations={"target": drawn.expected}, gamma=drawn.gamma,
+        empty={} if model is None else {"target": model},
+    )  # fmt: skip
+    return read_photograph(rendered.frame, [TARGET], place.known, settings=settings)
+
+
+def judge(
+    drawn: Case, seed: tuple[int, int, int], rendered: Rendered, photograph: Photograph
+) -> Outcome:
+    """Compare a reading with the truth."""
+    reading = photograph.readings[0]
+    nan = float("nan")
+    error, square = np.full(2, nan), nan
+    clean = drawn.clean
+    if drawn.main is not None:
+        truth = rendered.beams[drawn.main]
+        clean = clean and truth.share_clipped <= 0.05 and truth.share_on_target >= 0.99
+        if reading.spots and truth.share_on_target > 0.01:
+            spot = reading.spots[0]
+            error = spot.plane - truth.centroid
+            square = float(error @ np.linalg.solve(spot.covariance, error))
+    names = tuple(reason.name for reason in reading.reasons)
+    return Outcome(
+        drawn.condition, seed, clean, reading.good, any(n in drawn.fault for n in names),
+        (float(error[0]), float(error[1])), square, names, bool(drawn.fault),
+    )  # fmt: skip
+
+
+def run(task: tuple[int, int, int, tuple[int, int]]) -> list[tuple[Outcome, Outcome]]:
+    """Read so many frames of one world, with a model of the empty target and without."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    number, seed, count, size = task
+    place = world(number, seed, size)
+    model = learn(place, seed)
+    outcomes = []
+    for k in range(count):
+        key = (seed, number, k)
+        drawn = case(place, key)
+        rendered = render(drawn.scene, sum(key))
+        with_model, alone = (
+            judge(drawn, key, rendered, look(place, drawn, rendered, m)) for m in (model, None)
+        )
+        outcomes.append((with_model, alone))
+    return outcomes
+
+
+def measure(
+    frames: int, seed: int, processes: int = 2, size: tuple[int, int] = (1600, 1200),
+    worlds: int = WORLDS,
+) -> tuple[list[Outcome], list[Outcome]]:  # fmt: skip
+    """Return what comes of so many frames, with models of empty targets and without."""
+    tasks = [(n, seed, -(-frames // worlds), size) for n in range(worlds)]
+    if processes == 1:
+        pairs = [pair for task in tasks for pair in run(task)]
+    else:
+        with ProcessPoolExecutor(processes) as pool:
+            pairs = [pair for outcomes in pool.map(run, tasks) for pair in outcomes]
+    return [pair[0] for pair in pairs], [pair[1] for pair in pairs]
+
+
+def report(outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the table, line by line."""
+    lines = [
+        (
+            f"{'condition':<17}{'count':>6}{'clean':>6}{'taken':>7}{'east':>7}{'up':>7}{'rms':>7}"
+            f"{'in 68':>7}{'in 95':>7}{'worst':>7}{'wr.acc':>7}{'wr.rej':>7}{'named':>9}"
+        ),
+        f"{'':<36}{'mm':>7}{'mm':>7}{'mm':>7}{'%':>7}{'%':>7}{'mm':>7}",
+    ]
+    for name in sorted({o.condition for o in outcomes}):
+        lines.append(_line(name, [o for o in outcomes if o.condition == name]))  # noqa: PERF401
+    lines.append(_line("all", outcomes))
+    lines.append(_line("clean", [o for o in outcomes if o.clean]))
+    return lines
+
+
+def _line(name: str, outcomes: Sequence[Outcome]) -> str:
+    taken = [o for o in outcomes if o.accepted]
+    errors: FloatArray = np.array([o.error for o in taken if np.isfinite(o.off)]).reshape(-1, 2)
+    squares: Any = np.array([o.mahalanobis for o in taken if np.isfinite(o.off)])
+    text = f"{name:<17}{len(outcomes):>6}{sum(o.clean for o in outcomes):>6}{len(taken):>7}"
+    if len(errors):
+        east, up = 1e3 * errors.mean(axis=0)
+        rms = 1e3 * np.sqrt(np.mean(np.sum(errors**2, axis=1)))
+        inside = [100.0 * np.mean(squares < limit) for limit in (2.279, 5.991)]
+        worst = 1e3 * np.max(np.hypot(*errors.T))
+        text += f"{east:>7.1f}{up:>7.1f}{rms:>7.1f}{inside[0]:>7.0f}{inside[1]:>7.0f}{worst:>7.0f}"
+    else:
+        text += f"{'':>42}"
+    faulty = [o for o in outcomes if o.faulty]
+    named = f"{sum(o.named for o in faulty)}/{len(faulty)}" if faulty else ""
+    wrong = sum(o.wrong_accept for o in outcomes), sum(o.wrong_reject for o in outcomes)
+    return text + f"{wrong[0]:>7}{wrong[1]:>7}{named:>9}"
+
+
+def _wrong(outcomes: Iterable[Outcome]) -> list[str]:
+    return [
+        f"{'wrong accept' if o.wrong_accept else 'wrong reject'}: {o.condition}, seed {o.seed}, "
+        f"off {1e3 * o.off:.0f} mm, {', '.join(o.reasons) or 'no reason'}"
+        for o in outcomes
+        if o.wrong_accept or o.wrong_reject
+    ]
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """Return the rates in one line."""
+    outcomes = [o for o in outcomes if o.condition != "merged beams"]
+    clean = sum(o.clean for o in outcomes)
+    taken = sum(o.accepted for o in outcomes)
+    accepts, rejects = (
+        sum(o.wrong_accept for o in outcomes), sum(o.wrong_reject for o in outcomes)
+    )  # fmt: skip
+    return (
+        f"without merged beams: wrong accepts {accepts} of {len(outcomes)} frames "
+        f"({100 * accepts / max(len(outcomes), 1):.2f} %; {taken} accepted); wrong rejects "
+        f"{rejects} of {clean} clean frames ({100 * rejects / max(clean, 1):.2f} %)"
+    )
+
+
+def main() -> None:
+    """Print the tables."""
+    frames = int(sys.argv[1]) if len(sys.argv) > 1 else 2400
+    seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
+    titles = ("with a model of the empty target", "from each frame alone")
+    for title, outcomes in zip(titles, measure(frames, seed), strict=True):
+        print("\n".join([title, *report(outcomes), summary(outcomes), *_wrong(outcomes), ""]))
+
+
+if __name__ == "__main__":
+    main()
