@@ -1,0 +1,305 @@
+"""Links over an MQTT broker (Mosquitto), version 5 of the protocol.
+
+Each cluster has two topics, one for each direction, and a third that only informs::
+
+    PREFIX/CLUSTER/down      plant to cluster
+    PREFIX/CLUSTER/up        cluster to plant
+    PREFIX/CLUSTER/status    "online", and as the last will of the cluster "offline"; retained
+
+Messages go with QoS 1, never retained, and with their remaining time as message expiry, so that
+the broker throws away what it holds too long; it counts in whole seconds and not while it is
+frozen, so the receiver judges again (conversation.py). Sessions begin clean and end with the
+connection: nothing is kept for a cluster that is away. A retained message on the way up or down
+is nobody's order of now; it is refused and counted.
+
+Nothing rests on the status, on the last will or on MQTT's keepalive: a broker that is frozen
+keeps its connections. Our heartbeats pass through the broker to the other end and back, and
+their absence ends a connection.
+
+Nagle's algorithm is switched off at this end; the broker needs ``set_tcp_nodelay true``, else it
+adds up to 40 ms to a small message.
+"""
+
+import asyncio
+import contextlib
+import math
+import socket
+import ssl
+from dataclasses import dataclass
+
+import aiomqtt
+import paho.mqtt.client as paho
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from heliotrope.control.carried import CarriedLink
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import LinkError, LinkLostError, LinkSettings, Statistics
+from heliotrope.errors import InputError
+
+#: Messages in a row that the broker may leave unconfirmed before the connection is given up.
+#: Below the 20 from which on paho would keep messages back, to send them later.
+_UNCONFIRMED = 10
+#: Time for the last words of a connection, in s.
+_GOODBYE = 0.5
+#: Messages between the socket and the link, which takes them at once.
+_WAITING = 1000
+
+
+@dataclass(frozen=True)
+class Broker:
+    """Where the broker is, and how it knows us.
+
+    Parameters
+    ----------
+    host, port
+        As usual 1883, with TLS 8883.
+    username, password
+        None: the broker asks for none.
+    tls
+        None: in clear; `heliotrope.control.tcp.client_tls` makes one from files.
+    keepalive_s
+        MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clear up.
+    """
+
+    host: str
+    port: int = 1883
+    username: str | None = None
+    password: str | None = None
+    tls: ssl.SSLContext | None = None
+    keepalive_s: int = 60
+
+
+@dataclass(frozen=True)
+class _Ends:
+    """Topics and identity of one end."""
+
+    out: str
+    into: str
+    status: str
+    identifier: str
+
+
+def _ends(prefix: str, cluster: str, *, plant: bool) -> _Ends:
+    for name, value in (("prefix", prefix), ("cluster", cluster)):
+        if not value or any(sign in value for sign in "+#\0") or value != value.strip("/"):
+            raise InputError(
+                f"MQTT {name} {value!r}: it must not be empty, begin or end with a slash, or hold "
+                "+ or #, which stand for any topic"
+            )
+    if "/" in cluster:
+        raise InputError(f"MQTT cluster {cluster!r}: a name of one level, without a slash")
+    topic = f"{prefix}/{cluster}"
+    out, into = ("down", "up") if plant else ("up", "down")
+    identifier = f"{topic}/{'plant' if plant else 'cluster'}"
+    return _Ends(f"{topic}/{out}", f"{topic}/{into}", f"{topic}/status", identifier)
+
+
+class _MqttCarrier:
+    """One connection to the broker after the other, each with a client of its own.
+
+    A client that is used again would send again what was left unconfirmed: late.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        ends: _Ends,
+        key: bytes,
+        statistics: Statistics,
+        limit: float,
+        *,
+        reports: bool,
+    ) -> None:
+        self._broker = broker
+        self._ends = ends
+        self._key = key
+        self._statistics = statistics
+        self._limit = limit
+        self._reports = reports
+        self._client: aiomqtt.Client | None = None
+        self._unconfirmed = 0
+
+    def _make(self) -> aiomqtt.Client:
+        broker = self._broker
+        will = aiomqtt.Will(self._ends.status, b"offline", qos=1, retain=True)
+        client = aiomqtt.Client(
+            broker.host,
+            broker.port,
+            username=broker.username,
+            password=broker.password,
+            identifier=self._ends.identifier,
+            protocol=aiomqtt.ProtocolVersion.V5,
+            will=will if self._reports else None,
+            clean_start=True,
+            timeout=self._limit,
+            keepalive=broker.keepalive_s,
+            max_queued_incoming_messages=_WAITING,
+            tls_context=broker.tls,
+            socket_options=[(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)],
+        )
+        inner = client._client  # noqa: SLF001 (aiomqtt offers no other way)
+        inner.connect_timeout = self._limit  # it is in a thread, which nothing can end early
+        _write_while_open(inner)
+        return client
+
+    async def open(self) -> bytes:
+        """Connect and subscribe."""
+        client = self._make()
+        try:
+            await client.__aenter__()
+            await client.subscribe(
+                self._ends.into,
+                # The flag of retained messages is wanted even where they come as they are sent.
+                options=SubscribeOptions(qos=1, noLocal=True, retainAsPublished=True),
+            )
+            if self._reports:
+                await client.publish(self._ends.status, b"online", qos=1, retain=True)
+        except (aiomqtt.MqttError, ValueError) as error:
+            await _discard(client)
+            raise LinkError(
+                f"broker {self._broker.host}:{self._broker.port} does not let us in ({error})"
+            ) from None
+        except BaseException:
+            await _discard(client)
+            raise
+        self._client = client
+        self._unconfirmed = 0
+        return self._key
+
+    def _connected(self) -> aiomqtt.Client:
+        if self._client is None:
+            raise LinkLostError("closed")
+        return self._client
+
+    async def ready(self) -> None:
+        """Nothing to wait for, unless the broker no longer confirms."""
+        self._connected()
+        if self._unconfirmed >= _UNCONFIRMED:
+            raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
+
+    async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
+        """Publish; with ``confirmed`` return when the broker has it."""
+        properties = None
+        if lifetime is not None:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.MessageExpiryInterval = max(1, math.ceil(lifetime))
+        client = self._connected()
+        self._unconfirmed += confirmed
+        try:
+            await client.publish(
+                self._ends.out, envelope, qos=int(confirmed), retain=False, properties=properties
+            )
+        except aiomqtt.MqttError as error:
+            raise LinkLostError(f"the broker did not take a message ({error})") from None
+        if confirmed:
+            self._unconfirmed = 0
+
+    async def read(self) -> bytes:
+        """Wait for the next envelope that was sent to us as such."""
+        while True:
+            try:
+                message = await anext(aiter(self._connected().messages))
+            except aiomqtt.MqttError as error:
+                raise LinkLostError(f"the connection to the broker is gone ({error})") from None
+            if message.retain:
+                self._statistics.retained += 1
+            elif isinstance(message.payload, bytes):
+                return message.payload
+
+    async def close(self) -> None:
+        """Disconnect, with a goodbye if the broker takes it at once."""
+        client, self._client = self._client, None
+        if client is None:
+            return
+        with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+            async with asyncio.timeout(_GOODBYE):
+                if self._reports:
+                    await client.publish(self._ends.status, b"offline", qos=1, retain=True)
+                await client.__aexit__(None, None, None)
+        await _discard(client)
+
+
+def _write_while_open(client: paho.Client) -> None:
+    """Have the loop write for a client, but never to the number of a socket that is closed.
+
+    aiomqtt asks the loop for it by that number, some time later; by then it may be nobody's, or
+    another connection's.
+    """
+    loop = asyncio.get_running_loop()
+
+    def register(client: paho.Client, userdata: object, sock: "paho.SocketLike") -> None:
+        del userdata
+
+        def add() -> None:
+            if sock.fileno() >= 0:
+                loop.add_writer(sock.fileno(), client.loop_write)
+
+        loop.call_soon_threadsafe(add)
+
+    client.on_socket_register_write = register
+
+
+def _refuse_socket(client: paho.Client, userdata: object, sock: "paho.SocketLike") -> None:
+    del client, userdata
+    sock.close()
+
+
+async def _discard(client: aiomqtt.Client) -> None:
+    """End whatever is left of a client.
+
+    aiomqtt leaves the socket, its callbacks and a task behind when it gives up waiting for the
+    broker's answer or is cancelled meanwhile, and has no public way to end them.
+    """
+    inner = client._client  # noqa: SLF001
+    # The thread that connects may still be at it; it closes what it gets.
+    inner.on_socket_open = _refuse_socket
+    await asyncio.sleep(0)  # what it has asked of the loop so far is done now
+    inner._sock_close()  # noqa: SLF001
+    task = client._misc_task  # noqa: SLF001
+    if task is not None:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+def mqtt_link(
+    broker: Broker,
+    prefix: str,
+    cluster: str,
+    key: bytes,
+    clock: Clock,
+    settings: LinkSettings | None = None,
+    *,
+    plant: bool,
+) -> CarriedLink:
+    """Return one end of a link through a broker.
+
+    Parameters
+    ----------
+    broker
+        See `Broker`.
+    prefix
+        Of all topics of a plant: "heliotrope/upington".
+    cluster
+        Name of the cluster, one level of a topic.
+    key
+        That both ends share: messages under another key are refused, whoever the broker lets in.
+        b"": none; damage is still detected.
+    clock, settings
+        As in `CarriedLink`.
+    plant
+        Which end this is.
+
+    Raises
+    ------
+    InputError
+        Names that make no topic.
+    """
+    settings = settings or LinkSettings()
+    statistics = Statistics()
+    ends = _ends(prefix, cluster, plant=plant)
+    carrier = _MqttCarrier(broker, ends, key, statistics, settings.open_limit, reports=not plant)
+    name = f"cluster {cluster}" if plant else "plant"
+    where = f"{name} by {broker.host}:{broker.port}"
+    return CarriedLink(where, carrier, clock, settings, statistics)

@@ -1,0 +1,314 @@
+"""What the plant and its clusters say to each other over a `Link`.
+
+A message is one line of JSON, then, after a newline, a block of bytes (empty but for STATUS
+and PARAMETERS). The line names its kind and holds its fields; unknown fields are ignored, so that
+a newer plant can talk to an older cluster; an unknown kind is refused with its name.
+
+Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`.
+Cluster to plant: `Status`, `Progress`, `Alarm`, `Answer`.
+
+Whatever moves a mirror towards the receiver carries the authority's token and is sent with an
+expiry of the link; `Emergency` needs neither, and is taken from anyone.
+"""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import HeliotropeError
+
+VERSION = 1
+
+#: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
+#: age of the row when it was sent (2^32 - 1: never heard); states and flags as in `lcu.names`.
+NODE = np.dtype(
+    [
+        ("state", "u1"), ("fault", "u1"), ("flags", "<u4"), ("heard_ms", "<u4"),
+        ("primary", "<i4"), ("secondary", "<i4"),
+        ("primary_goal", "<i4"), ("secondary_goal", "<i4"),
+        ("sun_age_ms", "<u4"), ("supply_mv", "<u2"), ("temperature_degc", "i1"),
+        ("boots", "<u2"), ("armature_crc", "<u4"), ("asked", "<u4"), ("answered", "<u4"),
+    ]
+)  # fmt: skip
+NEVER = 0xFFFFFFFF
+
+
+class ProtocolError(HeliotropeError):
+    """A message that is none, or that this side doesn't know."""
+
+
+class Stage(Enum):
+    """How far a command has come, for one heliostat; the last three are final."""
+
+    ACCEPTED = "accepted"  # by the cluster
+    SENT = "sent"  # on the bus
+    ACKNOWLEDGED = "acknowledged"  # by the local controller
+    DONE = "done"  # the state that it asks for is reached
+    REFUSED = "refused"
+    FAILED = "failed"  # never acknowledged, or expired
+
+
+@dataclass(frozen=True)
+class Lease:
+    """The plant is there, and commands through this token (0: nobody may command).
+
+    The cluster goes on for ``lifetime`` s from when it was sent, and for ``autonomy`` s more.
+    """
+
+    kind: ClassVar[str] = "lease"
+    token: int
+    lifetime: float = 3.0
+    autonomy: float = 0.0
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the wire, by its name and values, to heliostats by name ((): all).
+
+    ``identity`` returns in every `Progress`. ``lifetime`` in s, from when it was sent.
+    """
+
+    kind: ClassVar[str] = "command"
+    identity: str
+    name: str
+    values: tuple[float, ...] = ()
+    heliostats: tuple[str, ...] = ()
+    token: int = 0
+    lifetime: float = 10.0
+
+
+@dataclass(frozen=True)
+class Emergency:
+    """DEFOCUS or STOW, to heliostats by name ((): all): from anyone, always, before all else."""
+
+    kind: ClassVar[str] = "emergency"
+    identity: str
+    name: str
+    heliostats: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Items of the journal of one heliostat (`lcu.journal.ITEMS`), to be stored there.
+
+    ``sizes`` tells how ``block`` falls into the items' bytes.
+    """
+
+    kind: ClassVar[str] = "parameters"
+    identity: str
+    heliostat: str
+    names: tuple[str, ...]
+    sizes: tuple[int, ...]
+    token: int = 0
+    lifetime: float = 30.0
+    block: bytes = b""
+
+    @classmethod
+    def of(
+        cls, identity: str, heliostat: str, items: Mapping[str, bytes], token: int
+    ) -> "Parameters":
+        """Return the message for items by name."""
+        names = tuple(items)
+        sizes = tuple(len(items[name]) for name in names)
+        block = b"".join(items.values())
+        return cls(identity, heliostat, names, sizes, token, block=block)
+
+    def items(self) -> dict[str, bytes]:
+        """Return the items by name.
+
+        Raises
+        ------
+        ProtocolError
+            If names, sizes and block don't fit together.
+        """
+        if len(self.names) != len(self.sizes) or sum(self.sizes) != len(self.block):
+            raise ProtocolError(
+                f"parameters of {self.heliostat}: {len(self.names)} names, sizes {self.sizes}, "
+                f"{len(self.block)} bytes do not fit together"
+            )
+        result, place = {}, 0
+        for name, size in zip(self.names, self.sizes, strict=True):
+            result[name] = self.block[place : place + size]
+            place += size
+        return result
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A question: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``."""
+
+    kind: ClassVar[str] = "ask"
+    identity: str
+    what: str
+    heliostat: str = ""
+
+
+@dataclass(frozen=True)
+class Status:
+    """Once a second: the cluster and all its heliostats.
+
+    ``names`` is given in the first message of a connection and whenever it changed, else ().
+    ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` how far it may be off.
+    ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
+    """
+
+    kind: ClassVar[str] = "status"
+    cluster: str
+    count: int
+    utc_s: float
+    time_quality: str
+    time_error_s: float
+    lease_left: float
+    cycle_s: float
+    acts: tuple[str, ...] = ()
+    names: tuple[str, ...] = ()
+    block: bytes = b""
+
+    def nodes(self) -> "npt.NDArray[Any]":
+        """Return the rows, of dtype `NODE`, read only.
+
+        Raises
+        ------
+        ProtocolError
+            If the block is no whole number of rows.
+        """
+        if len(self.block) % NODE.itemsize:
+            raise ProtocolError(
+                f"status of {self.cluster}: {len(self.block)} bytes are no rows of {NODE.itemsize}"
+            )
+        return np.frombuffer(self.block, dtype=NODE)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A stage that a command has reached; ``text`` says why it was refused or failed.
+
+    Without a heliostat it is about the whole command.
+    """
+
+    kind: ClassVar[str] = "progress"
+    identity: str
+    stage: Stage
+    heliostats: tuple[str, ...] = ()
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """One line for the operator, with the safety row or event that it comes from."""
+
+    kind: ClassVar[str] = "alarm"
+    condition: str
+    subject: str
+    severity: str
+    text: str
+    active: bool = True
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was asked; ``data`` is plain JSON, ``block`` stored bytes."""
+
+    kind: ClassVar[str] = "answer"
+    identity: str
+    data: Mapping[str, Any] = field(default_factory=dict)
+    block: bytes = b""
+
+
+Message = Lease | Command | Emergency | Parameters | Ask | Status | Progress | Alarm | Answer
+_KINDS: dict[str, type[Any]] = {
+    each.kind: each
+    for each in (Lease, Command, Emergency, Parameters, Ask, Status, Progress, Alarm, Answer)
+}
+
+
+def encode(message: Message) -> bytes:
+    """Return the bytes of a message."""
+    fields: dict[str, Any] = {"kind": message.kind, "version": VERSION}
+    block = b""
+    for each in dataclasses.fields(message):
+        value = getattr(message, each.name)
+        if each.name == "block":
+            block = value
+        else:
+            fields[each.name] = value.value if isinstance(value, Stage) else value
+    return json.dumps(fields, separators=(",", ":"), allow_nan=False).encode() + b"\n" + block
+
+
+def decode(data: bytes) -> Message:
+    """Return the message of some bytes.
+
+    Raises
+    ------
+    ProtocolError
+        If they are none, or of a kind or version that this side doesn't know.
+    """
+    line, _, block = data.partition(b"\n")
+    try:
+        fields = json.loads(line, parse_constant=_no_number)
+    except (ValueError, RecursionError):
+        raise ProtocolError(f"message of {len(data)} bytes does not begin with JSON") from None
+    if not isinstance(fields, dict) or fields.get("version") != VERSION:
+        version = fields.get("version") if isinstance(fields, dict) else None
+        raise ProtocolError(f"message of version {version!r}; this side speaks {VERSION}")
+    kind = _KINDS.get(str(fields.get("kind")))
+    if kind is None:
+        raise ProtocolError(f"message of unknown kind {fields.get('kind')!r}")
+    values: dict[str, Any] = {}
+    for each in dataclasses.fields(kind):
+        if each.name == "block":
+            values["block"] = block
+        elif each.name in fields:
+            values[each.name] = _checked(kind.kind, each, fields[each.name])
+    try:
+        message: Message = kind(**values)
+    except TypeError as error:
+        raise ProtocolError(f"{kind.kind}: {error}") from None
+    return message
+
+
+def _no_number(text: str) -> float:
+    raise ValueError(text)
+
+
+def _checked(kind: str, each: "dataclasses.Field[Any]", value: Any) -> Any:
+    """Return the value of a field if it is of the field's type."""
+    wanted: Any = each.type
+    good: Any = None
+    if wanted is Stage:
+        good = next((stage for stage in Stage if stage.value == value), None)
+    elif wanted is str or wanted is bool:
+        good = value if isinstance(value, wanted) else None
+    elif wanted is int:
+        good = value if isinstance(value, int) and not isinstance(value, bool) else None
+    elif wanted is float:
+        good = float(value) if _is_number(value) else None
+    elif wanted in _LISTS:
+        good = tuple(value) if isinstance(value, list) and all(map(_LISTS[wanted], value)) else None
+    elif isinstance(value, dict):
+        good = value
+    if good is None:
+        raise ProtocolError(f"{kind}: {each.name} is {value!r:.60}, not {wanted}")
+    return good
+
+
+def _is_number(value: object) -> bool:
+    try:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        return number and math.isfinite(float(value))  # type: ignore[arg-type]
+    except OverflowError:
+        return False
+
+
+_LISTS = {
+    tuple[str, ...]: lambda value: isinstance(value, str),
+    tuple[int, ...]: lambda value: isinstance(value, int) and not isinstance(value, bool),
+    tuple[float, ...]: _is_number,
+}

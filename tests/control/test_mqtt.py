@@ -1,0 +1,366 @@
+"""Links through a real Mosquitto on this machine: also frozen, killed and restarted."""
+
+import asyncio
+import getpass
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from heliotrope.control.clock import SystemClock, sleep_until
+from heliotrope.control.link import Link, LinkSettings, Outcome, running
+from heliotrope.control.mqtt import Broker, mqtt_link
+from heliotrope.errors import InputError
+
+KEY, OTHER_KEY = bytes(range(32)), bytes(32)
+PREFIX = "heliotrope/test"
+PATIENCE = 20.0
+#: Beats that are quick against the broker's keepalive of 60 s, and slow for a busy machine.
+QUICK = LinkSettings(period=0.1, deadline=1.0, open_limit=1.0, first_pause=0.05, longest_pause=0.2)
+CALM = LinkSettings(period=0.1, deadline=10.0, open_limit=5.0)
+CLOCK = SystemClock()
+
+MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
+
+
+class Mosquitto:
+    """A broker with its own configuration, on a port of this machine alone."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self.port = free.getsockname()[1]
+        self._config = folder / "mosquitto.conf"
+        self._config.write_text(
+            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\n"
+            f"persistence false\nuser {getpass.getuser()}\nlog_type all\nlog_dest file {folder}/mosquitto.log\n"
+        )
+        self.start()
+
+    def start(self) -> None:
+        assert MOSQUITTO is not None
+        self._process = subprocess.Popen(
+            [MOSQUITTO, "-c", self._config], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            try:
+                socket.create_connection(("127.0.0.1", self.port)).close()
+            except ConnectionRefusedError:
+                assert self._process.poll() is None, "mosquitto ended at once"
+                assert time.monotonic() < deadline, "mosquitto does not listen"
+                time.sleep(0.01)
+            else:
+                return
+
+    def freeze(self) -> None:
+        os.kill(self._process.pid, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        os.kill(self._process.pid, signal.SIGCONT)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+
+@pytest.fixture
+def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
+    if MOSQUITTO is None:
+        if os.environ.get("CI"):
+            pytest.fail("mosquitto is not installed, and CI tests everything: apt install it")
+        pytest.skip("mosquitto is not installed: links through a broker are not tested")
+    broker = Mosquitto(tmp_path)
+    yield broker
+    broker.kill()
+
+
+def real(main: Callable[[], Awaitable[None]]) -> None:
+    async def limited() -> None:
+        async with asyncio.timeout(2.0 * PATIENCE):
+            await main()
+
+    asyncio.run(limited())
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        while not holds():
+            await asyncio.sleep(0.01)
+
+
+async def connected(*links: Link) -> None:
+    await until(lambda: all(link.connected for link in links))
+
+
+def pair(
+    port: int, settings: LinkSettings = QUICK, cluster: str = "north", key: bytes = KEY
+) -> tuple[Link, Link]:
+    broker = Broker("127.0.0.1", port)
+    return (
+        mqtt_link(broker, PREFIX, cluster, key, CLOCK, settings, plant=True),
+        mqtt_link(broker, PREFIX, cluster, key, CLOCK, settings, plant=False),
+    )
+
+
+def test_messages_pass_both_ways_and_clusters_do_not_hear_each_other(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        north, south = pair(mosquitto.port), pair(mosquitto.port, cluster="south", key=OTHER_KEY)
+        async with running(*north, *south):
+            await connected(*north, *south)
+            for number in range(50):
+                data = bytes([number]) * 1000
+                expires = CLOCK.monotonic() + PATIENCE
+                assert await north[0].send(data, expires=expires) is Outcome.SENT
+                assert await north[1].receive() == data
+                assert await north[1].send(data) is Outcome.SENT
+                assert await north[0].receive() == data
+            assert south[1].statistics.received == south[0].statistics.received == 0
+            assert north[1].statistics.refused == south[1].statistics.refused == 0
+            where = f"by 127.0.0.1:{mosquitto.port}"
+            assert (north[0].name, north[1].name) == (f"cluster north {where}", f"plant {where}")
+
+    real(main)
+
+
+def test_without_the_key_the_broker_lets_in_but_nobody_listens(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port)[0], pair(mosquitto.port, key=OTHER_KEY)[1]
+        async with running(plant, cluster):
+            await until(lambda: plant.statistics.refused > 3 and cluster.statistics.refused > 3)
+            assert not plant.connected
+            assert not cluster.connected
+
+    real(main)
+
+
+def test_retained_messages_are_refused_and_counted(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        down = f"{PREFIX}/north/down"
+        plant, cluster = pair(mosquitto.port, CALM)
+        async with aiomqtt.Client("127.0.0.1", mosquitto.port) as stranger:
+            await stranger.publish(down, b"kept from before", qos=1, retain=True)
+            async with running(plant, cluster):
+                await connected(plant, cluster)
+                await until(lambda: cluster.statistics.retained == 1)
+                await stranger.publish(down, b"to be kept", qos=1, retain=True)
+                await until(lambda: cluster.statistics.retained == 2)
+                refused = cluster.statistics.refused
+                await stranger.publish(down, b"not of this house", qos=1)
+                await until(lambda: cluster.statistics.refused == refused + 1)
+                await plant.send(b"ours")
+                assert await cluster.receive() == b"ours"
+                assert cluster.statistics.received == 1
+
+    real(main)
+
+
+def test_what_goes_out_is_not_retained_expires_and_is_confirmed(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port, CALM)
+        seen: list[aiomqtt.Message] = []
+        stranger = aiomqtt.Client("127.0.0.1", mosquitto.port, protocol=aiomqtt.ProtocolVersion.V5)
+        async with stranger, running(plant, cluster):
+            await connected(plant, cluster)
+            await stranger.subscribe(f"{PREFIX}/north/down", qos=2)
+            await plant.send(b"move", expires=CLOCK.monotonic() + 6.5)
+            while not any(b"move" in message.payload for message in seen):
+                seen.append(await anext(aiter(stranger.messages)))
+        assert seen[-1].qos == 1
+        assert not seen[-1].retain
+        assert seen[-1].properties is not None
+        assert 5 <= seen[-1].properties.MessageExpiryInterval <= 7
+        assert all(message.qos == 0 for message in seen[:-1])  # heartbeats
+
+    real(main)
+
+
+def test_nothing_is_kept_for_a_cluster_that_is_away(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, before = pair(mosquitto.port, CALM)
+        async with running(plant):
+            async with running(before):
+                await connected(plant, before)
+            # The plant does not know yet that nobody is there; the broker takes the message.
+            sent = await plant.send(b"order", expires=CLOCK.monotonic() + PATIENCE)
+            assert sent is Outcome.SENT
+            after = pair(mosquitto.port, CALM)[1]
+            async with running(after):
+                await connected(plant, after)
+                await plant.send(b"new order")
+                assert await after.receive() == b"new order"
+
+    real(main)
+
+
+def test_the_status_informs_and_the_last_will_too(mosquitto: Mosquitto) -> None:
+    class Cut(threading.Thread):
+        """A relay that dies: the broker sees a connection end without a goodbye."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.listener = socket.create_server(("127.0.0.1", 0))
+            self.port = self.listener.getsockname()[1]
+            self.ends: list[socket.socket] = []
+
+        def run(self) -> None:
+            near, _ = self.listener.accept()
+            far = socket.create_connection(("127.0.0.1", mosquitto.port))
+            self.ends = [near, far]
+            back = threading.Thread(target=self.pump, args=(far, near))
+            back.start()
+            self.pump(near, far)
+            back.join()
+            for end in (near, far, self.listener):
+                end.close()
+
+        def pump(self, source: socket.socket, sink: socket.socket) -> None:
+            try:
+                while data := source.recv(4096):
+                    sink.sendall(data)
+            except OSError:
+                pass
+
+        def die(self) -> None:
+            for end in self.ends:
+                end.shutdown(socket.SHUT_RDWR)
+
+    async def main() -> None:
+        said: list[bytes] = []
+
+        async def next_is(status: bytes) -> None:
+            while not said or said[-1] != status:
+                said.append((await anext(aiter(watcher.messages))).payload)  # type: ignore[arg-type]
+
+        relay = Cut()
+        relay.start()
+        cluster = pair(relay.port, CALM)[1]
+        async with aiomqtt.Client("127.0.0.1", mosquitto.port) as watcher:
+            await watcher.subscribe(f"{PREFIX}/north/status", qos=1)
+            async with running(cluster):
+                await next_is(b"online")
+                relay.die()
+                await next_is(b"offline")
+            relay.join()
+            plant, cluster = pair(mosquitto.port, CALM)
+            async with running(plant, cluster):
+                await next_is(b"online")
+                # A lie about it changes nothing.
+                await connected(plant, cluster)
+                await watcher.publish(f"{PREFIX}/north/status", b"offline", retain=True)
+                await next_is(b"offline")
+                await plant.send(b"heard")
+                assert await cluster.receive() == b"heard"
+
+    real(main)
+
+
+def test_a_frozen_broker_is_noticed_by_the_heartbeat_and_what_it_held_comes_no_more(
+    mosquitto: Mosquitto,
+) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port)
+        async with running(plant, cluster):
+            await connected(plant, cluster)
+            mosquitto.freeze()
+            frozen = CLOCK.monotonic()
+            # Nobody knows yet: the message goes into the frozen broker's socket.
+            sent = await plant.send(b"old order", expires=frozen + 0.5)
+            assert sent in (Outcome.EXPIRED, Outcome.DISCONNECTED)
+            await until(lambda: not plant.connected and not cluster.connected)
+            # Long before the broker's keepalive of 60 s, for which this test would not wait.
+            assert plant.silent_for >= QUICK.deadline
+            await until(lambda: "heartbeat" in cluster.problem or "let us in" in cluster.problem)
+            late = await plant.send(b"later", expires=CLOCK.monotonic() + 60.0)
+            assert late is Outcome.DISCONNECTED
+            await until(lambda: plant.statistics.failures >= 1)  # it does not get in meanwhile
+            mosquitto.thaw()
+            await connected(plant, cluster)
+            assert await plant.send(b"new order") is Outcome.SENT
+            assert await cluster.receive() == b"new order"
+            assert cluster.statistics.received == 1
+
+    real(main)
+
+
+def test_what_a_broker_held_for_a_moment_is_late_by_our_own_reckoning(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port, CALM)
+        async with running(plant, cluster):
+            await connected(plant, cluster)
+            mosquitto.freeze()
+            # MQTT's expiry has whole seconds, and does not run in a frozen broker.
+            expires = CLOCK.monotonic() + 0.3
+            assert await plant.send(b"old", expires=expires) is Outcome.EXPIRED
+            await sleep_until(CLOCK, expires)
+            mosquitto.thaw()
+            await plant.send(b"new")
+            assert await cluster.receive() == b"new"
+            assert cluster.statistics.late == 1
+            assert cluster.statistics.reconnects == 0
+
+    real(main)
+
+
+def test_a_killed_broker_is_found_again(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port)
+        async with running(plant, cluster):
+            await connected(plant, cluster)
+            mosquitto.kill()
+            await until(lambda: plant.statistics.failures >= 1 and cluster.statistics.failures >= 1)
+            assert "does not let us in" in plant.problem
+            assert await plant.send(b"nobody") is Outcome.DISCONNECTED
+            await asyncio.to_thread(mosquitto.start)
+            await connected(plant, cluster)
+            assert min(plant.statistics.reconnects, cluster.statistics.reconnects) >= 1
+            assert await plant.send(b"again") is Outcome.SENT
+            assert await cluster.receive() == b"again"
+
+    real(main)
+
+
+def test_a_link_can_be_closed_while_the_broker_is_frozen(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port)
+        async with running(plant, cluster):
+            await connected(plant, cluster)
+            mosquitto.freeze()
+        newcomer = pair(mosquitto.port)[0]
+        async with running(newcomer):  # closed while it waits for the broker's answer
+            await asyncio.sleep(0.2)
+
+    real(main)
+
+
+def test_small_messages_go_out_at_once(mosquitto: Mosquitto) -> None:
+    async def main() -> None:
+        plant, cluster = pair(mosquitto.port)
+        async with running(plant, cluster):
+            await connected(plant, cluster)
+            link = plant._carrier._client._client.socket()  # type: ignore[attr-defined]
+            assert link.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+    real(main)
+
+
+@pytest.mark.parametrize(
+    ("prefix", "cluster", "text"),
+    [
+        ("", "north", "MQTT prefix ''"),
+        ("plant/#", "north", "stand for any topic"),
+        ("/plant", "north", "begin or end with a slash"),
+        ("plant", "+", "MQTT cluster"),
+        ("plant", "north/east", "a name of one level"),
+    ],
+)
+def test_names_that_make_no_topic_are_refused(prefix: str, cluster: str, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        mqtt_link(Broker("127.0.0.1"), prefix, cluster, KEY, CLOCK, plant=True)
