@@ -1,0 +1,341 @@
+"""A bus in this process: the cluster at one end, boards or a vectorised field at the other.
+
+It implements `control.link.Bus`: one transaction at a time, the urgent next, and nothing after its
+expiry. Bytes take their time at the baud rate. Faults are drawn by a seed and may be changed at
+any moment (`BusFaults`). Whatever stands on the bus is a `Station`.
+"""
+
+import asyncio
+import contextlib
+import heapq
+import itertools
+import random
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import LinkClosedError, Outcome
+from heliotrope.errors import InputError
+
+#: Start, eight data bits, stop.
+_BITS = 10
+
+
+class Station(Protocol):
+    """What stands on a bus."""
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        """Take bytes at a time in s, and return what is answered at once, b"" if nothing."""
+        ...
+
+
+class Tap(Protocol):
+    """Who listens to all that goes on, without disturbing it."""
+
+    def sent(self, frame: bytes, now: float) -> None:
+        """Note what the master sent."""
+        ...
+
+    def heard(self, place: int, data: bytes, how: str, now: float) -> None:
+        """Note what a station is about to hear, and how it came: "whole", or by which fault."""
+        ...
+
+    def answered(self, data: bytes, how: str, now: float) -> None:
+        """Note what the master hears."""
+        ...
+
+
+@dataclass(frozen=True)
+class BusFaults:
+    """What a bus does to frames, in either direction and for each station by itself.
+
+    Parameters
+    ----------
+    loss, corruption, burst, duplication, late
+        Chances, 0 to 1: nothing comes; one bit is inverted; a run of bytes is noise; it comes
+        twice; it comes only when the next frame is sent (out of order, or between others).
+    stuck
+        A transmitter holds the line: nobody hears anything.
+
+    Raises
+    ------
+    InputError
+        A chance outside 0 to 1.
+    """
+
+    loss: float = 0.0
+    corruption: float = 0.0
+    burst: float = 0.0
+    duplication: float = 0.0
+    late: float = 0.0
+    stuck: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "corruption", "burst", "duplication", "late"):
+            value = getattr(self, name)
+            if not 0.0 <= value <= 1.0:
+                raise InputError(f"bus faults: a chance of {name} of {value}; give 0 to 1")
+
+    @property
+    def any(self) -> bool:
+        """Whether it does anything."""
+        return self.stuck or any(
+            (self.loss, self.corruption, self.burst, self.duplication, self.late)
+        )
+
+
+def damaged(data: bytes, chance: random.Random, *, burst: bool) -> bytes:
+    """Return bytes with one bit inverted, or with a run of up to eight of them replaced."""
+    out = bytearray(data)
+    place = chance.randrange(len(out))
+    if not burst:
+        out[place] ^= 1 << chance.randrange(8)
+        return bytes(out)
+    for i in range(place, min(len(out), place + chance.randint(2, 8))):
+        out[i] = chance.randrange(256)
+    return bytes(out)
+
+
+class Turns:
+    """Whose turn it is on the bus: first come, first served, but the urgent before all others."""
+
+    def __init__(self) -> None:
+        self._busy = False
+        self._waiting: list[tuple[bool, int, asyncio.Future[None]]] = []
+        self._number = itertools.count()
+
+    @contextlib.asynccontextmanager
+    async def turn(self, *, urgent: bool) -> AsyncIterator[None]:
+        """Have the bus for a block."""
+        if self._busy:
+            mine = asyncio.get_running_loop().create_future()
+            heapq.heappush(self._waiting, (not urgent, next(self._number), mine))
+            try:
+                await mine
+            except asyncio.CancelledError:
+                if mine.done() and not mine.cancelled():
+                    self._next()
+                raise
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._next()
+
+    def _next(self) -> None:
+        while self._waiting:
+            _, _, other = heapq.heappop(self._waiting)
+            if not other.done():
+                other.set_result(None)
+                return
+        self._busy = False
+
+
+class TwinBus:
+    """A bus with stations on it.
+
+    Parameters
+    ----------
+    clock
+        Of the bus; its monotonic time is that of the stations.
+    stations
+        Who hears every frame.
+    seed
+        Of the faults.
+    baud_rate
+        Bits in a second; 0: bytes take no time.
+    turn_around
+        From the end of a frame to the answer, in s.
+    tap
+        Listens to everything.
+
+    Attributes
+    ----------
+    faults
+        See `BusFaults`; may be set at any moment.
+    plugged
+        Whether the port is there; False as when its adapter is pulled out.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        stations: "list[Station]",
+        *,
+        seed: int = 0,
+        baud_rate: int = 115200,
+        turn_around: float = 0.002,
+        tap: Tap | None = None,
+    ) -> None:
+        self.faults = BusFaults()
+        self.plugged = True
+        self.stations = stations
+        self._clock = clock
+        self._chance = random.Random(seed)
+        self._per_byte = _BITS / baud_rate if baud_rate else 0.0
+        self._turn_around = turn_around if baud_rate else 0.0
+        self._tap = tap
+        self._turns = Turns()
+        self._closing = asyncio.Event()
+        self._late: list[tuple[int, bytes]] = []
+        self._late_answers: list[bytes] = []
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open."""
+        return self.plugged and not self.closed
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        return self._closing.is_set()
+
+    async def run(self) -> None:
+        """Keep the port open until the bus is closed."""
+        await self._closing.wait()
+
+    async def close(self) -> None:
+        """Close it for good."""
+        self._closing.set()
+
+    async def transmit(
+        self, frame: bytes, *, expires: float | None = None, urgent: bool = False
+    ) -> Outcome:
+        """Send a frame that nobody answers, and wait until it is out.
+
+        Raises
+        ------
+        LinkClosedError
+            When the bus is closed.
+        """
+        async with self._turns.turn(urgent=urgent):
+            outcome = self._may(expires)
+            if outcome is Outcome.SENT:
+                await self._pause(len(frame))
+                self.carry(frame)
+            return outcome
+
+    async def transact(
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
+        complete: Callable[[bytes], bool] | None = None,
+    ) -> bytes:
+        """Send a frame and return what is answered, b"" if nothing is.
+
+        Raises
+        ------
+        InputError
+            A timeout that is not above 0.
+        LinkClosedError
+            When the bus is closed.
+        """
+        if not timeout > 0.0:
+            raise InputError(f"bus: a timeout of {timeout} s; it must be above 0")
+        async with self._turns.turn(urgent=urgent):
+            if self._may(expires) is not Outcome.SENT:
+                return b""
+            await self._pause(len(frame))
+            answer = self.carry(frame)
+            took = self._turn_around + self._per_byte * len(answer)
+            whole = complete(answer) if complete and answer else answer.endswith(b"\0")
+            if not answer or took > timeout or not whole:
+                # Nobody ends the wait early: an answer that is damaged or cut has no end.
+                await asyncio.sleep(timeout)
+                return answer if took <= timeout else b""
+            await asyncio.sleep(took)
+            return answer
+
+    async def _pause(self, size: int) -> None:
+        if self._per_byte:
+            await asyncio.sleep(self._per_byte * size)
+
+    def _may(self, expires: float | None) -> Outcome:
+        if self.closed:
+            raise LinkClosedError("bus: it is closed")
+        if not self.plugged:
+            return Outcome.DISCONNECTED
+        if expires is not None and self._clock.monotonic() >= expires:
+            return Outcome.EXPIRED
+        return Outcome.SENT
+
+    # -- the wire --------------------------------------------------------------------------
+
+    def carry(self, frame: bytes) -> bytes:
+        """Bring a frame of the master to all stations now; return what comes back."""
+        if self._tap is not None:
+            self._tap.sent(frame, self._clock.monotonic())
+        return self._back(self.inject(frame, late=True))
+
+    def inject(self, frame: bytes, *, how: str = "whole", late: bool = False) -> bytes:
+        """Bring bytes to all stations, from the master or from a stranger; return all answers.
+
+        Parameters
+        ----------
+        frame
+            Bytes.
+        how
+            What the tap is told of bytes that no fault of the bus touches.
+        late
+            Whether what was kept back before comes now, after these.
+        """
+        if self.faults.stuck:
+            return b""
+        answer = bytearray()
+        kept, self._late = (self._late, []) if late else ([], self._late)
+        for place in range(len(self.stations)):
+            answer += self._bring(place, frame, how)
+        for place, old in kept:
+            # An answer that comes between others is lost in them.
+            self._hear(place, old, "late")
+        return bytes(answer)
+
+    def _bring(self, place: int, frame: bytes, how: str) -> bytes:
+        faults = self.faults
+        if not faults.any:
+            return self._hear(place, frame, how)
+        if self._happens(faults.loss):
+            return b""
+        if self._happens(faults.late):
+            self._late.append((place, frame))
+            return b""
+        if self._happens(faults.corruption):
+            return self._hear(place, damaged(frame, self._chance, burst=False), "damaged")
+        if self._happens(faults.burst):
+            return self._hear(place, damaged(frame, self._chance, burst=True), "damaged")
+        answer = self._hear(place, frame, how)
+        if self._happens(faults.duplication):
+            self._hear(place, frame, "twice")
+        return answer
+
+    def _hear(self, place: int, data: bytes, how: str) -> bytes:
+        now = self._clock.monotonic()
+        if self._tap is not None:
+            self._tap.heard(place, data, how, now)
+        return self.stations[place].hear(data, now)
+
+    def _back(self, answer: bytes) -> bytes:
+        faults, how = self.faults, "whole"
+        if faults.any and answer:
+            if faults.stuck or self._happens(faults.loss):
+                answer = b""
+            elif self._happens(faults.late):
+                self._late_answers.append(answer)
+                answer, how = b"", "late"
+            elif self._happens(faults.corruption):
+                answer, how = damaged(answer, self._chance, burst=False), "damaged"
+            elif self._happens(faults.burst):
+                answer, how = damaged(answer, self._chance, burst=True), "damaged"
+        elif self._late_answers and answer:
+            # An answer of before comes first, as from a node that took too long.
+            answer, how = self._late_answers.pop(0) + answer, "late"
+        if self._tap is not None and answer:
+            self._tap.answered(answer, how, self._clock.monotonic())
+        return answer
+
+    def _happens(self, chance: float) -> bool:
+        return chance > 0.0 and self._chance.random() < chance

@@ -1,0 +1,77 @@
+"""NOR flash of a board, with a supply that may fail at any byte."""
+
+import random
+
+from heliotrope.errors import HeliotropeError
+
+
+class PowerCutError(HeliotropeError):
+    """The supply failed within a write or an erasure: nothing of the board runs on."""
+
+
+class NorFlash:
+    """NOR flash in memory that refuses what real flash cannot do.
+
+    Parameters
+    ----------
+    seed
+        Of the bits that a cut leaves.
+    block_size, blocks
+        In bytes, and their number.
+
+    Attributes
+    ----------
+    budget
+        Bytes of writing and erasing after which the supply fails; None: it holds.
+    ragged
+        At a cut, all bytes of the operation hold some of their new bits and some of the old, as
+        if a page took them in any order; else only the byte of the cut does.
+    erasures
+        Of each block.
+
+    Raises
+    ------
+    PowerCutError
+        By ``write`` and ``erase``, at the cut.
+    ValueError
+        By ``write``, where a byte was written since its erasure: the journal never does that.
+    """
+
+    def __init__(self, seed: int = 0, block_size: int = 4096, blocks: int = 6) -> None:
+        self.block_size = block_size
+        self.blocks = blocks
+        self.budget: int | None = None
+        self.ragged = False
+        self.erasures = [0] * blocks
+        self._cells = bytearray(b"\xff" * (blocks * block_size))
+        self._chance = random.Random(seed)
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Return bytes."""
+        return bytes(self._cells[offset : offset + size])
+
+    def write(self, offset: int, data: bytes) -> None:
+        """Clear the bits that are clear in ``data``."""
+        if self._cells[offset : offset + len(data)] != b"\xff" * len(data):
+            raise ValueError(f"flash: {len(data)} bytes at {offset} were written before; erase")
+        self._change(offset, data)
+
+    def erase(self, block: int) -> None:
+        """Set all bits of a block."""
+        self.erasures[block] += 1
+        self._change(block * self.block_size, b"\xff" * self.block_size)
+
+    def _change(self, offset: int, data: bytes) -> None:
+        size = len(data)
+        if self.budget is not None and self.budget < size:
+            whole = 0 if self.ragged else self.budget
+            self._cells[offset : offset + whole] = data[:whole]
+            for place in range(whole, size if self.ragged else whole + 1):
+                taken = self._chance.getrandbits(8)
+                old = self._cells[offset + place]
+                self._cells[offset + place] = old & ~taken | data[place] & taken
+            self.budget = None
+            raise PowerCutError(f"flash: the supply failed within {size} bytes at {offset}")
+        if self.budget is not None:
+            self.budget -= size
+        self._cells[offset : offset + size] = data

@@ -1,0 +1,101 @@
+"""Step timers and motors of one heliostat: what becomes of the segments that a board emits.
+
+A segment is ``count`` pulses, the interval waited after each. The timer plays those of an axis one
+after the other; what is not yet played when the supply fails is never made. Pulses turn the
+motor; the joint follows behind the play of the gear (backlash), and a motor that is overloaded
+misses some.
+"""
+
+import random
+from collections import deque
+
+
+class Axis:
+    """One motor with its timer and its gear.
+
+    Parameters
+    ----------
+    count
+        Where it stands, steps.
+    play
+        Play of the gear, steps: after a reversal the joint stands for so long.
+    miss
+        Chance of a segment to lose one of its steps.
+    chance
+        Draws.
+
+    Attributes
+    ----------
+    emitted
+        Sum of all signed steps that were ordered, from the count at the start.
+    turned
+        Where the motor stands, steps.
+    joint
+        Where the joint stands, in steps of the motor: with it when it came from below, up to
+        ``play`` above it after a reversal.
+    missed
+        Steps missed so far.
+    fastest
+        Least interval of a segment since the start, µs.
+    """
+
+    def __init__(
+        self, count: int, play: float = 0.0, miss: float = 0.0, chance: random.Random | None = None
+    ) -> None:
+        self.emitted = self.turned = count
+        self.joint = float(count)
+        self.play, self.miss = play, miss
+        self.missed = 0
+        self.fastest = 1 << 30
+        self._chance = chance or random.Random(0)
+        self._queue: deque[tuple[int, int, int]] = deque()  # direction, count, interval
+        self._free_at = 0.0  # when the timer takes the next segment, s
+        self._done = 0  # pulses of the first segment already made
+
+    def take(self, direction: int, count: int, interval_us: int, now: float) -> None:
+        """Queue a segment at a time in s."""
+        if not self._queue:
+            self._free_at = max(self._free_at, now)
+        self._queue.append((direction, count, interval_us))
+        self.emitted += direction * count
+        self.fastest = min(self.fastest, interval_us)
+
+    def play_to(self, now: float) -> None:
+        """Make the pulses that are due until a time in s."""
+        while self._queue:
+            direction, count, interval_us = self._queue[0]
+            # The interval is waited after each pulse: the first one comes at once.
+            due = 1 + int((now - self._free_at) * 1e6 / interval_us) if now >= self._free_at else 0
+            made = min(count, due)
+            self._turn(direction, made - self._done)
+            self._done = made
+            end = self._free_at + count * interval_us * 1e-6
+            if made < count or now < end:
+                return
+            self._queue.popleft()
+            self._free_at, self._done = end, 0
+
+    def _turn(self, direction: int, steps: int) -> None:
+        if steps <= 0:
+            return
+        if self.miss > 0.0 and self._chance.random() < self.miss:
+            self.missed += 1
+            steps -= 1
+        self.turned += direction * steps
+        # The joint is carried along by the flank that pushes.
+        self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
+
+    def stop(self) -> int:
+        """Stop at once; returns the signed steps that were ordered and not made."""
+        undone = sum(direction * count for direction, count, _ in self._queue)
+        if self._queue:
+            undone -= self._queue[0][0] * self._done
+        self._queue.clear()
+        self._done = 0
+        self.emitted -= undone
+        return undone
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is left to play."""
+        return not self._queue
