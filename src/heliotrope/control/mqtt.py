@@ -43,6 +43,10 @@ from heliotrope.errors import InputError
 _UNCONFIRMED = 10
 #: Time for the last words of a connection, in s.
 _GOODBYE = 0.5
+#: aiomqtt waits without a limit of its own; the link sets the limits (`asyncio.timeout`). Before
+#: Python 3.12 `asyncio.wait_for`, which aiomqtt limits with, forgets a cancellation that comes in
+#: the instant of the answer: the heartbeat went on, and a link could not be closed.
+_NO_LIMIT = math.inf
 #: Messages between the socket and the link, which takes them at once.
 _WAITING = 1000
 
@@ -133,7 +137,7 @@ class _MqttCarrier:
             protocol=aiomqtt.ProtocolVersion.V5,
             will=will if self._reports else None,
             clean_start=True,
-            timeout=self._limit,
+            timeout=_NO_LIMIT,
             keepalive=broker.keepalive_s,
             max_queued_incoming_messages=_WAITING,
             tls_context=broker.tls,
@@ -213,12 +217,14 @@ class _MqttCarrier:
         client, self._client = self._client, None
         if client is None:
             return
-        with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
-            async with asyncio.timeout(_GOODBYE):
-                if self._reports:
-                    await client.publish(self._ends.status, b"offline", qos=1, retain=True)
-                await client.__aexit__(None, None, None)
-        await _discard(client)
+        try:
+            with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+                async with asyncio.timeout(_GOODBYE):
+                    if self._reports:
+                        await client.publish(self._ends.status, b"offline", qos=1, retain=True)
+                    await client.__aexit__(None, None, None)
+        finally:  # also when the link is closed while it takes its leave
+            await _discard(client)
 
 
 def _write_while_open(client: paho.Client) -> None:
