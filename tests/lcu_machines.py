@@ -16,8 +16,8 @@ import numpy as np
 import heliotrope.lcu
 from heliotrope.geometry import direction
 from heliotrope.lcu import controller, drives, messages, states, ticks, wire
-from heliotrope.lcu.config import Config
 from heliotrope.lcu.journal import CODES_OF, Journal
+from heliotrope.lcu.node import Node
 from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
@@ -161,22 +161,48 @@ class Flash:
         self.data[start : start + self.block_size] = b"\xff" * self.block_size
 
 
+class Motors:
+    """A step timer that makes its steps at once, within the limits of the heliostat.
+
+    ``made`` are the counts of the motors; ``undone`` is what the next emergency stop takes back.
+    """
+
+    def __init__(self) -> None:
+        self.made, self.undone, self.stops = list(STOW), (0, 0), 0
+        self.node: Node | None = None
+
+    def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
+        assert self.node is not None
+        assert interval_us * LIMITS[0] >= 1_000_000
+        self.made[axis] += direction * count
+        limits = self.node.controller.config.axes[axis]
+        assert limits is not None
+        assert limits.low <= self.made[axis] <= limits.high
+        assert self.node.trouble or not self.node.journal.rest
+
+    def stop(self) -> tuple[int, int]:
+        self.stops += 1
+        undone, self.undone = self.undone, (0, 0)
+        self.made[0] -= undone[0]
+        self.made[1] -= undone[1]
+        return undone
+
+
 class Bench:
-    """A board with its controller, a cluster controller that talks to it, and a sun.
+    """A board with its node, a cluster controller that talks to it, and a sun.
 
     Invariants are checked after every call; ``made`` counts the steps of the motors.
     """
 
     def __init__(self, flash: Flash | None = None, tick: int = 0) -> None:
         self.machine = heliostat()
-        self.made, self.slip = list(STOW), [0, 0]
+        self.motors, self.slip = Motors(), [0, 0]
         self.now, self.true_ms = tick, 0
         self.sender = wire.Sender(0, START_S, sha256)
         self.sends_sun = self.sends_time = True
         self.clock_error_ms = 0
         self.tilt: tuple[float, float] | None = None
         self.answers: list[tuple[int, tuple[object, ...]]] = []
-        self.halts = 0
         self.edition = 0
         self.fed = False
         self.last_sun_ms = -(10**9)
@@ -184,70 +210,75 @@ class Bench:
 
     def start(self, flash: Flash | None = None) -> None:
         """Switch the board on, with an empty or a given flash."""
-        self.flash = Flash() if flash is None else flash
-        self.journal = Journal(self.flash)
-        items = self.journal.load()
-        if not items:
-            self.journal.store(items_of_heliostat(self.machine))
-            self.journal.zero(*STOW)
-        self.journal.boot()
-        config = Config()
-        config.serial = 4711
-        assert config.load(self.journal.items)
-        gate = wire.Gate(sha256, KEY, self.edition)
-        self.controller = controller.Controller(config, self.now, gate, self.read_tilt)
-        journal = self.journal
+        if flash is None:
+            flash = Flash()
+            journal = Journal(flash)
+            journal.load()
+            journal.store(items_of_heliostat(self.machine))
+            journal.zero(*STOW)
+        self.flash = flash
+        before = self.made
+        kept = Journal(flash)
+        kept.load()
         # Where the journal's counts are not those of the motors, it slips for good.
-        counts = [journal.primary, journal.secondary]
-        self.slip = [s + m - c for s, m, c in zip(self.slip, self.made, counts, strict=True)]
-        self.made[:] = counts
-        self.do(
-            self.controller.boot(
-                journal.primary, journal.secondary, journal.doubt, journal.state, journal.aim,
-                journal.boots, journal.looping,
-            )
+        counts = [kept.primary, kept.secondary]
+        self.slip = [s + m - c for s, m, c in zip(self.slip, before, counts, strict=True)]
+        self.made = counts
+        self.motors.node = None
+        self.node = Node(
+            flash, self.motors, self.hear, self.now, 4711, sha256=sha256, key=KEY,
+            sensor=self.read_tilt, feed=self.feed,
         )  # fmt: skip
+        self.motors.node = self.node
+        self.journal.zero = self.declare  # type: ignore[method-assign]
+        self.check()
+
+    def declare(self, *counts: int) -> None:
+        """ZERO: the motors stand where they stood, under other counts."""
+        slip = zip(self.slip, self.made, counts, strict=True)
+        self.slip = [s + m - c for s, m, c in slip]
+        self.made = list(counts)
+        Journal.zero(self.journal, *counts)
 
     def read_tilt(self) -> tuple[float, float] | None:
         """The accelerometer."""
         return self.tilt
+
+    def feed(self) -> None:
+        """The watchdog."""
+        self.fed = True
+
+    def hear(self, data: bytes) -> None:
+        """What the cluster controller gets."""
+        for frame in wire.Reader().feed(data):
+            assert frame.to == 0
+            values = frame.values()
+            assert values is not None
+            self.answers.append((frame.number, values))
+
+    @property
+    def controller(self) -> controller.Controller:
+        return self.node.controller
+
+    @property
+    def journal(self) -> Journal:
+        return self.node.journal
+
+    @property
+    def made(self) -> list[int]:
+        return self.motors.made
+
+    @made.setter
+    def made(self, counts: list[int]) -> None:
+        self.motors.made[:] = counts
 
     @property
     def state(self) -> str:
         return states.STATES[self.controller.state]
 
     def do(self, actions: list[tuple[object, ...]]) -> None:
-        """Obey the controller's actions."""
-        for action in list(actions):
-            kind, *rest = action
-            if kind == controller.SEGMENT:
-                axis, direction, count, interval = rest
-                assert interval * LIMITS[0] >= 1_000_000
-                self.made[axis] += direction * count
-                limits = self.controller.config.axes[axis]
-                assert limits.low <= self.made[axis] <= limits.high
-                assert not self.journal.rest
-            elif kind == controller.ANSWER:
-                wire.pack(messages.name_of(rest[0]), *rest[1])
-                self.answers.append((rest[0], rest[1]))
-            elif kind == controller.STORE:
-                self.journal.store(rest[0])
-            elif kind == controller.BEFORE_STEPS:
-                self.journal.before_steps(*rest)
-            elif kind == controller.AT_REST:
-                assert rest == self.made
-                self.journal.at_rest(*rest)
-            elif kind == controller.NOTE:
-                self.journal.note(*rest)
-            elif kind == controller.ZEROED:
-                slip = zip(self.slip, self.made, rest, strict=True)
-                self.slip = [s + m - c for s, m, c in slip]
-                self.made[:] = rest
-                self.journal.zero(*rest)
-            elif kind == controller.HALT:
-                self.halts += 1
-            elif kind == controller.FEED:
-                self.fed = True
+        """Obey the controller's actions, where a test calls it past the node."""
+        self.node._obey(actions, self.now)
         self.check()
 
     def check(self) -> None:
@@ -280,8 +311,8 @@ class Bench:
 
     def deliver(self, data: bytes) -> None:
         """Bring bytes to the board."""
-        for frame in wire.Reader().feed(data):
-            self.do(self.controller.on_frame(frame, self.now))
+        self.node.on_bytes(data, self.now)
+        self.check()
 
     def order(self, name: str, *values: object, life_s: int = 5, token: int = TOKEN) -> int:
         """Give a command and return the result in the ACK."""
@@ -318,7 +349,8 @@ class Bench:
         self.now = ticks.add(self.now, ms)
         self.true_ms += ms
         self.fed = False
-        self.do(self.controller.on_tick(self.now))
+        self.node.on_tick(self.now)
+        self.check()
 
     def run(self, seconds: float, *, until: str = "") -> float:
         """Let time pass, at most until a state is reached; returns how long that took, s."""

@@ -420,12 +420,11 @@ def test_an_emergency_stop_takes_steps_back() -> None:
     bench.order("STOW")
     bench.run(6)
     assert not bench.controller.motion.still()
-    bench.do(bench.controller.on_fault(controller.LIMIT_SWITCH, bench.now, True))
-    assert bench.halts == 1
+    bench.motors.undone = 37, -11
+    bench.node.on_fault(controller.LIMIT_SWITCH, bench.now, True)
+    bench.check()
+    assert bench.motors.stops == 1
     assert bench.state == "FAULT"
-    undone = [37, -11]
-    bench.made = [made - rest for made, rest in zip(bench.made, undone, strict=True)]
-    bench.do(bench.controller.halted(*undone))
     held = list(bench.made)
     bench.run(10)
     assert bench.made == held
@@ -541,7 +540,9 @@ def test_a_diagnosis_sees_the_elevation_move() -> None:
     assert tilt == pytest.approx(0.02, rel=0.05)
     bench.answers.clear()
     bench.send("QUERY_DIAGNOSIS")
-    assert bench.answers == [(0x08, bench.controller.motion.diagnosis)]
+    (number, values), = bench.answers  # fmt: skip
+    assert (number, values[:3]) == (0x08, bench.controller.motion.diagnosis[:3])
+    assert values[3:] == pytest.approx(bench.controller.motion.diagnosis[3:])
     assert bench.state == "IDLE"
 
 
@@ -769,6 +770,7 @@ def test_questions_are_answered() -> None:
     bench.send("DISCOVER", 5000, 6000, to=0xFFFF)
     assert bench.answers == []
     bench.send("DISCOVER", 4000, 5000, to=0xFFFF)
+    bench.run(1)
     assert bench.answers == [(0x0C, (4711, 0, ADDRESS))]
     out = bench.controller.on_message(0x09, 1, (5,), b"", DONE, bench.now, True)
     assert (controller.RECALL, 5) in out

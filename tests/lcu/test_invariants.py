@@ -178,14 +178,14 @@ class Fuzz:
         bench, own = self.bench, self.bench.controller
         number = self.random.choice([controller.SUPPLY, controller.LIMIT_SWITCH])
         halt = self.random.random() < 0.5
-        bench.do(own.on_fault(number, bench.now, halt))
-        assert own.fault != controller.NO_FAULT
         if halt:
             axes = own.motion.stepper.axes  # type: ignore[union-attr]
             # No step beyond the limits is undone: it was never made.
-            undone = [a.direction * self.random.randint(0, 9) if a.speed else 0 for a in axes]
-            bench.made = [made - rest for made, rest in zip(bench.made, undone, strict=True)]
-            bench.do(own.halted(*undone))
+            one, two = [a.direction * self.random.randint(0, 9) if a.speed else 0 for a in axes]
+            bench.motors.undone = one, two
+        bench.node.on_fault(number, bench.now, halt)
+        bench.check()
+        assert own.fault != controller.NO_FAULT
         if self.random.random() < 0.8:
             own.fault_gone(number)
 

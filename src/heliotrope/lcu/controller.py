@@ -291,7 +291,7 @@ class Controller:
         now_ms
             The present tick.
         reply
-            Whether it came to this address alone, so that an ACK is wanted.
+            Whether it came to this address alone, so that an answer is wanted.
         """
         self.out.clear()
         self._time(now_ms)
@@ -316,7 +316,8 @@ class Controller:
         else:
             self._heard.start(now_ms, self.config.silence_ms)
             if who == messages.ASK:
-                self._answer(name, values)
+                if reply or name == "DISCOVER":  # if all answered at once, none was understood
+                    self._answer(name, values)
                 return
             if who == messages.CLUSTER:
                 self._hear(name, values, now_ms)

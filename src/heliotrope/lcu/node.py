@@ -1,0 +1,271 @@
+"""A whole local controller but for its pins: what boards and the simulator run.
+
+``Node`` joins the reader of frames, the gate, the controller, the journal and the step timer.
+It has no loop, no clock and no port of its own: bytes and time come in by calls, bytes go out
+by ``write``, steps go to the timer, records go to flash. It boots when it is made; to reset
+it, make another one on the same flash.
+
+::
+
+    node = Node(flash, timer, uart.write, now_ms(), serial=4711, sha256=sha256, key=key)
+    while True:
+        node.on_bytes(uart.read(), now_ms())     # when bytes have come
+        node.on_tick(now_ms())                   # always, every 50 ms or more often
+
+``now_ms`` is a counter of milliseconds modulo 2^30, as of ``time.ticks_ms``; see ``ticks``.
+
+**Answers** carry the sequence of the frame that asked, and go out within the call that brought
+it, but for HERE: that waits for a slot drawn by chance, ``HERE_SLOTS`` of ``HERE_SLOT_MS`` each.
+Nothing else answers a question to everybody.
+
+**Order.** Flash is written before the steps are played that it tells of, and before an ACK says
+that something was stored. An emergency stop comes before everything.
+
+**A journal that fails** latches the fault JOURNAL, which holds until the next reset; from then
+on nothing is written and nothing stored. The mirror still goes off the receiver and to stow,
+because that protects more than the step counts; a boot on such flash takes the counts as unknown.
+"""
+
+from . import controller, messages, ticks, wire
+from .config import Config
+from .controller import Controller
+from .journal import HEALTHY_MS, Journal, item_name
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
+    from collections.abc import Callable
+    from typing import Any, Protocol
+
+    from .journal import Storage
+
+    class StepTimer(Protocol):
+        """Makes the steps of two axes by hardware."""
+
+        def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
+            """Queue ``count`` steps of ``axis`` (0, 1), ``direction`` being 1 or -1.
+
+            The steps come after those already queued for the axis, ``interval_us`` apart. The
+            two axes run independently. It never blocks.
+            """
+
+        def stop(self) -> "tuple[int, int]":
+            """Stop both axes at once; returns the signed steps queued and not made, by axis."""
+
+
+#: Slots in which HERE answers DISCOVER: their number, and the length of each (ms).
+HERE_SLOTS, HERE_SLOT_MS = 32, 20
+ACK, HERE, STORED = 0x0D, 0x0C, 0x0A
+#: An action of the node itself, beside those of the controller.
+HEALTHY = -1
+
+
+def no_sensor() -> "tuple[float, float] | None":
+    """The tilt, where no accelerometer is fitted."""
+    return None
+
+
+def no_watchdog() -> None:
+    """Feed nothing."""
+
+
+class Node:
+    """One local controller.
+
+    Parameters
+    ----------
+    storage
+        NOR flash: ``block_size``, ``blocks``, ``read``, ``write``, ``erase``; see ``journal``.
+    timer
+        Step timer: ``play(axis, direction, count, interval_us)``, and ``stop()``, which returns
+        the signed steps that were queued and not made.
+    write
+        Sends bytes to the cluster controller.
+    now_ms
+        The present tick.
+    serial, firmware
+        As in HERE.
+    sha256
+        The hash, ``sha256(data) -> 32 bytes``; None: nothing can be stored.
+    key
+        Of this controller; b"": nothing can be stored.
+    sensor
+        Gives the mirror's tilt (x, y), rad, or None; see ``Motion``.
+    feed
+        Feeds the hardware's watchdog.
+
+    Attributes
+    ----------
+    controller, journal, reader, timer
+        The parts.
+    trouble
+        What flash said when it failed, "" if it did not.
+    """
+
+    def __init__(
+        self,
+        storage: "Storage",
+        timer: "StepTimer",
+        write: "Callable[[bytes], Any]",
+        now_ms: int,
+        serial: int,
+        firmware: int = 0,
+        sha256: "Callable[[bytes], bytes] | None" = None,
+        key: bytes = b"",
+        sensor: "Callable[[], tuple[float, float] | None]" = no_sensor,
+        feed: "Callable[[], Any]" = no_watchdog,
+    ) -> None:
+        self.timer, self.reader, self.trouble = timer, wire.Reader(), ""
+        self._write, self._feed = write, feed
+        self.journal = journal = Journal(storage)
+        config = Config()
+        config.serial, config.firmware = serial, firmware
+        good = config.load(journal.load()) and not journal.damaged
+        edition = journal.numbers("edition")
+        gate = wire.Gate(sha256, key, edition[0] if edition else 0)
+        self.controller = Controller(config, now_ms, gate, sensor)
+        self._address = self._sequence = 0  # of the answers to the frame in hand
+        self._here: tuple[Any, ...] = ()  # a HERE that waits for its slot
+        self._slot, self._well = ticks.Deadline(), ticks.Deadline()
+        self._well.start(now_ms, HEALTHY_MS)
+        self._healthy = False
+        doubt = journal.doubt
+        try:
+            journal.boot()
+        except OSError as error:
+            self.trouble, doubt = str(error), -1
+        self._chance = (serial * 0x9E3779B1 + journal.boots) & 0xFFFFFFFF or 1
+        actions = self.controller.boot(
+            journal.primary, journal.secondary, doubt, journal.state, journal.aim,
+            journal.boots, journal.looping,
+        )  # fmt: skip
+        self._obey(actions, now_ms)
+        if self.trouble or not good:
+            self.on_fault(controller.JOURNAL, now_ms, False)
+            if not self.trouble:  # what was lost can be stored again
+                self.controller.fault_gone(controller.JOURNAL)
+
+    def on_bytes(self, data: bytes, now_ms: int) -> None:
+        """Take bytes as they came, in pieces of any size."""
+        own = self.controller
+        for frame in self.reader.feed(data):
+            # A new address takes effect after the answer.
+            self._address, self._sequence = own.config.address, frame.sequence
+            self._obey(own.on_frame(frame, now_ms), now_ms)
+
+    def on_tick(self, now_ms: int) -> None:
+        """Go on; to be called every 50 ms or more often."""
+        self._obey(self.controller.on_tick(now_ms), now_ms)
+        if self._here and self._slot.over(now_ms):
+            values, self._here = self._here, ()
+            self._send(values[0], values[1], HERE, values[2])
+        if not self._healthy and self._well.over(now_ms):
+            self._healthy = True
+            self._obey([(HEALTHY,)], now_ms)
+
+    def on_fault(self, number: int, now_ms: int, halt: bool) -> None:
+        """Latch a fault (of ``controller``) that the board found; ``halt`` stops the motors.
+
+        The cause counts as present until ``fault_gone``.
+        """
+        undone = self.timer.stop() if halt else (0, 0)
+        self._obey(self.controller.on_fault(number, now_ms, halt), now_ms)
+        if halt:
+            self._obey(self.controller.halted(undone[0], undone[1]), now_ms)
+
+    def fault_gone(self, number: int) -> None:
+        """The cause of a fault is gone; the fault stays until CLEAR_FAULT."""
+        self.controller.fault_gone(number)
+
+    def on_supply_failing(self, now_ms: int) -> bool:
+        """Stop and keep the step counts: the supply falls and milliseconds are left.
+
+        Returns whether flash holds the counts. The fault SUPPLY is latched; when the supply has
+        come back without a reset, call ``fault_gone``.
+        """
+        undone = self.timer.stop()
+        motion = self.controller.motion
+        kept = False
+        if not self.trouble:
+            try:
+                kept = self.journal.brown_out(
+                    motion.place(0) - undone[0], motion.place(1) - undone[1]
+                )
+            except OSError as error:
+                self.trouble = str(error)
+        self._obey(self.controller.on_fault(controller.SUPPLY, now_ms, True), now_ms)
+        self._obey(self.controller.halted(undone[0], undone[1]), now_ms)
+        return kept
+
+    def measured(self, supply_mv: int, temperature_degc: int) -> None:
+        """Say what STATUS shall tell of supply and temperature."""
+        self.controller.supply_mv = min(max(supply_mv, 0), 0xFFFF)
+        self.controller.temperature_degc = min(max(temperature_degc, -128), 127)
+
+    # What the controller orders.
+
+    def _obey(self, actions: "list[tuple[Any, ...]]", now_ms: int) -> None:
+        before = self.trouble
+        kept = True
+        for action in actions:
+            kind = action[0]
+            if kind == controller.SEGMENT:
+                self.timer.play(action[1], action[2], action[3], action[4])
+            elif kind == controller.FEED:
+                self._feed()
+            elif kind == controller.ANSWER:
+                self._answer(action[1], action[2], kept, now_ms)
+            elif kind == controller.RECALL:
+                data = self.journal.items.get(item_name(action[1]), b"")
+                self._send(self._address, self._sequence, STORED, (action[1], data))
+            elif kind != controller.HALT:  # who calls for HALT has stopped the timer before
+                kept = self._keep(kind, action) and kept
+        if self.trouble and not before:
+            self.on_fault(controller.JOURNAL, now_ms, False)
+
+    def _keep(self, kind: int, action: "tuple[Any, ...]") -> bool:
+        """Do what concerns the journal; False if flash failed, now or before."""
+        journal = self.journal
+        if self.trouble:
+            return False
+        try:
+            if kind == controller.BEFORE_STEPS:
+                journal.before_steps(action[1], action[2], action[3], action[4])
+            elif kind == controller.AT_REST:
+                journal.at_rest(action[1], action[2])
+            elif kind == controller.NOTE:
+                journal.note(action[1], action[2])
+            elif kind == controller.STORE:
+                journal.store(action[1])
+            elif kind == controller.ZEROED:
+                journal.zero(action[1], action[2])
+            elif kind == HEALTHY:
+                journal.healthy()
+        except OSError as error:
+            self.trouble = str(error) or "journal: flash failed"
+            return False
+        return True
+
+    # Answers.
+
+    def _answer(self, number: int, values: "tuple[Any, ...]", kept: bool, now_ms: int) -> None:
+        if number == ACK and values[2] == messages.DONE and not kept:
+            values = values[0], values[1], messages.NOT_STORED
+        if number != HERE:
+            self._send(self._address, self._sequence, number, values)
+            return
+        self._here = self._address, self._sequence, values
+        self._slot.start(now_ms, self._draw(now_ms) * HERE_SLOT_MS)
+
+    def _draw(self, now_ms: int) -> int:
+        """A slot, other for each controller and each time: xorshift of Marsaglia."""
+        chance = self._chance ^ now_ms or 1
+        chance ^= (chance << 13) & 0xFFFFFFFF
+        chance ^= chance >> 17
+        chance ^= (chance << 5) & 0xFFFFFFFF
+        self._chance = chance
+        return chance % HERE_SLOTS
+
+    def _send(self, address: int, sequence: int, number: int, values: "tuple[Any, ...]") -> None:
+        payload = wire.pack(messages.name_of(number), *values)
+        frame = wire.Frame(wire.CLUSTER_ADDRESS, address, sequence, number, payload)
+        self._write(wire.encode(frame))
