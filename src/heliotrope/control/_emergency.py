@@ -110,16 +110,25 @@ class Proof:
 
     def with_acknowledged(self, node: str, at: float) -> "Proof":
         """Return the proof with a node's acknowledgement; only the first one counts."""
-        if not self._counts(node, at):
-            return replace(self, refused=self.refused + 1)
-        return replace(self, acknowledged={node: at, **self.acknowledged})
+        return self.with_news(acknowledged=(node,), at=at)
 
     def with_done(self, node: str, at: float) -> "Proof":
         """Return the proof with a node's report that it is done, which acknowledges too."""
-        if not self._counts(node, at):
-            return replace(self, refused=self.refused + 1)
+        return self.with_news(done=(node,), at=at)
+
+    def with_news(
+        self, *, acknowledged: Iterable[str] = (), done: Iterable[str] = (), at: float
+    ) -> "Proof":
+        """Return the proof with the reports of many nodes of one time: one copy for all."""
+        told, ready = tuple(acknowledged), tuple(done)
+        good_told = [node for node in told if self._counts(node, at)]
+        good_ready = [node for node in ready if self._counts(node, at)]
+        wrong = len(told) + len(ready) - len(good_told) - len(good_ready)
         return replace(
-            self, done={node: at, **self.done}, acknowledged={node: at, **self.acknowledged}
+            self,
+            acknowledged={**dict.fromkeys(good_told + good_ready, at), **self.acknowledged},
+            done={**dict.fromkeys(good_ready, at), **self.done} if good_ready else self.done,
+            refused=self.refused + wrong,
         )
 
     def with_flux(self, share: float, at: float) -> "Proof":

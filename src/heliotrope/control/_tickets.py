@@ -1,0 +1,166 @@
+"""How far an accepted command has come: heliostat by heliostat, to be awaited."""
+
+import asyncio
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from heliotrope.control.clock import Clock, sleep_until
+from heliotrope.control.protocol import Stage
+
+#: Waiting in the plant, then the stages in their order; from FINAL on nothing changes any more.
+WAITING = 0
+RANK = {
+    Stage.ACCEPTED: 1, Stage.SENT: 2, Stage.ACKNOWLEDGED: 3, Stage.DONE: 4, Stage.REFUSED: 5,
+    Stage.FAILED: 6,
+}  # fmt: skip
+FINAL = RANK[Stage.DONE]
+#: Commands that change no state: acknowledged is done.
+ACKNOWLEDGED_IS_DONE = frozenset(
+    (
+        "AIM",
+        "STANDBY",
+        "LOCK_AIM",
+        "ROUGH",
+        "PARAMETERS",
+        "JOG",
+        "GOTO",
+        "DIAGNOSE",
+        "UNLOCK",
+        "CLEAR_FAULT",
+    )
+)
+
+
+class Ticket:
+    """One accepted command.
+
+    Attributes
+    ----------
+    identity
+        That of its record in the audit.
+    name, heliostats
+        What, to whom.
+    refusals
+        Why it was refused or failed, by heliostat.
+    accepted_at
+        Monotonic s.
+    """
+
+    def __init__(
+        self, identity: str, name: str, heliostats: Sequence[str], clock: Clock, patience: float
+    ) -> None:
+        self.identity, self.name, self.heliostats = identity, name, tuple(heliostats)
+        self.refusals: dict[str, str] = {}
+        self.accepted_at = clock.monotonic()
+        self._clock = clock
+        self._row = {name: i for i, name in enumerate(self.heliostats)}
+        self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)
+        #: When each one is given up at its present stage, monotonic s.
+        self._until = np.full(len(self.heliostats), math.inf)
+        self._patience = patience
+        self._news = asyncio.Event()
+
+    def __repr__(self) -> str:
+        return f"<Ticket {self.identity} {self.text}>"
+
+    def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
+        """Take a stage that heliostats have reached: never backwards, and nothing after the end."""
+        if stage is Stage.ACKNOWLEDGED and self.name in ACKNOWLEDGED_IS_DONE:
+            stage = Stage.DONE
+        rank = RANK[stage]
+        rows = [self._row[name] for name in heliostats if name in self._row]
+        if not rows:
+            return
+        index = np.array(rows, dtype=np.intp)
+        index = index[(self._stage[index] < FINAL) & (self._stage[index] < rank)]
+        self._stage[index] = rank
+        if stage is Stage.ACKNOWLEDGED:
+            self._until[index] = self._clock.monotonic() + self._patience
+        if text or rank > FINAL:
+            for i in index:
+                self.refusals[self.heliostats[i]] = text or stage.value
+        if index.size:
+            self._news.set()
+
+    def expect(self, heliostats: Iterable[str], until: float) -> None:
+        """Say until when (monotonic s) heliostats must have acknowledged."""
+        rows = [self._row[name] for name in heliostats if name in self._row]
+        self._until[np.array(rows, dtype=np.intp)] = until
+
+    def expire(self, now: float) -> None:
+        """End what was not answered in time."""
+        late = np.flatnonzero((self._stage < FINAL) & (now >= self._until))
+        for i in late:
+            acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
+            text = (
+                f"acknowledged, but not done within {self._patience:.0f} s" if acknowledged
+                else "no answer before it expired"
+            )  # fmt: skip
+            self.advance([self.heliostats[i]], Stage.FAILED, text)
+
+    @property
+    def finished(self) -> bool:
+        """Whether every heliostat has come to an end."""
+        return bool((self._stage >= FINAL).all())
+
+    @property
+    def good(self) -> bool:
+        """Whether every heliostat is done."""
+        return bool((self._stage == FINAL).all())
+
+    def stage(self, heliostat: str) -> Stage | None:
+        """Return how far it is for one heliostat; None while it waits in the plant."""
+        rank = int(self._stage[self._row[heliostat]])
+        return next((stage for stage, value in RANK.items() if value == rank), None)
+
+    def counted(self) -> dict[str, int]:
+        """Return how many heliostats are at each stage; "waiting" while in the plant."""
+        found = np.bincount(self._stage, minlength=FINAL + 3)
+        words = ("waiting", *(stage.value for stage in RANK))
+        return {word: int(n) for word, n in zip(words, found, strict=True) if n}
+
+    @property
+    def text(self) -> str:
+        """One line: how many are where, and the first reasons."""
+        parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
+        why = "; ".join(f"{name}: {text}" for name, text in list(self.refusals.items())[:3])
+        more = f"; and {len(self.refusals) - 3} more" if len(self.refusals) > 3 else ""
+        return f"{self.name}: {parts}" + (f" ({why}{more})" if why else "")
+
+    async def reached(self, stage: Stage, timeout: float = math.inf) -> bool:
+        """Wait until every heliostat is at a stage or has ended; False if one was refused.
+
+        Parameters
+        ----------
+        stage
+            ACCEPTED to DONE.
+        timeout
+            s, by the plant's clock; False when it is over.
+        """
+        until = self._clock.monotonic() + timeout
+        while not (self._stage >= RANK[stage]).all():
+            self._news.clear()
+            if math.isinf(until):
+                await self._news.wait()
+            elif not await _within(self._clock, until, self._news):
+                return False
+        return bool((self._stage <= FINAL).all())
+
+    async def end(self, timeout: float = math.inf) -> bool:
+        """Wait until every heliostat has ended; True if all are done."""
+        return await self.reached(Stage.DONE, timeout)
+
+
+async def _within(clock: Clock, until: float, event: asyncio.Event) -> bool:
+    """Wait for an event up to an instant; False if that came first."""
+    if clock.monotonic() >= until:
+        return False
+    try:
+        async with asyncio.timeout(max(1e-6, until - clock.monotonic())):
+            await event.wait()
+    except TimeoutError:
+        await sleep_until(clock, until)
+        return event.is_set()
+    return True

@@ -1,0 +1,260 @@
+"""The audit: of every accepted command exactly one record of who, what, when and its result.
+
+A record is begun before a command is sent, and a command whose record cannot be begun is not
+accepted. DEFOCUS and STOW never wait: they are sent first, and their records follow, again and
+again until they are written. `Audit` is what the plant needs of a store; `JsonLines` is one file.
+
+A file holds two lines for each record, both appended and synced to the disk: "accepted" and
+"result". `read` puts them together. What a loss of power leaves torn at the end of a file is
+passed over and counted; records without a result are ended at the next start.
+
+::
+
+    HeliotropeError
+    └── AuditError            a record that could not be written
+"""
+
+import fcntl
+import json
+import os
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Protocol
+
+from heliotrope.errors import FormatError, HeliotropeError, InputError
+
+#: Less than this left on the disk (bytes) counts as full: records must not end half-way.
+LEAST_FREE = 1 << 20
+#: Result of records that were open when the plant stopped.
+STOPPED = "unknown: the plant stopped before the result was known"
+
+
+class AuditError(HeliotropeError):
+    """A record that could not be written."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """One accepted command.
+
+    Attributes
+    ----------
+    identity
+        Unique for all time.
+    who, role
+        The person, or the part of the plant, that gave it.
+    what
+        Name of the command.
+    values
+        Its numbers; for groups with different numbers see ``note``.
+    heliostats
+        Names; () for all.
+    at
+        When it was accepted, UTC, ISO 8601.
+    note
+        Reason, further details.
+    result, finished
+        What became of it and when; "" until that is known.
+    """
+
+    identity: str
+    who: str
+    role: str
+    what: str
+    at: str
+    values: tuple[float, ...] = ()
+    heliostats: tuple[str, ...] = ()
+    note: str = ""
+    result: str = ""
+    finished: str = ""
+
+
+class Audit(Protocol):
+    """Where records are kept."""
+
+    def begin(self, record: Record) -> None:
+        """Keep a record without result; it is safe when this returns."""
+        ...
+
+    def finish(self, identity: str, result: str, at: str) -> None:
+        """Add the result to a record that was begun."""
+        ...
+
+    def confirm(self) -> None:
+        """See that a record could be written now."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+class JsonLines:
+    """An audit in one file, to which nothing but lines is ever appended.
+
+    Parameters
+    ----------
+    path
+        Made if it is not there. One process at a time has it.
+    started
+        UTC, for the records that are ended now since the plant stopped before.
+
+    Raises
+    ------
+    AuditError
+        If it cannot be opened, or another process has it.
+    FormatError
+        If its records contradict each other.
+    """
+
+    def __init__(self, path: str | Path, started: datetime) -> None:
+        self.path = Path(path)
+        try:
+            self._file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
+        except OSError as error:
+            raise AuditError(f"audit {self.path}: {error.strerror}; give a file to write") from None
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            records, torn = read(self.path)
+        except BlockingIOError:
+            os.close(self._file)
+            raise AuditError(
+                f"audit {self.path}: another process writes to it; only one plant may run"
+            ) from None
+        except BaseException:
+            os.close(self._file)
+            raise
+        self._open = {record.identity for record in records if not record.result}
+        self._known = {record.identity for record in records}
+        #: Lines that a loss of power tore, and whether the last one has no end yet: it must not
+        #: become part of the next.
+        self.torn = torn
+        self._torn = not _ends_with_newline(self._file)
+        for identity in sorted(self._open):
+            self.finish(identity, STOPPED, started.isoformat())
+
+    def begin(self, record: Record) -> None:
+        """Keep a record without result.
+
+        Raises
+        ------
+        AuditError
+            If it could not be written and synced.
+        InputError
+            An identity that was used before.
+        """
+        if record.identity in self._known:
+            raise InputError(f"audit: a record {record.identity} exists; identities are unique")
+        fields = asdict(record)
+        del fields["result"], fields["finished"]
+        self._append({"event": "accepted", **fields})
+        self._known.add(record.identity)
+        self._open.add(record.identity)
+
+    def finish(self, identity: str, result: str, at: str) -> None:
+        """Add the result to a record.
+
+        Raises
+        ------
+        AuditError
+            If it could not be written and synced.
+        InputError
+            A record that was not begun, or has its result.
+        """
+        if identity not in self._open:
+            raise InputError(f"audit: no record {identity} waits for a result")
+        line = {"event": "result", "identity": identity, "result": result, "finished": at}
+        self._append(line)
+        self._open.discard(identity)
+
+    def confirm(self) -> None:
+        """See that a record could be written now: the disk takes it and has room.
+
+        Raises
+        ------
+        AuditError
+            If not.
+        """
+        try:
+            os.fsync(self._file)
+            disk = os.fstatvfs(self._file)
+        except OSError as error:
+            raise AuditError(f"audit {self.path}: {error.strerror}") from None
+        if disk.f_bavail * disk.f_frsize < LEAST_FREE:
+            raise AuditError(
+                f"audit {self.path}: {disk.f_bavail * disk.f_frsize} bytes are left on its disk, "
+                f"below {LEAST_FREE}; make room"
+            )
+
+    def close(self) -> None:
+        """Close the file."""
+        os.close(self._file)
+
+    def _append(self, fields: dict[str, Any]) -> None:
+        line = json.dumps(fields, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+        data = (b"\n" if self._torn else b"") + line.encode() + b"\n"
+        try:
+            # One write: with O_APPEND it lands whole behind whatever is there.
+            written = os.write(self._file, data)
+            os.fsync(self._file)
+        except OSError as error:
+            self._torn = True
+            raise AuditError(f"audit {self.path}: {error.strerror}; see to its disk") from None
+        self._torn = written != len(data)
+        if self._torn:
+            raise AuditError(f"audit {self.path}: only {written} of {len(data)} bytes written")
+
+
+def _ends_with_newline(file: int) -> bool:
+    size = os.fstat(file).st_size
+    return size == 0 or os.pread(file, 1, size - 1) == b"\n"
+
+
+def read(path: str | Path) -> tuple[list[Record], int]:
+    """Return all records of a file in the order of their beginning, and how many lines are torn.
+
+    Raises
+    ------
+    FormatError
+        Two beginnings or two results of one identity, or a result of a record that was not begun.
+    """
+    records: dict[str, Record] = {}
+    torn = 0
+    data = Path(path).read_bytes()
+    for number, line in enumerate(data.split(b"\n"), 1):
+        if not line:
+            continue
+        try:
+            fields = json.loads(line)
+            event, identity = fields.pop("event"), fields["identity"]
+        except (ValueError, KeyError, AttributeError, TypeError):
+            torn += 1
+            continue
+        known = records.get(identity)
+        if (known is not None) == (event == "accepted") or (known is not None and known.result):
+            # The write of a line may have come through although its syncing failed.
+            if known is not None and _repeats(known, event, fields):
+                continue
+            raise FormatError(
+                path, f"{event!r} of record {identity} does not fit what stands before",
+                f"line {number}",
+            )  # fmt: skip
+        if known is None:
+            fields["values"] = tuple(fields.get("values", ()))
+            fields["heliostats"] = tuple(fields.get("heliostats", ()))
+            try:
+                records[identity] = Record(**fields)
+            except TypeError as error:
+                raise FormatError(path, f"no record: {error}", f"line {number}") from None
+        else:
+            records[identity] = replace(known, result=fields["result"], finished=fields["finished"])
+    return list(records.values()), torn
+
+
+def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
+    """Whether a line says what is known already."""
+    if event == "result":
+        return bool(known.result == fields["result"])
+    names = ("who", "what", "at")
+    return all(str(getattr(known, name)) == fields.get(name) for name in names)

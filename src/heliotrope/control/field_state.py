@@ -1,0 +1,238 @@
+"""The state of the whole field in one table, each row with its age.
+
+Rows come from the clusters' `protocol.Status`. A row is as old as the answer of its local
+controller: what the cluster says of its age when it sent it, and the time since. A row that is
+older than the limit is stale, and its values are masked wherever they are asked for: what is
+not known is never shown as if it were (invariant 11).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control.protocol import NEVER, NODE, Status
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+
+#: Age from which a row is stale, s: three polls were missed.
+STALE = 3.0
+
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class HeliostatState:
+    """One heliostat.
+
+    Attributes
+    ----------
+    name, cluster
+        Whose.
+    age
+        Of all the following, s; infinite if it was never heard.
+    live
+        Whether it is younger than the limit. If not, ``state`` is "" and nothing else counts.
+    state, fault, flags
+        In words.
+    counts, goals
+        Steps of the two axes, and where they go, (2,).
+    """
+
+    name: str
+    cluster: str
+    age: float
+    live: bool
+    state: str = ""
+    fault: str = ""
+    flags: tuple[str, ...] = ()
+    counts: tuple[int, int] = (0, 0)
+    goals: tuple[int, int] = (0, 0)
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        if not self.live:
+            since = f"for {self.age:.0f} s" if math.isfinite(self.age) else "yet"
+            return f"{self.name}: not heard {since}"
+        fault = f", {self.fault}" if self.fault != "none" else ""
+        return f"{self.name}: {self.state}{fault}"
+
+
+class FieldState:
+    """N heliostats of C clusters.
+
+    Parameters
+    ----------
+    clusters
+        Names of the heliostats by name of the cluster.
+    limit
+        Age from which a row is stale, s.
+
+    Attributes
+    ----------
+    names, index
+        Names, N of them, and their rows.
+    clusters, cluster
+        Names of the clusters, and which one each heliostat hangs on, (N,).
+    rows
+        Last known rows of dtype `NODE`, (N,): use `values`, which masks what is stale.
+    heard
+        When each row was true, monotonic s, (N,); minus infinity if never.
+
+    Raises
+    ------
+    InputError
+        No heliostats, or one in two clusters.
+    """
+
+    def __init__(self, clusters: Mapping[str, Sequence[str]], limit: float = STALE) -> None:
+        self.clusters = tuple(clusters)
+        pairs = [(name, c) for c, held in enumerate(clusters.values()) for name in held]
+        self.names = tuple(name for name, _ in pairs)
+        self.index = {name: row for row, name in enumerate(self.names)}
+        if len(self.index) != len(pairs) or not pairs:
+            twice = sorted({name for name in self.names if self.names.count(name) > 1})
+            raise InputError(
+                f"field: heliostat {twice[0]} is in two clusters; a name stands once"
+                if twice else "field: no cluster has a heliostat; give at least one"
+            )  # fmt: skip
+        self.cluster = np.array([c for _, c in pairs], dtype=np.intp)
+        self.limit = limit
+        self.rows: npt.NDArray[Any] = np.zeros(len(pairs), NODE)
+        self.heard = np.full(len(pairs), -np.inf)
+        self.failed_at = np.full(len(pairs), -np.inf)
+        self.status_at = dict.fromkeys(self.clusters, -math.inf)
+        self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def take(self, cluster: str, status: Status, at: float) -> list[str]:
+        """Take a status that came at ``at`` (monotonic s); return what is wrong with it.
+
+        Raises
+        ------
+        ProtocolError
+            If its block is no whole number of rows.
+        """
+        nodes = status.nodes()
+        if status.names:
+            self._places[cluster] = (status.names, self._rows_of(cluster, status.names))
+        known = self._places.get(cluster)
+        if known is None:
+            return [f"cluster {cluster}: status without names; which rows it holds is not known"]
+        reported, places = known
+        if len(nodes) != len(reported):
+            return [f"cluster {cluster}: {len(nodes)} rows for {len(reported)} names"]
+        self.status_at[cluster] = at
+        problems = [
+            f"cluster {cluster}: it reports {name}, which is not its own; correct a configuration"
+            for name, place in zip(reported, places, strict=True)
+            if place < 0 and status.names
+        ]
+        good = (places >= 0) & (nodes["heard_ms"] != NEVER) & (nodes["state"] < len(states.STATES))
+        mine, new = places[good], nodes[good]
+        self._note_failures(mine, new, at)
+        self.rows[mine] = new
+        self.heard[mine] = at - 1e-3 * new["heard_ms"].astype(np.float64)
+        return problems
+
+    def _rows_of(self, cluster: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
+        """Return the row of each name, -1 for what is not of this cluster."""
+        c = self.clusters.index(cluster)
+        rows = [self.index.get(name, -1) for name in names]
+        return np.array([r if r >= 0 and self.cluster[r] == c else -1 for r in rows], np.intp)
+
+    def _note_failures(self, mine: npt.NDArray[np.intp], new: npt.NDArray[Any], at: float) -> None:
+        """Note who failed: fell into FAULT, or fell silent while its cluster talks."""
+        known = np.isfinite(self.heard[mine])
+        before = self.rows["state"][mine] == states.FAULT
+        faulty = known & ~before & (new["state"] == states.FAULT)
+        silent = 1e-3 * new["heard_ms"].astype(np.float64) > self.limit
+        was_silent = 1e-3 * self.rows["heard_ms"][mine].astype(np.float64) > self.limit
+        self.failed_at[mine[faulty | (known & silent & ~was_silent)]] = at
+
+    def forget_order(self, cluster: str) -> None:
+        """Forget the order of a cluster's rows, as a new connection begins."""
+        self._places.pop(cluster, None)
+
+    def place(self, name: str) -> int:
+        """Return the row of a heliostat.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name.
+        """
+        row = self.index.get(name)
+        if row is None:
+            raise UnknownNameError("heliostat", name, self.names)
+        return row
+
+    def age(self, now: float) -> FloatArray:
+        """Return the age of each row, s, (N,); infinite if never heard."""
+        return as_float(now - self.heard)
+
+    def live(self, now: float) -> Mask:
+        """Return which rows are younger than the limit, (N,)."""
+        return np.asarray(self.age(now) <= self.limit)
+
+    def values(self, field: str, now: float) -> "np.ma.MaskedArray[Any, Any]":
+        """Return one column of `NODE`, (N,), masked where it is stale.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such column.
+        """
+        if field not in (NODE.names or ()):
+            raise UnknownNameError("value of a heliostat", field, NODE.names or ())
+        return np.ma.MaskedArray(self.rows[field].copy(), mask=~self.live(now))
+
+    def among(self, wanted: Sequence[int], now: float) -> Mask:
+        """Return which heliostats are live and in one of some states, (N,)."""
+        return np.asarray(self.live(now) & np.isin(self.rows["state"], list(wanted)))
+
+    def counted(self, now: float) -> dict[str, int]:
+        """Return how many heliostats are in each state; those not live under "stale"."""
+        live = self.live(now)
+        found = np.bincount(self.rows["state"][live], minlength=len(states.STATES))
+        counts = {name: int(n) for name, n in zip(states.STATES, found, strict=True) if n}
+        stale = len(self) - int(live.sum())
+        return {**counts, "stale": stale} if stale else counts
+
+    def failed_share(self, now: float, span: float = 600.0) -> float:
+        """Return the share of heliostats that failed within a span, s."""
+        return float(np.mean(now - self.failed_at < span))
+
+    def of(self, name: str, now: float) -> HeliostatState:
+        """Return one heliostat.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name.
+        """
+        row = self.place(name)
+        cluster = self.clusters[self.cluster[row]]
+        age = float(self.age(now)[row])
+        if not age <= self.limit:
+            return HeliostatState(name, cluster, age, live=False)
+        node = self.rows[row]
+        fault = int(node["fault"])
+        flags = int(node["flags"])
+        known = fault < len(meanings.FAULTS)
+        return HeliostatState(
+            name, cluster, age, live=True,
+            state=states.STATES[int(node["state"])],
+            fault=meanings.FAULTS[fault] if known else f"fault {fault}",
+            flags=tuple(flag for i, flag in enumerate(meanings.FLAGS) if flags >> i & 1),
+            counts=(int(node["primary"]), int(node["secondary"])),
+            goals=(int(node["primary_goal"]), int(node["secondary_goal"])),
+        )  # fmt: skip
