@@ -1,0 +1,264 @@
+"""A board of a heliostat, true to the firmware: a real `lcu.node.Node` on simulated hardware.
+
+The board has flash, a millisecond counter, two motors with step timers, and a supply that may
+fail at any instant, within a write of flash too. `Board` is a `twin.bus.Station`; `step` lets its
+time go on. A `Witness` sees all that happens, and the board does not know what for.
+"""
+
+import contextlib
+import math
+import random
+from typing import Protocol
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.lcu.controller import Controller
+from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.node import Node
+from heliotrope.twin.clocks import TickCounter
+from heliotrope.twin.flash import NorFlash, PowerCutError
+from heliotrope.twin.motors import Axis
+from heliotrope.twin.outfit import STOW, Outfit, sha256
+
+#: Longest pauses between two looks of the main loop: while steps are made; while the sun is
+#: followed; at rest. A board looks far more often. This is the worst that the core allows for
+#: the first, and saves time for the others.
+MOVING, FOLLOWING, RESTING = 0.05, 0.1, 0.5
+
+
+class Witness(Protocol):
+    """Who sees what a board does."""
+
+    def acted(self, board: "Board", what: str, now: float) -> None:
+        """Note that a board has done something: "bytes", "tick", "boot" or "cut"."""
+        ...
+
+    def stepped(
+        self, board: "Board", axis: int, direction: int, count: int, interval_us: int
+    ) -> None:
+        """Note a segment that a board has ordered of its timer."""
+        ...
+
+
+class _Timer:
+    """The step timer that a node sees."""
+
+    def __init__(self, board: "Board") -> None:
+        self._board = board
+
+    def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
+        board = self._board
+        if board.witness is not None:
+            board.witness.stepped(board, axis, direction, count, interval_us)
+        board.axes[axis].take(direction, count, interval_us, board.now)
+
+    def stop(self) -> tuple[int, int]:
+        for axis in self._board.axes:
+            axis.play_to(self._board.now)
+        return self._board.axes[0].stop(), self._board.axes[1].stop()
+
+
+class Board:
+    """One local controller with its heliostat.
+
+    Parameters
+    ----------
+    outfit
+        What it is.
+    seed
+        Of flash, motors and chance.
+    ticks
+        Its counter of milliseconds.
+    play, miss
+        Of the motors; see `twin.motors.Axis`.
+
+    Attributes
+    ----------
+    node
+        None while the supply is off.
+    axes
+        Motors.
+    slip
+        By how much the motors stand beyond the node's counts: set at each boot, steps.
+    now
+        True time of what happens, in s.
+    tilt
+        What the accelerometer says, or None.
+    """
+
+    def __init__(
+        self,
+        outfit: Outfit,
+        *,
+        seed: int = 0,
+        ticks: TickCounter | None = None,
+        play: float = 0.0,
+        miss: float = 0.0,
+    ) -> None:
+        chance = random.Random(seed)
+        self.outfit = outfit
+        self.ticks = ticks or TickCounter()
+        self.flash = NorFlash(chance.getrandbits(32))
+        self.axes = [Axis(count, play, miss, random.Random(chance.random())) for count in STOW]
+        self.node: Node | None = None
+        self.witness: Witness | None = None
+        self.slip = [0, 0]
+        self.now = 0.0
+        self.tilt: tuple[float, float] | None = None
+        self._out = bytearray()
+        self._looked = -math.inf
+        self._restless = False
+        journal = Journal(self.flash)
+        journal.load()
+        journal.store(outfit.items)
+        journal.zero(*STOW)
+
+    # -- the supply --------------------------------------------------------------------
+
+    def power_on(self, now: float) -> None:
+        """Boot, unless it runs; flash may fail within the boot."""
+        if self.node is not None:
+            return
+        self.now = now
+        # Where the journal's counts are not those of the motors, the board slips.
+        journal = Journal(self.flash)
+        journal.load()
+        self.slip = [
+            axis.turned - count
+            for axis, count in zip(self.axes, (journal.primary, journal.secondary), strict=True)
+        ]
+        self._looked = -math.inf
+        try:
+            self.node = Node(
+                self.flash, _Timer(self), self._out.extend, self.ticks.at(now),
+                serial=self.outfit.serial, sha256=sha256, key=self.outfit.key,
+                sensor=lambda: self.tilt,
+            )  # fmt: skip
+        except PowerCutError:
+            self._die()
+            return
+        self._tell("boot")
+
+    def power_off(self, now: float, *, warned: bool = False) -> None:
+        """Cut the supply; ``warned``: the brown-out detector sees it come."""
+        self._to(now)
+        if self.node is None:
+            return
+        if warned:
+            with contextlib.suppress(PowerCutError):
+                self.node.on_supply_failing(self.ticks.at(now))
+        self._die()
+
+    def _die(self) -> None:
+        for axis in self.axes:
+            axis.play_to(self.now)
+            axis.stop()
+        self.flash.budget = None
+        self._out.clear()
+        self.node = None
+        self._tell("cut")
+
+    def _to(self, now: float) -> None:
+        self.now = now
+        for axis in self.axes:
+            if not axis.idle:
+                axis.play_to(now)
+
+    def _tell(self, what: str) -> None:
+        if self.witness is not None:
+            self.witness.acted(self, what, self.now)
+
+    # -- what happens ------------------------------------------------------------------
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        """Take bytes from the bus; return what it answers at once."""
+        self._to(now)
+        if self.node is None:
+            return b""
+        self._restless = True
+        try:
+            self.node.on_bytes(data, self.ticks.at(now))
+        except PowerCutError:
+            self._die()
+            return b""
+        self._tell("bytes")
+        return self._spoken()
+
+    def step(self, now: float) -> bytes:
+        """Let the main loop look once; return what it says by itself."""
+        self._to(now)
+        if self.node is None:
+            return b""
+        self._looked = now
+        self._restless = False
+        try:
+            self.node.on_tick(self.ticks.at(now))
+        except PowerCutError:
+            self._die()
+            return b""
+        self._tell("tick")
+        return self._spoken()
+
+    def _spoken(self) -> bytes:
+        out = bytes(self._out)
+        self._out.clear()
+        return out
+
+    def due(self, now: float) -> float:
+        """Return when the main loop should look next, in s: earlier is always allowed."""
+        node = self.node
+        if node is None:
+            return math.inf
+        if self._restless or not node.controller.motion.still():
+            return self._looked + MOVING
+        own = node.controller
+        busy = own.state in (states.APPROACHING, states.SEARCHING, states.STOWING)
+        pause = RESTING
+        if busy or own.motion.following():
+            pause = MOVING if busy else FOLLOWING
+        if own.sun.fresh():
+            # At the end of the lease it looks at once, as a board does.
+            left = (own.config.lease_ms - own.sun.age_ms() + 1) / 1000.0
+            pause = min(pause, max(0.0, now - self._looked) + left)
+        return self._looked + pause
+
+    # -- what is true ------------------------------------------------------------------
+
+    @property
+    def controller(self) -> Controller | None:
+        """The controller, None while the supply is off."""
+        return None if self.node is None else self.node.controller
+
+    @property
+    def state(self) -> int:
+        """State of `lcu.states`, -1 while the supply is off."""
+        return -1 if self.node is None else self.node.controller.state
+
+    def beam(self, sun: FloatArray, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Return vertex (3,) and direction (3,) of the reflected ray.
+
+        Parameters
+        ----------
+        sun
+            Direction to the sun, (3,).
+        believed
+            Whether what has slipped is taken out: where the node thinks that the beam goes.
+        """
+        counts = [axis.joint for axis in self.axes]
+        if believed:
+            counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
+        pose = self.outfit.mechanism.pose(counts)
+        normal, vertex = pose.normal, pose.vertex
+        return vertex, 2.0 * (normal @ sun) * normal - sun
+
+    def miss(
+        self, sun: FloatArray, point: "tuple[float, float, float]", *, believed: bool = False
+    ) -> float:
+        """Return how far the ray passes a point, m; infinite if it goes away from it."""
+        vertex, ray = self.beam(sun, believed=believed)
+        way = np.subtract(point, vertex)
+        if way @ ray <= 0.0:
+            return math.inf
+        return float(np.linalg.norm(np.cross(way, ray)))
