@@ -18,19 +18,9 @@ RANK = {
 FINAL = RANK[Stage.DONE]
 #: Commands that change no state: acknowledged is done.
 ACKNOWLEDGED_IS_DONE = frozenset(
-    (
-        "AIM",
-        "STANDBY",
-        "LOCK_AIM",
-        "ROUGH",
-        "PARAMETERS",
-        "JOG",
-        "GOTO",
-        "DIAGNOSE",
-        "UNLOCK",
-        "CLEAR_FAULT",
-    )
-)
+    {"AIM", "STANDBY", "LOCK_AIM", "ROUGH", "PARAMETERS", "JOG", "GOTO", "DIAGNOSE", "UNLOCK",
+     "CLEAR_FAULT"}
+)  # fmt: skip
 
 
 class Ticket:

@@ -44,19 +44,9 @@ class Role(IntEnum):
 
 #: Commands that an operator may give; all others of the wire need an engineer.
 OPERATOR_COMMANDS = frozenset(
-    (
-        "APPROACH",
-        "IDLE",
-        "TRACK",
-        "REFOCUS",
-        "LOCK",
-        "UNLOCK",
-        "AIM",
-        "STANDBY",
-        "LOCK_AIM",
-        "SEARCH",
-    )
-)
+    {"APPROACH", "IDLE", "TRACK", "REFOCUS", "LOCK", "UNLOCK", "AIM", "STANDBY", "LOCK_AIM",
+     "SEARCH"}
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -162,6 +162,10 @@ class FieldState:
         """Forget the order of a cluster's rows, as a new connection begins."""
         self._places.pop(cluster, None)
 
+    def knows_order(self, cluster: str) -> bool:
+        """Whether it is known which rows a cluster reports."""
+        return cluster in self._places
+
     def place(self, name: str) -> int:
         """Return the row of a heliostat.
 

@@ -187,20 +187,26 @@ class Wanted:
     items: dict[str, dict[str, bytes]] = field(default_factory=dict)
     missing: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:
-        """Want items of a heliostat, besides those that are wanted already.
+    def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
+        """See that items can be pushed.
 
         Raises
         ------
         InputError
-            An item that no plant sets, or one of a wrong length.
+            None, an item that no plant sets, or one of a wrong length.
         """
+        if not items:
+            raise InputError(f"{heliostat}: no items; give at least one, as items_of makes them")
         for name, data in items.items():
             if name in OWN or len(data) != SIZE_OF.get(name, -1):
                 raise InputError(
                     f"{heliostat}: item {name!r} of {len(data)} bytes cannot be pushed; give items "
                     "as items_of makes them"
                 )
+
+    def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:
+        """Want items of a heliostat, besides those that are wanted already; see `check`."""
+        self.check(heliostat, items)
         self.items[heliostat] = {**self.items.get(heliostat, {}), **items}
 
     def compare(self, heliostat: str, stored: Mapping[str, int]) -> tuple[str, ...]:

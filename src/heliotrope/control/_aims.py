@@ -1,0 +1,197 @@
+"""Which heliostat aims where, and whether its beam may go there."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control.beam_paths import Mirrors, Volume, beams, enter, move
+from heliotrope.errors import InputError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import Status, Tracking, track
+
+#: How far a beam that nothing stops is followed, m.
+FAR = 3000.0
+
+
+def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
+    """Return an aim point for each heliostat, (N, 3): each point is given as often as any other.
+
+    Neighbours in azimuth about the points get different ones, so that a cloud or a lost cluster
+    darkens all of them alike.
+
+    Parameters
+    ----------
+    vertices
+        Of the heliostats, ENU, m, (N, 3).
+    points
+        Aim points, ENU, m, (P, 3) or (3,).
+
+    Raises
+    ------
+    InputError
+        No points, or coordinates that are not finite.
+    """
+    places = np.atleast_2d(as_vectors(vertices, "vertices"))
+    targets = np.atleast_2d(as_vectors(points, "aim points"))
+    if not len(targets) or not np.isfinite(targets).all():
+        raise InputError(f"aim points: {len(targets)} of them; give at least one, finite, in ENU m")
+    away = places - targets.mean(axis=0)
+    order = np.lexsort((np.linalg.norm(away, axis=-1), np.arctan2(away[:, 0], away[:, 1])))
+    found = np.empty((len(places), 3))
+    found[order] = targets[np.arange(len(places)) % len(targets)]
+    return found
+
+
+def default_aims(
+    design: Plant, names: Sequence[str], vertices: FloatArray, points: npt.ArrayLike | None
+) -> dict[str, FloatArray]:
+    """Return an aim for each heliostat: points spread over them, else the design's own.
+
+    Parameters
+    ----------
+    design
+        Where a heliostat has no aim of its own, the centre of its first receiver is taken.
+    names, vertices
+        Heliostats, and where they are, ENU, m, (N, 3).
+    points
+        Aim points, (P, 3), in place of the design's; None: the design's.
+
+    Raises
+    ------
+    InputError
+        If there is nothing to aim at.
+    """
+    if points is not None:
+        return dict(zip(names, spread(vertices, points), strict=True))
+    centre = design.receivers[0].center if design.receivers else np.full(3, np.nan)
+    found = {}
+    for name in names:
+        group, row = design.find(name)
+        own = centre if group.aim is None else group.aim[row]
+        found[name] = own = own if np.isfinite(own).all() else centre
+        if not np.isfinite(own).all():
+            raise InputError(f"heliostat {name}: no aim and no receiver; give aim points")
+    return found
+
+
+class BeamCheck:
+    """Knows mirrors and keep-out volumes; says which beams may not go where they are wanted.
+
+    Parameters
+    ----------
+    design
+        The plant, with calibrated mechanisms.
+    names
+        Of the N heliostats, in the order of all arrays here.
+    volumes
+        Where no beam may be.
+    """
+
+    def __init__(self, design: Plant, names: Sequence[str], volumes: Sequence[Volume]) -> None:
+        place = {name: i for i, name in enumerate(design.names)}
+        rows = np.array([place[name] for name in names], dtype=np.intp)
+        self.names, self.volumes = tuple(names), tuple(volumes)
+        self.armature = Armature(design.armature.table[rows])
+        self.drives = Drive(design.drives.table[rows])
+        groups = design.groups.values()
+        sizes = [np.concatenate([getattr(g, what) for g in groups])[rows]
+                 for what in ("width", "height")]  # fmt: skip
+        self.mirrors = Mirrors.of(*sizes)
+
+    def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
+        """Take a heliostat's new calibration: rows (18,) and (2, 19)."""
+        self.armature.table[row] = armature
+        self.drives.table[row] = drives
+
+    def poses(self, rows: npt.NDArray[np.intp], aims: FloatArray, sun: FloatArray) -> Tracking:
+        """Return the poses for aims (K, 3) of heliostats ``rows`` (K,)."""
+        # By night nothing moves; the pose for a sun overhead tells as much of the beam's way.
+        source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
+        return track(
+            Armature(self.armature.table[rows]), source, aims, drives=Drive(self.drives.table[rows])
+        )
+
+    def problems(
+        self,
+        rows: npt.NDArray[np.intp],
+        aims: FloatArray,
+        sun: FloatArray,
+        *,
+        start: FloatArray,
+        stopped: bool,
+    ) -> dict[str, str]:
+        """Return why heliostats may not aim at points, by name; empty if all may.
+
+        Parameters
+        ----------
+        rows
+            Of the heliostats, (K,).
+        aims
+            ENU, m, (K, 3).
+        sun
+            Unit vector, (3,).
+        start
+            Points where their beams are before, (K, 3), NaN where on no point: the sweep from
+            there is proven too.
+        stopped
+            Whether something stands at the aim that stops the beam (receiver, target). What
+            comes to a standby point goes on beyond it.
+        """
+        found: dict[str, str] = {}
+        solved = self.poses(rows, aims, sun)
+        status = solved.chosen(solved.status)
+        for i in np.flatnonzero(status != Status.OK):
+            found[self.names[rows[i]]] = (
+                f"the aim {_point(aims[i])} m: {Status(int(status[i])).text}"
+            )
+        if not self.volumes:
+            return found
+        vertex = solved.chosen(solved.vertex)
+        part = _rows_of(self.mirrors, rows)
+        reach = np.linalg.norm(aims - vertex, axis=-1) if stopped else np.full(len(rows), FAR)
+        rest = enter(beams(vertex, aims, part, reach=reach), self.volumes)
+        self._tell(found, rows, rest.entered, rest.first, "at the aim")
+        swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == Status.OK))
+        if swept.size and sun[2] > 0.0:
+            self._sweep(found, rows[swept], start[swept], solved, swept, sun)
+        return found
+
+    def _sweep(
+        self, found: dict[str, str], rows: npt.NDArray[np.intp], start: FloatArray,
+        solved: Tracking, which: npt.NDArray[np.intp], sun: FloatArray,
+    ) -> None:  # fmt: skip
+        """Add what is in the way from a start to the solved poses."""
+        before = self.poses(rows, start, sun)
+        good = before.chosen(before.status) == Status.OK
+        ends = solved.chosen(solved.angles)[which]
+        path = np.stack([before.chosen(before.angles), ends], axis=-2)[good]
+        if not len(path):
+            return
+        rows = rows[good]
+        armature, mirrors = Armature(self.armature.table[rows]), _rows_of(self.mirrors, rows)
+        motion = move(armature, path, sun, mirrors, self.volumes, reach=FAR)
+        self._tell(found, rows, motion.entered, motion.distance, "on its way there")
+
+    def _tell(
+        self, found: dict[str, str], rows: npt.NDArray[np.intp], entered: npt.NDArray[np.bool_],
+        distance: FloatArray, when: str,
+    ) -> None:  # fmt: skip
+        for i in np.flatnonzero(entered.any(axis=-1)):
+            v = int(np.flatnonzero(entered[i])[0])
+            found.setdefault(
+                self.names[rows[i]],
+                f"the beam enters {self.volumes[v].name} {distance[i, v]:.0f} m from the mirror "
+                f"{when}; choose another point",
+            )
+
+
+def _rows_of(mirrors: Mirrors, rows: npt.NDArray[np.intp]) -> Mirrors:
+    return Mirrors(**{name: values[rows] for name, values in vars(mirrors).items()})
+
+
+def _point(point: FloatArray) -> str:
+    return "(" + ", ".join(f"{x:.1f}" for x in point) + ")"

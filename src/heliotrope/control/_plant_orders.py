@@ -1,0 +1,240 @@
+"""Accepted commands under way: their records, their messages, what came of them."""
+
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from heliotrope.control._cluster_end import ClusterEnd
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.audit import Audit, AuditError, Record
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import Outcome
+from heliotrope.control.protocol import Command, Emergency, Parameters, Progress, Stage
+from heliotrope.control.safety import Act
+from heliotrope.errors import InputError
+
+#: What a cluster may need beyond a command's life to say that it failed, s.
+GRACE = 3.0
+
+
+@dataclass(frozen=True)
+class _Under:
+    """One message under way."""
+
+    ticket: Ticket
+    cluster: str
+    heliostats: tuple[str, ...]
+
+
+class PlantOrders:
+    """The desk over which every accepted command goes.
+
+    Parameters
+    ----------
+    clock
+        Of the plant.
+    audit
+        Where records are kept.
+    ends
+        Clusters by name.
+    prefix
+        Of identities; no two runs of a plant may have the same.
+    lifetime, patience
+        Of a command until it is acknowledged, and then until it is done, s.
+
+    Attributes
+    ----------
+    confirmed_at
+        When the audit last confirmed that it can write, monotonic s.
+    problem
+        Why it does not, "" if it does.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        audit: Audit,
+        ends: Mapping[str, ClusterEnd],
+        prefix: str,
+        lifetime: float,
+        patience: float,
+    ) -> None:
+        self._clock, self._audit, self._ends = clock, audit, ends
+        self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
+        self._home = {name: end.name for end in ends.values() for name in end.members}
+        self._number = self._messages = 0
+        self._open: dict[str, Ticket] = {}
+        self._under: dict[str, _Under] = {}
+        self._owed: list[Callable[[], None]] = []
+        self.confirmed_at = clock.monotonic()
+        self.problem = ""
+
+    @property
+    def open(self) -> tuple[Ticket, ...]:
+        """Commands that have not come to their end."""
+        return tuple(self._open.values())
+
+    def accept(
+        self, record: tuple[str, str, str], values: Sequence[float], heliostats: Sequence[str],
+        note: str = "", *, late: bool = False,
+    ) -> Ticket:  # fmt: skip
+        """Accept a command: its record is safe when this returns.
+
+        Parameters
+        ----------
+        record
+            Who, in which role, what.
+        values, heliostats, note
+            For the record, and the ticket.
+        late
+            The record may follow: DEFOCUS and STOW wait for nothing.
+
+        Raises
+        ------
+        AuditError
+            If the record could not be written, unless it may follow.
+        """
+        self._number += 1
+        who, role, what = record
+        identity = f"{self._prefix}-{self._number}"
+        whom = () if len(heliostats) == len(self._home) else tuple(heliostats)
+        entry = Record(identity, who, role, what, self._utc(), tuple(values), whom, note)
+        if late:
+            self._owed.append(lambda: self._audit.begin(entry))
+        else:
+            self._audit.begin(entry)
+            self.confirmed_at = self._clock.monotonic()
+        ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
+        self._open[identity] = ticket
+        return ticket
+
+    def note(self, who: str, role: str, what: str, note: str) -> None:
+        """Record what is done as soon as it is said, such as a change of the authority."""
+        ticket = self.accept((who, role, what), (), (), note, late=True)
+        del self._open[ticket.identity]
+        self._owe_result(ticket.identity, "done")
+
+    def pay(self) -> None:
+        """Write the records that are owed, in their order, as far as the audit takes them."""
+        try:
+            while self._owed:
+                self._owed[0]()
+                del self._owed[0]
+            self._audit.confirm()
+            self.confirmed_at, self.problem = self._clock.monotonic(), ""
+        except AuditError as error:
+            self.problem = str(error)
+
+    # Sending.
+
+    def command(
+        self, ticket: Ticket, name: str, values: tuple[float, ...], heliostats: Iterable[str],
+        token: int,
+    ) -> None:  # fmt: skip
+        """Send a command to some of a ticket's heliostats."""
+        for end, part in self._by_cluster(heliostats):
+            identity = self._begin(ticket, end, part)
+            whom = () if len(part) == len(end.members) else part
+            message = Command(identity, name, values, whom, token, self._lifetime)
+            end.post(message, self._lifetime, self._told(identity))
+
+    def emergency(self, ticket: Ticket, act: Act, heliostats: Iterable[str]) -> None:
+        """Send DEFOCUS or STOW, before all else that has not gone out."""
+        for end, part in self._by_cluster(heliostats):
+            identity = self._begin(ticket, end, part)
+            whom = () if len(part) == len(end.members) else part
+            end.post(Emergency(identity, act.name, whom), None, self._told(identity), urgent=True)
+
+    def parameters(
+        self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int
+    ) -> None:
+        """Send items of one heliostat."""
+        for end, part in self._by_cluster([heliostat]):
+            identity = self._begin(ticket, end, part)
+            message = Parameters.of(identity, heliostat, items, token)
+            ticket.expect(part, self._clock.monotonic() + message.lifetime + GRACE)
+            end.post(message, message.lifetime, self._told(identity))
+
+    def _by_cluster(
+        self, heliostats: Iterable[str]
+    ) -> Iterable[tuple[ClusterEnd, tuple[str, ...]]]:
+        parts: dict[str, list[str]] = {}
+        for name in heliostats:
+            parts.setdefault(self._home[name], []).append(name)
+        return [(self._ends[cluster], tuple(part)) for cluster, part in parts.items()]
+
+    def _begin(self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...]) -> str:
+        self._messages += 1
+        identity = f"{ticket.identity}.{self._messages}"
+        self._under[identity] = _Under(ticket, end.name, part)
+        ticket.expect(part, self._clock.monotonic() + self._lifetime + GRACE)
+        return identity
+
+    def _told(self, identity: str) -> Callable[[Outcome], None]:
+        def told(outcome: Outcome) -> None:
+            under = self._under.get(identity)
+            # An emergency is sent again until it is acknowledged.
+            if under is None or outcome is Outcome.SENT or under.ticket.name in ("DEFOCUS", "STOW"):
+                return
+            text = f"cluster {under.cluster}: {outcome.value}"
+            under.ticket.advance(under.heliostats, Stage.FAILED, text)
+
+        return told
+
+    # What comes back.
+
+    def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
+        """Take a stage; return its ticket and heliostats, None if it is of nothing known here."""
+        under = self._under.get(progress.identity)
+        if under is None or under.cluster != cluster:
+            return None
+        mine = set(under.heliostats)
+        part = tuple(name for name in progress.heliostats if name in mine)
+        # Without a heliostat it is about all of them.
+        part = part if progress.heliostats else under.heliostats
+        under.ticket.advance(part, progress.stage, progress.text)
+        return under.ticket, part
+
+    def beat(self, now: float) -> None:
+        """End what was not answered in time, and note the results of what has ended."""
+        ended = set()
+        for identity, ticket in self._open.items():
+            ticket.expire(now)
+            if ticket.finished:
+                ended.add(identity)
+                self._owe_result(identity, ticket.text)
+        if ended:
+            self._open = {key: t for key, t in self._open.items() if key not in ended}
+            self._under = {
+                key: u for key, u in self._under.items() if u.ticket.identity not in ended
+            }
+
+    def _owe_result(self, identity: str, result: str) -> None:
+        at = self._utc()
+        self._owed.append(lambda: self._audit.finish(identity, result, at))
+
+    def _utc(self) -> str:
+        return self._clock.utc().isoformat(timespec="milliseconds")
+
+
+def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...]:
+    """Return a command's numbers if they fit the wire's codes.
+
+    Raises
+    ------
+    InputError
+        Another number of them, or one out of range.
+    """
+    if len(values) != len(codes):
+        raise InputError(f"{command}: {len(values)} numbers given; the wire takes {len(codes)}")
+    checked: list[float] = [
+        int(v) if code not in "fd" and float(v).is_integer() else v
+        for v, code in zip(values, codes, strict=True)
+    ]
+    try:
+        data = struct.pack("<" + codes, *checked)
+    except (struct.error, OverflowError) as error:
+        raise InputError(f"{command}: {tuple(values)} cannot be sent: {error}") from None
+    if not all(abs(v) < float("inf") for v in struct.unpack("<" + codes, data)):
+        raise InputError(f"{command}: {tuple(values)} cannot be sent: give finite numbers")
+    return tuple(float(v) for v in values)

@@ -1,0 +1,111 @@
+"""An emergency order: to whom it went, and the proof that it was carried out.
+
+Acknowledged is what a local controller has acknowledged, or what its state shows that was heard
+after the order. Done is judged by the state *and* by where the axes stand: off the beam means
+within `NEAR` of the goals of the defocus, whatever the state is called.
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control._emergency import Proof, ProofReport
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.protocol import Stage
+from heliotrope.control.safety import Act
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.mechanism.drives import Drive
+
+#: A mirror this close (rad) to the goal of its defocus is off the receiver.
+NEAR = 5e-3
+#: A mirror that goes to stow has left the receiver so long (s) after the order.
+LEAVING = 5.0
+#: In these states a beam is on its way to, or on, the receiver or the standby point.
+ON_BEAM = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
+_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
+
+Mask = npt.NDArray[np.bool_]
+
+
+class EmergencyOrder:
+    """One DEFOCUS or STOW of the whole field.
+
+    Attributes
+    ----------
+    act
+        `Act.DEFOCUS` or `Act.STOW`.
+    who, reason
+        Who gave it and why.
+    at
+        Monotonic s.
+    ticket
+        Its stages, heliostat by heliostat.
+    proof
+        See `safety.Proof`.
+    """
+
+    def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
+        self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
+        self.proof = Proof.of(act.name, ticket.heliostats, at)
+
+    def report(self, now: float) -> ProofReport:
+        """Return how far it has come."""
+        return self.proof.report(now)
+
+    def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
+        """Return which of some heliostats have not acknowledged it."""
+        return tuple(name for name in heliostats if name not in self.proof.acknowledged)
+
+    def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
+        """Take a cluster's progress."""
+        new = tuple(name for name in heliostats if name not in self.proof.acknowledged)
+        if stage is Stage.ACKNOWLEDGED and new:
+            self.proof = self.proof.with_news(acknowledged=new, at=now)
+        elif stage is Stage.DONE:
+            left = tuple(name for name in heliostats if name not in self.proof.done)
+            if left:
+                self.proof = self.proof.with_news(done=left, at=now)
+
+    def take_rows(
+        self,
+        names: tuple[str, ...],
+        rows: npt.NDArray[Any],
+        heard: npt.NDArray[np.float64],
+        drives: Drive,
+        now: float,
+    ) -> None:
+        """Take what is heard of heliostats (K,): rows of `NODE`, when they were true, drives."""
+        fresh = heard >= self.at
+        fulfilled = fresh & done(self.act, rows, drives, heard >= self.at + LEAVING)
+        ready = [names[i] for i in np.flatnonzero(fulfilled) if names[i] not in self.proof.done]
+        if ready:
+            self.proof = self.proof.with_news(done=ready, at=now)
+            self.ticket.advance(ready, Stage.DONE)
+
+
+def done(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
+    """Return which rows (K,) of `NODE` show that DEFOCUS or STOW is carried out.
+
+    Parameters
+    ----------
+    act
+        Which.
+    rows
+        As a cluster reports them.
+    drives
+        Of these heliostats, (K, 2).
+    settled
+        Whether a mirror on its way to stow has had the time to leave the receiver, (K,).
+    """
+    stowed = (rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0)
+    if act is Act.STOW:
+        return np.asarray(stowed)
+    counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
+    goals = np.stack([rows["primary_goal"], rows["secondary_goal"]], axis=-1).astype(np.float64)
+    left = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
+    off = ~np.isin(rows["state"], ON_BEAM)
+    # On the way to stow the goal is far away, but the beam has left all the same.
+    leaving = rows["state"] == states.STOWING
+    return np.asarray(stowed | (off & np.where(leaving, settled, left < NEAR)))

@@ -1,0 +1,641 @@
+"""The plant: the central controller of a field of clusters.
+
+It knows the state of every heliostat with its age, holds the one command authority, takes
+commands of persons, sends them to clusters and follows them to their end, tells every cluster
+each second that it is there, watches the safety table, and proves an emergency.
+
+Commands are accepted or refused at once (`RefusedError`, with the reason); what is accepted has
+its record in the audit before it is sent, and a `Ticket` to await. DEFOCUS and STOW are taken
+from anybody, and wait for nothing. Nothing moves by itself: neither at the start nor after an
+emergency.
+"""
+
+import asyncio
+import math
+import secrets
+from collections import deque
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import sun
+from heliotrope.control._aims import BeamCheck, default_aims
+from heliotrope.control._cluster_end import ClusterEnd
+from heliotrope.control._joining import Job, JoinQueue
+from heliotrope.control._plant_orders import PlantOrders, whole
+from heliotrope.control._plant_watch import PlantWatch
+from heliotrope.control._sentinel import Sentinel
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.audit import Audit, AuditError
+from heliotrope.control.authority import Authority, Grant, Person, RefusedError, Role
+from heliotrope.control.beam_paths import Volume
+from heliotrope.control.clock import Clock, sleep_until
+from heliotrope.control.emergency import EmergencyOrder
+from heliotrope.control.field_state import FieldState
+from heliotrope.control.link import Link, messages
+from heliotrope.control.parameters import CALIBRATION_ITEMS, Wanted
+from heliotrope.control.plant_settings import Counters, PlantSettings, clusters_of
+from heliotrope.control.protocol import (
+    Alarm,
+    Answer,
+    Ask,
+    Lease,
+    Progress,
+    ProtocolError,
+    Status,
+    decode,
+)
+from heliotrope.control.safety import Act, Condition, conditions
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.lcu import messages as wire
+from heliotrope.lcu import states
+
+#: Commands that bring beams to the receiver or move them across it.
+JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
+#: Commands that points are given with; `PlantController.aim` and `standby` check their beams.
+POINTS = frozenset({"AIM", "STANDBY"})
+#: In these states a beam is at its aim, or at its standby point.
+_ON_AIM = (states.TRACKING, states.SEARCHING)
+#: States in which a controller takes items of its calibration, and items of its machine.
+_TAKES_CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT,
+                      states.IDLE, states.DEFOCUSED)  # fmt: skip
+_TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
+
+
+class PlantController:
+    """The central controller.
+
+    Parameters
+    ----------
+    design
+        Site, heliostats, receivers, targets.
+    links
+        To each cluster, by its name.
+    clock
+        Its monotonic time decides everything.
+    audit
+        Of accepted commands.
+    clusters
+        Names of the heliostats of each cluster; None: as the design says.
+    settings
+        Times and limits.
+    volumes
+        Where no beam may be.
+    wanted
+        What local controllers should hold.
+    table
+        Safety rows; None: the defaults at the autonomy of the settings.
+    entropy
+        Random bytes, for tokens and identities.
+    on_alarm
+        Called with each alarm.
+
+    Attributes
+    ----------
+    design, field, authority, wanted, counters
+        See their classes.
+    alarms
+        The last ones, oldest first.
+    aims, standbys
+        What was assigned, ENU, m, (N, 3); NaN before.
+
+    Raises
+    ------
+    InputError
+        Clusters without a link, or links without a cluster.
+    UnknownNameError
+        A cluster has a heliostat that the design does not know.
+    """
+
+    def __init__(
+        self,
+        design: Plant,
+        links: Mapping[str, Link],
+        clock: Clock,
+        audit: Audit,
+        *,
+        clusters: Mapping[str, Sequence[str]] | None = None,
+        settings: PlantSettings | None = None,
+        volumes: Sequence[Volume] = (),
+        wanted: Wanted | None = None,
+        table: Iterable[Condition] | None = None,
+        entropy: Callable[[int], bytes] = secrets.token_bytes,
+        on_alarm: Callable[[Alarm], None] | None = None,
+    ) -> None:
+        held = clusters_of(design) if clusters is None else clusters
+        if set(held) != set(links):
+            odd = sorted(set(held) ^ set(links))
+            raise InputError(f"plant: cluster {odd[0]} has heliostats or a link, not both")
+        for name in (name for names in held.values() for name in names):
+            design.find(name)
+        self.design, self.settings = design, settings or PlantSettings()
+        self.field = FieldState(held, self.settings.stale)
+        self.authority = Authority(clock, self.settings.authority, entropy)
+        self.wanted = wanted or Wanted()
+        self.counters = Counters()
+        self.alarms: deque[Alarm] = deque(maxlen=1000)
+        self._clock, self._audit, self._on_alarm = clock, audit, on_alarm
+        self._ends = {
+            name: ClusterEnd(name, tuple(held[name]), links[name], clock) for name in held
+        }
+        prefix = f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}"
+        self._orders = PlantOrders(
+            clock, audit, self._ends, prefix, self.settings.lifetime, self.settings.patience
+        )
+        rows = conditions(self.settings.autonomy) if table is None else table
+        self._watch = PlantWatch(rows, tuple(held), self.settings.sensors, clock.monotonic())
+        self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
+        self.beams = BeamCheck(design, self.field.names, volumes)
+        count = len(self.field)
+        self.aims, self.standbys = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+        self._sentinel = Sentinel(
+            clock, design.site, self.field, self._ends, self._orders, self._joining,
+            self.authority, self._watch, self.beams.drives, self.settings.repeat,
+        )  # fmt: skip
+        self._paid_at = -math.inf
+        self._tried: dict[str, float] = {}
+        self._answers: dict[str, asyncio.Future[Answer]] = {}
+        self._asked = 0
+        self._closing = asyncio.Event()
+
+    # Running.
+
+    async def run(self) -> None:
+        """Run until closed. If any part of it fails all of it ends, and with it the leases."""
+        async with asyncio.TaskGroup() as group:
+            parts: list[Coroutine[Any, Any, None]] = [self._beats()]
+            for end in self._ends.values():
+                parts += [end.link.run(), self._hear(end), self._keep(end)]
+                parts += [end.deliver(urgent=True), end.deliver(urgent=False)]
+            tasks = [group.create_task(part) for part in parts]
+            await self._closing.wait()
+            for end in self._ends.values():
+                await end.link.close()
+            for task in tasks:
+                task.cancel()
+        self._orders.pay()
+
+    async def close(self) -> None:
+        """End it, and the links; the clusters then defocus when their leases are over."""
+        self._closing.set()
+
+    async def _keep(self, end: ClusterEnd) -> None:
+        """Tell one cluster each second that the plant is there."""
+        while True:
+            due = self._clock.monotonic() + self.settings.period
+            if end.link.connected:
+                if not end.greeted:
+                    self._greet(end)
+                lease = Lease(self.authority.token, self.settings.lease, self.settings.autonomy)
+                # A lease counts from its arrival: an old one must not arrive at all.
+                end.post(lease, self.settings.period, urgent=True)
+                self.counters.leases += 1
+            else:
+                end.greeted = False
+            await sleep_until(self._clock, due)
+
+    def _greet(self, end: ClusterEnd) -> None:
+        """Begin with a cluster that has connected."""
+        end.greeted = True
+        self.field.forget_order(end.name)
+        self._ask(end, "names")
+        self._ask(end, "checksums")
+        # What was ordered while it was away holds for it too.
+        end.act = -1
+        self._sentinel.repeat([end])
+
+    def _ask(self, end: ClusterEnd, what: str, heliostat: str = "") -> str:
+        self._asked += 1
+        identity = f"{what}-{self._asked}"
+        end.post(Ask(identity, what, heliostat), 5.0)
+        return identity
+
+    async def _hear(self, end: ClusterEnd) -> None:
+        async for data in messages(end.link):
+            now = self._clock.monotonic()
+            try:
+                self._take(end, decode(data), now)
+            except ProtocolError as error:
+                self.counters.refused += 1
+                self.counters.problems.append(f"cluster {end.name}: {error}")
+
+    def _take(self, end: ClusterEnd, message: object, now: float) -> None:
+        match message:
+            case Status():
+                self._take_status(end, message, now)
+            case Progress():
+                found = self._orders.take(end.name, message)
+                if found is not None:
+                    self._sentinel.take_progress(*found, message)
+            case Alarm():
+                self._tell(Alarm(message.condition, message.subject or end.name,
+                                 message.severity, message.text, message.active))  # fmt: skip
+            case Answer():
+                self._take_answer(end, message)
+            case _:
+                raise ProtocolError(f"{type(message).__name__.lower()}: a cluster sends no such")
+
+    def _take_status(self, end: ClusterEnd, status: Status, now: float) -> None:
+        self.counters.statuses += 1
+        problems = self.field.take(end.name, status, now)
+        self.counters.problems.extend(problems)
+        if problems and not self.field.knows_order(end.name):
+            self._ask(end, "names")
+        self._sentinel.take_rows(end, now)
+
+    def _take_answer(self, end: ClusterEnd, answer: Answer) -> None:
+        waiting = self._answers.pop(answer.identity, None)
+        if waiting is not None and not waiting.done():
+            waiting.set_result(answer)
+        if not answer.identity.startswith("checksums-"):
+            return
+        for name, stored in answer.data.items():
+            if name in end.members and isinstance(stored, dict):
+                missing = self.wanted.compare(name, stored)
+                if missing:
+                    text = f"{name}: {', '.join(missing)} differ from what is wanted"
+                    self._tell(Alarm("parameters_differ", name, "warning", text))
+
+    # Time.
+
+    async def _beats(self) -> None:
+        while True:
+            due = self._clock.monotonic() + self.settings.beat
+            self._beat(self._clock.monotonic())
+            await sleep_until(self._clock, due)
+
+    def _beat(self, now: float) -> None:
+        for alarm in self._sentinel.beat(now):
+            self._tell(alarm)
+        token = self.authority.token
+        for job, part in self._joining.admit(now, token):
+            self._orders.command(job.ticket, job.name, job.values, part, token)
+        self._orders.beat(now)
+        if now - self._paid_at >= 1.0:
+            self._paid_at = now
+            self._orders.pay()
+            self._push(now)
+
+    def _push(self, now: float) -> None:
+        """Push what differs to controllers that are in a state to take it."""
+        token = self.authority.token
+        if not token or not self.wanted.missing or self._sentinel.refusal(self.field.clusters):
+            return
+        live = self.field.live(now)
+        for name, missing in list(self.wanted.missing.items()):
+            row = self.field.index.get(name)
+            if row is None or not live[row] or now - self._tried.get(name, -math.inf) < 60.0:
+                continue
+            state = int(self.field.rows["state"][row])
+            able = [
+                item for item in missing
+                if state in _TAKES_MACHINE
+                or (state in _TAKES_CALIBRATION and item in CALIBRATION_ITEMS)
+            ]  # fmt: skip
+            if able:
+                self._tried[name] = now
+                items = {item: self.wanted.items[name][item] for item in able}
+                ticket = self._orders.accept(
+                    ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able), late=True
+                )
+                self._orders.parameters(ticket, name, items, token)
+
+    def _tell(self, alarm: Alarm) -> None:
+        self.alarms.append(alarm)
+        if self._on_alarm is not None:
+            self._on_alarm(alarm)
+
+    # Anybody.
+
+    def defocus(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
+        """Take beams off the receiver now: of some heliostats, or of all; anybody may."""
+        return self._safe(who, Act.DEFOCUS, heliostats)
+
+    def stow(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
+        """Send heliostats to stow, or all; anybody may."""
+        return self._safe(who, Act.STOW, heliostats)
+
+    def _safe(self, who: str, act: Act, heliostats: Sequence[str]) -> Ticket:
+        for name in heliostats:
+            self.field.place(name)
+        whom = tuple(heliostats) or self.field.names
+        self._joining.drop(f"{act.name} by {who}", frozenset(whom))
+        return self._send_safe(who, "anybody", act, whom, "")
+
+    def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
+        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
+
+        It holds until it is withdrawn and the rows that it trips are acknowledged.
+
+        Raises
+        ------
+        InputError
+            Another act.
+        """
+        if act not in (Act.DEFOCUS, Act.STOW):
+            raise InputError(f"emergency: {act.name} is none; give DEFOCUS or STOW")
+        return self._sentinel.call(who, act, reason or f"emergency order of {who}")
+
+    def put(self, name: str, value: float, subject: str = "") -> None:
+        """Take a reading of the safety table from a sensor, taken now.
+
+        Raises
+        ------
+        UnknownNameError
+            If it is not one of the settings' sensors.
+        """
+        if name not in self._watch.sensors:
+            raise UnknownNameError("sensor of the plant", name, self._watch.sensors)
+        self._watch.put(name, value, self._clock.monotonic(), subject)
+
+    def put_flux(self, share: float) -> None:
+        """Take the flux on the receiver as a share of the nominal, measured now, as proof."""
+        order = self._sentinel.order
+        if order is not None:
+            order.proof = order.proof.with_flux(share, self._clock.monotonic())
+
+    @property
+    def emergency(self) -> EmergencyOrder | None:
+        """The last order to the whole field, None before the first."""
+        return self._sentinel.order
+
+    @property
+    def unwatched(self) -> tuple[str, ...]:
+        """Rows of the safety table that nobody gives readings for."""
+        return self._watch.unwatched
+
+    @property
+    def emergency_on(self) -> bool:
+        """Whether an emergency of the whole field holds."""
+        return self._sentinel.on
+
+    @property
+    def waiting(self) -> int:
+        """How many mirrors wait to join the receiver."""
+        return len(self._joining)
+
+    @property
+    def orders(self) -> tuple[Ticket, ...]:
+        """Commands that have not come to their end."""
+        return self._orders.open
+
+    def sun_vector(self) -> FloatArray:
+        """Return the unit vector to the sun now, ENU, (3,)."""
+        return sun.vector(self._clock.utc(), self.design.site)
+
+    def now(self) -> float:
+        """Return the monotonic time, s."""
+        return self._clock.monotonic()
+
+    # The authority.
+
+    def take_authority(self, person: Person) -> Grant:
+        """Take the command authority, if nobody has it.
+
+        Raises
+        ------
+        RefusedError
+            See `Authority.take`.
+        """
+        before = self.authority.token
+        grant = self.authority.take(person)
+        if grant.token != before:
+            self._orders.note(person.name, person.role.name.lower(), "AUTHORITY", "taken")
+        return grant
+
+    def seize_authority(self, person: Person, reason: str) -> Grant:
+        """Break another's command authority and take it.
+
+        Raises
+        ------
+        RefusedError
+            See `Authority.seize`.
+        """
+        before = self.authority.grant
+        grant = self.authority.seize(person, reason)
+        whom = "nobody" if before is None else before.holder.name
+        note = f"broken, from {whom}: {reason}"
+        self._orders.note(person.name, person.role.name.lower(), "AUTHORITY", note)
+        return grant
+
+    def release_authority(self, person: Person, token: int) -> None:
+        """Give the command authority back; what waits to join is dropped.
+
+        Raises
+        ------
+        RefusedError
+            If it is not theirs.
+        """
+        self.authority.release(person, token)
+        self._orders.note(person.name, person.role.name.lower(), "AUTHORITY", "released")
+
+    def withdraw_emergency(self, person: Person) -> None:
+        """Take an emergency order back; rows that it tripped wait for `acknowledge`.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer.
+        """
+        if person.role < Role.OPERATOR:
+            raise RefusedError(f"emergency: {person.name} is viewer; it needs operator")
+        self._sentinel.called = False
+        self._orders.note(person.name, person.role.name.lower(), "WITHDRAW", "emergency order")
+
+    def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
+        """Acknowledge a row of the safety table that waits for it.
+
+        Raises
+        ------
+        RefusedError
+            If the role is too low, or its cause has not gone.
+        """
+        role = person.role.acknowledges_as
+        if role is None:
+            raise RefusedError(f"{condition}: {person.name} is viewer; it needs operator")
+        refusal = self._watch.acknowledge(condition, person.name, role, subject)
+        if refusal:
+            raise RefusedError(refusal)
+        self._orders.note(
+            person.name, person.role.name.lower(), "ACKNOWLEDGE", f"{condition} {subject}".strip()
+        )
+
+    # Commands.
+
+    def command(
+        self, person: Person, token: int, name: str, heliostats: Sequence[str] = (),
+        values: Sequence[float] = (),
+    ) -> Ticket:  # fmt: skip
+        """Give a command of the wire to some heliostats, or to all.
+
+        Parameters
+        ----------
+        person, token
+            Who, with the token of the authority.
+        name, values
+            As in `lcu.messages`; for AIM and STANDBY see `aim` and `standby`.
+        heliostats
+            Names; () for all.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted; nothing is sent then.
+        InputError
+            An unknown name, or values that do not fit.
+        """
+        if name in ("DEFOCUS", "STOW"):
+            return self._safe(person.name, Act[name], heliostats)
+        row = wire.ROW_OF.get(wire.NUMBER_OF.get(name, -1))
+        if row is None or row[2] != wire.AUTHORITY or name in POINTS:
+            known = [r[1] for r in wire.MESSAGES if r[2] == wire.AUTHORITY and r[1] not in POINTS]
+            raise UnknownNameError("command (points are given by aim and standby)", name, known)
+        numbers = whole(values, row[3], name)
+        whom = tuple(dict.fromkeys(heliostats)) or self.field.names
+        ticket = self._accept(person, token, name, numbers, whom)
+        if name in JOINING:
+            self._join(ticket, name, numbers, whom, token)
+        else:
+            self._orders.command(ticket, name, numbers, whom, token)
+        return ticket
+
+    def default_aims(
+        self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
+    ) -> dict[str, FloatArray]:
+        """Return an aim for each heliostat (() for all), for `aim`; see `_aims.default_aims`."""
+        names = tuple(heliostats) or self.field.names
+        rows = np.array([self.field.place(name) for name in names], dtype=np.intp)
+        vertices = self.beams.armature.origin_1[rows]
+        return default_aims(self.design, names, vertices, points)
+
+    def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Aim heliostats at points that stop their beams: on the receiver or on a target.
+
+        Mirrors that track join their new aim as slowly as the receiver.
+
+        Parameters
+        ----------
+        person, token
+            Who, with the token of the authority.
+        points
+            ENU, m, (3,), by name.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted, or one of the beams may not go there.
+        """
+        return self._point(person, token, "AIM", points)
+
+    def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Set standby points, beyond which beams go on; see `aim`."""
+        return self._point(person, token, "STANDBY", points)
+
+    def parameters(
+        self, person: Person, token: int, heliostat: str, items: Mapping[str, bytes]
+    ) -> Ticket:
+        """Push items of the journal to one heliostat (see `control.parameters`), and want them.
+
+        Raises
+        ------
+        RefusedError
+            If it is not accepted.
+        InputError
+            Items that no plant pushes.
+        """
+        self.field.place(heliostat)
+        self.wanted.check(heliostat, items)
+        note = ", ".join(items)
+        ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
+        self.wanted.set(heliostat, items)
+        self._orders.parameters(ticket, heliostat, items, token)
+        return ticket
+
+    async def stored(self, heliostat: str, timeout: float = 10.0) -> dict[str, int]:
+        """Return the checksums of what a local controller holds, by item.
+
+        Raises
+        ------
+        RefusedError
+            If no answer comes.
+        """
+        row = self.field.place(heliostat)
+        end = self._ends[self.field.clusters[self.field.cluster[row]]]
+        identity = self._ask(end, "checksums", heliostat)
+        future = self._answers[identity] = asyncio.get_running_loop().create_future()
+        try:
+            async with asyncio.timeout(timeout):
+                answer = await future
+        except TimeoutError:
+            raise RefusedError(
+                f"{heliostat}: cluster {end.name} did not tell its checksums within {timeout:g} s"
+            ) from None
+        finally:
+            self._answers.pop(identity, None)
+        stored = answer.data.get(heliostat)
+        if not isinstance(stored, dict):
+            raise RefusedError(f"{heliostat}: cluster {end.name} told no checksums of it")
+        return {str(name): int(value) for name, value in stored.items()}
+
+    def _point(
+        self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
+    ) -> Ticket:
+        whom = tuple(points)
+        rows = np.array([self.field.place(n) for n in whom], dtype=np.intp)
+        if not whom:
+            raise InputError(f"{name}: no points; give one for each heliostat")
+        wanted = as_vectors(
+            np.stack([as_vectors(points[n], f"{n}: point") for n in whom]), "points"
+        )
+        tracking = self.field.among(_ON_AIM, self.now())[rows]
+        start = np.where(tracking[:, None], self.aims[rows], self.standbys[rows])
+        stopped = name == "AIM"
+        wrong = self.beams.problems(rows, wanted, self.sun_vector(), start=start, stopped=stopped)
+        if wrong:
+            first, text = next(iter(wrong.items()))
+            more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+            raise RefusedError(f"{name} {first}{more}: {text}")
+        groups: dict[tuple[float, ...], list[str]] = {}
+        for heliostat, point in zip(whom, wanted, strict=True):
+            groups.setdefault(tuple(float(x) for x in point), []).append(heliostat)
+        values = next(iter(groups)) if len(groups) == 1 else ()
+        ticket = self._accept(person, token, name, values, whom, f"{len(groups)} points")
+        (self.aims if stopped else self.standbys)[rows] = wanted
+        moving = {whom[i] for i in np.flatnonzero(tracking)} if stopped else set()
+        for point, members in groups.items():
+            still = [n for n in members if n not in moving]
+            if still:
+                self._orders.command(ticket, name, point, still, token)
+            if len(still) < len(members):
+                self._join(ticket, name, point, [n for n in members if n in moving], token)
+        return ticket
+
+    def _join(
+        self, ticket: Ticket, name: str, values: tuple[float, ...], heliostats: Sequence[str],
+        token: int,
+    ) -> None:  # fmt: skip
+        until = self.now() + self.settings.join_wait
+        self._joining.put(Job(ticket, name, values, token, deque(heliostats), until))
+
+    def _accept(
+        self, person: Person, token: int, name: str, values: tuple[float, ...],
+        heliostats: Sequence[str], note: str = "",
+    ) -> Ticket:  # fmt: skip
+        rows = [self.field.place(n) for n in heliostats]
+        self.authority.check(person, token, name)
+        clusters = {self.field.clusters[self.field.cluster[row]] for row in rows}
+        reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
+        if reason:
+            raise RefusedError(f"{name}: not accepted now: {reason}")
+        try:
+            return self._orders.accept(
+                (person.name, person.role.name.lower(), name), values, heliostats, note
+            )
+        except AuditError as error:
+            raise RefusedError(
+                f"{name}: not accepted, since it cannot be recorded: {error}"
+            ) from None
