@@ -4,7 +4,7 @@ A message is one line of JSON, then, after a newline, a block of bytes (empty bu
 and PARAMETERS). The line names its kind and holds its fields; unknown fields are ignored, so that
 a newer plant can talk to an older cluster; an unknown kind is refused with its name.
 
-Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`.
+Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`, `Acknowledge`.
 Cluster to plant: `Status`, `Progress`, `Alarm`, `Answer`.
 
 Whatever moves a mirror towards the receiver carries the authority's token and is sent with an
@@ -151,6 +151,20 @@ class Ask:
 
 
 @dataclass(frozen=True)
+class Acknowledge:
+    """A person acknowledges a latched row of the cluster's safety table (an `Alarm` of it).
+
+    ``role`` is the name of a `safety.Role`. `Progress` says DONE, or REFUSED and why.
+    """
+
+    kind: ClassVar[str] = "acknowledge"
+    identity: str
+    condition: str
+    who: str
+    role: str
+
+
+@dataclass(frozen=True)
 class Status:
     """Once a second: the cluster and all its heliostats.
 
@@ -222,10 +236,32 @@ class Answer:
     block: bytes = b""
 
 
-Message = Lease | Command | Emergency | Parameters | Ask | Status | Progress | Alarm | Answer
+Message = (
+    Lease
+    | Command
+    | Emergency
+    | Parameters
+    | Ask
+    | Acknowledge
+    | Status
+    | Progress
+    | Alarm
+    | Answer
+)
 _KINDS: dict[str, type[Any]] = {
     each.kind: each
-    for each in (Lease, Command, Emergency, Parameters, Ask, Status, Progress, Alarm, Answer)
+    for each in (
+        Lease,
+        Command,
+        Emergency,
+        Parameters,
+        Ask,
+        Acknowledge,
+        Status,
+        Progress,
+        Alarm,
+        Answer,
+    )
 }
 
 

@@ -1,0 +1,77 @@
+"""Questions of the plant: checksums, what is stored, statistics, and who is on the bus."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import Any
+
+from heliotrope.control._exchange import Exchange
+from heliotrope.control._nodes import Node
+from heliotrope.control._orders import stored
+from heliotrope.control._reports import Reports
+from heliotrope.control.cluster_config import ClusterConfig
+from heliotrope.control.protocol import Answer, Ask
+from heliotrope.lcu.journal import ITEMS
+
+_SECRET = "key_id"  # noqa: S105 (the name of an item that is never told)
+_PATIENCE = 5.0
+
+
+class Asked:
+    """Answers the plant's questions when nothing else is to be done."""
+
+    def __init__(
+        self, config: ClusterConfig, nodes: Sequence[Node], exchange: Exchange, reports: Reports,
+        clock: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self._config, self._nodes, self._exchange = config, nodes, exchange
+        self._reports, self._clock = reports, clock
+        self._waiting: deque[Ask] = deque(maxlen=64)
+
+    @property
+    def ready(self) -> bool:
+        """Whether a question waits for the bus."""
+        return bool(self._waiting)
+
+    def take(self, ask: Ask) -> None:
+        """Answer a question, or keep it until the bus is free."""
+        if ask.what == "checksums":
+            data = {node.name: node.status[7] for node in self._nodes if node.counts.answered}
+            self._reports.answer(Answer(ask.identity, data))
+        elif ask.what == "statistics":
+            self._reports.answer(Answer(ask.identity, self.statistics()))
+        elif ask.what == "stored":
+            self._waiting.append(ask)
+        else:
+            known = "checksums, stored, statistics, discover"
+            self._error(ask, f"question {ask.what!r} is not known; give one of {known}")
+
+    def statistics(self) -> dict[str, Any]:
+        """Return the counts of each node."""
+        now = self._clock()
+        return {
+            node.name: asdict(node.counts)
+            | {"heard_s": now - node.heard_at if node.counts.answered else None}
+            for node in self._nodes
+        }
+
+    async def serve(self) -> None:
+        """Answer the first question that waits."""
+        ask = self._waiting.popleft()
+        node = next((each for each in self._nodes if each.name == ask.heliostat), None)
+        if node is None:
+            self._error(ask, f"cluster {self._config.name} has no heliostat {ask.heliostat!r}")
+            return
+        found: dict[str, bytes] = {}
+        for name, _ in ITEMS:
+            if name != _SECRET:
+                data = await stored(self._exchange, node, name, self._clock() + _PATIENCE)
+                if data is None:
+                    self._error(ask, f"{node.name} does not answer")
+                    return
+                found[name] = data
+        data_of = {"names": list(found), "sizes": [len(data) for data in found.values()]}
+        self._reports.answer(Answer(ask.identity, data_of, b"".join(found.values())))
+
+    def _error(self, ask: Ask, text: str) -> None:
+        self._reports.answer(Answer(ask.identity, {"error": text}))

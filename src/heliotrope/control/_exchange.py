@@ -1,0 +1,147 @@
+"""Questions and commands of a cluster over its bus, counted by node; one thing at a time."""
+
+import hashlib
+from collections import deque
+from typing import Any, NamedTuple
+
+from heliotrope.control._nodes import Node, Question, answer_in
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import Bus, Outcome
+from heliotrope.lcu import messages, wire
+
+#: The share of bad frames is taken over so many seconds.
+_WINDOW = 10
+
+
+def sha256(data: bytes) -> bytes:
+    """Return the hash that the wire's MACs use."""
+    return hashlib.sha256(data).digest()
+
+
+class Answer(NamedTuple):
+    """Name and values of an answer, and how often the question had gone out in vain before."""
+
+    name: str
+    values: tuple[Any, ...]
+    attempt: int
+
+
+class Exchange:
+    """The bus as the cluster uses it.
+
+    Parameters
+    ----------
+    bus, clock
+        See `Bus`; its time is this clock's.
+    epoch
+        Of this run; see `lcu.wire`.
+    answer
+        Longest time to a whole answer, in s.
+
+    Attributes
+    ----------
+    sender
+        Numbers what is sent.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, epoch: int, answer: float) -> None:
+        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
+        self._bus, self._clock, self._answer = bus, clock, answer
+        self._asked = self._bad = self._answered = 0
+        self._seconds: deque[tuple[int, int, int]] = deque(maxlen=_WINDOW)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open."""
+        return self._bus.connected
+
+    async def broadcast(
+        self, name: str, *values: Any, life: float = 0.5, urgent: bool = False
+    ) -> bool:
+        """Send a message to everybody within ``life`` s, and return whether it went out."""
+        return await self.transmit(
+            self.sender.frame(wire.BROADCAST, name, *values), life=life, urgent=urgent
+        )
+
+    async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
+        """Send a frame that nobody answers within ``life`` s; whether it went out."""
+        expires = self._clock.monotonic() + life
+        outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
+        return outcome is Outcome.SENT
+
+    async def poll(self, node: Node, question: Question, sequence: int) -> tuple[Any, ...] | None:
+        """Ask a node, and return the values of its answer or None."""
+        begin = self._clock.monotonic()
+        node.counts.asked += 1
+        self._asked += 1
+        data = await self._bus.transact(node.frame(question, sequence), self._answer)
+        values = question.read(data, node.address, sequence)
+        if values is None:
+            frame = answer_in(data, node.address, sequence, (question.answer,)) if data else None
+            if frame is None or (values := frame.values()) is None:
+                self._spoilt(node, data, begin)
+                return None
+        now = self._clock.monotonic()
+        self._answered += 1
+        node.answered(now, now - begin)
+        return values
+
+    async def ask(
+        self, node: Node, name: str, *values: Any, key: bytes = b"", expires: float,
+        numbers: tuple[str, ...] = ("ACK",), timeout: float | None = None, tries: int = 1,
+        urgent: bool = False,
+    ) -> Answer | None:  # fmt: skip
+        """Send a message to a node, the same frame again if nothing comes, and return the answer.
+
+        A frame that is repeated before any other is made acts once: if the node has taken it
+        before, it answers "duplicate".
+        """
+        frame = self.sender.frame(node.address, name, *values, key=key)
+        sequence = self.sender.count & 0xFFFF
+        wanted = tuple(messages.NUMBER_OF[number] for number in numbers)
+        for attempt in range(tries):
+            begin = self._clock.monotonic()
+            if begin >= expires:
+                break
+            node.counts.asked += 1
+            node.counts.retries += attempt > 0
+            self._asked += 1
+            data = await self._bus.transact(
+                frame, timeout or self._answer, expires=expires, urgent=urgent
+            )
+            answer = answer_in(data, node.address, sequence, wanted) if data else None
+            found = None if answer is None else answer.values()
+            if answer is not None and found is not None:
+                now = self._clock.monotonic()
+                self._answered += 1
+                node.answered(now, now - begin)
+                return Answer(answer.name, found, attempt)
+            self._spoilt(node, data, begin)
+        return None
+
+    async def gather(self, name: str, *values: Any, span: float) -> bytes:
+        """Ask everybody, and return all that comes within a time in s."""
+        frame = self.sender.frame(wire.BROADCAST, name, *values)
+        return await self._bus.transact(frame, span, complete=lambda _: False)
+
+    def _spoilt(self, node: Node, data: bytes, now: float) -> None:
+        node.spoilt(data)
+        # A node that is switched off says nothing about the bus; damage always does.
+        if data or now - node.heard_at <= _WINDOW:
+            self._bad += 1
+
+    def second(self) -> float:
+        """End a second, and return the share of bad frames of the last ten."""
+        if not self.connected:
+            self._seconds.clear()
+            self._asked = self._bad = self._answered = 0
+            return 1.0
+        if self._asked:
+            self._seconds.append((self._asked, self._bad, self._answered))
+        self._asked = self._bad = self._answered = 0
+        asked = sum(row[0] for row in self._seconds)
+        bad = sum(row[1] for row in self._seconds)
+        answered = sum(row[2] for row in self._seconds)
+        if asked and not answered:
+            return 1.0
+        return bad / (bad + answered) if bad else 0.0

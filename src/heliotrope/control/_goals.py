@@ -1,0 +1,164 @@
+"""What a command is to bring about at a heliostat, and whether it has.
+
+A command is acknowledged when the local controller has taken it, and done when STATUS shows the
+state that it asks for. Commands that are not in the table are done when they are acknowledged.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from heliotrope.control._nodes import Node
+from heliotrope.control._reports import Reports
+from heliotrope.control.protocol import Stage
+from heliotrope.control.safety import DEFOCUS_BUDGET, STOW_BUDGET
+from heliotrope.lcu import names, states
+from heliotrope.lcu.states import (
+    APPROACHING,
+    FAULT,
+    IDLE,
+    LOCKED,
+    SEARCHING,
+    STOWED,
+    STOWING,
+    TRACKING,
+)
+
+_ALL = frozenset(range(len(states.STATES)))
+#: States in which a beam may be on the receiver, on its standby point, or under way to them.
+BEAM_OUT = frozenset({APPROACHING, IDLE, TRACKING, SEARCHING})
+
+_MOVING = 1 << names.FLAGS.index("MOVING")
+_AT_STOW = 1 << names.FLAGS.index("AT_STOW")
+_DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
+
+#: A STATUS asked for sooner after the ACK may not show the motion yet, s: a few ticks of a board.
+_SETTLE = 0.2
+#: For the longest way from stow to standby, s.
+_LONGEST = 900.0
+
+
+@dataclass(frozen=True)
+class Goal:
+    """States that a command leads to, and those on the way there.
+
+    Attributes
+    ----------
+    there, on_way
+        States.
+    clear, needed
+        Flags that must be clear, and set, in one of ``there``; until then it is on its way.
+    limit
+        For getting there, s.
+    """
+
+    there: frozenset[int]
+    on_way: frozenset[int] = frozenset()
+    clear: int = 0
+    needed: int = 0
+    limit: float = _LONGEST
+
+    def reached(self, state: int, flags: int) -> bool | None:
+        """Return True if it is there, None if it is on its way, False if it is neither."""
+        if state in self.there:
+            return True if not flags & self.clear and flags & self.needed == self.needed else None
+        return None if state in self.on_way else False
+
+
+GOALS = {
+    "APPROACH": Goal(frozenset({IDLE}), frozenset({APPROACHING})),
+    "IDLE": Goal(frozenset({IDLE})),
+    "TRACK": Goal(frozenset({TRACKING})),
+    "REFOCUS": Goal(frozenset({TRACKING})),
+    "SEARCH": Goal(frozenset({SEARCHING, IDLE})),
+    "LOCK": Goal(frozenset({LOCKED})),
+    "UNLOCK": Goal(_ALL - {LOCKED}),
+    "CLEAR_FAULT": Goal(_ALL - {FAULT}),
+    "JOG": Goal(frozenset({IDLE}), clear=_MOVING),
+    "GOTO": Goal(frozenset({IDLE}), clear=_MOVING),
+    "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING),
+    "DEFOCUS": Goal(_ALL - BEAM_OUT, clear=_MOVING, limit=DEFOCUS_BUDGET),
+    "STOW": Goal(
+        _ALL - BEAM_OUT - {states.DEFOCUSED}, clear=_MOVING, needed=_AT_STOW, limit=STOW_BUDGET
+    ),
+}
+assert STOWED in GOALS["STOW"].there
+assert STOWING in GOALS["STOW"].there
+
+
+@dataclass(frozen=True)
+class _Watch:
+    identity: str
+    name: str
+    since: float
+
+
+class Goals:
+    """Who is to reach what; told of every STATUS."""
+
+    def __init__(self, reports: Reports) -> None:
+        self._reports = reports
+        self._watches: dict[int, list[_Watch]] = {}
+
+    def begin(self, identity: str, name: str, node: Node, now: float) -> None:
+        """Note that a node has acknowledged a command; older goals of it are void."""
+        if name not in GOALS:
+            self._reports.add(identity, Stage.DONE, node.name)
+            return
+        self.end(node, f"{name} came after it")
+        self._watches[node.index] = [_Watch(identity, name, now)]
+
+    def waits(self, node: Node) -> bool:
+        """Whether a node is to reach something."""
+        return node.index in self._watches
+
+    def end(self, node: Node, why: str) -> None:
+        """Give up the goals of a node."""
+        for watch in self._watches.pop(node.index, []):
+            self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
+
+    def heard(self, node: Node, asked_at: float) -> None:
+        """Judge a STATUS that was asked for at an instant."""
+        watches = self._watches.get(node.index)
+        if watches is None:
+            return
+        state = states.STATES[node.state]
+        self._judge(node, lambda watch: self._verdict(node, watch, state, asked_at))
+
+    def second(self, nodes: list[Node], now: float) -> None:
+        """Give up what takes too long."""
+        for index in list(self._watches):
+            node = nodes[index]
+            state = states.STATES[node.state]
+            self._judge(
+                node,
+                lambda watch, state=state: (  # type: ignore[misc]
+                    f"still {state} after {now - watch.since:.0f} s"
+                    if now - watch.since > GOALS[watch.name].limit
+                    else None
+                ),
+            )
+
+    def _judge(self, node: Node, verdict: "Callable[[_Watch], str | None]") -> None:
+        left = []
+        for watch in self._watches.get(node.index, []):
+            text = verdict(watch)
+            if text is None:
+                left.append(watch)
+            elif text:
+                self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {text}")
+            else:
+                self._reports.add(watch.identity, Stage.DONE, node.name)
+        if left:
+            self._watches[node.index] = left
+        else:
+            self._watches.pop(node.index, None)
+
+    def _verdict(self, node: Node, watch: _Watch, state: str, asked_at: float) -> str | None:
+        """Return "" if it is done, a text if it cannot be any more, None if neither."""
+        if asked_at < watch.since + _SETTLE:
+            return None
+        reached = GOALS[watch.name].reached(node.state, node.flags)
+        if reached is None:
+            return None
+        fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
+        return "" if reached else f"went to {state}{fault}"

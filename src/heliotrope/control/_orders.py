@@ -1,0 +1,418 @@
+"""Commands and parameters on their way to the heliostats: sent, tried again, judged, reported.
+
+A command that is not answered is sent again as the same frame, which acts once, and in the next
+second as a new one, until it expires. If the answer to an earlier frame was lost, "duplicate" or
+"not in this state" may mean that the command was taken: then the state decides. What must not act
+twice (JOG) is not sent as a new frame.
+"""
+
+import re
+import struct
+from binascii import crc32
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from heliotrope.control._exchange import Exchange
+from heliotrope.control._goals import GOALS, Goals
+from heliotrope.control._kept import Kept
+from heliotrope.control._nodes import SEQUENCES, STATUS, Node
+from heliotrope.control._reports import Reports
+from heliotrope.control.cluster_config import ClusterConfig
+from heliotrope.control.protocol import Command, Parameters, ProtocolError, Stage
+from heliotrope.lcu import messages, names, states, wire
+from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
+
+#: The same frame is sent so often before others get their turn.
+TRIES = 3
+#: Refused for a moment: the node has not heard of the time, the session or the authority yet.
+_AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
+#: May mean that an earlier frame was taken whose answer was lost.
+_MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
+#: Would act twice.
+_RELATIVE = ("JOG",)
+#: Written to flash before they are acknowledged.
+_STORED = ("STANDBY",)
+#: Moves a mirror, or may: refused while a safety row forbids new motion.
+MOTIONS = frozenset(
+    {"APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "STANDBY", "JOG", "GOTO", "SEARCH", "DIAGNOSE"}
+)
+#: A command's life on the wire is shorter than what a local controller takes, by its clock.
+_WIRE_LIFE = wire.HORIZON_S - 2.0
+_ITEM_NUMBER = {row[0]: number for number, row in enumerate(ITEMS, 1)}
+#: The message that sets an item, and the axis where it is one of two.
+_MESSAGE_OF = {
+    item: (name, axis if len(items) == 2 else None)
+    for name, items in TARGETS.items()
+    for axis, item in enumerate(items)
+}
+
+
+class Refusal(Exception):  # noqa: N818 (it is an answer, not a failure)
+    """A command that is not taken; the text says why."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One message of an order, or, if ``item`` is given, the check of what is stored."""
+
+    name: str
+    values: tuple[Any, ...] = ()
+    item: str = ""
+    data: bytes = b""
+
+
+@dataclass(frozen=True)
+class Order:
+    """A command or a set of parameters."""
+
+    identity: str
+    name: str
+    steps: tuple[Step, ...]
+    deadline: float
+    token: int
+
+
+class Job:
+    """An order at one heliostat."""
+
+    def __init__(self, order: Order, node: Node) -> None:
+        self.order, self.node = order, node
+        self.place = 0
+        self.told_sent = False
+        self.unanswered = False  # an earlier frame of this step may have been taken
+        self.edition = -1  # that the node holds; not known yet
+        self.last = ""  # why it is tried again
+
+    @property
+    def step(self) -> Step:
+        """What is to be done now."""
+        return self.order.steps[self.place]
+
+
+class Orders:
+    """All orders of a cluster.
+
+    Parameters
+    ----------
+    config, nodes, exchange, goals, reports, kept
+        Parts of the cluster.
+    clock
+        Returns monotonic s.
+    gps
+        Returns the GPS time of the local controllers in s, None if they have none.
+    look
+        Asks a node for its state.
+
+    Attributes
+    ----------
+    token
+        Of the one authority, 0 if nobody has it.
+    out_of_step
+        Commands in a row that were answered "duplicate" for no known reason.
+    """
+
+    def __init__(
+        self, config: ClusterConfig, nodes: Sequence[Node], exchange: Exchange, goals: Goals,
+        reports: Reports, kept: Kept, clock: Callable[[], float],
+        gps: Callable[[], float | None], look: Callable[[Node], Awaitable[None]],
+    ) -> None:  # fmt: skip
+        self._config, self._nodes, self._exchange = config, nodes, exchange
+        self._goals, self._reports, self._kept = goals, reports, kept
+        self._clock, self._gps, self._look = clock, gps, look
+        self._by_name = {node.name: node for node in nodes}
+        self._ready: deque[Job] = deque()
+        self._later: list[Job] = []
+        self.token = 0
+        self.out_of_step = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether something can be sent now."""
+        return bool(self._ready)
+
+    # -- accepting -------------------------------------------------------------------------
+
+    def chosen(self, wanted: Iterable[str]) -> list[Node]:
+        """Return heliostats by name, all if none is named.
+
+        Raises
+        ------
+        Refusal
+            A name that is not of this cluster.
+        """
+        found = []
+        for name in dict.fromkeys(wanted):
+            node = self._by_name.get(name)
+            if node is None:
+                raise Refusal(f"cluster {self._config.name} has no heliostat {name!r}")
+            found.append(node)
+        return found or list(self._nodes)
+
+    def accept(self, command: Command, forbidden: str) -> None:
+        """Take a command, or refuse it; ``forbidden`` says why nothing may move, "" if it may."""
+        try:
+            nodes = self.chosen(command.heliostats)
+            steps = self._steps_of(command, nodes, forbidden)
+            self._may(command.token, command.lifetime)
+        except Refusal as refusal:
+            for name in command.heliostats or ("",):
+                self._reports.add(command.identity, Stage.REFUSED, name, str(refusal))
+            return
+        deadline = self._clock() + command.lifetime
+        for node, own in zip(nodes, steps, strict=True):
+            order = Order(command.identity, command.name, (own,), deadline, command.token)
+            self._begin(order, node)
+
+    def _steps_of(self, command: Command, nodes: list[Node], forbidden: str) -> list[Step]:
+        number = messages.NUMBER_OF.get(command.name)
+        who = -1 if number is None else messages.who_of(number)
+        if number is None or who not in (messages.AUTHORITY, messages.KEY):
+            raise Refusal(f"{command.name!r} is no command of the wire")
+        if command.name in MOTIONS and forbidden:
+            raise Refusal(forbidden)
+        steps = []
+        for node in nodes:
+            values = command.values
+            if command.name == "SET_ADDRESS" and not values:
+                if node.member.serial is None:
+                    raise Refusal(f"{node.name}: no serial number is configured; add it")
+                values = node.member.serial, node.address
+            if who == messages.KEY and not node.member.key:
+                raise Refusal(f"{node.name}: no key is configured; add it, then it can be stored")
+            steps.append(Step(command.name, _typed(number, values)))
+        return steps
+
+    def _may(self, token: int, lifetime: float) -> None:
+        if self.token == 0:
+            raise Refusal("nobody has the authority: the lease of the plant is over")
+        if token != self.token:
+            raise Refusal("not the authority: the token is another one's; take the authority first")
+        if not 0.0 < lifetime <= 3600.0:
+            raise Refusal(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
+        if self._gps() is None:
+            raise Refusal("the local controllers have no time yet; nothing could expire there")
+
+    def accept_parameters(self, message: Parameters) -> None:
+        """Take items for the journal of a heliostat, or refuse them."""
+        try:
+            (node,) = self.chosen((message.heliostat,))
+            steps = _steps_of_items(node, message)
+            self._may(message.token, message.lifetime)
+        except Refusal as refusal:
+            self._reports.add(message.identity, Stage.REFUSED, message.heliostat, str(refusal))
+            return
+        deadline = self._clock() + message.lifetime
+        self._begin(Order(message.identity, "parameters", steps, deadline, message.token), node)
+
+    def _begin(self, order: Order, node: Node) -> None:
+        self._reports.add(order.identity, Stage.ACCEPTED, node.name)
+        self._ready.append(Job(order, node))
+
+    # -- time ------------------------------------------------------------------------------
+
+    def second(self) -> None:
+        """Give what is to be tried again its turn."""
+        self._ready.extend(self._later)
+        self._later.clear()
+
+    def cancel(self, nodes: Iterable[Node], why: str) -> None:
+        """Give up what was not acknowledged yet, and what is on its way, for some heliostats."""
+        chosen = {node.index for node in nodes}
+        for job in [*self._ready, *self._later]:
+            if job.node.index in chosen:
+                self._fail(job, why)
+        self._ready = deque(job for job in self._ready if job.node.index not in chosen)
+        self._later = [job for job in self._later if job.node.index not in chosen]
+        for index in chosen:
+            self._goals.end(self._nodes[index], why)
+
+    # -- sending ---------------------------------------------------------------------------
+
+    async def serve(self) -> None:
+        """Do one step of one order."""
+        job = self._ready.popleft()
+        if job.order.token != self.token:
+            return self._fail(job, "the authority has changed or its lease is over")
+        if self._clock() >= job.order.deadline:
+            return self._fail(job, job.last or "not acknowledged before it expired")
+        if not job.told_sent:
+            job.told_sent = True
+            if self._goals.waits(job.node):
+                # What it has reached since it was last asked would be forgotten.
+                await self._look(job.node)
+            self._reports.add(job.order.identity, Stage.SENT, job.node.name)
+        if job.step.item:
+            return await self._check(job)
+        return await self._set(job)
+
+    async def _set(self, job: Job) -> None:
+        step, node, order = job.step, job.node, job.order
+        gps = self._gps()
+        if gps is None:
+            return self._again(job, "the local controllers have lost the time")
+        head: tuple[int, ...] = (order.token, self._expiry(gps, order))
+        key = b""
+        if messages.who_of(messages.NUMBER_OF[step.name]) == messages.KEY:
+            if not await self._knows_edition(job):
+                return self._again(job, "no answer to QUERY_STORED before it expired")
+            head, key = (*head, self._kept.next_edition(job.edition)), node.member.key
+        slow = bool(key) or step.name in _STORED
+        answer = await self._exchange.ask(
+            node, step.name, *head, *step.values, key=key, expires=order.deadline, tries=TRIES,
+            timeout=self._config.stored_answer if slow else None,
+        )  # fmt: skip
+        if answer is not None:
+            return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
+        job.unanswered = True
+        if step.name in _RELATIVE:
+            return self._fail(job, f"no answer to {step.name}; it may have been taken")
+        return self._again(job, f"no answer to {step.name} before it expired")
+
+    def _expiry(self, gps: float, order: Order) -> int:
+        life = min(order.deadline - self._clock(), _WIRE_LIFE)
+        return int(gps + life) & 0xFFFFFFFF
+
+    async def _knows_edition(self, job: Job) -> bool:
+        """Ask for the edition that the node holds: its journal may have been written by another."""
+        if job.edition < 0:
+            data = await self._stored(job, "edition")
+            if data is None:
+                return False
+            job.edition = struct.unpack("<I", data)[0] if len(data) == SIZE_OF["edition"] else 0
+        return True
+
+    async def _stored(self, job: Job, item: str) -> bytes | None:
+        return await stored(self._exchange, job.node, item, job.order.deadline)
+
+    async def _check(self, job: Job) -> None:
+        """Compare what is stored, and the checksum that STATUS tells."""
+        step, node = job.step, job.node
+        data = await self._stored(job, step.item)
+        if data is None:
+            return self._again(job, f"no answer to QUERY_STORED of {step.item} before it expired")
+        same = data == step.data
+        if same and step.item == "armature":
+            status = await self._exchange.poll(node, STATUS, SEQUENCES[0])
+            if status is None:
+                return self._again(job, "no answer to QUERY_STATUS before it expired")
+            same = status[7] == crc32(data)
+        if not same:
+            return self._fail(
+                job, f"{step.item}: what is stored differs from what was sent; send it again"
+            )
+        return self._advance(job)
+
+    def _judge(self, job: Job, result: int, *, lost: bool) -> None:
+        """Go on after an ACK; ``lost``: an earlier answer may have been lost."""
+        name = job.step.name
+        if result == messages.DONE:
+            self.out_of_step = 0
+            return self._advance(job)
+        if lost and result in _MAYBE and name in GOALS:
+            return self._advance(job)
+        text = f"{name}: {self._why(job.node, result)}"
+        if result in _AGAIN:
+            self.out_of_step += result == messages.DUPLICATE and not lost
+            return self._again(job, text)
+        self._reports.add(job.order.identity, Stage.REFUSED, job.node.name, text)
+        return None
+
+    def _why(self, node: Node, result: int) -> str:
+        text = messages.RESULTS[result] if result < len(messages.RESULTS) else f"result {result}"
+        if result == messages.REFUSED_STATE:
+            fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
+            text += f" ({states.STATES[node.state]}{fault})"
+        return text
+
+    def _advance(self, job: Job) -> None:
+        order, node, done = job.order, job.node, job.step
+        job.place += 1
+        job.unanswered = False
+        left = order.steps[job.place :]
+        if not done.item and (not left or left[0].item):
+            self._reports.add(order.identity, Stage.ACKNOWLEDGED, node.name)
+        if left:
+            self._ready.append(job)
+        elif done.item:
+            self._reports.add(order.identity, Stage.DONE, node.name)
+        else:
+            self._goals.begin(order.identity, done.name, node, self._clock())
+
+    def _again(self, job: Job, why: str) -> None:
+        job.last = why
+        self._later.append(job)
+
+    def _fail(self, job: Job, why: str) -> None:
+        self._reports.add(job.order.identity, Stage.FAILED, job.node.name, why)
+
+
+async def stored(exchange: Exchange, node: Node, item: str, expires: float) -> bytes | None:
+    """Return what a node has stored of an item, b"" if nothing; None if it does not answer."""
+    answer = await exchange.ask(
+        node, "QUERY_STORED", _ITEM_NUMBER[item], expires=expires, tries=TRIES,
+        numbers=("STORED",),
+    )  # fmt: skip
+    if answer is None or answer.values[0] != _ITEM_NUMBER[item]:
+        return None
+    data: bytes = answer.values[1]
+    return data
+
+
+def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
+    """Return numbers as the wire's codes want them.
+
+    Raises
+    ------
+    Refusal
+        Too many, too few, or what a code cannot hold.
+    """
+    name = messages.name_of(number)
+    head = len(messages.HEADS[messages.who_of(number)][0])
+    typed = [int(v) if float(v).is_integer() else v for v in values]
+    codes = "".join(
+        code * int(count or "1")
+        for count, code in re.findall(r"(\d*)(\D)", messages.ROW_OF[number][3])
+    )
+    if len(codes) == len(values):
+        typed = [
+            float(v) if code in "fd" else w for v, w, code in zip(values, typed, codes, strict=True)
+        ]
+    try:
+        wire.pack(name, *([0] * head), *typed)
+    except ValueError as error:
+        raise Refusal(str(error)) from None
+    return tuple(typed)
+
+
+def _steps_of_items(node: Node, message: Parameters) -> tuple[Step, ...]:
+    """Return the messages that store items, then the checks.
+
+    Raises
+    ------
+    Refusal
+        Items that cannot be stored.
+    """
+    try:
+        items = message.items()
+    except ProtocolError as error:
+        raise Refusal(str(error)) from None
+    if not node.member.key:
+        raise Refusal(f"{node.name}: no key is configured; add it, then it can be stored")
+    if not items:
+        raise Refusal("no items; name at least one")
+    sets, checks = [], []
+    for item, data in items.items():
+        if item not in SIZE_OF or item in ("key_id", "edition", "address"):
+            raise Refusal(f"item {item!r} cannot be set by parameters")
+        if len(data) != SIZE_OF[item]:
+            raise Refusal(f"item {item}: {len(data)} bytes, {SIZE_OF[item]} needed")
+        values = struct.unpack(CODES_OF[item], data)
+        name, axis = _MESSAGE_OF.get(item, ("STANDBY", None))
+        values = values if axis is None else (axis, *values)
+        if not wire.finite(values):
+            raise Refusal(f"item {item}: a number that is not finite")
+        sets.append(Step(name, values))
+        checks.append(Step("QUERY_STORED", item=item, data=data))
+    return (*sets, *checks)

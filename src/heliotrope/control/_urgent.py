@@ -1,0 +1,148 @@
+"""DEFOCUS and STOW: called to everybody three times, then confirmed node by node.
+
+They come from the operator, from anyone, or from the safety table. Nothing else goes on the bus
+before them; who has not acknowledged is asked again in every second, and named, until it has.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from heliotrope.control._exchange import Exchange
+from heliotrope.control._goals import Goals
+from heliotrope.control._nodes import Node
+from heliotrope.control._reports import Reports
+from heliotrope.control.protocol import Stage
+from heliotrope.control.safety import ORDER_BUDGET
+
+NAMES = ("DEFOCUS", "STOW")
+_CALLS = 3
+#: For asking again in each second after the first, s: polling and the sun go on besides.
+_SHARE = 0.3
+#: In the first round a node is asked so often.
+_ROUNDS = 3
+#: Not heard so often: asked after all others.
+_SILENT = 3
+#: Not acknowledged for so long: given up as far as the plant is told; it is asked all the same.
+_PATIENCE = 30.0
+
+
+class _Order:
+    def __init__(self, identity: str, name: str, nodes: list[Node], everybody: bool, now: float):
+        self.identity, self.name, self.everybody = identity, name, everybody
+        self.began = now
+        self.calls = _CALLS if everybody else 0
+        self.waiting = deque(sorted(nodes, key=lambda node: node.missed >= _SILENT))
+        self.new = True
+        self.told_sent = self.given_up = False
+
+
+class Urgent:
+    """All emergencies of a cluster that are not yet acknowledged.
+
+    Attributes
+    ----------
+    pressing
+        Whether something is to be sent before all else.
+    """
+
+    def __init__(
+        self, nodes: Sequence[Node], exchange: Exchange, goals: Goals, reports: Reports,
+        clock: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self._nodes, self._exchange = nodes, exchange
+        self._goals, self._reports, self._clock = goals, reports, clock
+        self._orders: list[_Order] = []
+        self.pressing = False
+
+    def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
+        """Take an emergency, for some heliostats or for all."""
+        everybody = len(nodes) == len(self._nodes)
+        if name == "STOW" and everybody:
+            for older in self._orders:
+                # Who has not defocused yet goes to stow at once.
+                older.name = name
+        self._orders.append(_Order(identity, name, nodes, everybody, self._clock()))
+        for node in nodes:
+            self._reports.add(identity, Stage.ACCEPTED, node.name)
+        self.pressing = True
+
+    async def serve(self) -> None:
+        """Call and ask until every order has had its round; a new one goes first."""
+        while self.pressing:
+            self.pressing = False
+            for order in self._orders:
+                await self._call(order)
+            for order in list(self._orders):
+                await self._round(order)
+                if self.pressing:
+                    break
+        self._orders = [order for order in self._orders if order.waiting or order.calls]
+
+    def second(self) -> None:
+        """Begin a second: ask again who has not acknowledged, and name them."""
+        now = self._clock()
+        for order in self._orders:
+            self._name(order, now)
+        self.pressing = bool(self._orders)
+
+    def missing(self) -> list[str]:
+        """Who has not acknowledged, by name."""
+        return sorted({node.name for order in self._orders for node in order.waiting})
+
+    async def _call(self, order: _Order) -> None:
+        while order.calls > 0:
+            if not await self._exchange.broadcast(order.name, urgent=True):
+                return
+            order.calls -= 1
+            self._sent(order)
+
+    def _sent(self, order: _Order) -> None:
+        if not order.told_sent:
+            order.told_sent = True
+            for node in order.waiting:
+                self._reports.add(order.identity, Stage.SENT, node.name)
+
+    async def _round(self, order: _Order) -> None:
+        """Ask each that has not acknowledged."""
+        begin = self._clock()
+        rounds, order.new = (_ROUNDS if order.new else 1), False
+        for _ in range(rounds):
+            for _ in range(len(order.waiting)):
+                if self.pressing or not self._exchange.connected:
+                    return
+                if rounds == 1 and self._clock() - begin > _SHARE:
+                    return
+                node = order.waiting.popleft()
+                if order.given_up and node.missed > 0:
+                    order.waiting.append(node)  # polling finds it when it comes back
+                else:
+                    await self._ask(order, node)
+
+    async def _ask(self, order: _Order, node: Node) -> None:
+        answer = await self._exchange.ask(
+            node, order.name, expires=self._clock() + 1.0, urgent=True
+        )
+        self._sent(order)
+        if answer is None:
+            node.counts.retries += 1
+            order.waiting.append(node)
+            return
+        self._reports.clear("order_unacknowledged", node.name, f"{node.name} has acknowledged")
+        if not order.given_up:
+            self._reports.add(order.identity, Stage.ACKNOWLEDGED, node.name)
+            self._goals.begin(order.identity, order.name, node, self._clock())
+
+    def _name(self, order: _Order, now: float) -> None:
+        """Tell of those that have not acknowledged in time."""
+        age = now - order.began
+        if age <= ORDER_BUDGET:
+            return
+        for node in order.waiting:
+            text = f"{node.name} has not acknowledged {order.name}; where its beam is, is not known"
+            self._reports.alarm("order_unacknowledged", node.name, "EMERGENCY", text)
+            if age > _PATIENCE and not order.given_up:
+                self._reports.add(
+                    order.identity, Stage.FAILED, node.name,
+                    f"{order.name} not acknowledged within {_PATIENCE:g} s; it is asked further",
+                )  # fmt: skip
+        order.given_up = order.given_up or age > _PATIENCE

@@ -1,0 +1,188 @@
+"""What a cluster watches: its rows of the safety table, and the plant's lease."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from heliotrope.control._reports import Reports
+from heliotrope.control.protocol import Lease
+from heliotrope.control.safety import (
+    Act,
+    Action,
+    Reading,
+    Role,
+    SafetyState,
+    Severity,
+    Watcher,
+    acknowledge,
+    conditions,
+    decision,
+    evaluate,
+    start,
+    watched_by,
+)
+from heliotrope.control.timekeeping import Time
+
+_LINE = "emergency_line"
+#: The row of the plant's silence trips after so long, autonomy apart; a lease may be no longer.
+_PLANT_LEASE = 3.0
+#: A row that has tripped releases below 2 s of silence: a shorter lease would never release it.
+_SHORTEST_LEASE = 1.0
+#: Stands for a time without a bound, s.
+_UNBOUNDED = 1e9
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the safety table demands.
+
+    Attributes
+    ----------
+    act
+        The strongest, None if nothing is wrong.
+    new
+        DEFOCUS or STOW if it has just become due, else None.
+    acts
+        For the status: "DEFOCUS plant_link_lost".
+    forbidden
+        Why nothing may be moved, "" if it may.
+    """
+
+    act: Act | None = None
+    new: Act | None = None
+    acts: tuple[str, ...] = ()
+    forbidden: str = ""
+
+    @property
+    def dark(self) -> bool:
+        """Whether no sun is to be sent."""
+        return self.act is not None and self.act >= Act.DEFOCUS
+
+
+class Watch:
+    """The safety table of a cluster, fed once a second, and the plant's lease.
+
+    Parameters
+    ----------
+    cluster
+        Its name.
+    longest_autonomy
+        Most that the plant may grant, s.
+    reports
+        Where alarms go.
+    now
+        Monotonic s.
+    line
+        Returns whether current flows in the emergency line; None: there is no line.
+
+    Attributes
+    ----------
+    token
+        Of the authority, as the last lease says.
+    """
+
+    def __init__(
+        self, cluster: str, longest_autonomy: float, reports: Reports, now: float,
+        line: Callable[[], bool] | None = None,
+    ) -> None:  # fmt: skip
+        self._cluster, self._longest, self._line = cluster, longest_autonomy, line
+        self._reports = reports
+        self._autonomy = 0.0
+        self._state: SafetyState = start(self._table(), now)
+        self._lease: Reading | None = None
+        self._over = -math.inf
+        self._offset: float | None = None
+        self.token = 0
+        self.verdict = Verdict()
+
+    def _table(self) -> tuple:  # type: ignore[type-arg]
+        rows = watched_by(conditions(self._autonomy), Watcher.CLUSTER)
+        return tuple(row for row in rows if self._line is not None or row.name != _LINE)
+
+    # -- the lease -------------------------------------------------------------------------
+
+    def take(self, lease: Lease, now: float) -> str:
+        """Take a lease that has just come; returns why it is refused, "" if it is taken."""
+        if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
+            return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
+        if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
+            return f"lease with token {lease.token} and autonomy {lease.autonomy:g} s: out of range"
+        autonomy = min(lease.autonomy, self._longest)
+        if autonomy < lease.autonomy:
+            self._reports.alarm(
+                "autonomy_limited", "", "WARNING",
+                f"the plant grants {lease.autonomy:g} s of autonomy; cluster {self._cluster} is "
+                f"configured for {self._longest:g} s, which it keeps to",
+            )  # fmt: skip
+        if autonomy != self._autonomy:
+            self._autonomy = autonomy
+            self._state = replace(self._state, table=self._table())
+        self.token = lease.token
+        self._lease = Reading(_PLANT_LEASE - lease.lifetime, now)
+        self._over = now + lease.lifetime
+        return ""
+
+    def lease_left(self, now: float) -> float:
+        """Return what is left of the plant's lease, s, autonomy apart; below 0 if it is over."""
+        return max(self._over - now, -_UNBOUNDED)
+
+    def alone(self, now: float) -> bool:
+        """Whether lease and autonomy are over."""
+        return now >= self._over + self._autonomy
+
+    # -- the table -------------------------------------------------------------------------
+
+    def second(self, time: Time, bus_errors: float, now: float) -> Verdict:
+        """Feed the table, and return what it demands."""
+        readings = {
+            ("bus_errors", ""): Reading(bus_errors, now),
+            ("clock_step", ""): Reading(self._step(time, now), now),
+            ("time_uncertainty", ""): Reading(
+                time.error if math.isfinite(time.error) and time.quality != "none" else _UNBOUNDED,
+                now,
+            ),
+        }
+        if time.quality in ("gps", "system"):
+            readings["time_source_silence", ""] = Reading(0.0, now)
+        if self._lease is not None:
+            readings["plant_silence", ""] = self._lease
+        if self._line is not None:
+            readings["emergency_line_live", ""] = Reading(float(self._line()), now)
+        before = self.verdict.act
+        self._state, actions = evaluate(readings, self._state, now)
+        self._alarm(actions)
+        if self.alone(now):
+            self.token = 0
+        act = decision(actions, cluster=self._cluster)
+        strong = act is not None and act >= Act.DEFOCUS
+        fresh = any(action.new and action.act == act for action in actions)
+        new = act if strong and (fresh or before != act) else None
+        self.verdict = Verdict(
+            act, new, tuple(f"{action.act.name} {action.condition}" for action in actions),
+            next((a.text for a in actions if a.act >= Act.REFUSE_NEW), ""),
+        )  # fmt: skip
+        return self.verdict
+
+    def _step(self, time: Time, now: float) -> float:
+        """Return by how much the time stepped against the monotonic clock, s."""
+        if time.quality == "none":
+            self._offset = None
+            return 0.0
+        before, self._offset = self._offset, time.gps_s - now
+        step = 0.0 if before is None else abs(self._offset - before)
+        return max(step, 1.0 if time.jumped else 0.0)
+
+    def _alarm(self, actions: list[Action]) -> None:
+        tripped = {action.condition for action in actions}
+        for alarm in self._reports.alarms:
+            if alarm.condition not in tripped and alarm.subject == self._cluster:
+                self._reports.clear(alarm.condition, self._cluster)
+        for action in actions:
+            self._reports.alarm(
+                action.condition, self._cluster, Severity(action.severity).name, action.text
+            )
+
+    def acknowledge(self, condition: str, who: str, role: Role) -> str:
+        """Acknowledge a row that latches; returns why that is refused, "" if it is not."""
+        self._state, refusal = acknowledge(self._state, condition, who, role)
+        return refusal

@@ -1,0 +1,132 @@
+"""What a cluster controller is told: its site, its heliostats, its limits. See `cluster_file`."""
+
+import math
+from dataclasses import dataclass
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.lcu import wire
+from heliotrope.sun import Site
+
+#: RS485 with unit loads carries as many.
+MOST_MEMBERS = 32
+
+
+@dataclass(frozen=True)
+class Member:
+    """One heliostat of a cluster.
+
+    Parameters
+    ----------
+    name
+        As the plant knows it.
+    address
+        On the bus, 1 to 65534.
+    serial
+        Number of its local controller, by which it is found and given its address; None: not
+        known.
+    key
+        Of its local controller, for what is stored there; b"": nothing can be stored.
+
+    Raises
+    ------
+    InputError
+        An empty name, or a number out of range.
+    """
+
+    name: str
+    address: int
+    serial: int | None = None
+    key: bytes = b""
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError(f"heliostat at address {self.address}: it has no name; give one")
+        for what, value, low, high in (
+            ("address", self.address, 1, wire.BROADCAST - 1),
+            ("serial number", self.serial, 0, 0xFFFFFFFF),
+        ):
+            if value is not None and not low <= value <= high:
+                raise InputError(
+                    f"heliostat {self.name}: {what} {value} is not within {low} to {high}"
+                )
+
+
+@dataclass(frozen=True)
+class ClusterConfig:
+    """A cluster.
+
+    Parameters
+    ----------
+    name
+        As the plant knows it.
+    site
+        Place and air, for the sun.
+    heliostats
+        1 to 32; they are polled in the order of their addresses, and told of in this one.
+    answer
+        Longest time from the end of a question to the whole answer, in s.
+    stored_answer
+        The same where flash is written before the answer, in s.
+    steps_every
+        Step counts of each heliostat are asked for every so many seconds.
+    silence
+        A heliostat not heard for so long is reported, in s.
+    longest_autonomy
+        Most that the plant may grant, in s. Above 0 only where a hard-wired emergency line
+        reaches this cluster.
+    phase
+        Each second begins so long after that of GPS, in s, 0 to below 1.
+
+    Raises
+    ------
+    InputError
+        Something that no cluster can be.
+    """
+
+    name: str
+    site: Site
+    heliostats: tuple[Member, ...]
+    answer: float = 0.05
+    stored_answer: float = 0.6
+    steps_every: int = 1
+    silence: float = 10.0
+    longest_autonomy: float = 0.0
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        at = f"cluster {self.name!r}"
+        if not self.name:
+            raise InputError(f"{at}: it has no name; give one")
+        if not 1 <= len(self.heliostats) <= MOST_MEMBERS:
+            raise InputError(
+                f"{at}: {len(self.heliostats)} heliostats; one bus carries 1 to {MOST_MEMBERS}"
+            )
+        for what in ("name", "address", "serial"):
+            values = [getattr(each, what) for each in self.heliostats]
+            for value in values:
+                if value is not None and values.count(value) > 1:
+                    raise InputError(f"{at}: two heliostats have the {what} {value}; each its own")
+        for what, number, low, high in (
+            ("answer", self.answer, 0.001, 1.0),
+            ("stored_answer", self.stored_answer, self.answer, 2.0),
+            ("silence", self.silence, 2.0, 3600.0),
+            ("longest_autonomy", self.longest_autonomy, 0.0, 86400.0),
+            ("phase", self.phase, 0.0, math.nextafter(1.0, 0.0)),
+        ):
+            if not low <= number <= high:
+                raise InputError(f"{at}: {what} {number} s is not within {low:g} to {high:g} s")
+        if not 1 <= self.steps_every <= 60:
+            raise InputError(f"{at}: steps_every {self.steps_every} s is not within 1 to 60 s")
+
+    def member(self, name: str) -> Member:
+        """Return a heliostat by its name.
+
+        Raises
+        ------
+        UnknownNameError
+            If this cluster has none of that name.
+        """
+        for each in self.heliostats:
+            if each.name == name:
+                return each
+        raise UnknownNameError("heliostat", name, [each.name for each in self.heliostats])

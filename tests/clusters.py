@@ -1,0 +1,237 @@
+"""What the tests of the cluster share: real local controllers on a bus in memory, and a plant."""
+
+import asyncio
+import contextlib
+import struct
+from collections.abc import AsyncIterator, Callable
+from typing import Any, TypeVar
+
+from heliotrope.control.carried import CarriedLink
+from heliotrope.control.clock import VirtualClock
+from heliotrope.control.cluster import Cluster
+from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.link import Bus, messages, running
+from heliotrope.control.memory import memory_pair
+from heliotrope.control.protocol import (
+    Alarm,
+    Command,
+    Emergency,
+    Lease,
+    Message,
+    Progress,
+    Stage,
+    Status,
+    decode,
+    encode,
+)
+from heliotrope.control.timekeeping import SystemTime
+from heliotrope.lcu import states, ticks
+from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.node import Node
+from heliotrope.sun import Site
+from heliotrope.twin.bus import TwinBus
+from lcu_machines import STOW, Flash, heliostat, items_of_heliostat, sha256
+
+SITE = Site(37.09, -2.36, 500.0, name="Tabernas")
+TOKEN = 0xABCD
+AIM = (0.0, 0.0, 50.0)
+M = TypeVar("M", bound=Message)
+
+
+def key_of(number: int) -> bytes:
+    return bytes([number]) * 32
+
+
+class Timer:
+    """A step timer that counts."""
+
+    def __init__(self) -> None:
+        self.made = list(STOW)
+
+    def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
+        self.made[axis] += direction * count
+
+    def stop(self) -> tuple[int, int]:
+        return 0, 0
+
+
+class Board:
+    """A local controller on the bus; ``on`` is its supply."""
+
+    def __init__(self, number: int, address: int | None = None, *, configured: bool = True) -> None:
+        self.number = number
+        self.serial = 5000 + 37 * number
+        self.flash, self.timer = Flash(), Timer()
+        self.on = True
+        self.out = bytearray()
+        if configured:
+            items = items_of_heliostat(heliostat())
+            items["address"] = struct.pack("<H", address or number)
+            journal = Journal(self.flash)
+            journal.load()
+            journal.store(items)
+            journal.zero(*STOW)
+        self.boot(0.0)
+
+    def boot(self, now: float) -> None:
+        self.node = Node(
+            self.flash, self.timer, self.out.extend, self._tick(now), self.serial,
+            sha256=sha256, key=key_of(self.number),
+        )  # fmt: skip
+        self.on = True
+
+    @staticmethod
+    def _tick(now: float) -> int:
+        return round(now * 1000) % ticks.PERIOD
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        self.out.clear()
+        if self.on:
+            self.node.on_bytes(data, self._tick(now))
+        return bytes(self.out)
+
+    def tick(self, now: float) -> bytes:
+        self.out.clear()
+        if self.on:
+            self.node.on_tick(self._tick(now))
+        return bytes(self.out)
+
+    @property
+    def state(self) -> str:
+        return states.STATES[self.node.controller.state]
+
+
+def config_of(count: int, **changes: Any) -> ClusterConfig:
+    members = tuple(
+        Member(f"A{n}", n, serial=5000 + 37 * n, key=key_of(n)) for n in range(1, count + 1)
+    )
+    values: dict[str, Any] = {"name": "C1", "site": SITE, "heliostats": members, **changes}
+    return ClusterConfig(**values)
+
+
+class Plant:
+    """The plant's end of the link, and what came over it."""
+
+    def __init__(self, link: CarriedLink, clock: VirtualClock) -> None:
+        self.link, self.clock = link, clock
+        self.heard: list[Message] = []
+        self.leases = True
+        self.token = TOKEN
+        self.autonomy = 0.0
+
+    async def listen(self) -> None:
+        async for data in messages(self.link):
+            self.heard.append(decode(data))
+
+    async def lease(self) -> None:
+        while True:
+            if self.leases:
+                await self.send(Lease(self.token, autonomy=self.autonomy))
+            await asyncio.sleep(1.0)
+
+    async def send(self, message: Message) -> None:
+        await self.link.send(encode(message), expires=self.clock.monotonic() + 1.0)
+
+    def all(self, kind: type[M]) -> list[M]:
+        return [each for each in self.heard if isinstance(each, kind)]
+
+    def status(self) -> Status:
+        return self.all(Status)[-1]
+
+    def stages(self, identity: str, heliostat: str) -> list[Stage]:
+        """The stages of a command at a heliostat, in order."""
+        return [
+            each.stage
+            for each in self.all(Progress)
+            if each.identity == identity and heliostat in each.heliostats
+        ]
+
+    def text(self, identity: str, heliostat: str = "") -> str:
+        """Why a command was refused or failed."""
+        return next(
+            each.text
+            for each in self.all(Progress)
+            if each.identity == identity
+            and each.stage in (Stage.REFUSED, Stage.FAILED)
+            and (not heliostat or heliostat in each.heliostats)
+        )
+
+    def alarms(self, condition: str) -> list[Alarm]:
+        return [each for each in self.all(Alarm) if each.condition == condition]
+
+
+class Field:
+    """A cluster, its boards, its bus and its plant, in virtual time."""
+
+    def __init__(
+        self, clock: VirtualClock, count: int = 2, *, boards: list[Board] | None = None,
+        bus: Callable[[VirtualClock, list[Board]], Bus] | None = None, seed: int = 0,
+        **changes: Any,
+    ) -> None:  # fmt: skip
+        self.clock = clock
+        self.boards = boards or [Board(n) for n in range(1, count + 1)]
+        for board in self.boards:
+            board.boot(clock.monotonic())
+        self.config = config_of(count, **changes)
+        self.bus: Any = (
+            bus(clock, self.boards) if bus else TwinBus(clock, [*self.boards], seed=seed)
+        )
+        near, far, self.line = memory_pair(clock, seed=seed)
+        self.plant = Plant(near, clock)
+        self.link = far
+        self.time = SystemTime(clock)
+        self.cluster = Cluster(self.config, self.bus, self.link, clock, self.time)
+
+    async def _tick(self) -> None:
+        while True:
+            for board in self.boards:
+                board.tick(self.clock.monotonic())
+            await asyncio.sleep(0.05)
+
+    @contextlib.asynccontextmanager
+    async def alive(self) -> AsyncIterator["Field"]:
+        """Run everything beside a block."""
+        async with asyncio.TaskGroup() as group:
+            others = [
+                group.create_task(part())
+                for part in (self._tick, self.plant.listen, self.plant.lease)
+            ]
+            async with (
+                running(self.bus, self.link, self.plant.link, self.time),
+                running(self.cluster),
+            ):
+                yield self
+            for other in others:
+                other.cancel()
+
+    async def until(self, holds: Callable[[], bool], limit: float = 30.0) -> float:
+        """Wait until something holds; returns how long that took, s."""
+        begin = self.clock.monotonic()
+        while not holds():
+            assert self.clock.monotonic() - begin < limit, self.states()
+            await asyncio.sleep(0.05)
+        return self.clock.monotonic() - begin
+
+    def states(self) -> list[str]:
+        return [board.state for board in self.boards]
+
+    async def order(self, identity: str, name: str, *values: float, **more: Any) -> None:
+        await self.plant.send(
+            Command(identity, name, values, **{"token": self.plant.token, **more})
+        )
+
+    async def emergency(self, identity: str, name: str, *heliostats: str) -> None:
+        await self.plant.send(Emergency(identity, name, heliostats))
+
+    async def to_tracking(self) -> None:
+        """From power-on to tracking."""
+        await self.until(lambda: bool(self.plant.all(Status)) and self.status_fresh())
+        await self.order("aim", "AIM", *AIM)
+        await self.order("approach", "APPROACH")
+        await self.until(lambda: set(self.states()) == {"IDLE"}, 300.0)
+        await self.order("track", "TRACK")
+        await self.until(lambda: set(self.states()) == {"TRACKING"}, 10.0)
+
+    def status_fresh(self) -> bool:
+        """Whether the sun has arrived everywhere."""
+        return all(board.node.controller.sun.fresh() for board in self.boards if board.on)
