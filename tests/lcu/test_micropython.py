@@ -315,7 +315,9 @@ def test_cuts_leave_old_or_new_there_too(answers: dict[str, Any]) -> None:
 
 def test_handling_frames_takes_no_memory_for_good(answers: dict[str, Any]) -> None:
     first, second, third = answers["memory"][3:]
-    assert third <= second <= first
+    # 1000 frames each: a leak of the smallest piece of memory per frame were 16,000 bytes.
+    assert abs(second - first) < 1000
+    assert abs(third - second) < 1000
 
 
 # Compiled, as on a board.
@@ -334,7 +336,8 @@ def test_compiled_core_does_the_same_within_its_memory(
     before, with_wire, with_journal, first, second, third = answer["memory"]
     assert with_wire - before < 20 * 1024
     assert with_journal - before < 30 * 1024  # of the core's budget of 64 KB
-    assert third <= second <= first
+    assert abs(second - first) < 1000
+    assert abs(third - second) < 1000
 
 
 @pytest.mark.parametrize("version", [OLDEST, NEWEST])

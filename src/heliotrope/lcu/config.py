@@ -16,6 +16,8 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 FAR, MOST_STEPS = 1e5, 1 << 29
 #: A defocus of less than this (rad) on both axes would leave the beam on the receiver.
 LEAST_DEFOCUS, MOST_DEFOCUS = 0.02, 1.6
+#: Points that the item "way" has room for.
+MOST_POINTS = 4
 
 
 def is_place(point: "tuple[float, ...]") -> bool:
@@ -38,10 +40,10 @@ class Config:
     defocus, location, standby
         Angles (rad), and ENU points (m), the latter None while missing.
     path
-        ENU points (m) of the safe way from the ground to below the standby point; empty: see
-        ``Motion``.
+        ENU points (m) of the safe way from the ground to below the standby point, from SET_WAY;
+        empty: see ``Motion``.
     azimuth_axis
-        The axis (0, 1) that moves first when leaving stow and last when returning.
+        The axis (0, 1) that moves first when leaving stow and last when returning, from SET_WAY.
     serial, firmware, address
         As in HERE.
     lease_ms, stow_wait_ms, silence_ms
@@ -137,6 +139,13 @@ class Config:
             if not is_place(values):
                 return False
             setattr(self, name, values)
+        elif name == "way":
+            axis, count = values[0], values[1]
+            if axis > 1 or count > MOST_POINTS or not is_place(values[2:]):
+                return False
+            self.azimuth_axis = axis
+            points = [values[2 + 3 * i : 5 + 3 * i] for i in range(count)]
+            self.path = [(east, north, up) for east, north, up in points]
         elif name == "address":
             if not 1 <= values[0] < 0xFFFF:
                 return False

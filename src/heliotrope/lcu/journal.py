@@ -69,6 +69,7 @@ ITEMS = (
     ("stow", "ii"),
     ("defocus", "ff"),
     ("standby", "fff"),
+    ("way", "BB12f"),
 )
 SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
 CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
@@ -83,10 +84,11 @@ TARGETS = {
     "SET_STOW": ("stow",),
     "SET_LIMITS": ("limits_primary", "limits_secondary"),
     "SET_DEFOCUS": ("defocus",),
+    "SET_WAY": ("way",),
     "ZERO": (),
 }
 
-MAGIC, LAYOUT = 0x48, 1
+MAGIC, LAYOUT = 0x48, 2
 SLOT_HEAD = "<BBHI"  # magic, layout, which items are there, counter
 SLOT_HEAD_SIZE = 8
 SLOT_SIZE = SLOT_HEAD_SIZE + sum(SIZE_OF.values()) + 4

@@ -118,28 +118,53 @@ MESSAGES = (
      "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash"),
     # How far the angles go when defocused.
     (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad"),
+    # The safe way from stow: the axis (0 or 1) that moves first when leaving and last when
+    # returning, how many points follow (0: the way is found without them), and the points
+    # that the beam passes on its way from the ground to the standby point, ENU.
+    (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m"),
 )  # fmt: skip
 
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}
 ROW_OF = {row[0]: row for row in MESSAGES}
 
+#: What a board needs of the table, as text: number (two hexadecimal digits), who, name, codes
+#: with those of the head. ``scripts/shrink.py`` leaves the rest out there.
+TABLE = "\n" + "".join(
+    [
+        f"{row[0]:02x}{row[2]}{row[1]} {HEADS[row[2]][0] if row[2] in HEADS else ''}{row[3]}\n"
+        for row in MESSAGES
+    ]
+)
+
+
+def _start(number: int) -> int:
+    return TABLE.find(f"\n{number:02x}")
+
 
 def name_of(number: int) -> str:
     """Return the name of a message number, "" if the table has none."""
-    row = ROW_OF.get(number)
-    return row[1] if row else ""
+    start = _start(number)
+    return TABLE[start + 4 : TABLE.find(" ", start)] if start >= 0 else ""
 
 
 def who_of(number: int) -> int:
     """Return who may send a message; -1 if the table has no such number."""
-    row = ROW_OF.get(number)
-    return row[2] if row else -1
+    start = _start(number)
+    return int(TABLE[start + 3]) if start >= 0 else -1
 
 
 def codes_of(number: int) -> str:
-    """Return the ``struct`` codes of a message's payload with its head, without byte order."""
-    row = ROW_OF[number]
-    return HEADS[row[2]][0] + row[3] if row[2] in HEADS else row[3]
+    """Return the ``struct`` codes of a message's payload with its head, without byte order.
+
+    Raises
+    ------
+    KeyError
+        The table has no such number.
+    """
+    start = _start(number)
+    if start < 0:
+        raise KeyError(number)
+    return TABLE[TABLE.find(" ", start) + 1 : TABLE.find("\n", start + 1)]
 
 
 def fields_of(number: int) -> list[str]:

@@ -26,6 +26,8 @@ on nothing is written and nothing stored. The mirror still goes off the receiver
 because that protects more than the step counts; a boot on such flash takes the counts as unknown.
 """
 
+import struct
+
 from . import controller, messages, ticks, wire
 from .config import Config
 from .controller import Controller
@@ -266,6 +268,9 @@ class Node:
         return chance % HERE_SLOTS
 
     def _send(self, address: int, sequence: int, number: int, values: "tuple[Any, ...]") -> None:
-        payload = wire.pack(messages.name_of(number), *values)
+        if number == STORED:
+            payload = bytes([values[0]]) + values[1]
+        else:
+            payload = struct.pack("<" + messages.codes_of(number), *values)
         frame = wire.Frame(wire.CLUSTER_ADDRESS, address, sequence, number, payload)
-        self._write(wire.encode(frame))
+        self._write(wire.sealed(frame))
