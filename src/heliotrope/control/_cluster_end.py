@@ -1,6 +1,7 @@
 """The plant's end of one cluster: what is posted to it, in what order, and what became of it."""
 
 import asyncio
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,14 +34,16 @@ class ClusterEnd:
         Strongest emergency act that it was told to carry out as a whole, and that still holds;
         -1 if none.
     greeted
-        Whether it was asked for its checksums since it connected.
+        Whether it was greeted since it connected.
+    asked_at
+        When it was asked for the names of its rows last, monotonic s.
     """
 
     def __init__(self, name: str, members: tuple[str, ...], link: Link, clock: Clock) -> None:
         self.name, self.members, self.link = name, members, link
         self.act = -1
         self.greeted = False
-        self.refused = 0
+        self.asked_at = -math.inf
         self._clock = clock
         self._urgent: deque[_Post] = deque()
         self._normal: deque[_Post] = deque()

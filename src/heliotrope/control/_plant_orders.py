@@ -209,6 +209,14 @@ class PlantOrders:
                 key: u for key, u in self._under.items() if u.ticket.identity not in ended
             }
 
+    def end(self, now: float) -> None:
+        """Record how far everything has come, at the end of the plant."""
+        self.beat(now)
+        for identity, ticket in self._open.items():
+            self._owe_result(identity, f"{ticket.text}; then the plant was closed")
+        self._open.clear()
+        self.pay()
+
     def _owe_result(self, identity: str, result: str) -> None:
         at = self._utc()
         self._owed.append(lambda: self._audit.finish(identity, result, at))

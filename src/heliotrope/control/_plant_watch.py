@@ -44,6 +44,8 @@ class PlantWatch:
 
     Attributes
     ----------
+    rows
+        Names of the rows that are evaluated.
     unwatched
         Rows whose readings nobody gives: they are not evaluated, and whoever runs the plant must
         know it.
@@ -75,6 +77,7 @@ class PlantWatch:
         able = tuple(row for row in rows if row.reading in fed | OWN_READINGS)
         self.unwatched = tuple(row.name for row in rows if row not in able)
         self.actions: list[Action] = []
+        self.rows = frozenset(row.name for row in able)
         subjects = {row.name: clusters for row in able if row.scope is Scope.CLUSTER}
         self._state = start(able, now, subjects)
         self._readings: dict[tuple[str, str], Reading] = {}

@@ -16,11 +16,6 @@ RANK = {
     Stage.FAILED: 6,
 }  # fmt: skip
 FINAL = RANK[Stage.DONE]
-#: Commands that change no state: acknowledged is done.
-ACKNOWLEDGED_IS_DONE = frozenset(
-    {"AIM", "STANDBY", "LOCK_AIM", "ROUGH", "PARAMETERS", "JOG", "GOTO", "DIAGNOSE", "UNLOCK",
-     "CLEAR_FAULT"}
-)  # fmt: skip
 
 
 class Ticket:
@@ -57,8 +52,6 @@ class Ticket:
 
     def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
         """Take a stage that heliostats have reached: never backwards, and nothing after the end."""
-        if stage is Stage.ACKNOWLEDGED and self.name in ACKNOWLEDGED_IS_DONE:
-            stage = Stage.DONE
         rank = RANK[stage]
         rows = [self._row[name] for name in heliostats if name in self._row]
         if not rows:

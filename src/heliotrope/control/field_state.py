@@ -123,7 +123,7 @@ class FieldState:
         """
         nodes = status.nodes()
         if status.names:
-            self._places[cluster] = (status.names, self._rows_of(cluster, status.names))
+            self.learn_order(cluster, status.names)
         known = self._places.get(cluster)
         if known is None:
             return [f"cluster {cluster}: status without names; which rows it holds is not known"]
@@ -158,9 +158,9 @@ class FieldState:
         was_silent = 1e-3 * self.rows["heard_ms"][mine].astype(np.float64) > self.limit
         self.failed_at[mine[faulty | (known & silent & ~was_silent)]] = at
 
-    def forget_order(self, cluster: str) -> None:
-        """Forget the order of a cluster's rows, as a new connection begins."""
-        self._places.pop(cluster, None)
+    def learn_order(self, cluster: str, names: tuple[str, ...]) -> None:
+        """Take the names of the rows that a cluster reports, in their order."""
+        self._places[cluster] = (names, self._rows_of(cluster, names))
 
     def knows_order(self, cluster: str) -> bool:
         """Whether it is known which rows a cluster reports."""

@@ -26,6 +26,7 @@ from heliotrope.control._cluster_end import ClusterEnd
 from heliotrope.control._joining import Job, JoinQueue
 from heliotrope.control._plant_orders import PlantOrders, whole
 from heliotrope.control._plant_watch import PlantWatch
+from heliotrope.control._pushing import Pusher, stored_items
 from heliotrope.control._sentinel import Sentinel
 from heliotrope.control._tickets import Ticket
 from heliotrope.control.audit import Audit, AuditError
@@ -35,9 +36,10 @@ from heliotrope.control.clock import Clock, sleep_until
 from heliotrope.control.emergency import EmergencyOrder
 from heliotrope.control.field_state import FieldState
 from heliotrope.control.link import Link, messages
-from heliotrope.control.parameters import CALIBRATION_ITEMS, Wanted
+from heliotrope.control.parameters import Wanted, checksums
 from heliotrope.control.plant_settings import Counters, PlantSettings, clusters_of
 from heliotrope.control.protocol import (
+    Acknowledge,
     Alarm,
     Answer,
     Ask,
@@ -60,10 +62,6 @@ JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
 POINTS = frozenset({"AIM", "STANDBY"})
 #: In these states a beam is at its aim, or at its standby point.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
-#: States in which a controller takes items of its calibration, and items of its machine.
-_TAKES_CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT,
-                      states.IDLE, states.DEFOCUSED)  # fmt: skip
-_TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
 
 
 class PlantController:
@@ -156,8 +154,8 @@ class PlantController:
             clock, design.site, self.field, self._ends, self._orders, self._joining,
             self.authority, self._watch, self.beams.drives, self.settings.repeat,
         )  # fmt: skip
+        self._pusher = Pusher(self.field, self.wanted, self._orders, self._ask_stored)
         self._paid_at = -math.inf
-        self._tried: dict[str, float] = {}
         self._answers: dict[str, asyncio.Future[Answer]] = {}
         self._asked = 0
         self._closing = asyncio.Event()
@@ -177,7 +175,7 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
-        self._orders.pay()
+        self._orders.end(self._clock.monotonic())
 
     async def close(self) -> None:
         """End it, and the links; the clusters then defocus when their leases are over."""
@@ -201,18 +199,23 @@ class PlantController:
     def _greet(self, end: ClusterEnd) -> None:
         """Begin with a cluster that has connected."""
         end.greeted = True
-        self.field.forget_order(end.name)
-        self._ask(end, "names")
-        self._ask(end, "checksums")
         # What was ordered while it was away holds for it too.
         end.act = -1
         self._sentinel.repeat([end])
+        for name in end.members:
+            self._pusher.compare(name)
 
     def _ask(self, end: ClusterEnd, what: str, heliostat: str = "") -> str:
         self._asked += 1
         identity = f"{what}-{self._asked}"
         end.post(Ask(identity, what, heliostat), 5.0)
         return identity
+
+    def _ask_stored(self, heliostat: str) -> str:
+        return self._ask(self._end_of(heliostat), "stored", heliostat)
+
+    def _end_of(self, heliostat: str) -> ClusterEnd:
+        return self._ends[self.field.clusters[self.field.cluster[self.field.place(heliostat)]]]
 
     async def _hear(self, end: ClusterEnd) -> None:
         async for data in messages(end.link):
@@ -241,24 +244,22 @@ class PlantController:
 
     def _take_status(self, end: ClusterEnd, status: Status, now: float) -> None:
         self.counters.statuses += 1
-        problems = self.field.take(end.name, status, now)
-        self.counters.problems.extend(problems)
-        if problems and not self.field.knows_order(end.name):
-            self._ask(end, "names")
+        self.counters.problems.extend(self.field.take(end.name, status, now))
+        if not self.field.knows_order(end.name) and now - end.asked_at >= 5.0:
+            # The message that told the names was lost; the statistics come in the rows' order.
+            end.asked_at = now
+            self._ask(end, "statistics")
         self._sentinel.take_rows(end, now)
 
     def _take_answer(self, end: ClusterEnd, answer: Answer) -> None:
         waiting = self._answers.pop(answer.identity, None)
         if waiting is not None and not waiting.done():
             waiting.set_result(answer)
-        if not answer.identity.startswith("checksums-"):
-            return
-        for name, stored in answer.data.items():
-            if name in end.members and isinstance(stored, dict):
-                missing = self.wanted.compare(name, stored)
-                if missing:
-                    text = f"{name}: {', '.join(missing)} differ from what is wanted"
-                    self._tell(Alarm("parameters_differ", name, "warning", text))
+        elif answer.identity.startswith("statistics-") and "error" not in answer.data:
+            self.field.learn_order(end.name, tuple(answer.data))
+        elif (found := self._pusher.take(answer)) is not None and found[1]:
+            text = f"{found[0]}: {', '.join(found[1])} differ from what is wanted"
+            self._tell(Alarm("parameters_differ", found[0], "warning", text))
 
     # Time.
 
@@ -278,31 +279,8 @@ class PlantController:
         if now - self._paid_at >= 1.0:
             self._paid_at = now
             self._orders.pay()
-            self._push(now)
-
-    def _push(self, now: float) -> None:
-        """Push what differs to controllers that are in a state to take it."""
-        token = self.authority.token
-        if not token or not self.wanted.missing or self._sentinel.refusal(self.field.clusters):
-            return
-        live = self.field.live(now)
-        for name, missing in list(self.wanted.missing.items()):
-            row = self.field.index.get(name)
-            if row is None or not live[row] or now - self._tried.get(name, -math.inf) < 60.0:
-                continue
-            state = int(self.field.rows["state"][row])
-            able = [
-                item for item in missing
-                if state in _TAKES_MACHINE
-                or (state in _TAKES_CALIBRATION and item in CALIBRATION_ITEMS)
-            ]  # fmt: skip
-            if able:
-                self._tried[name] = now
-                items = {item: self.wanted.items[name][item] for item in able}
-                ticket = self._orders.accept(
-                    ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able), late=True
-                )
-                self._orders.parameters(ticket, name, items, token)
+            allowed = not self._sentinel.refusal(self.field.clusters)
+            self._pusher.beat(now, token, allowed)
 
     def _tell(self, alarm: Alarm) -> None:
         self.alarms.append(alarm)
@@ -324,7 +302,7 @@ class PlantController:
             self.field.place(name)
         whom = tuple(heliostats) or self.field.names
         self._joining.drop(f"{act.name} by {who}", frozenset(whom))
-        return self._send_safe(who, "anybody", act, whom, "")
+        return self._sentinel.send_safe((who, "anybody"), act, whom, "")
 
     def raise_emergency(self, who: str, act: Act = Act.DEFOCUS, reason: str = "") -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field with proof; anybody may.
@@ -449,20 +427,33 @@ class PlantController:
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
         """Acknowledge a row of the safety table that waits for it.
 
+        Parameters
+        ----------
+        person
+            Whose role is high enough for the row.
+        condition, subject
+            As the alarm tells them. A row that a cluster watches has the cluster as subject; the
+            cluster judges, and tells with an alarm that it is over.
+
         Raises
         ------
         RefusedError
             If the role is too low, or its cause has not gone.
         """
-        role = person.role.acknowledges_as
+        role, title = person.role.acknowledges_as, person.role.name.lower()
         if role is None:
             raise RefusedError(f"{condition}: {person.name} is viewer; it needs operator")
-        refusal = self._watch.acknowledge(condition, person.name, role, subject)
-        if refusal:
-            raise RefusedError(refusal)
-        self._orders.note(
-            person.name, person.role.name.lower(), "ACKNOWLEDGE", f"{condition} {subject}".strip()
-        )
+        if condition in self._watch.rows or subject not in self._ends:
+            refusal = self._watch.acknowledge(condition, person.name, role, subject)
+            if refusal:
+                raise RefusedError(refusal)
+        else:
+            self._asked += 1
+            identity = f"acknowledge-{self._asked}"
+            message = Acknowledge(identity, condition, person.name, role.name.lower())
+            self._ends[subject].post(message, 5.0)
+        note = f"{condition} {subject}".strip()
+        self._orders.note(person.name, title, "ACKNOWLEDGE", note)
 
     # Commands.
 
@@ -553,33 +544,32 @@ class PlantController:
         ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
         self.wanted.set(heliostat, items)
         self._orders.parameters(ticket, heliostat, items, token)
+        self._pusher.follow(heliostat, ticket)
         return ticket
 
-    async def stored(self, heliostat: str, timeout: float = 10.0) -> dict[str, int]:
-        """Return the checksums of what a local controller holds, by item.
+    async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
+        """Return the checksums of what a local controller has stored, by item.
 
         Raises
         ------
         RefusedError
             If no answer comes.
         """
-        row = self.field.place(heliostat)
-        end = self._ends[self.field.clusters[self.field.cluster[row]]]
-        identity = self._ask(end, "checksums", heliostat)
+        identity = self._ask_stored(heliostat)
         future = self._answers[identity] = asyncio.get_running_loop().create_future()
         try:
             async with asyncio.timeout(timeout):
                 answer = await future
         except TimeoutError:
             raise RefusedError(
-                f"{heliostat}: cluster {end.name} did not tell its checksums within {timeout:g} s"
+                f"{heliostat}: what it has stored was not told within {timeout:g} s; is it there?"
             ) from None
         finally:
             self._answers.pop(identity, None)
-        stored = answer.data.get(heliostat)
-        if not isinstance(stored, dict):
-            raise RefusedError(f"{heliostat}: cluster {end.name} told no checksums of it")
-        return {str(name): int(value) for name, value in stored.items()}
+        items = stored_items(answer)
+        if not items:
+            raise RefusedError(f"{heliostat}: {answer.data.get('error', 'nothing is stored')}")
+        return checksums(items)
 
     def _point(
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
