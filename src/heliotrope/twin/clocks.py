@@ -1,5 +1,6 @@
 """Clocks that drift and jump, and times that come and go: what a cluster is told in simulation."""
 
+import asyncio
 from collections.abc import Callable
 from datetime import datetime
 
@@ -40,7 +41,7 @@ class SimulatedTime:
         self._gps = gps_seconds(clock.utc())
         self._error = error
         self._jumped_at = -1e9
-        self._running = True
+        self._closing = asyncio.Event()
         self.offset = 0.0
         self.detects = True
         self.quality: Quality = "gps"
@@ -64,10 +65,12 @@ class SimulatedTime:
         return Time(utc_of_gps(gps).timestamp(), gps, error, self.quality, jumped)
 
     async def run(self) -> None:
-        """Do nothing: it is always there."""
+        """Wait until it is closed: it has nothing to do."""
+        await self._closing.wait()
 
     async def close(self) -> None:
-        """Do nothing."""
+        """End ``run``."""
+        self._closing.set()
 
 
 class DriftingClock:

@@ -1,0 +1,234 @@
+"""What the observer knows of one heliostat."""
+
+from collections import deque
+
+from heliotrope.lcu import messages, motion, states, wire
+from heliotrope.lcu.journal import items_of
+from heliotrope.twin.board import Board
+from heliotrope.twin.ledger import Sent
+from heliotrope.twin.outfit import LIMITS, STOW
+
+#: A timer may be given so much more than its rate allows until now, s: what is emitted ahead.
+AHEAD = 0.2
+#: The sun comes every second; served is who had it within this, s.
+SERVED = 2.0
+#: Slowing down takes half a second at most; then only the axis whose turn it is may move, s.
+BRAKING = 1.0
+
+
+def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
+    """Return all that a refused frame must leave alone.
+
+    Parameters
+    ----------
+    board
+        With its supply on.
+    gate
+        Whether the gate's count of frames belongs to it: what a stranger sends, and what is
+        replayed from before a restart of the cluster, may use numbers up.
+    clock
+        Whether clock and gate belong to it. Old time may be taken by who has heard no later frame
+        of the same epoch: it makes commands void and ends the lease early, and moves nothing.
+    """
+    node = board.node
+    assert node is not None
+    own, way = node.controller, node.controller.motion
+    found: dict[str, object] = {
+        "state": own.state, "motion": way.kind, "aim": way.aim, "ready": way.ready,
+        "primary goal": way.goal(0), "secondary goal": way.goal(1), "fault": own.fault,
+        "standby": own.config.standby, "journal": id(node.journal.items),
+    }  # fmt: skip
+    if clock:
+        found |= {
+            "second": own.clock.second, "millisecond": own.clock.ms, "flags": own.flags(),
+            "sun age": own.sun.age_ms(),
+        }  # fmt: skip
+    if own.gate is not None:
+        found |= {"token": own.gate.token, "edition": own.gate.edition}
+        if gate and clock:
+            found |= {"epoch": own.gate.replay.epoch, "count": own.gate.replay.count}
+    return found
+
+
+class Account:
+    """One heliostat in the eyes of the observer.
+
+    Attributes
+    ----------
+    state
+        As last seen; -1 while the supply is off.
+    sun_at
+        When the newest sun that it has heard was sent, s.
+    taken
+        Place of the last frame for it, questions and safe orders aside, that came whole.
+    in_hand, how, forged, quiet, before, good
+        Of the frame that it is hearing: what the cluster sent, how it came, what a stranger
+        sent, the invariant by which it must change nothing, what was before.
+    answers
+        When the cluster heard it, and the state that it told or -1.
+    from_stow
+        Whether it has left stow and not tracked since.
+    """
+
+    def __init__(self, board: Board, now: float) -> None:
+        self.board = board
+        self.address, self.name = board.outfit.address, board.outfit.name
+        self.state = board.state
+        self.sun_at = float("-inf")
+        self.taken = -1
+        self.in_hand: Sent | None = None
+        self.how = ""
+        self.forged: wire.Frame | None = None
+        self.quiet = 0
+        self.before: dict[str, object] = {}
+        self.good = 0
+        self.answers: deque[tuple[float, int]] = deque(maxlen=12)
+        self.from_stow = False
+        self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
+        self._items = board.node.journal.items if board.node is not None else board.outfit.items
+        self._pending: dict[str, bytes] = {}
+        self._served_at = now
+        self._ordered: dict[str, float] = {}
+        self._level = [0.0, 0.0]
+        self._filled_at = [now, now]
+        self._leg = 0  # of leaving stow: 0 none, 1 azimuth expected, 2 it moved, 3 elevation moves
+        self._stowing_since: float | None = None
+
+    # -- states ----------------------------------------------------------------------------
+
+    def entered(self, state: int, now: float) -> None:
+        """Note a new state."""
+        if state == states.APPROACHING:
+            self._leg = 1 if self.state == states.STOWED else 0
+            self.from_stow = True
+        elif state in (states.TRACKING, states.SEARCHING, states.DEFOCUSED):
+            self.from_stow = False
+        under_way = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.LOCKED)
+        by_itself = state == states.IDLE and self.state == states.APPROACHING
+        if state in under_way or (state == states.IDLE and not by_itself):
+            # A later command has taken the place of the order.
+            self._ordered.clear()
+        self.state = state
+        self._history.append((now, state))
+
+    def was_in(self, wanted: tuple[int, ...], since: float) -> bool:
+        """Whether it was in one of some states at any time since."""
+        begun = [state for at, state in self._history if at <= since][-1:]
+        later = [state for at, state in self._history if at > since]
+        return any(state in wanted for state in begun + later)
+
+    def cut(self, now: float) -> None:
+        """Note that the supply is off."""
+        sent = self.in_hand
+        self._pending = {}
+        if sent is not None and sent.who == messages.KEY:
+            self._pending = items_of(sent.name, sent.payload)
+        elif sent is not None and sent.name == "STANDBY":
+            self._pending = {"standby": sent.payload[8:]}
+        self.in_hand, self.how, self.quiet = None, "", 0
+        self._ordered.clear()
+        self._leg, self._stowing_since = 0, None
+        self.from_stow = False
+        self.state = -1
+        self._history.append((now, -1))
+
+    def booted(self, now: float) -> None:
+        """Note that it runs again: its times begin anew, and no frame of before counts."""
+        self.state = self.board.state
+        self._history.append((now, self.state))
+        self._served_at = now
+        self.taken = -1
+        self.sun_at = float("-inf")
+        self._level = [0.0, 0.0]
+        self.keep()
+
+    # -- the journal -----------------------------------------------------------------------
+
+    def keep(self) -> bool:
+        """Note what the journal holds; return whether it is other than before.
+
+        The reference is kept: a store makes a new dictionary and leaves the old one alone.
+        """
+        node = self.board.node
+        assert node is not None
+        changed = node.journal.items is not self._items
+        self._items = node.journal.items
+        if node.controller.motion.kind != motion.STOW:
+            self._stowing_since = None
+        elif self._stowing_since is None:
+            self._stowing_since = self.board.now
+        return changed
+
+    def mixture(self, held: dict[str, bytes]) -> str:
+        """Return what a journal holds that is neither the old nor the new record, or ""."""
+        old = dict(self._items)
+        if held in (old, {**old, **self._pending}):
+            return ""
+        wrong = [name for name in {**old, **held} if held.get(name) != old.get(name)]
+        return "other values of " + ", ".join(sorted(wrong))
+
+    # -- steps -----------------------------------------------------------------------------
+
+    def place(self) -> tuple[int, int]:
+        """Return the step counts, as ordered of the timers."""
+        one, two = (a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True))
+        return one, two
+
+    def rate(self, axis: int, count: int, now: float) -> str:
+        """Take steps that are ordered now; return what is wrong with their rate, or ""."""
+        limit = float(LIMITS[0])
+        gone = limit * (now - self._filled_at[axis])
+        self._filled_at[axis] = now
+        level = self._level[axis] = max(0.0, self._level[axis] - gone) + count
+        if level <= AHEAD * limit:
+            return ""
+        return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
+
+    def order(self, axis: int) -> str | None:
+        """Take a segment: what is wrong with the order of the axes, "", or None: any will do."""
+        board = self.board
+        if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
+            if axis == 1:
+                return ""
+            wrong = self.place()[1] != STOW[1]
+            return f"azimuth moves to stow while elevation is at {self.place()[1]}" if wrong else ""
+        if self._leg == 0 or self.state != states.APPROACHING:
+            return None
+        if axis == 1:
+            early = self._leg == 1
+            self._leg = 3
+            return "elevation leaves stow before azimuth" if early else ""
+        if self._leg == 3:
+            if board.axes[0].idle and board.axes[1].idle:
+                self._leg = 0
+                return ""
+            return "azimuth moves on while elevation leaves stow"
+        self._leg = 2
+        return ""
+
+    # -- what is due -----------------------------------------------------------------------
+
+    def served(self, now: float, leased: bool) -> None:
+        """Note whether plant and cluster are there for it."""
+        if leased and now - self.sun_at <= SERVED:
+            self._served_at = now
+
+    def must(self, name: str, now: float) -> None:
+        """Note an order to DEFOCUS or STOW."""
+        if self.board.node is not None:
+            self._ordered.setdefault(name, now)
+
+    def forget(self) -> None:
+        """Forget the orders: who was to carry them is gone."""
+        self._ordered.clear()
+
+    def deadlines(self, now: float) -> list[tuple[str, float]]:
+        """Return since when it has to be going away, by cause."""
+        found = list(self._ordered.items())
+        if now - self._served_at > SERVED:
+            found.append(("it was cut off", self._served_at))
+        return found
+
+    def must_stow(self, why: str) -> bool:
+        """Whether it must go on to stow."""
+        return why != "DEFOCUS"

@@ -1,0 +1,162 @@
+"""Faults of a simulated run: drawn from a seed as a list, so that some can be left out.
+
+A fault is data: what happens, when, for how long, to which heliostat, how large. The same seed
+gives the same list; a list that breaks an invariant is shrunk by leaving faults out (`shrunk`).
+"""
+
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from heliotrope.errors import InputError
+from heliotrope.lcu import ticks
+
+#: What can go wrong: kind, weight in the drawing, meaning.
+KINDS = {
+    "line_cut": (3, "plant and cluster do not hear each other"),
+    "line_one_way": (1, "one of them does not hear the other"),
+    "line_drop": (2, "the connection breaks and both notice"),
+    "line_bad": (3, "messages are lost, doubled, overtaken, damaged, delayed"),
+    "plant_silent": (2, "the plant stands still"),
+    "cluster_crash": (3, "the cluster ends at once and starts again later"),
+    "bus_bad": (6, "frames are lost, damaged, doubled, late"),
+    "bus_stuck": (2, "a transmitter holds the line"),
+    "bus_unplugged": (1, "the cluster's adapter is gone"),
+    "power_cut": (6, "a board loses its supply at any instant"),
+    "brown_out": (2, "a board loses its supply and sees it come"),
+    "flash_cut": (8, "a board loses its supply at a byte of its next write of flash"),
+    "tick_jump": (3, "a board's counter jumps"),
+    "time_jump": (4, "the cluster's time is set"),
+    "time_lost": (2, "the cluster has no time to rely on"),
+    "replay": (8, "a recorded frame is sent again"),
+    "forgery": (6, "a stranger without authority and key commands"),
+    "stranger_safe": (3, "a stranger sends DEFOCUS or STOW"),
+    "noise": (4, "a stranger sends noise"),
+}
+#: Longest duration of a fault, s.
+_LONGEST = {
+    "line_cut": 60.0, "line_one_way": 60.0, "line_bad": 60.0, "plant_silent": 60.0,
+    "cluster_crash": 40.0, "bus_bad": 60.0, "bus_stuck": 40.0, "bus_unplugged": 30.0,
+    "power_cut": 20.0, "brown_out": 20.0, "flash_cut": 5.0, "time_lost": 60.0,
+}  # fmt: skip
+#: A cut-off this long must have led to stow, s.
+_LONG = 330.0
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault.
+
+    Attributes
+    ----------
+    kind
+        Of `KINDS`.
+    at, lasts
+        s since the start; duration in s, 0 for what happens at once.
+    target
+        Place of the heliostat, where it is one's.
+    size
+        0 to 1: how bad; each kind reads it in its way.
+    """
+
+    kind: str
+    at: float
+    lasts: float
+    target: int
+    size: float
+
+    def __str__(self) -> str:
+        what = f"{self.at:9.3f} s  {self.kind} for {self.lasts:.2f} s"
+        return f"{what}, of {self.target}, size {self.size:.3f}"
+
+
+def drawn(
+    seed: int, seconds: float, heliostats: int, *, pause: float = 12.0, only: Sequence[str] = ()
+) -> list[Fault]:
+    """Return the faults of a run, in the order of their times.
+
+    Parameters
+    ----------
+    seed
+        Of the drawing.
+    seconds
+        Length of the run.
+    heliostats
+        Number of targets.
+    pause
+        Mean time between two faults, s.
+    only
+        Kinds to draw from; () for all.
+
+    Raises
+    ------
+    InputError
+        A kind that there is not, or a pause that is not above 0.
+    """
+    for kind in only:
+        if kind not in KINDS:
+            raise InputError(f"fault {kind!r} is not known; known: {', '.join(KINDS)}")
+    if not pause > 0.0:
+        raise InputError(f"a pause of {pause} s between faults; it must be above 0")
+    chance = random.Random(f"faults {seed}")
+    kinds = list(only or KINDS)
+    weights = [KINDS[kind][0] for kind in kinds]
+    found: list[Fault] = []
+    at = chance.expovariate(1.0 / pause)
+    while at < seconds:
+        kind = chance.choices(kinds, weights)[0]
+        longest = _LONGEST.get(kind, 0.0)
+        lasts = longest * chance.random() ** 3
+        if longest > 20.0 and chance.random() < 0.03:
+            lasts = _LONG
+        found.append(Fault(kind, at, lasts, chance.randrange(heliostats), chance.random()))
+        at += chance.expovariate(1.0 / pause)
+    return found
+
+
+def tick_jump(size: float) -> int:
+    """Return a jump of a counter, ms: small, large, and up to half its period."""
+    chance = random.Random(f"jump {size}")
+    return chance.choice(
+        [-1, 1, -900, 3000, -5000, 40_000, 10**6, -(10**7), ticks.HALF - 1, -ticks.HALF + 1]
+    )
+
+
+def time_jump(size: float) -> float:
+    """Return a jump of the cluster's time, s: less than a second up to years."""
+    chance = random.Random(f"jump {size}")
+    return chance.choice([-0.4, 0.4, -1.5, 2.5, -4.0, 7.0, -30.0, 100.0, -3600.0, 86400.0, -3e7])
+
+
+def shrunk(
+    faults: Sequence[Fault], fails: Callable[[list[Fault]], bool], most: int = 200
+) -> list[Fault]:
+    """Return fewer faults that still fail: delta debugging (Zeller and Hildebrandt 2002, ddmin).
+
+    Parameters
+    ----------
+    faults
+        A list that fails.
+    fails
+        Whether a run with a list fails.
+    most
+        Runs to spend.
+    """
+    left, parts, spent = list(faults), 2, 0
+    if spent < most and left and fails([]):
+        return []
+    while len(left) >= 2 and spent < most:
+        size = -(-len(left) // parts)
+        for start in range(0, len(left), size):
+            rest = left[:start] + left[start + size :]
+            spent += 1
+            if rest and fails(rest):
+                left, parts = rest, max(2, parts - 1)
+                break
+            if spent >= most:
+                break
+        else:
+            if size == 1:
+                break
+            parts = min(len(left), 2 * parts)
+    return left

@@ -1,0 +1,72 @@
+"""A stranger at the bus: he records and replays, forges without token and key, and makes noise.
+
+Against somebody who can speak at the right moment with recorded time and sun only the MAC
+protects, and only what is stored (see `lcu.wire`). This one speaks at any moment, one frame at a
+time.
+"""
+
+import random
+
+from heliotrope.lcu import messages, wire
+from heliotrope.twin.ledger import FrameLedger
+from heliotrope.twin.outfit import sha256
+
+#: What he would like to command.
+WANTED = ("TRACK", "APPROACH", "REFOCUS", "IDLE", "AIM", "UNLOCK", "CLEAR_FAULT", "LOCK", "GOTO",
+          "SET_BIAS", "ZERO", "SET_DEFOCUS")  # fmt: skip
+_NUMBERS: dict[str, tuple[float, ...]] = {
+    "AIM": (0.0, 0.0, 50.0), "GOTO": (1000, 1000), "SET_BIAS": (0.1, 0.1), "ZERO": (0, 0),
+    "SET_DEFOCUS": (0.05, 0.05),
+}  # fmt: skip
+
+
+class Intruder:
+    """What a stranger puts on the bus.
+
+    Parameters
+    ----------
+    frames
+        What he has recorded.
+    addresses
+        Of the heliostats.
+    """
+
+    def __init__(self, frames: FrameLedger, addresses: list[int]) -> None:
+        self._frames = frames
+        self._addresses = addresses
+
+    def recorded(self, size: float) -> bytes:
+        """Return a frame of before, b"" if there is none; ``size`` (0 to 1) says how long ago."""
+        count = len(self._frames)
+        return self._frames.data(min(count - 1, int(size * count))) if count else b""
+
+    def forged(self, target: int, size: float) -> bytes:
+        """Return a command to a heliostat by its place, with a token and a key of his own."""
+        chance = random.Random(f"forgery {size}")
+        name = chance.choice(WANTED)
+        token, edition = chance.getrandbits(32) | 1, chance.randrange(1, 2**31)
+        last = self._frames.last.get("SESSION")
+        epoch = int(last.values[0]) if last is not None else 0
+        sender = wire.Sender(chance.choice([0, 0, 99]), epoch, sha256)
+        # As if he had counted along with the cluster.
+        sender.count = chance.choice([len(self._frames), chance.randrange(1 << 16)])
+        time = self._frames.last.get("SUN")
+        expires = int(time.values[0]) + 5 if time is not None else 0
+        is_key = messages.who_of(messages.NUMBER_OF[name]) == messages.KEY
+        head = (token, expires, edition) if is_key else (token, expires)
+        return sender.frame(
+            self._addresses[target], name, *head, *_NUMBERS.get(name, ()),
+            key=b"guessed" if is_key else b"",
+        )  # fmt: skip
+
+    def safe(self, target: int, size: float) -> bytes:
+        """Return DEFOCUS or STOW, to one heliostat or to all, after a zero that ends any noise."""
+        chance = random.Random(f"safe {size}")
+        to = chance.choice([self._addresses[target], wire.BROADCAST])
+        sender = wire.Sender(chance.choice([0, 77]), chance.getrandbits(16))
+        return b"\0" + sender.frame(to, chance.choice(["DEFOCUS", "STOW"]))
+
+    def noise(self, size: float) -> bytes:
+        """Return bytes of any kind, ended."""
+        chance = random.Random(f"noise {size}")
+        return bytes(chance.randrange(256) for _ in range(chance.randint(1, 300))) + b"\0"

@@ -1,0 +1,559 @@
+"""The eleven safety invariants, checked by an observer who belongs to nobody.
+
+The observer sees the frames on the bus, what each board does, what the plant orders and what it
+is told. It keeps its own accounts and takes nobody's word: the age of a sun counts from when the
+cluster sent it, a heliostat is defocused when its beam passes the receiver, a duplicate is what
+came before, in true time throughout.
+
+========  ============================================================================
+number    what is checked
+========  ============================================================================
+1         In a state that needs the sun, the last one is not older than the lease.
+2         What is cut off from plant or cluster is off the receiver in 30 s and at stow in
+          5 min; so is what was ordered to.
+3         TRACKING and SEARCHING, and every way out of STOWED and FAULT, begin with a genuine
+          command in that instant.
+4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority.
+5         Duplicate, late, replayed and expired commands change nothing.
+6         A damaged frame changes nothing.
+7         After a boot the state is a safe one, the journal holds the old or the new record, and
+          the step counts are right to within what it says of them.
+8         Steps keep to range and rate; counted steps are those that were ordered.
+9         As 1, and the plant's lease too, while a clock or counter has jumped.
+10        Azimuth first from stow, last to stow; no beam on the receiver on the way.
+11        Every command on the bus was accepted and reported once; nothing is told to be younger
+          or other than it is.
+========  ============================================================================
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from heliotrope.control.protocol import NEVER, Progress, Stage, Status
+from heliotrope.errors import HeliotropeError
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages, states, wire
+from heliotrope.twin._account import Account, fingerprint
+from heliotrope.twin.board import Board
+from heliotrope.twin.ledger import FrameLedger, Order, OrderLedger, Sent
+from heliotrope.twin.outfit import LIMITS, RANGES, RECEIVER, STOW
+
+#: Gives the true direction to the sun, (3,), at a time in s.
+SunAt = Callable[[float], FloatArray]
+
+#: Title of each invariant.
+TITLES = {
+    1: "no tracking on an old sun",
+    2: "what is cut off defocuses and stows",
+    3: "no way to tracking without a command",
+    4: "defocus and stow always, all else by authority",
+    5: "what is old moves nothing",
+    6: "what is damaged changes nothing",
+    7: "safe after a reset, journal whole",
+    8: "steps within limits, and counted",
+    9: "no jump of time extends a lease",
+    10: "beams travel safely",
+    11: "every command once, every value true",
+}
+
+#: Local lease, and how much later a board may look, s.
+LEASE, LOOK = 6.0, 0.15
+#: The plant's lease to a cluster, s, and how late the last sun of it may go out.
+PLANT_LEASE, SUN_AFTER = 3.0, 1.2
+#: Time to be off the receiver, and at stow, s.
+DEFOCUS_WITHIN, STOW_WITHIN = 30.0, 300.0
+#: A beam this far (m) from its middle is off the receiver.
+OFF = 4.0
+#: After a jump the checks of the leases count as those of number 9 for so long, s.
+JUMP_COUNTS = 60.0
+#: From an order to its first frame on a healthy bus, s.
+ORDER_WITHIN = 1.0
+#: A value may be told this much (s) younger than it is: the rounding of its age.
+AGE_ROUNDING = 0.05
+#: A status is not delivered later than this after it was sent, s.
+STATUS_LIFE = 1.0
+
+#: What a controller may do by itself, or by DEFOCUS and STOW: state before, state after.
+FREE = {
+    *((before, states.DEFOCUSED) for before in (
+        states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)),
+    *((before, states.STOWING) for before in (
+        states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)),
+    *((before, states.FAULT) for before in range(len(states.STATES)) if before not in (
+        states.UNCONFIGURED, states.LOCKED)),
+    (states.STOWING, states.STOWED), (states.APPROACHING, states.IDLE),
+    (states.SEARCHING, states.IDLE), (states.UNCONFIGURED, states.LOCKED),
+}  # fmt: skip
+#: What else needs which command, by the state that is entered.
+BY_COMMAND = {
+    states.TRACKING: ("TRACK", "REFOCUS"), states.SEARCHING: ("SEARCH",),
+    states.APPROACHING: ("APPROACH",), states.LOCKED: ("LOCK",),
+    states.IDLE: ("IDLE", "UNLOCK", "CLEAR_FAULT"),
+    states.STOWED: ("UNLOCK", "CLEAR_FAULT"), states.FAULT: ("UNLOCK",),
+}  # fmt: skip
+#: States that a boot may lead to.
+AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
+#: What DEFOCUS and STOW never leave a mirror in.
+ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
+#: States that a command asks for: what DONE must mean.
+ASKED = {
+    "APPROACH": (states.IDLE,), "IDLE": (states.IDLE,), "TRACK": (states.TRACKING,),
+    "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,), "SEARCH": (states.SEARCHING,),
+}  # fmt: skip
+
+
+class InvariantError(HeliotropeError):
+    """An invariant is broken.
+
+    Attributes
+    ----------
+    violation
+        Which, when, where and what was seen.
+    """
+
+    def __init__(self, violation: "Violation") -> None:
+        self.violation = violation
+        super().__init__(str(violation))
+
+
+@dataclass(frozen=True)
+class Violation:
+    """What broke an invariant.
+
+    Attributes
+    ----------
+    number
+        1 to 11.
+    at
+        s since the start.
+    subject
+        Name of the heliostat, or "cluster".
+    saw
+        What was seen, with values and limits.
+    """
+
+    number: int
+    at: float
+    subject: str
+    saw: str
+
+    def __str__(self) -> str:
+        title = TITLES[self.number]
+        return f"invariant {self.number} ({title}): at {self.at:.3f} s, {self.subject}: {self.saw}"
+
+
+class Observer:
+    """Listens to bus, boards and plant, and raises at the first broken invariant.
+
+    It is a `twin.bus.Tap` and a `twin.board.Witness`; `look` is called every half second.
+
+    Parameters
+    ----------
+    boards
+        In the order of their places on the bus.
+    start
+        Time that counts as 0 s in what it says.
+    sun
+        Gives the true direction to the sun, (3,), at a time in s.
+
+    Attributes
+    ----------
+    checks
+        How often each invariant was checked.
+    frames, orders
+        The ledgers.
+    leased_at
+        When the plant last sent a lease on a line that was whole, s.
+    jumped_at, disturbed_at
+        When a clock or counter last jumped; when line, bus or cluster last failed; s.
+    autonomy
+        Of the plant's leases, s.
+    entered
+        How often each state was entered.
+    start
+        As given.
+    """
+
+    def __init__(self, boards: Sequence[Board], start: float, sun: SunAt) -> None:
+        self.checks: Counter[int] = Counter(dict.fromkeys(TITLES, 0))
+        self.frames = FrameLedger()
+        self.orders = OrderLedger()
+        self.leased_at = start
+        self.jumped_at = self.disturbed_at = float("-inf")
+        self.autonomy = 0.0
+        self.accounts = [Account(board, start) for board in boards]
+        self.start = start
+        self._sun = sun
+        self._by_address = {account.address: account for account in self.accounts}
+        self._emergencies: list[tuple[str, float]] = []
+        self._unreported: deque[tuple[float, str, list[int], list[Order]]] = deque()
+        self.entered: Counter[int] = Counter()
+        for account in self.accounts:
+            account.board.witness = self
+
+    # -- saying so -------------------------------------------------------------------------
+
+    def check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
+        """Count a check, and raise if it fails.
+
+        Raises
+        ------
+        InvariantError
+            If ``good`` is False.
+        """
+        self.checks[number] += 1
+        if not good:
+            raise InvariantError(Violation(number, now - self.start, subject, saw))
+
+    def _lease_number(self, now: float, usual: int) -> int:
+        return 9 if now - self.jumped_at < JUMP_COUNTS else usual
+
+    # -- the bus (Tap) ---------------------------------------------------------------------
+
+    def sent(self, frame: bytes, now: float) -> None:
+        """Judge what the cluster sends."""
+        sent = self.frames.note(frame, now)
+        if sent is None:
+            self.check(6, False, now, "cluster", f"it sent {len(frame)} bytes that are no frame")
+            return
+        if sent.name == "SUN":
+            age = now - self.leased_at
+            limit = PLANT_LEASE + self.autonomy + SUN_AFTER
+            saw = f"it sends SUN {age:.2f} s after the plant's last lease, limit {limit:.2f} s"
+            self.check(self._lease_number(now, 2), age <= limit, now, "cluster", saw)
+        elif sent.who in (messages.AUTHORITY, messages.KEY):
+            self._authorised(sent, now)
+        elif sent.who == messages.ANYONE:
+            self._emergencies = [(name, at) for name, at in self._emergencies if name != sent.name]
+
+    def _authorised(self, sent: Sent, now: float) -> None:
+        """A command on the bus: from an order, in time, of the authority, and reported."""
+        name = "PARAMETERS" if sent.who == messages.KEY else sent.name
+        addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
+        orders = self.orders.covering(name, addresses, now)
+        where = f"{sent.name} to {sent.to}"
+        allowed = [order for order in orders if order.authorised]
+        self.check(4, bool(allowed), now, "cluster", f"{where} without an order of the authority")
+        fresh = [order for order in allowed if now <= order.until]
+        latest = max((order.until for order in allowed), default=0.0)
+        late = f"{where} {now - latest:.2f} s after its order has expired"
+        self.check(5, bool(fresh), now, "cluster", late)
+        if fresh:
+            self._unreported.append((now, where, addresses, fresh))
+
+    def heard(self, place: int, data: bytes, how: str, now: float) -> None:
+        """Take note of what a board is about to hear, and of what it then was."""
+        account = self.accounts[place]
+        sent = self.frames.of(data)
+        if how == "damaged" and sent is not None:
+            how = "whole"  # the noise has hit nothing
+        account.in_hand, account.how = sent, how
+        account.forged = None
+        if account.board.node is None:
+            return
+        if how == "forged":
+            account.forged = _first(data)
+        account.quiet = self._expects_quiet(account, sent, how)
+        if account.quiet:
+            # Its own time first, so that nothing but the frame is left to change anything.
+            account.board.step(now)
+            if account.board.state < 0:
+                account.quiet = 0
+                return
+            account.before = self._fingerprint(account, how)
+        account.good = account.board.node.reader.good
+
+    def _expects_quiet(self, account: Account, sent: Sent | None, how: str) -> int:
+        """Return the invariant by which a frame must change nothing, 0 if it may act."""
+        if how == "damaged":
+            return 6
+        if how == "forged":
+            forged = account.forged
+            mine = forged is not None and forged.for_address(account.address)
+            safe = forged is not None and forged.name in ("DEFOCUS", "STOW")
+            return 0 if safe and mine else 4
+        if sent is None or sent.who == messages.ANYONE or how == "whole":
+            return 0
+        if not sent.addresses(account.address):
+            return 5
+        node = account.board.node
+        if sent.name == "SESSION" and node is not None and node.controller.gate is not None:
+            # A late one of a cluster that has started again since is news.
+            return 5 if sent.values[0] < node.controller.gate.replay.epoch else 0
+        return 5 if sent.index <= account.taken else 0
+
+    def _fingerprint(self, account: Account, how: str) -> dict[str, object]:
+        sent = account.in_hand
+        told = sent is not None and sent.who == messages.CLUSTER
+        return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not told)
+
+    def answered(self, data: bytes, how: str, now: float) -> None:
+        """Note what the master has heard from whom."""
+        del how
+        for frame in wire.Reader().feed(data):
+            account = self._by_address.get(frame.sender)
+            if account is not None:
+                values = frame.values()
+                state = int(values[0]) if frame.name == "STATUS" and values else -1
+                account.answers.append((now, state))
+
+    # -- the boards (Witness) --------------------------------------------------------------
+
+    def acted(self, board: Board, what: str, now: float) -> None:
+        """Judge what a board has done."""
+        account = self._by_address[board.outfit.address]
+        node = board.node
+        if what == "cut" or node is None:
+            account.cut(now)
+            return
+        if what == "boot":
+            self._booted(account, now)
+            return
+        heard = what == "bytes"
+        if heard:
+            self._took(account, now)
+        if account.board.state != account.state:
+            self._changed(account, now, heard)
+        self._leases(account, now)
+        if account.keep():
+            sent = account.in_hand if heard else None
+            by = sent is not None and (sent.who == messages.KEY or sent.name == "STANDBY")
+            saw = "its journal has changed without a message that sets anything"
+            self.check(4, by, now, account.name, saw)
+        if heard:
+            account.in_hand = None
+            account.how = ""
+
+    def _took(self, account: Account, now: float) -> None:
+        board, sent = account.board, account.in_hand
+        node = board.node
+        assert node is not None
+        good = node.reader.good > account.good
+        name = account.name
+        if account.quiet:
+            after = self._fingerprint(account, account.how)
+            what = sent.name if sent else "noise"
+            what = account.forged.name if account.forged else what
+            saw = f"{what} ({account.how}) has changed {_difference(account.before, after)}"
+            self.check(account.quiet, after == account.before, now, name, saw)
+        elif account.how == "forged" and good:
+            state = states.STATES[board.state]
+            what = account.forged.name if account.forged else ""
+            self.check(
+                4, board.state not in ON_THE_WAY, now, name,
+                f"it is {state} after {what}, which is for everybody to send",
+            )  # fmt: skip
+        elif sent is not None and sent.addresses(account.address) and good:
+            if sent.who not in (messages.ANYONE, messages.ASK):
+                account.taken = max(account.taken, sent.index)
+            if sent.name == "SUN":
+                account.sun_at = max(account.sun_at, sent.at)
+            elif sent.who == messages.ANYONE:
+                state = states.STATES[board.state]
+                saw = f"it is {state} after {sent.name}"
+                self.check(4, board.state not in ON_THE_WAY, now, name, saw)
+        account.quiet = 0
+
+    def _changed(self, account: Account, now: float, heard: bool) -> None:
+        """A state was left: by a command in this instant, or as the table of `FREE` allows."""
+        before, after = account.state, account.board.state
+        account.entered(after, now)
+        self.entered[after] += 1
+        if (before, after) in FREE:
+            return
+        sent = account.in_hand if heard else None
+        name = sent.name if sent is not None else ""
+        good = name in BY_COMMAND.get(after, ())
+        cause = name or ("bytes" if heard else "nothing but time")
+        saw = f"from {states.STATES[before]} to {states.STATES[after]} by {cause}"
+        self.check(3, good, now, account.name, saw)
+
+    def _leases(self, account: Account, now: float) -> None:
+        """A state that needs the sun has one that is young enough."""
+        if account.board.state in states.NEED_SUN:
+            age = now - account.sun_at
+            state = states.STATES[account.board.state]
+            saw = f"{state} with a sun of {age:.3f} s, lease {LEASE:g} s"
+            number = self._lease_number(now, 1)
+            self.check(number, age <= LEASE + LOOK, now, account.name, saw)
+
+    def _booted(self, account: Account, now: float) -> None:
+        board = account.board
+        node = board.node
+        assert node is not None
+        state, name = states.STATES[board.state], account.name
+        self.check(7, board.state in AFTER_BOOT, now, name, f"{state} after a boot")
+        held = dict(node.journal.items)
+        wrong = account.mixture(held)
+        self.check(7, not wrong, now, name, f"after a boot its journal holds {wrong}")
+        doubt = node.journal.doubt
+        slip = max(abs(s) for s in board.slip)
+        saw = f"step counts are {slip} steps wrong after a boot, and doubted by {doubt}"
+        self.check(7, doubt < 0 or slip <= doubt, now, name, saw)
+        account.booted(now)
+
+    def stepped(
+        self, board: Board, axis: int, direction: int, count: int, interval_us: int
+    ) -> None:
+        """Judge a segment: range, rate, and the order of the axes."""
+        account, now = self._by_address[board.outfit.address], board.now
+        name, which = account.name, ("azimuth", "elevation")[axis]
+        rate = 1e6 / max(1, interval_us)
+        limit = LIMITS[0]
+        saw = f"{count} steps of {which} at {rate:.0f} steps/s, limit {limit}"
+        self.check(8, count > 0 and rate <= limit, now, name, saw)
+        place = board.axes[axis].emitted - board.slip[axis] + direction * count
+        low, high = RANGES[axis]
+        saw = f"{which} ordered to step {place}, range {low} to {high}"
+        self.check(8, low <= place <= high, now, name, saw)
+        saw = account.rate(axis, count, now)
+        self.check(8, not saw, now, name, saw)
+        wrong = account.order(axis)
+        if wrong is not None:
+            self.check(10, not wrong, now, name, wrong)
+
+    # -- the plant -------------------------------------------------------------------------
+
+    def leased(self, now: float) -> None:
+        """Note that the plant has sent a lease on a line that carries it."""
+        self.leased_at = now
+
+    def ordered(self, order: Order) -> None:
+        """Note an order of the plant."""
+        self.orders.note(order)
+
+    def emergency(self, name: str, now: float, *, carried: bool) -> None:
+        """Note DEFOCUS or STOW for everybody; ``carried``: line and cluster are there."""
+        if carried:
+            self._emergencies.append((name, now))
+        for account in self.accounts:
+            account.must(name, now)
+
+    def jumped(self, now: float) -> None:
+        """Note that a clock or a counter jumps."""
+        self.jumped_at = now
+
+    def disturbed(self, now: float, *, crashed: bool = False) -> None:
+        """Note that line, bus or cluster fail: what was due from the cluster is not."""
+        self.disturbed_at = now
+        self._emergencies.clear()
+        if crashed:
+            for account in self.accounts:
+                account.forget()
+
+    def progress(self, message: Progress, now: float) -> None:
+        """Judge what the plant is told of a command."""
+        order = self.orders.by_identity.get(message.identity)
+        if order is None:
+            return
+        subject = f"command {message.identity}"
+        if message.stage is Stage.ACCEPTED:
+            order.accepted.update(message.heliostats)
+            most = max(order.accepted.values(), default=0)
+            saw = f"{order.name} was reported as accepted {most} times"
+            self.check(11, most == 1, now, subject, saw)
+            saw = f"{order.name} was accepted without authority"
+            self.check(4, order.authorised, now, subject, saw)
+        if message.stage is Stage.DONE and order.name in ASKED:
+            for account in self.accounts:
+                if account.name in message.heliostats:
+                    reached = account.was_in(ASKED[order.name], order.at)
+                    saw = f"{order.name} of {account.name} is reported as done and never was"
+                    self.check(11, reached, now, subject, saw)
+
+    def status(self, message: Status, names: Iterable[str], now: float) -> None:
+        """Judge what the plant is told of each heliostat: no younger, no other than it is."""
+        by_name = {account.name: account for account in self.accounts}
+        for name, row in zip(names, message.nodes(), strict=True):
+            account = by_name.get(name)
+            if account is None or int(row["heard_ms"]) == NEVER:
+                continue
+            claimed = now - int(row["heard_ms"]) / 1000.0
+            last = account.answers[-1][0] if account.answers else float("-inf")
+            # The age is that of when it was sent; a bad line may keep it for as long as it lives.
+            slack = AGE_ROUNDING if now - self.disturbed_at > STATUS_LIFE else STATUS_LIFE + 0.1
+            saw = f"told to be heard {now - claimed:.2f} s ago, it was {now - last:.2f} s ago"
+            self.check(11, claimed <= last + slack, now, name, saw)
+            told = {state for at, state in account.answers if state >= 0}
+            state = int(row["state"])
+            saw = f"told to be {states.STATES[state]}, which it has not answered of late"
+            self.check(11, state in told, now, name, saw)
+
+    # -- time ------------------------------------------------------------------------------
+
+    def look(self, now: float) -> None:
+        """Judge what must have come true by now."""
+        for name, at in self._emergencies:
+            saw = f"{name} was ordered {now - at:.2f} s ago and is not on the bus"
+            self.check(4, now - at <= ORDER_WITHIN, now, "cluster", saw)
+        self.orders.drop(now)
+        self._reported(now)
+        leased = now - self.leased_at <= 1.6
+        sun = self._sun(now)
+        for account in self.accounts:
+            if account.board.node is not None:
+                self._counted(account, now)
+                self._due(account, sun, now, leased)
+
+    def _reported(self, now: float) -> None:
+        """What went out on the bus was told to the plant, if line and cluster were whole."""
+        while self._unreported and now - self._unreported[0][0] > ORDER_WITHIN:
+            at, where, addresses, orders = self._unreported.popleft()
+            if min(order.at for order in orders) <= self.disturbed_at:
+                continue
+            names = {self._by_address[address].name for address in addresses}
+            told = any(names <= set(order.accepted) for order in orders)
+            saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
+            self.check(11, told, now, "cluster", saw)
+
+    def _counted(self, account: Account, now: float) -> None:
+        """Counted steps are those that were ordered of the timers."""
+        board = account.board
+        assert board.node is not None
+        motion = board.node.controller.motion
+        for i in (0, 1):
+            ordered = board.axes[i].emitted - board.slip[i]
+            counted = motion.place(i)
+            saw = f"axis {i} counts {counted} steps, and {ordered} were ordered"
+            self.check(8, ordered == counted, now, account.name, saw)
+
+    def _due(self, account: Account, sun: FloatArray, now: float, leased: bool) -> None:
+        """What is cut off, or was ordered to, is off the receiver, and at stow, in time."""
+        board, name = account.board, account.name
+        account.served(now, leased)
+        assert board.node is not None
+        motion = board.node.controller.motion
+        if board.state in (states.LOCKED, states.UNCONFIGURED) or not motion.known:
+            return
+        on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
+        for why, begin in account.deadlines(now):
+            passed = now - begin
+            state = states.STATES[board.state]
+            if passed > DEFOCUS_WITHIN:
+                saw = f"{state} {passed:.1f} s after {why}, limit {DEFOCUS_WITHIN:g} s"
+                self.check(2, board.state not in states.NEED_SUN, now, name, saw)
+                miss = board.miss(sun, RECEIVER, believed=True)
+                saw = f"{state}, beam {miss:.1f} m from the receiver {passed:.1f} s after {why}"
+                self.check(2, miss > OFF, now, name, saw)
+            if passed > STOW_WITHIN and account.must_stow(why):
+                saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {STOW}"
+                self.check(2, account.place() == STOW, now, name, saw)
+        if on_way or board.state == states.STOWED:
+            miss = board.miss(sun, RECEIVER, believed=True)
+            saw = f"{states.STATES[board.state]}, its beam passes the receiver at {miss:.1f} m"
+            self.check(10, miss > OFF, now, name, saw)
+
+
+def _first(data: bytes) -> wire.Frame | None:
+    frames = wire.Reader().feed(data)
+    return frames[0] if frames else None
+
+
+def _difference(before: "dict[str, object]", after: "dict[str, object]") -> str:
+    """Name what differs."""
+    return ", ".join(
+        f"{key} from {before[key]!r} to {after[key]!r}"
+        for key in before
+        if before[key] != after[key]
+    )

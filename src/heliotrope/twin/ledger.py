@@ -1,0 +1,137 @@
+"""What was said, kept by somebody who only listens: frames of the bus and orders of the plant."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from heliotrope.lcu import messages, wire
+
+
+@dataclass(frozen=True)
+class Sent:
+    """A frame that the cluster sent.
+
+    Attributes
+    ----------
+    index
+        Its place among all frames of the bus.
+    at
+        When, in s.
+    name, who
+        Of `lcu.messages`.
+    to
+        Address.
+    values, payload
+        As in the frame.
+    """
+
+    index: int
+    at: float
+    name: str
+    who: int
+    to: int
+    values: tuple[float, ...]
+    payload: bytes
+
+    def addresses(self, address: int) -> bool:
+        """Whether it is meant for an address."""
+        return self.to in (address, wire.BROADCAST)
+
+
+@dataclass
+class Order:
+    """A command that the plant gave.
+
+    Attributes
+    ----------
+    identity, name
+        Of the command; a set of parameters has the name of no command.
+    addresses
+        Of the heliostats that it is for.
+    at, until
+        When it was given and when it expires, in s.
+    authorised
+        Whether it carried the token of the authority.
+    accepted
+        How often it was reported as accepted, by heliostat.
+    """
+
+    identity: str
+    name: str
+    addresses: frozenset[int]
+    at: float
+    until: float
+    authorised: bool
+    accepted: Counter[str] = field(default_factory=Counter)
+
+
+class FrameLedger:
+    """All frames that the cluster has sent.
+
+    Attributes
+    ----------
+    last
+        The last frame of each name.
+    """
+
+    def __init__(self) -> None:
+        self._frames: dict[bytes, Sent] = {}
+        self._order: list[bytes] = []
+        self.last: dict[str, Sent] = {}
+
+    def __len__(self) -> int:
+        return len(self._order)
+
+    def note(self, data: bytes, now: float) -> Sent | None:
+        """Keep a frame; None if the bytes hold none."""
+        found = self._frames.get(data)
+        if found is not None:
+            return found
+        frames = wire.Reader().feed(data)
+        if not frames:
+            return None
+        frame = frames[-1]
+        sent = Sent(
+            len(self._order), now, frame.name, messages.who_of(frame.number), frame.to,
+            frame.values() or (), frame.payload,
+        )  # fmt: skip
+        self._frames[data] = self.last[frame.name] = sent
+        self._order.append(data)
+        return sent
+
+    def of(self, data: bytes) -> Sent | None:
+        """Return the frame of some bytes, None if the cluster never sent it."""
+        return self._frames.get(data)
+
+    def data(self, index: int) -> bytes:
+        """Return the bytes of a frame by its place."""
+        return self._order[index]
+
+
+#: Orders are forgotten so long after they have expired, s.
+_KEPT = 60.0
+
+
+class OrderLedger:
+    """The orders of the plant of late."""
+
+    def __init__(self) -> None:
+        self.by_identity: dict[str, Order] = {}
+
+    def note(self, order: Order) -> None:
+        """Keep an order; the second one of an identity is the same order, sent again."""
+        self.by_identity.setdefault(order.identity, order)
+
+    def drop(self, now: float) -> None:
+        """Forget what has expired long ago."""
+        old = [i for i, order in self.by_identity.items() if order.until + _KEPT < now]
+        for identity in old:
+            del self.by_identity[identity]
+
+    def covering(self, name: str, addresses: Iterable[int], now: float) -> list[Order]:
+        """Return the orders of a name for all these addresses that were given before now."""
+        wanted = frozenset(addresses)
+        return [
+            order for order in self.by_identity.values()
+            if order.name == name and wanted <= order.addresses and order.at <= now
+        ]  # fmt: skip
