@@ -3,6 +3,7 @@
 import asyncio
 import getpass
 import os
+import re
 import shutil
 import signal
 import socket
@@ -18,6 +19,7 @@ import pytest
 from heliotrope.control.clock import SystemClock, sleep_until
 from heliotrope.control.link import Link, LinkSettings, Outcome, running
 from heliotrope.control.mqtt import Broker, mqtt_link
+from heliotrope.control.tcp import client_tls
 from heliotrope.errors import InputError
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
@@ -31,17 +33,20 @@ CLOCK = SystemClock()
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
 
 
+_CONFIG = "listener 8883\nallow_anonymous true\nset_tcp_nodelay true\npersistence false"
+
+
 class Mosquitto:
     """A broker with its own configuration, on a port of this machine alone."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, config: str = _CONFIG) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             self.port = free.getsockname()[1]
+        self.log = folder / "mosquitto.log"
         self._config = folder / "mosquitto.conf"
         self._config.write_text(
-            f"listener {self.port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\n"
-            f"persistence false\nuser {getpass.getuser()}\n"
-            f"log_type all\nlog_dest file {folder}/mosquitto.log\n"
+            f"{config.replace('listener 8883', f'listener {self.port} 127.0.0.1')}\n"
+            f"user {getpass.getuser()}\nlog_type all\nlog_dest file {self.log}\n"
         )
         self.start()
 
@@ -406,3 +411,122 @@ def test_small_messages_go_out_at_once(mosquitto: Mosquitto) -> None:
 def test_names_that_make_no_topic_are_refused(prefix: str, cluster: str, text: str) -> None:
     with pytest.raises(InputError, match=text):
         mqtt_link(Broker("127.0.0.1"), prefix, cluster, KEY, CLOCK, plant=True)
+
+
+# -- the page about Mosquitto ----------------------------------------------------------
+
+
+def page_block(kind: str) -> str:
+    page = Path(__file__).parents[2] / "docs" / "how-to" / "mqtt.md"
+    found = re.search(rf"^```{kind}\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE)
+    assert found is not None, kind
+    return found[1]
+
+
+@pytest.fixture(scope="module")
+def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make an authority, a broker's certificate, passwords and the page's access list."""
+    missing = [tool for tool in ("openssl", "mosquitto_passwd") if shutil.which(tool) is None]
+    if missing or MOSQUITTO is None:
+        if os.environ.get("CI"):
+            pytest.fail(f"{missing or 'mosquitto'} not installed, and CI tests everything")
+        pytest.skip(f"{missing or 'mosquitto'} not installed: the page's settings are not tested")
+    folder = tmp_path_factory.mktemp("papers")
+
+    def run(*command: str) -> None:
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+
+    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    run("openssl", "req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-days", "2",
+        "-subj", "/CN=the plant's authority")  # fmt: skip
+    run("openssl", "req", *key, "-keyout", "broker.key", "-out", "broker.csr",
+        "-subj", "/CN=broker")  # fmt: skip
+    (folder / "names").write_text("subjectAltName=IP:127.0.0.1\n")
+    run("openssl", "x509", "-req", "-in", "broker.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
+        "-set_serial", "1", "-days", "2", "-extfile", "names", "-out", "broker.pem")  # fmt: skip
+    (folder / "passwords").touch()
+    for user in ("plant", "north", "south"):
+        run("mosquitto_passwd", "-b", "passwords", user, f"{user}'s own")
+    (folder / "acl").write_text(page_block("acl").replace("heliotrope/upington", PREFIX))
+    for path in folder.iterdir():  # Mosquitto warns of files that others can read
+        path.chmod(0o600)
+    return folder
+
+
+@pytest.fixture
+def page_broker(papers: Path, tmp_path: Path) -> Iterator[Mosquitto]:
+    config = page_block("conf").replace("/etc/mosquitto/heliotrope", str(papers))
+    broker = Mosquitto(tmp_path, config)
+    yield broker
+    broker.kill()
+
+
+def test_the_settings_of_the_page_let_plant_and_clusters_talk(
+    page_broker: Mosquitto, papers: Path
+) -> None:
+    def link(user: str, cluster: str, password: str = "") -> Link:
+        broker = Broker(
+            "127.0.0.1", page_broker.port, username=user, password=password or f"{user}'s own",
+            tls=client_tls(papers / "ca.pem"),
+        )  # fmt: skip
+        return mqtt_link(broker, PREFIX, cluster, KEY, CLOCK, CALM, plant=user == "plant")
+
+    async def main() -> None:
+        ends = [link("plant", "north"), link("north", "north")]
+        other = [link("plant", "south"), link("south", "south")]
+        async with running(*ends, *other):
+            await connected(*ends, *other)
+            order = bytes(CALM.largest)
+            assert await ends[0].send(order) is Outcome.SENT
+            assert await ends[1].receive() == order
+            await other[1].send(b"report")
+            assert await other[0].receive() == b"report"
+        refused = link("north", "north", "another's")
+        async with running(refused):
+            await until(lambda: refused.statistics.failures >= 1)
+            assert "Not authorized" in refused.problem
+
+    real(main)
+    warnings = [line for line in page_broker.log.read_text().splitlines() if "Warning" in line]
+    assert not warnings
+
+
+def test_the_access_list_of_the_page_keeps_clusters_apart(
+    page_broker: Mosquitto, papers: Path
+) -> None:
+    heard: list[str] = []
+
+    def client(user: str) -> aiomqtt.Client:
+        return aiomqtt.Client(
+            "127.0.0.1", page_broker.port, username=user, password=f"{user}'s own",
+            tls_context=client_tls(papers / "ca.pem"),
+        )  # fmt: skip
+
+    async def main() -> None:
+        async with client("plant") as plant, client("north") as north, client("south") as south:
+            await south.subscribe(f"{PREFIX}/#")
+            await plant.subscribe(f"{PREFIX}/#")
+            for user, sender in (("north", north), ("plant", plant)):
+                for topic in ("north/up", "north/status", "north/down", "south/up", "south/down"):
+                    await sender.publish(f"{PREFIX}/{topic}", f"{user} on {topic}", qos=1)
+            await south.publish(f"{PREFIX}/south/up", b"last", qos=1)
+            async for message in plant.messages:
+                if message.payload == b"last":
+                    break
+                heard.append(f"plant hears {message.payload.decode()}")
+            async for message in south.messages:
+                heard.append(f"south hears {message.payload.decode()}")
+                break
+            await plant.publish(f"{PREFIX}/south/down", b"last", qos=1)
+            async for message in south.messages:
+                if message.payload == b"last":
+                    break
+                heard.append(f"south hears {message.payload.decode()}")
+
+    real(main)
+    assert heard == [
+        "plant hears north on north/up",
+        "plant hears north on north/status",
+        "south hears plant on south/down",
+    ]
+    assert "Denied PUBLISH" in page_broker.log.read_text()
