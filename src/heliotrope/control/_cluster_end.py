@@ -34,7 +34,7 @@ class ClusterEnd:
         Strongest emergency act that it was told to carry out as a whole, and that still holds;
         -1 if none.
     greeted
-        Whether it was greeted since it connected.
+        Number of the connection that it was greeted in last.
     asked_at
         When it was asked for the names of its rows last, monotonic s.
     """
@@ -42,7 +42,7 @@ class ClusterEnd:
     def __init__(self, name: str, members: tuple[str, ...], link: Link, clock: Clock) -> None:
         self.name, self.members, self.link = name, members, link
         self.act = -1
-        self.greeted = False
+        self.greeted = -1
         self.asked_at = -math.inf
         self._clock = clock
         self._urgent: deque[_Post] = deque()

@@ -12,7 +12,6 @@ from heliotrope.control.safety import (
     Scope,
     Watcher,
     acknowledge,
-    decision,
     evaluate,
     start,
     watched_by,
@@ -113,10 +112,10 @@ class PlantWatch:
         return refusal
 
     def demanded(self, cluster: str = "") -> Act | None:
-        """Return the strongest act for the field, or for a cluster."""
-        if not cluster:
-            return max((a.act for a in self.actions if a.scope is Scope.FIELD), default=None)
-        return decision(self.actions, cluster)
+        """Return the strongest act for the field, or for one cluster beside that."""
+        scope = Scope.CLUSTER if cluster else Scope.FIELD
+        acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
+        return max(acts, default=None)
 
     def caused(self) -> bool:
         """Whether anything but the consequences of an emergency demands one for the field."""

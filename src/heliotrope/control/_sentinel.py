@@ -100,13 +100,15 @@ class Sentinel:
     def _obey_field(self, now: float) -> None:
         wanted = self._watch.demanded()
         order = self.order
-        if wanted is not None and wanted >= Act.DEFOCUS:
+        caused = self._watch.caused()
+        # What only follows from an emergency may make it worse, but begins none: it would
+        # never end.
+        if wanted is not None and wanted >= Act.DEFOCUS and (caused or self.on):
             if not self.on or order is None or wanted > order.act:
                 self.order_field(wanted, "safety table", self._watch.reasons(Act.DEFOCUS), now)
             elif now - self._repeated_at >= self._repeat:
                 self.repeat(self._ends.values())
-        # What only follows from the emergency keeps none going: it would never end.
-        if self.on and not self._watch.caused():
+        if not caused:
             self.on = False
         if wanted is not None and wanted >= Act.HOLD:
             self._joining.drop(self._watch.reasons(Act.HOLD))

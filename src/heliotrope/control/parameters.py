@@ -12,7 +12,7 @@ from zlib import crc32
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import drives
-from heliotrope.lcu.config import Config
+from heliotrope.lcu.config import MOST_POINTS, Config
 from heliotrope.lcu.journal import CODES_OF, SIZE_OF
 from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism.chain import Mechanism
@@ -23,6 +23,8 @@ _ORDER = (
     slot.ZERO, slot.RATE, slot.STROKE, slot.OFFSET, slot.RADIUS, slot.SCALE, slot.WORM_COS,
     slot.WORM_SIN, slot.WORM_RATIO, slot.SAG,
 )  # fmt: skip
+#: Points that a controller keeps of its safe way.
+WAY_POINTS = MOST_POINTS
 _ENDS = ("primary", "secondary")
 #: What a controller has of its own, and no plant pushes or compares.
 OWN = frozenset({"address", "key_id", "edition"})
@@ -87,12 +89,17 @@ class Machine:
         ENU, m, or None.
     defocus
         rad.
+    azimuth_axis, way
+        Which axis (0, 1) leaves stow first; and the points (ENU, m) that the beam passes from the
+        ground to the standby point, at most `WAY_POINTS`; (): the controller finds its own.
     """
 
     axes: tuple[Axis, Axis]
     stow: tuple[int, int]
     standby: tuple[float, float, float] | None = None
     defocus: tuple[float, float] = (0.1, 0.1)
+    azimuth_axis: int = 0
+    way: tuple[tuple[float, float, float], ...] = ()
 
 
 def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, bytes]:
@@ -127,6 +134,13 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
         numbers |= {"stow": machine.stow, "defocus": machine.defocus}
         if machine.standby is not None:
             numbers["standby"] = machine.standby
+        if len(machine.way) > WAY_POINTS:
+            raise InputError(
+                f"way: {len(machine.way)} points; a controller keeps {WAY_POINTS} at most"
+            )
+        rest = (0.0,) * (3 * (WAY_POINTS - len(machine.way)))
+        points = (x for point in machine.way for x in point)
+        numbers["way"] = (machine.azimuth_axis, len(machine.way), *points, *rest)
         for axis, end in zip(machine.axes, _ENDS, strict=True):
             numbers[f"limits_{end}"] = (
                 axis.low, axis.high, axis.rate, axis.acceleration, axis.backlash

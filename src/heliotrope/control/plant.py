@@ -185,20 +185,19 @@ class PlantController:
         """Tell one cluster each second that the plant is there."""
         while True:
             due = self._clock.monotonic() + self.settings.period
+            opened = end.link.statistics.opened
             if end.link.connected:
-                if not end.greeted:
+                if end.greeted != opened:
+                    end.greeted = opened
                     self._greet(end)
                 lease = Lease(self.authority.token, self.settings.lease, self.settings.autonomy)
                 # A lease counts from its arrival: an old one must not arrive at all.
                 end.post(lease, self.settings.period, urgent=True)
                 self.counters.leases += 1
-            else:
-                end.greeted = False
             await sleep_until(self._clock, due)
 
     def _greet(self, end: ClusterEnd) -> None:
         """Begin with a cluster that has connected."""
-        end.greeted = True
         # What was ordered while it was away holds for it too.
         end.act = -1
         self._sentinel.repeat([end])

@@ -1,0 +1,269 @@
+"""Emergencies of the plant: order, proof, repetition, causes, hysteresis, release."""
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.control.audit import read
+from heliotrope.control.authority import RefusedError
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.emergency import done
+from heliotrope.control.plant_settings import PlantSettings
+from heliotrope.control.protocol import NODE, Acknowledge, Emergency
+from heliotrope.control.safety import Act, adjusted, conditions
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.mechanism.drives import Drive, rotary
+from plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
+
+Play = Callable[[Bench], Awaitable[None]]
+WINDY = PlantSettings(sensors=frozenset({"wind_gust", "receiver_flux"}))
+
+
+def play(folder: Path, scene: Play, seed: int = 0, **options: Any) -> Bench:
+    """Run a scene in virtual time, the field tracking at its begin."""
+    made: list[Bench] = []
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, folder, **options)
+        made.append(bench)
+        for cluster in bench.clusters.values():
+            cluster.set(states.TRACKING)
+        async with running(bench):
+            await scene(bench)
+
+    run_virtual(main, seed)
+    return made[0]
+
+
+def orders(bench: Bench, cluster: str = "pod-1") -> list[tuple[str, tuple[str, ...]]]:
+    """Emergencies that a cluster was sent."""
+    return [(m.name, m.heliostats) for m in bench.clusters[cluster].of(Emergency)]
+
+
+async def feed(bench: Bench, seconds: float, **readings: float) -> None:
+    """Give sensors' readings once a second."""
+    for _ in range(round(seconds)):
+        for name, value in readings.items():
+            bench.plant.put(name, value)
+        await bench.wait(1.0)
+
+
+def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        bench.cluster_of("P3B").deaf.add("P3B")
+        order = plant.raise_emergency("a visitor", reason="smoke")
+        await bench.wait(0.5)
+        assert bench.count(states.DEFOCUSED) == 17
+        early = order.report(plant.now())
+        assert (early.unacknowledged, early.not_done) == (("P3B",), ("P3B",))
+        assert early.flux_proven is None
+        plant.put_flux(0.04)
+        assert order.report(plant.now()).flux_proven
+        await bench.wait(1.0)
+        assert order.report(plant.now()).late == ("P3B",)
+        assert "1 not acknowledged: P3B" in order.report(plant.now()).text
+        bench.cluster_of("P3B").deaf.clear()
+        await bench.wait(1.5)
+        plant.put_flux(0.04)
+        assert order.report(plant.now()).complete
+        assert order.report(plant.now()).text.startswith("every node acknowledged and done")
+        # What nobody lifts goes on to stow.
+        await bench.wait(35.0)
+        assert bench.count(states.STOWED) == 18
+        assert plant.emergency is not order
+        assert plant.emergency is not None
+        assert plant.emergency.act is Act.STOW
+        assert plant.emergency.report(plant.now()).not_done == ()
+
+    bench = play(tmp_path, scene)
+    assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
+    # It was repeated to the one that was silent, and to no other.
+    repeated = orders(bench, "pod-3")
+    assert repeated[0] == ("DEFOCUS", ())
+    assert set(repeated[1:-1]) == {("DEFOCUS", ("P3B",))}
+    records, _ = read(bench.audit.path)
+    assert (records[0].who, records[0].what, records[0].note) == ("a visitor", "DEFOCUS", "smoke")
+
+
+def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        # A dead node must not keep an emergency going for ever.
+        bench.cluster_of("P1C").deaf.add("P1C")
+        token = await bench.commanded()
+        plant.raise_emergency("Olga")
+        await bench.wait(3.0)
+        with pytest.raises(RefusedError, match=r"APPROACH: not accepted now: an emergency holds"):
+            plant.command(OPERATOR, token, "APPROACH")
+        assert plant.command(OPERATOR, token, "LOCK", ("P2A",))
+        with pytest.raises(RefusedError, match="the cause has not gone"):
+            plant.acknowledge(OPERATOR, "operator_emergency")
+        with pytest.raises(RefusedError, match="Vera is viewer"):
+            plant.withdraw_emergency(VIEWER)
+        plant.withdraw_emergency(OPERATOR)
+        with pytest.raises(RefusedError, match="Vera is viewer"):
+            plant.acknowledge(VIEWER, "operator_emergency")
+        await bench.wait(3.0)
+        plant.authority.keep(OPERATOR, token)
+        plant.acknowledge(OPERATOR, "operator_emergency")
+        await bench.wait(1.0)
+        assert not plant.emergency_on
+        # The node that did not answer is a finding of its own, to be acknowledged.
+        await bench.wait(3.0)
+        plant.acknowledge(OPERATOR, "nodes_unacknowledged")
+        await bench.wait(5.0)
+        plant.authority.keep(OPERATOR, token)
+        assert bench.count(states.DEFOCUSED) == 16
+        assert plant.command(OPERATOR, token, "APPROACH", ("P2B",))
+        with pytest.raises(RefusedError, match="it is not tripped"):
+            plant.acknowledge(OPERATOR, "operator_emergency")
+
+    bench = play(tmp_path, scene)
+    records, _ = read(bench.audit.path)
+    assert [r.what for r in records if r.who == "Olga"] == [
+        "AUTHORITY", "DEFOCUS", "LOCK", "WITHDRAW", "ACKNOWLEDGE", "ACKNOWLEDGE", "APPROACH"
+    ]  # fmt: skip
+    assert not any(r.what == "STOW" for r in records)
+
+
+def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        await feed(bench, 3, wind_gust=8.0, receiver_flux=0.7)
+        assert bench.count(states.TRACKING) == 18
+        await feed(bench, 2, wind_gust=16.0, receiver_flux=0.7)
+        assert bench.count(states.TRACKING) == 18
+        await feed(bench, 3, wind_gust=16.0, receiver_flux=0.0)
+        assert bench.count(states.DEFOCUSED) == 18
+        plant.put_flux(0.0)
+        # Between its limits it stays as it is, however long.
+        await feed(bench, 30, wind_gust=13.0, receiver_flux=0.0)
+        assert plant.emergency_on
+        await feed(bench, 1, wind_gust=21.0, receiver_flux=0.0)
+        assert bench.count(states.STOWED) == 18
+        await feed(bench, 50, wind_gust=5.0, receiver_flux=0.0)
+        assert plant.emergency_on
+        await feed(bench, 15, wind_gust=5.0, receiver_flux=0.0)
+        assert not plant.emergency_on
+        assert bench.count(states.STOWED) == 18
+        # The flux was not measured after the orders: somebody has to look why.
+        with pytest.raises(RefusedError, match="supervisor must acknowledge, not operator"):
+            plant.acknowledge(OPERATOR, "flux_after_emergency")
+        plant.acknowledge(ENGINEER, "flux_after_emergency")
+        told = [(a.condition, a.active) for a in plant.alarms if a.condition.startswith("wind")]
+        assert told[:2] == [("wind_gust_defocus", True), ("wind_gust_stow", True)]
+        assert set(told[2:]) == {("wind_gust_defocus", False), ("wind_gust_stow", False)}
+
+    # Ten minutes of calm are long in a test: here one does.
+    table = conditions()
+    for row in ("wind_gust_defocus", "wind_gust_stow"):
+        table = adjusted(table, row, clear_for=60.0)
+    bench = play(tmp_path, scene, settings=WINDY, table=table)
+    assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
+
+
+def test_a_sensor_that_falls_silent_counts_as_the_worst(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        await feed(bench, 5, wind_gust=3.0, receiver_flux=0.5)
+        assert bench.count(states.TRACKING) == 18
+        await bench.wait(6.0)
+        assert bench.count(states.STOWED) == 18
+        assert "no gust of wind (3 s)" in bench.plant.emergency.reason  # type: ignore[union-attr]
+        assert "wind_mean_stow" in bench.plant.unwatched
+        with pytest.raises(UnknownNameError, match="no sensor of the plant 'wind_mean'"):
+            bench.plant.put("wind_mean", 1.0)
+
+    play(tmp_path, scene, settings=WINDY)
+
+
+def test_a_silent_cluster_is_defocused_alone_and_told_again_when_it_is_back(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        bench.clusters["pod-4"].mute = True
+        took = await bench.until(lambda: bench.count(states.DEFOCUSED) == 3, 10.0)
+        assert took <= 4.5
+        assert not plant.emergency_on
+        token = await bench.commanded()
+        with pytest.raises(RefusedError, match="silence of the cluster"):
+            plant.command(OPERATOR, token, "TRACK", ("P4A",))
+        assert plant.command(OPERATOR, token, "TRACK", ("P5A",))
+        await bench.wait(32.0)
+        assert bench.count(states.STOWED) == 3
+        bench.clusters["pod-4"].mute = False
+        await bench.wait(8.0)
+        token = await bench.commanded()
+        assert plant.command(OPERATOR, token, "APPROACH", ("P4A",))
+
+    bench = play(tmp_path, scene)
+    assert orders(bench, "pod-4") == [("DEFOCUS", ()), ("STOW", ())]
+    assert orders(bench, "pod-3") == []
+
+
+def test_who_comes_back_during_an_emergency_is_told(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        line = bench.lines["pod-2"]
+        line.cut()
+        await bench.wait(2.5)
+        bench.plant.raise_emergency("Olga", Act.STOW)
+        await bench.wait(2.0)
+        assert bench.count(states.STOWED) == 15
+        line.heal()
+        await bench.until(lambda: bench.count(states.STOWED) == 18, 5.0)
+        with pytest.raises(InputError, match="HOLD is none"):
+            bench.plant.raise_emergency("Olga", Act.HOLD)
+
+    play(tmp_path, scene)
+
+
+def test_when_the_plant_ends_so_do_its_leases(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        await bench.plant.close()
+        await bench.wait(1.0)
+        counts = [len(c.taken) for c in bench.clusters.values()]
+        await bench.wait(5.0)
+        assert [len(c.taken) for c in bench.clusters.values()] == counts
+
+    play(tmp_path, scene)
+
+
+def test_a_row_of_a_cluster_is_acknowledged_there(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        bench.plant.acknowledge(ENGINEER, "clock_jump", "pod-1")
+        with pytest.raises(RefusedError, match="there is no such condition"):
+            bench.plant.acknowledge(ENGINEER, "clock_jump", "pod-9")
+        await bench.wait(1.0)
+
+    bench = play(tmp_path, scene)
+    (sent,) = bench.clusters["pod-1"].of(Acknowledge)
+    assert (sent.condition, sent.who, sent.role) == ("clock_jump", "Egon", "supervisor")
+    assert not bench.clusters["pod-2"].of(Acknowledge)
+
+
+def test_done_is_judged_by_state_and_by_axes() -> None:
+    one = rotary(200, 2400, microsteps=4)
+    drives = Drive(np.broadcast_to(one.table, (1, 2, 19)))
+    step = 2.0 * np.pi / (200 * 2400 * 4)
+    stowed = 1 << meanings.FLAGS.index("AT_STOW")
+
+    def judged(act: Act, state: int, left: float, *, settled: bool = True, flags: int = 0) -> bool:
+        rows = np.zeros(1, NODE)
+        rows["state"], rows["primary_goal"], rows["flags"] = state, round(left / step), flags
+        return bool(done(act, rows, drives, np.array([settled]))[0])
+
+    for state in (states.TRACKING, states.IDLE, states.APPROACHING, states.SEARCHING):
+        assert not judged(Act.DEFOCUS, state, 0.0)
+    for state in (states.DEFOCUSED, states.FAULT, states.LOCKED):
+        assert judged(Act.DEFOCUS, state, 4e-3)
+        assert not judged(Act.DEFOCUS, state, 6e-3)
+        assert not judged(Act.DEFOCUS, state, -6e-3)
+    assert judged(Act.DEFOCUS, states.STOWING, 1.0)
+    assert not judged(Act.DEFOCUS, states.STOWING, 1.0, settled=False)
+    assert not judged(Act.STOW, states.STOWING, 0.0)
+    assert judged(Act.STOW, states.LOCKED, 0.0, flags=stowed)
+    assert judged(Act.STOW, states.STOWED, 0.0)

@@ -1,0 +1,254 @@
+"""A plant with scripted clusters in virtual time: what they do is told by the test."""
+
+import asyncio
+import contextlib
+import struct
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliotrope.control.audit import JsonLines
+from heliotrope.control.authority import Person, Role
+from heliotrope.control.clock import VirtualClock, sleep_until
+from heliotrope.control.link import Link, messages
+from heliotrope.control.memory import Faults, MemoryLine, memory_pair
+from heliotrope.control.plant import PlantController
+from heliotrope.control.plant_settings import PlantSettings
+from heliotrope.control.protocol import (
+    NEVER,
+    NODE,
+    Answer,
+    Ask,
+    Command,
+    Emergency,
+    Lease,
+    Message,
+    Parameters,
+    Progress,
+    Stage,
+    Status,
+    decode,
+    encode,
+)
+from heliotrope.field.example import prototype
+from heliotrope.field.plant import Plant
+from heliotrope.lcu import states
+
+OPERATOR = Person("Olga", Role.OPERATOR)
+ENGINEER = Person("Egon", Role.ENGINEER)
+VIEWER = Person("Vera", Role.VIEWER)
+#: Where a command leads at once.
+LEADS = {
+    "APPROACH": states.IDLE, "IDLE": states.IDLE, "TRACK": states.TRACKING,
+    "REFOCUS": states.TRACKING, "LOCK": states.LOCKED, "DEFOCUS": states.DEFOCUSED,
+    "STOW": states.STOWED, "SEARCH": states.SEARCHING,
+}  # fmt: skip
+
+
+class ScriptedCluster:
+    """The other end of a link: obeys at once, except as it is told.
+
+    Attributes
+    ----------
+    deaf, stubborn
+        Heliostats that acknowledge nothing, and that refuse all commands.
+    mute
+        Whether it sends no status.
+    taken
+        Messages as they came, with their time.
+    rows, age_ms
+        What it reports, and how old each row is beside that.
+    stored
+        Items of each heliostat's journal.
+    """
+
+    def __init__(self, name: str, names: tuple[str, ...], link: Link, clock: VirtualClock) -> None:
+        self.name, self.names, self.link, self.clock = name, names, link, clock
+        self.deaf: set[str] = set()
+        self.stubborn: set[str] = set()
+        self.mute = False
+        self.greets = True
+        self.taken: list[tuple[float, Message]] = []
+        self.rows = np.zeros(len(names), NODE)
+        self.rows["state"] = states.STOWED
+        self.age_ms = np.zeros(len(names), dtype=np.int64)
+        self.stored: dict[str, dict[str, bytes]] = {name: {} for name in names}
+        self.token = 0
+        self.first = True
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        """The messages of a kind."""
+        return [message for _, message in self.taken if isinstance(message, kind)]
+
+    def commands(self, name: str) -> list[Command]:
+        """The commands of a name."""
+        return [message for message in self.of(Command) if message.name == name]
+
+    def set(self, state: int, *names: str) -> None:
+        """Put heliostats (none: all) into a state."""
+        for name in names or self.names:
+            self.rows["state"][self.names.index(name)] = state
+
+    async def run(self) -> None:
+        """Hear and tell until the link is closed."""
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(self.link.run())
+            telling = group.create_task(self._tell())
+            async for data in messages(self.link):
+                await self._take(decode(data))
+            telling.cancel()
+            await running
+
+    async def _tell(self) -> None:
+        due = self.clock.monotonic()
+        while True:
+            due += 1.0
+            if self.link.connected and not self.mute:
+                rows = self.rows.copy()
+                rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
+                greet = self.first and self.greets
+                status = Status(
+                    self.name, len(rows), self.clock.utc().timestamp(), "gps", 1e-3, 3.0, 0.2,
+                    names=self.names if greet else (), block=rows.tobytes(),
+                )  # fmt: skip
+                await self.send(status)
+                self.first = False
+            await sleep_until(self.clock, due)
+
+    async def send(self, message: Message) -> None:
+        """Send a message."""
+        await self.link.send(encode(message), expires=self.clock.monotonic() + 1.0)
+
+    async def _take(self, message: Message) -> None:
+        self.taken.append((self.clock.monotonic(), message))
+        if isinstance(message, Lease):
+            self.token = message.token
+        elif isinstance(message, Emergency):
+            await self._obey(message.identity, message.name, message.heliostats)
+        elif isinstance(message, Command):
+            if message.token != self.token or not self.token:
+                await self.send(Progress(message.identity, Stage.REFUSED, (), "not the authority"))
+                return
+            await self._obey(message.identity, message.name, message.heliostats)
+        elif isinstance(message, Parameters):
+            self.stored[message.heliostat].update(message.items())
+            for stage in (Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE):
+                await self.send(Progress(message.identity, stage, (message.heliostat,)))
+        elif isinstance(message, Ask):
+            await self.send(self._answer(message))
+
+    def _answer(self, ask: Ask) -> Answer:
+        if ask.what == "statistics":
+            return Answer(ask.identity, {name: {} for name in self.names})
+        if ask.what == "stored" and ask.heliostat not in self.deaf:
+            items = self.stored[ask.heliostat] or {"address": struct.pack("<H", 1)}
+            sizes = [len(data) for data in items.values()]
+            return Answer(
+                ask.identity, {"names": list(items), "sizes": sizes}, b"".join(items.values())
+            )
+        return Answer(ask.identity, {"error": f"{ask.heliostat} does not answer"})
+
+    async def _obey(self, identity: str, name: str, heliostats: tuple[str, ...]) -> None:
+        whom = heliostats or self.names
+        await self.send(Progress(identity, Stage.ACCEPTED, ()))
+        await self.send(Progress(identity, Stage.SENT, whom))
+        refused = tuple(n for n in whom if n in self.stubborn and name not in ("DEFOCUS", "STOW"))
+        good = tuple(n for n in whom if n not in self.deaf and n not in refused)
+        if refused:
+            await self.send(Progress(identity, Stage.REFUSED, refused, "not in this state"))
+        if not good:
+            return
+        await self.send(Progress(identity, Stage.ACKNOWLEDGED, good))
+        if name in LEADS:
+            self.set(LEADS[name], *good)
+        await self.send(Progress(identity, Stage.DONE, good))
+
+
+class Bench:
+    """A plant, its scripted clusters, and the lines between them."""
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        folder: Path,
+        *,
+        design: Plant | None = None,
+        faults: Faults | None = None,
+        seed: int = 1,
+        **options: Any,
+    ) -> None:
+        self.clock = clock
+        self.design = design or prototype()
+        self.audit = JsonLines(folder / "audit.jsonl", clock.utc())
+        held: dict[str, list[str]] = {}
+        for group in self.design.groups.values():
+            for name, cluster in zip(group.names, group.cluster, strict=True):
+                held.setdefault(cluster, []).append(name)
+        links: dict[str, Link] = {}
+        self.lines: dict[str, MemoryLine] = {}
+        self.clusters: dict[str, ScriptedCluster] = {}
+        for i, (name, names) in enumerate(held.items()):
+            near, far, line = memory_pair(
+                clock, names=("plant", name), faults=faults, seed=100 * seed + i
+            )
+            links[name], self.lines[name] = near, line
+            self.clusters[name] = ScriptedCluster(name, tuple(names), far, clock)
+        counter = iter(range(1, 10_000))
+        self.plant = PlantController(
+            self.design, links, clock, self.audit,
+            entropy=lambda n: (next(counter) * 7919).to_bytes(n, "little"),
+            **{"settings": PlantSettings(), **options},
+        )  # fmt: skip
+
+    def cluster_of(self, name: str) -> ScriptedCluster:
+        """The cluster of a heliostat."""
+        return next(c for c in self.clusters.values() if name in c.names)
+
+    def count(self, state: int) -> int:
+        """How many heliostats are in a state, in truth."""
+        return sum(int((c.rows["state"] == state).sum()) for c in self.clusters.values())
+
+    async def wait(self, seconds: float) -> None:
+        """Let time pass."""
+        await sleep_until(self.clock, self.clock.monotonic() + seconds)
+
+    async def until(self, what: Callable[[], bool], limit: float = 60.0) -> float:
+        """Wait until something holds; return how long that took, s."""
+        begin = self.clock.monotonic()
+        while not what():
+            assert self.clock.monotonic() - begin < limit, f"not within {limit} s"
+            await self.wait(0.05)
+        return self.clock.monotonic() - begin
+
+    async def commanded(self, person: Person = OPERATOR) -> int:
+        """Take the authority, and wait until commands are accepted; return the token."""
+        token = self.plant.take_authority(person).token
+        for _ in range(8):
+            await self.wait(0.5)
+            self.plant.authority.keep(person, token)
+        return token
+
+
+@contextlib.asynccontextmanager
+async def running(bench: Bench) -> AsyncIterator[Bench]:
+    """Run a bench, its clusters first, until the block ends."""
+    failure: Exception | None = None
+    async with asyncio.TaskGroup() as group:
+        others = [group.create_task(cluster.run()) for cluster in bench.clusters.values()]
+        task = group.create_task(bench.plant.run())
+        try:
+            await bench.wait(3.0)
+            yield bench
+        except Exception as error:  # noqa: BLE001 (it goes on as it came, not in a group)
+            failure = error
+        finally:
+            await bench.plant.close()
+            await task
+            for cluster in bench.clusters.values():
+                await cluster.link.close()
+            await asyncio.gather(*others)
+            bench.audit.close()
+    if failure is not None:
+        raise failure
