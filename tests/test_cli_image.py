@@ -198,6 +198,54 @@ def test_an_empty_frame_serves_as_background(folder: Path, call: Any) -> None:
     assert np.linalg.norm(place - truth) < 0.03
 
 
+def test_a_log_names_the_empty_frame_of_each_photograph(folder: Path, call: Any) -> None:
+    write_image(_photograph((0.0, 0.0), 8, beams=0).frame, folder / "empty.png")
+    log = folder / "log.csv"
+    lines = log.read_text().splitlines()
+    log.write_text("\n".join([lines[0] + ",empty", *(f"{each},empty.png" for each in lines[1:])]))
+    both = []
+    for given in (["--log", log], ["--empty", folder / "empty.png"]):
+        code, out, err = call(
+            folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
+            "--no-pictures", *given,
+        )  # fmt: skip
+        assert code == 0, err
+        both.append(json.loads(out)["images"][0]["targets"][0]["spots"][0])
+    assert both[0] == both[1]
+    log.write_text(log.read_text().replace("empty.png", "missing.png"))
+    code, _, err = call(
+        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--log", log,
+    )  # fmt: skip
+    assert code == 2
+    assert "missing.png: there is no such file" in err
+
+
+def test_empty_targets_are_learnt_and_used(folder: Path, call: Any) -> None:
+    for k in range(4):
+        write_image(_photograph((0.0, 0.0), 80 + k, beams=0).frame, folder / f"e{k}.png")
+    (folder / "before").mkdir()
+    for k in range(4):
+        (folder / f"e{k}.png").rename(folder / "before" / f"e{k}.png")
+    plant, memory = folder / "plant.toml", folder / "memory"
+    photograph = folder / "photographs" / "p0.png"
+    code, _, err = call(photograph, "--plant", plant, "--memory", memory)
+    assert code == 2
+    assert "there is no model of an empty target" in err
+    code, _, err = call(
+        folder / "before", "--plant", plant, "--live", "--limit", 4, "--memory", memory
+    )
+    assert code == 0, err
+    assert len(list(memory.glob("*.npz"))) == 1
+    code, out, err = call(
+        photograph, "--plant", plant, "--memory", memory, "--json", "--no-pictures"
+    )
+    assert code == 0, err
+    (reading,) = json.loads(out)["images"][0]["targets"]
+    assert reading["good"], reading["reasons"]
+    alone = json.loads(call(photograph, "--plant", plant, "--json", "--no-pictures")[1])
+    assert alone["images"][0]["targets"][0]["spots"] != reading["spots"]
+
+
 def test_a_tower_file_is_plant_enough(folder: Path, call: Any) -> None:
     tower = juelich() / "tower-measurements.json"
     image = juelich() / "images" / "target-camera" / "213508-raw.png"

@@ -41,6 +41,9 @@ def image(
     empty: Annotated[
         Path | None, typer.Option(help="The same camera's photograph without the beam.")
     ] = None,
+    memory: Annotated[
+        Path | None, typer.Option(help="Folder of models of the empty targets, learnt with --live.")
+    ] = None,
     annotated: Annotated[Path | None, typer.Option(help="Folder for annotated pictures.")] = Path(
         "out/image"
     ),
@@ -77,13 +80,13 @@ def image(
 
     place = open_place(plant)
     if live:
-        job = _job(place, target, crop, camera, empty, None)
-        _follow(paths, place, job, limit, burst, archive, as_json)
+        job = _job(place, target, crop, camera, empty, None, None)
+        _follow(paths, place, job, limit, burst, archive, memory, as_json)
         return
     files = _files([Path(path) for path in paths])
     table: Log | None = None if log is None else read_log(log)
     entries = campaign.known_of(files, table, heliostat)
-    job = _job(place, target, crop, camera, empty, annotated if pictures else None)
+    job = _job(place, target, crop, camera, empty, memory, annotated if pictures else None)
     with _cluster(scheduler) as client, shared.progress("reading", as_json) as advance:
         outcomes = campaign.process_many(
             files, job, entries,
@@ -103,7 +106,7 @@ def image(
 
 def _follow(
     paths: list[str], place: "Place", job: "Job", limit: int | None, burst: int,
-    archive: Path | None, as_json: bool,
+    archive: Path | None, memory: Path | None, as_json: bool,
 ) -> None:  # fmt: skip
     from heliotrope.cli._live import follow
     from heliotrope.errors import InputError
@@ -117,7 +120,7 @@ def _follow(
     folder = place.folder if named is not None else Path()
     frames = None if limit is None else limit * burst
     source = open_source(text, folder=folder, watch=Path(text).is_dir(), limit=frames)
-    follow(source, job, burst=burst, archive=archive, as_json=as_json)
+    follow(source, job, burst=burst, archive=archive, memory=memory, as_json=as_json)
 
 
 @dataclass(frozen=True)
@@ -180,10 +183,11 @@ def _files(paths: Sequence[Path]) -> list[Path]:
 
 def _job(
     place: Place, target: str, crop: bool, camera: str,
-    empty: Path | None, annotated: Path | None,
+    empty: Path | None, memory: Path | None, annotated: Path | None,
 ) -> "Job":  # fmt: skip
-    from heliotrope.errors import UnknownNameError
+    from heliotrope.errors import InputError, UnknownNameError
     from heliotrope.imaging.campaign import Job
+    from heliotrope.imaging.memory import Memory
     from heliotrope.imaging.photograph import Settings
     from heliotrope.imaging.reading import read_image
     from heliotrope.imaging.teaching import read_pictures
@@ -201,11 +205,17 @@ def _job(
     if annotated is not None:
         annotated.mkdir(parents=True, exist_ok=True)
     taught = read_pictures(place.folder, place.targets)
+    known_empty = Memory() if memory is None else Memory.load(memory)
+    if memory is not None and not known_empty:
+        raise InputError(
+            f"{memory}: there is no model of an empty target (*.npz) in it; --live with --memory "
+            "learns one"
+        )
     return Job(
         targets=place.targets,
         origin=(place.site.latitude_deg, place.site.longitude_deg, place.site.height),
         camera=known,
-        settings=Settings(pictures=taught),
+        settings=Settings(pictures=taught, empty=known_empty.models),
         crop=crop,
         target=target,
         annotated=annotated,

@@ -163,7 +163,7 @@ class EmptyTarget:
             looked for.
         """
         self._check(picture)
-        known = float(np.median(self.weight)) >= _KNOWN
+        known = self.ready
         background = from_model(picture, self) if known else from_frame(picture)
         light = background.values / self.reflectance if known else background.values
         lit = beams(picture, background) if spots is None else spots
@@ -204,7 +204,7 @@ class EmptyTarget:
         FormatError
             If it is not one of ours.
         """
-        file = check_file(path, "model of an empty target")
+        file = check_file(path, "a model of an empty target", binary=True)
         try:
             with np.load(file, allow_pickle=False) as held:
                 reflectance, weight = held["reflectance"], held["weight"]
@@ -221,6 +221,17 @@ class EmptyTarget:
                 f"memory {memory} above 0; learn a model anew from empty frames",
             )
         return EmptyTarget(reflectance.astype(np.float32), weight.astype(np.float32), memory, names)
+
+    @property
+    def ready(self) -> bool:
+        """Whether it has seen enough to say more of the paint than one frame does."""
+        return float(np.median(self.weight)) >= _KNOWN
+
+    def fits(self, picture: Rectified) -> bool:
+        """Whether it is a model of just the targets that a picture shows, on its grid."""
+        names = {target.name for target in picture.face.targets}
+        same = not self.targets or set(self.targets) == names
+        return same and picture.shape == self.reflectance.shape
 
     def _check(self, picture: Rectified) -> None:
         names = tuple(target.name for target in picture.face.targets)

@@ -20,6 +20,7 @@ from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.log import Entry, Log, beside
 from heliotrope.imaging.photograph import (
+    LookedAt,
     Photograph,
     PlacedSpot,
     Reading,
@@ -104,6 +105,8 @@ class Outcome:
         The annotated picture, if one was written.
     views
         How the faces lie in the frame, for the next one.
+    faces
+        What was seen on each face: the models of the empty targets learn from it.
     """
 
     path: Path
@@ -117,6 +120,7 @@ class Outcome:
     time_deviation: float = float("nan")
     annotated: Path | None = None
     views: tuple[View, ...] = ()
+    faces: tuple[LookedAt, ...] = ()
 
 
 def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
@@ -133,7 +137,9 @@ def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
     """
     try:
         frame = read_image(path)
-        return replace(look(frame, path, job, entry), views=())
+        if entry is not None and entry.empty is not None:
+            job = replace(job, without=read_image(entry.empty))
+        return replace(look(frame, path, job, entry), views=(), faces=())
     except HeliotropeError as error:
         return Outcome(path, problem=str(error))
 
@@ -191,6 +197,7 @@ def look(
         time_deviation=frame.time_deviation,
         annotated=drawn,
         views=photograph.views,
+        faces=photograph.faces,
     )
 
 

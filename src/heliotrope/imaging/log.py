@@ -16,7 +16,7 @@ from heliotrope.geometry import FloatArray, direction
 #: Columns of a log; a row needs a file's name or id, a heliostat and two counts.
 COLUMNS = (
     "file", "id", "heliostat", "timestamp", "target", "axis_1_motor_position",
-    "axis_2_motor_position", "sun_azimuth_deg_south0_east", "sun_elevation_deg_apparent",
+    "axis_2_motor_position", "sun_azimuth_deg_south0_east", "sun_elevation_deg_apparent", "empty",
 )  # fmt: skip
 
 
@@ -36,6 +36,8 @@ class Entry:
         With its zone; None if unknown.
     sun
         Unit vector to the apparent sun, ENU, (3,); None if unknown.
+    empty
+        The camera's photograph without the beam, of the same minute; None if there is none.
     """
 
     heliostat: str = ""
@@ -43,6 +45,7 @@ class Entry:
     target: str = ""
     time: datetime | None = None
     sun: FloatArray | None = None
+    empty: Path | None = None
 
 
 class Log:
@@ -79,7 +82,8 @@ def read_log(path: str | Path) -> Log:
     Parameters
     ----------
     path
-        With columns of :data:`COLUMNS`; the Jülich ``measurements.csv`` is one.
+        With columns of :data:`COLUMNS`; the Jülich ``measurements.csv`` is one. ``empty`` is
+        seen from the log's folder.
 
     Raises
     ------
@@ -133,12 +137,14 @@ def _entry(file: Path, line: int, row: Mapping[str, str]) -> Entry:
                 file, f"{text!r} is no time with a zone; write 2026-06-21T12:00:00Z",
                 f"line {line}, column timestamp",
             )  # fmt: skip
+    empty = row.get("empty", "").strip()
     return Entry(
         heliostat=row.get("heliostat", "").strip(),
         counts=counts if np.isfinite(counts).all() else None,
         target=row.get("target", "").strip(),
         time=time,
         sun=_sun(*angles),
+        empty=(file.parent / empty).resolve() if empty else None,
     )
 
 

@@ -164,7 +164,7 @@ class Settings:
         "frame", "model" (with ``empty``) or "difference" (with an empty frame); "auto"
         takes the best of what is there.
     empty
-        Models of the empty face by the name of one of its targets.
+        Models of the empty faces by any names; the one of a face's targets is taken.
     expectations
         By target.
     pictures
@@ -356,9 +356,10 @@ def _read_face(
 def _background(picture: Rectified, chosen: Settings, empty: Rectified | None) -> Background:
     way = chosen.background
     names = [t.name for t in picture.face.targets]
-    model = next((chosen.empty[n] for n in names if n in chosen.empty), None)
+    model = next((m for m in chosen.empty.values() if m.fits(picture)), None)
     if way == "auto":
-        way = "difference" if empty is not None else "model" if model is not None else "frame"
+        ready = model is not None and model.ready
+        way = "difference" if empty is not None else "model" if ready else "frame"
     if way == "difference":
         if empty is None:
             raise InputError("background by difference: give a frame without the beam as well")

@@ -5,7 +5,7 @@ evenly over paint and over print, and stray light. Second derivatives of the dra
 a blur that is not the one it is drawn with, so blur moves no mark.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -23,6 +23,9 @@ Values = npt.NDArray[np.float32]
 _PIXELS, _MOST, _COARSE, _FEWEST = 1.5, 32, 20, 6
 #: Neighbouring samples share light by lens and interpolation: so many count as one.
 _SHARED = 4.0
+#: A mark that is as bright as this part of the paint around it is pale; how much softer drawings
+#: are then tried, strokes.
+_PALE, _SOFTNESS = 0.6, (0.0, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7)
 #: What no fit of a drawing can see: print, relief and blur of a mark, pixels.
 _FLOOR = 0.1
 #: A drawing is softened by this, samples: about what pixels and a lens do.
@@ -380,14 +383,14 @@ def _adjust(
     basis, step, shape = template.basis, template.step, template.values.shape
     shift = np.zeros(2)
     numbers, weight = np.zeros(10), paint
-    samples = residual = inside = paint
+    samples = shown = residual = inside = paint
     for _ in range(_STEPS):
         taken = _sample(grey, pixel + scale @ shift, scale, template.first, step, shape)
         if taken is None:
             return None
         seen = np.asarray(cv2.GaussianBlur(taken[0], (0, 0), _SMOOTH), dtype=np.float32)
-        seen = _relit(seen, template.stroke) if relit else seen
-        samples = seen.ravel()
+        shown = seen.ravel()
+        samples = _relit(seen, template.stroke).ravel() if relit else shown
         inside = paint if taken[1] is None else paint * taken[1].ravel()
         _, numbers = _solve(basis[:, :10], weight * inside, samples)
         residual = samples - basis[:, :10] @ numbers.astype(np.float32)
@@ -401,7 +404,11 @@ def _adjust(
         if float(np.abs(move).max()) < 0.01 * step:
             break
     place = pixel + scale @ shift
-    return _judged(template, samples, weight, inside, residual, numbers, place, scale)
+    found = _judged(template, samples, weight, inside, residual, numbers, place, scale)
+    if found.contrast > _PALE:
+        contrast, blur = _softer(template, shown, inside, found.contrast, found.blur)
+        found = replace(found, contrast=contrast, blur=blur)
+    return found
 
 
 def _quantile(values: Values, share: float) -> float:
@@ -453,3 +460,33 @@ def _judged(
         blur=blur,
         shape=shape,
     )
+
+
+def _softer(
+    template: _Template, samples: Values, weight: Values, contrast: float, blur: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return contrast and blur of a pale mark: under stray light, or only out of focus.
+
+    The model's terms for blur hold while that is small to the stroke. Beyond, drawings
+    of several softnesses each way are compared, and the one that explains most tells.
+    """
+    import cv2
+
+    even, root = template.basis[:, :3], np.sqrt(weight)[:, None]
+    widest = 0.5 * max(template.values.shape)
+    ways = [(a, b) for a in _SOFTNESS for b in _SOFTNESS]
+    found, least = (contrast, blur), np.inf
+    for way in ways:
+        wide = np.maximum(template.stroke * np.array(way), 1e-3)
+        if wide.max() > widest:
+            continue
+        drawn = cv2.GaussianBlur(template.values, (0, 0), wide[0], sigmaY=wide[1])
+        parts = np.column_stack([even, drawn.ravel().astype(np.float32)])
+        numbers, left, _, _ = np.linalg.lstsq(parts * root, samples * root[:, 0], rcond=None)
+        if not left.size or float(left[0]) >= least:
+            continue
+        least = float(left[0])
+        if any(way):
+            pale = float((numbers[0] + numbers[3]) / max(float(numbers[0]), 1e-9))
+            found = pale, np.maximum(blur, template.step * wide)
+    return found

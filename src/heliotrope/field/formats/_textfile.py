@@ -11,7 +11,7 @@ from heliotrope.errors import FormatError, InputError
 LIMIT = 64 * 2**20
 
 
-def check_file(path: str | Path, what: str) -> Path:
+def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
     """Return the path if it is a readable file of a plausible size.
 
     Parameters
@@ -20,6 +20,8 @@ def check_file(path: str | Path, what: str) -> Path:
         The file.
     what
         What it should be, as an error calls it ("a HelioK file").
+    binary
+        Whether it need not begin like text.
 
     Raises
     ------
@@ -45,7 +47,7 @@ def check_file(path: str | Path, what: str) -> Path:
             file, f"{size / 2**20:.0f} MiB are more than the limit of {LIMIT / 2**20:.0f} MiB; "
             f"this is not {what}"
         )  # fmt: skip
-    if b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
+    if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise FormatError(file, f"the file is binary; it should be {what}")
     return file
 

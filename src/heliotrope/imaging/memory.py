@@ -1,0 +1,93 @@
+"""What the empty targets of a plant look like, kept up to date from photograph to photograph."""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from heliotrope.errors import InputError
+from heliotrope.imaging.background import EmptyTarget
+from heliotrope.imaging.photograph import LookedAt
+
+
+class Memory:
+    """Models of empty targets, one for each face that was seen.
+
+    Parameters
+    ----------
+    models
+        To begin with.
+
+    Examples
+    --------
+    ::
+
+        memory = Memory.load("empty")
+        photograph = read_photograph(frame, targets, settings=Settings(empty=memory.models))
+        memory.learn(photograph.faces)
+        memory.save("empty")
+    """
+
+    def __init__(self, models: Iterable[EmptyTarget] = ()) -> None:
+        self._models = {_name(model.targets): model for model in models}
+
+    def __len__(self) -> int:
+        return len(self._models)
+
+    @property
+    def models(self) -> Mapping[str, EmptyTarget]:
+        """By the names of their targets, for :class:`heliotrope.imaging.photograph.Settings`."""
+        return self._models
+
+    def learn(self, faces: Iterable[LookedAt]) -> None:
+        """Take in what was seen on faces; where beams were, nothing is learnt.
+
+        A face that is mostly in beams or shadows, or whose grid has changed, teaches nothing.
+        """
+        for face in faces:
+            picture = face.picture
+            name = _name(tuple(target.name for target in picture.face.targets))
+            model = self._models.get(name)
+            if model is None:
+                model = EmptyTarget.of(picture)
+            if model.fits(picture) and face.background.seen >= _LEAST_FREE:
+                self._models[name] = model.learn(picture)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "Memory":
+        """Return the memory of a folder; of one that is not there yet, an empty one.
+
+        Raises
+        ------
+        FormatError
+            If a file in it is no model.
+        InputError
+            If it is no folder.
+        """
+        place = Path(folder)
+        if place.exists() and not place.is_dir():
+            raise InputError(f"{place}: a folder is wanted here, for models of empty targets")
+        return cls(EmptyTarget.load(file) for file in sorted(place.glob("*.npz")))
+
+    def save(self, folder: str | Path) -> None:
+        """Write each model to the folder, whole or not at all.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
+        place = Path(folder)
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{place}: {error.strerror}; give a folder to write to") from None
+        for name, model in self._models.items():
+            model.save(place / f"{name}.npz")
+
+
+#: A face with less of its paint free of light teaches nothing.
+_LEAST_FREE = 0.3
+
+
+def _name(targets: Iterable[str]) -> str:
+    return "+".join(re.sub(r"[^\w.-]+", "_", name) for name in sorted(targets)) or "target"
