@@ -93,6 +93,7 @@ class Account:
         self._filled_at = [now, now]
         self._leg = 0  # of leaving stow: 0 none, 1 azimuth expected, 2 it moved, 3 elevation moves
         self._stowing_since: float | None = None
+        self._on_since: float | None = None
 
     # -- states ----------------------------------------------------------------------------
 
@@ -206,12 +207,25 @@ class Account:
         self._leg = 2
         return ""
 
+    def jumped(self) -> None:
+        """Note that its counter jumps: what its timers hold it may take for played."""
+        self._leg = 0
+
     # -- what is due -----------------------------------------------------------------------
 
     def served(self, now: float, leased: bool) -> None:
         """Note whether plant and cluster are there for it."""
         if leased and now - self.sun_at <= SERVED:
             self._served_at = now
+
+    def crosses(self, on: bool, now: float) -> float:
+        """Note whether the beam is on the receiver; return for how long, s."""
+        if not on:
+            self._on_since = None
+            return 0.0
+        if self._on_since is None:
+            self._on_since = now
+        return now - self._on_since
 
     def must(self, name: str, now: float) -> None:
         """Note an order to DEFOCUS or STOW."""
@@ -223,7 +237,7 @@ class Account:
         self._ordered.clear()
 
     def deadlines(self, now: float) -> list[tuple[str, float]]:
-        """Return since when it has to be going away, by cause."""
+        """Return since when it has to be going away, by cause, s."""
         found = list(self._ordered.items())
         if now - self._served_at > SERVED:
             found.append(("it was cut off", self._served_at))

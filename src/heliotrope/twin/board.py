@@ -259,6 +259,7 @@ class Board:
         """Return how far the ray passes a point, m; infinite if it goes away from it."""
         vertex, ray = self.beam(sun, believed=believed)
         way = np.subtract(point, vertex)
-        if way @ ray <= 0.0:
+        along = float(way @ ray)
+        if along <= 0.0:
             return math.inf
-        return float(np.linalg.norm(np.cross(way, ray)))
+        return math.sqrt(max(0.0, float(way @ way) - along * along))

@@ -365,7 +365,7 @@ class Damage:
             board.flash.ragged = chance.random() < 0.5
             self._pause = 0.1 + fault.lasts
         elif fault.kind == "tick_jump":
-            of.observer.jumped(now)
+            of.observer.jumped(now, fault.target)
             board.ticks.jump(kinds.tick_jump(fault.size))
         elif fault.kind == "time_jump":
             self._time_jump(fault, now)

@@ -1,0 +1,100 @@
+"""``heliotrope simulate``: a cluster in virtual time, everything that goes wrong, eleven checks."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from heliotrope.cli._common import print_json, print_table
+
+
+def simulate(
+    seed: Annotated[
+        int, typer.Option(help="Of everything that is drawn; the first of --runs.")
+    ] = 0,
+    hours: Annotated[float, typer.Option(help="Simulated time of a run.")] = 0.1,
+    heliostats: Annotated[int, typer.Option(help="On the bus, 1 to 32.")] = 4,
+    pause: Annotated[float, typer.Option(help="Mean time between two faults, s.")] = 12.0,
+    runs: Annotated[int, typer.Option(help="Runs, with seeds one after the other.")] = 1,
+    processes: Annotated[int, typer.Option(help="Runs at a time.")] = 1,
+    minutes: Annotated[
+        float | None, typer.Option(help="Begin no further run after this time.")
+    ] = None,
+    progress: Annotated[
+        Path | None, typer.Option(help="Keep what was run in this file, and go on from it.")
+    ] = None,
+    shrink: Annotated[
+        bool, typer.Option(help="Find fewer faults that still break a run that fails.")
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Run a real cluster and real local controllers in virtual time, with faults by a seed.
+
+    The eleven safety invariants are checked at every step. The exit code is 1 if one is broken.
+    """
+    from heliotrope.errors import InputError
+    from heliotrope.twin.simulation import Plan
+    from heliotrope.twin.soak import soak
+
+    if runs < 1 or (minutes is not None and not minutes > 0.0):
+        raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
+    plans = [Plan(seed + i, 3600.0 * hours, heliostats, pause) for i in range(runs)]
+    found = soak(
+        plans,
+        processes=processes,
+        budget=float("inf") if minutes is None else 60.0 * minutes,
+        progress=progress,
+    )
+    document = _document(found)
+    if shrink and found.broken:
+        document["shrunk"] = _shrunk(plans, found)
+    if as_json:
+        print_json(document)
+    else:
+        _print(document)
+    if found.broken:
+        raise typer.Exit(1)
+
+
+def _document(found: Any) -> dict[str, Any]:
+    from heliotrope.lcu import states
+    from heliotrope.twin.invariants import TITLES
+
+    return {
+        "runs": found.runs,
+        "hours": found.seconds / 3600.0,
+        "faults": dict(sorted(found.faults.items())),
+        "states": {states.STATES[k]: v for k, v in sorted(found.states.items())},
+        "checks": [
+            {"number": n, "invariant": title, "checks": found.checks[n]}
+            for n, title in TITLES.items()
+        ],
+        "broken": found.broken,
+    }
+
+
+def _shrunk(plans: list[Any], found: Any) -> list[str]:
+    """Shrink the first run that failed."""
+    from heliotrope.twin.simulation import run, shrink
+
+    for plan in plans:
+        if any(f"--seed {plan.seed} " in line for line in found.broken):
+            outcome = run(plan)
+            if not outcome.good:
+                less = shrink(outcome)
+                return [less.text, *map(str, less.plan.drawn)]
+    return []
+
+
+def _print(document: dict[str, Any]) -> None:
+    rows = [[str(c["number"]), c["invariant"], f"{c['checks']:,}"] for c in document["checks"]]
+    title = f"{document['runs']} runs, {document['hours']:.2f} simulated hours"
+    print_table(["", "invariant", "checks"], rows, title=title)
+    for what in ("faults", "states"):
+        print(f"{what}: " + ", ".join(f"{name} {count}" for name, count in document[what].items()))
+    for line in document["broken"]:
+        print(f"broken: {line}")
+    for line in document.get("shrunk", []):
+        print(f"  {line}")
+    if not document["broken"]:
+        print("no invariant was broken")
