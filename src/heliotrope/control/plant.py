@@ -364,6 +364,11 @@ class PlantController:
         """Return the unit vector to the sun now, ENU, (3,)."""
         return sun.vector(self._clock.utc(), self.design.site)
 
+    @property
+    def clock(self) -> Clock:
+        """What tells the time here."""
+        return self._clock
+
     def now(self) -> float:
         """Return the monotonic time, s."""
         return self._clock.monotonic()

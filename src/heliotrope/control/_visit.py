@@ -1,0 +1,176 @@
+"""A heliostat sent to a target by a person: there, while it is watched, and back to standby."""
+
+import asyncio
+from bisect import bisect_right
+
+import numpy as np
+
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.authority import Person, RefusedError
+from heliotrope.control.clock import sleep_until
+from heliotrope.control.plant import PlantController
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.mechanism.drives import Drive
+
+#: A mirror has arrived when both axes are this close (rad) to where they go, in two rows running.
+ARRIVED = 3e-4
+#: Looks at the field, s apart.
+_LOOK = 0.25
+
+
+class Visit:
+    """One heliostat on its way to, and at, a target.
+
+    Parameters
+    ----------
+    plant, person, token
+        On whose behalf every command is given.
+    heliostat, target
+        Who, and where to.
+
+    Attributes
+    ----------
+    row
+        Of the heliostat in the field.
+    away
+        Whether it was sent away from where it was.
+    """
+
+    def __init__(
+        self, plant: PlantController, person: Person, token: int, heliostat: str, target: Target
+    ) -> None:
+        self.plant, self.person, self.token = plant, person, token
+        self.heliostat, self.target = heliostat, target
+        self.row = plant.field.place(heliostat)
+        self._drives = Drive(plant.beams.drives.table[self.row])
+        self.away = False
+        self._times: list[float] = []
+        self._counts: list[FloatArray] = []
+
+    @property
+    def state(self) -> int:
+        """Its state now.
+
+        Raises
+        ------
+        RefusedError
+            If it is not live.
+        """
+        if not self.plant.field.live(self.plant.now())[self.row]:
+            shown = self.plant.field.of(self.heliostat, self.plant.now()).text
+            raise RefusedError(f"{shown}; nothing can be done with it")
+        return int(self.plant.field.rows["state"][self.row])
+
+    async def obey(self, ticket: Ticket, limit: float) -> None:
+        """Wait until a command is done.
+
+        Raises
+        ------
+        RefusedError
+            If it is refused, or not done within ``limit`` s.
+        """
+        if not await ticket.end(limit):
+            raise RefusedError(f"{self.heliostat}: {ticket.text}")
+
+    async def command(
+        self, name: str, values: tuple[float, ...] = (), limit: float = 120.0
+    ) -> None:
+        """Give it a command and wait until that is done; see `obey`."""
+        ticket = self.plant.command(self.person, self.token, name, (self.heliostat,), values)
+        await self.obey(ticket, limit)
+
+    async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
+        """Give it an aim and wait until it has taken it; see `obey`."""
+        await self.obey(self.plant.aim(self.person, self.token, {self.heliostat: point}), limit)
+
+    async def go(self, limit: float) -> None:
+        """Send it to the target and wait until it is there.
+
+        Raises
+        ------
+        RefusedError
+            If it is neither at standby nor tracking, a command is refused, or it does not
+            arrive within ``limit`` s.
+        """
+        state = self.state
+        if state not in (states.IDLE, states.TRACKING):
+            raise RefusedError(
+                f"{self.heliostat} is {states.STATES[state]}; bring it to standby (APPROACH) first"
+            )
+        self.away = True
+        await self.aim(self.target.center)
+        if self.state != states.TRACKING:
+            await self.command("TRACK")
+        await self.arrived(limit)
+
+    async def arrived(self, limit: float) -> None:
+        """Wait until it stays where it was sent; see `go`."""
+        until = self.plant.now() + limit
+        since, seen = self.plant.now(), 0
+        while seen < 2:
+            if self.plant.now() >= until:
+                raise RefusedError(f"{self.heliostat}: not at its aim within {limit:g} s")
+            await self.look()
+            if self.state != states.TRACKING:
+                raise RefusedError(
+                    f"{self.heliostat} is {states.STATES[self.state]}, not TRACKING any more"
+                )
+            heard = float(self.plant.field.heard[self.row])
+            if heard > since:
+                since = heard
+                seen = seen + 1 if self._left() < ARRIVED else 0
+
+    def _left(self) -> float:
+        node = self.plant.field.rows[self.row]
+        here = np.array([node["primary"], node["secondary"]], dtype=np.float64)
+        goal = np.array([node["primary_goal"], node["secondary_goal"]], dtype=np.float64)
+        return float(np.abs((goal - here) * self._drives.radians_per_count(here)).max())
+
+    async def look(self) -> None:
+        """Let a little time pass, and note the counts if they are new."""
+        await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
+        heard = float(self.plant.field.heard[self.row])
+        node = self.plant.field.rows[self.row]
+        # The age of a row jitters with the way of its message: not every change is a new answer.
+        if np.isfinite(heard) and (not self._times or heard > self._times[-1] + _LOOK):
+            self._times.append(heard)
+            self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
+
+    async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
+        """Return the step counts at an instant, between two rows that surround it, (2,).
+
+        Raises
+        ------
+        RefusedError
+            If it was not heard before and within ``limit`` s after.
+        """
+        until = self.plant.now() + limit
+        while not (len(self._times) > 1 and self._times[-1] >= instant):
+            if self.plant.now() >= until:
+                raise RefusedError(
+                    f"{self.heliostat}: not heard within {limit:g} s of the photograph, so where "
+                    "it stood is not known"
+                )
+            await self.look()
+        after = bisect_right(self._times, instant)
+        after = min(max(after, 1), len(self._times) - 1)
+        if not self._times[0] <= instant:
+            raise RefusedError(f"{self.heliostat}: the photograph is older than all that is known")
+        gap = self._times[after] - self._times[after - 1]
+        share = (instant - self._times[after - 1]) / gap
+        return np.asarray(
+            self._counts[after - 1] + share * (self._counts[after] - self._counts[after - 1])
+        )
+
+    async def home(self) -> None:
+        """Bring it back to standby; where that is not possible, take its beam off the target."""
+        if not self.away:
+            return
+        try:
+            await self.command("IDLE", limit=60.0)
+        except (RefusedError, asyncio.CancelledError):
+            self.plant.defocus(f"visit of {self.person.name}", (self.heliostat,))
+            raise
+        self.away = False
