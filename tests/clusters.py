@@ -2,12 +2,16 @@
 
 import asyncio
 import contextlib
+import copy
+import functools
 import struct
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
+from datetime import UTC, datetime
 from typing import Any, TypeVar
 
+from heliotrope.control._kept import Kept
 from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import VirtualClock
+from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.control.cluster import Cluster
 from heliotrope.control.cluster_config import ClusterConfig, Member
 from heliotrope.control.link import Bus, messages, running
@@ -64,6 +68,7 @@ class Board:
         self.flash, self.timer = Flash(), Timer()
         self.on = True
         self.out = bytearray()
+        self.begin = self.at = 0.0
         if configured:
             items = items_of_heliostat(heliostat())
             items["address"] = struct.pack("<H", address or number)
@@ -75,14 +80,23 @@ class Board:
 
     def boot(self, now: float) -> None:
         self.node = Node(
-            self.flash, self.timer, self.out.extend, self._tick(now), self.serial,
+            self.flash, self.timer, self._write, self._tick(now), self.serial,
             sha256=sha256, key=key_of(self.number),
         )  # fmt: skip
         self.on = True
 
-    @staticmethod
-    def _tick(now: float) -> int:
-        return round(now * 1000) % ticks.PERIOD
+    def _write(self, data: bytes) -> None:
+        self.out += data
+
+    def _tick(self, now: float) -> int:
+        self.at = now
+        return round((now - self.begin) * 1000) % ticks.PERIOD
+
+    def resume(self, now: float) -> "Board":
+        """Go on in another field, whose time is another."""
+        self.begin += now - self.at
+        self.at = now
+        return self
 
     def hear(self, data: bytes, now: float) -> bytes:
         self.out.clear()
@@ -166,12 +180,18 @@ class Field:
     def __init__(
         self, clock: VirtualClock, count: int = 2, *, boards: list[Board] | None = None,
         bus: Callable[[VirtualClock, list[Board]], Bus] | None = None, seed: int = 0,
+        kept: Kept | None = None, line: Callable[[], bool] | None = None,
         **changes: Any,
     ) -> None:  # fmt: skip
         self.clock = clock
-        self.boards = boards or [Board(n) for n in range(1, count + 1)]
-        for board in self.boards:
-            board.boot(clock.monotonic())
+        now = clock.monotonic()
+        if boards is None:
+            self.boards = [Board(n) for n in range(1, count + 1)]
+            for board in self.boards:
+                board.boot(now)
+        else:
+            self.boards = [board.resume(now) for board in boards]
+            count = len(boards)
         self.config = config_of(count, **changes)
         self.bus: Any = (
             bus(clock, self.boards) if bus else TwinBus(clock, [*self.boards], seed=seed)
@@ -180,7 +200,10 @@ class Field:
         self.plant = Plant(near, clock)
         self.link = far
         self.time = SystemTime(clock)
-        self.cluster = Cluster(self.config, self.bus, self.link, clock, self.time)
+        self.kept = kept or Kept(None)
+        self.cluster = Cluster(
+            self.config, self.bus, self.link, clock, self.time, self.kept, line=line
+        )
 
     async def _tick(self) -> None:
         while True:
@@ -200,6 +223,7 @@ class Field:
                 running(self.bus, self.link, self.plant.link, self.time),
                 running(self.cluster),
             ):
+                await self.until(lambda: bool(self.plant.all(Status)))
                 yield self
             for other in others:
                 other.cancel()
@@ -225,13 +249,90 @@ class Field:
 
     async def to_tracking(self) -> None:
         """From power-on to tracking."""
-        await self.until(lambda: bool(self.plant.all(Status)) and self.status_fresh())
+        await self.until(self.sun_is_fresh)
         await self.order("aim", "AIM", *AIM)
         await self.order("approach", "APPROACH")
         await self.until(lambda: set(self.states()) == {"IDLE"}, 300.0)
         await self.order("track", "TRACK")
         await self.until(lambda: set(self.states()) == {"TRACKING"}, 10.0)
 
-    def status_fresh(self) -> bool:
+    def sun_is_fresh(self) -> bool:
         """Whether the sun has arrived everywhere."""
         return all(board.node.controller.sun.fresh() for board in self.boards if board.on)
+
+
+#: When fields begin whose boards come from another.
+LATER = datetime(2026, 6, 21, 10, 15, tzinfo=UTC)
+
+
+@functools.cache
+def _saved() -> dict[str, list[Board]]:
+    found = {}
+
+    async def main(clock: VirtualClock) -> None:
+        async with Field(clock).alive() as field:
+            await field.until(field.sun_is_fresh)
+            await field.order("aim", "AIM", *AIM)
+            await field.order("approach", "APPROACH")
+            await field.until(lambda: set(field.states()) == {"IDLE"}, 300.0)
+            found["IDLE"] = copy.deepcopy(field.boards)
+            await field.order("track", "TRACK")
+            await field.until(lambda: set(field.states()) == {"TRACKING"}, 10.0)
+            await asyncio.sleep(20.0)
+            found["TRACKING"] = copy.deepcopy(field.boards)
+
+    run_virtual(main)
+    return found
+
+
+def boards_in(state: str) -> list[Board]:
+    """Two boards that are in IDLE, or TRACKING; for a field that begins at `LATER`."""
+    return copy.deepcopy(_saved()[state])
+
+
+def run(
+    main: Callable[["Field"], Coroutine[Any, Any, None]], state: str = "", seed: int = 0,
+    **settings: Any,
+) -> Field:  # fmt: skip
+    """Run a test in virtual time, on two boards of a state or on new ones, and return its field."""
+    boards = boards_in(state) if state else settings.pop("boards", None)
+
+    async def live(clock: VirtualClock) -> Field:
+        field = Field(clock, boards=boards, seed=seed, **settings)
+        async with field.alive():
+            await main(field)
+        return field
+
+    return run_virtual(live, seed, start=LATER)
+
+
+class SlotBus(TwinBus):
+    """A bus on which those who speak at once spoil each other, and late answers are heard."""
+
+    STEP = 0.005
+
+    async def transact(
+        self, frame: bytes, timeout: float, *, expires: float | None = None,
+        urgent: bool = False, complete: Callable[[bytes], bool] | None = None,
+    ) -> bytes:  # fmt: skip
+        boards: list[Any] = list(self.stations)
+        now = self._clock.monotonic()
+        heard = bytearray(_at_once([board.hear(frame, now) for board in boards]))
+        while self._clock.monotonic() - now < timeout and not (heard and complete is None):
+            await asyncio.sleep(self.STEP)
+            heard += _at_once([board.tick(self._clock.monotonic()) for board in boards])
+            if complete is not None and complete(bytes(heard)):
+                break
+        return bytes(heard)
+
+
+def _at_once(spoken: list[bytes]) -> bytes:
+    """What is heard of several who speak at once: the line is low where anyone pulls it low."""
+    spoken = [data for data in spoken if data]
+    if len(spoken) < 2:
+        return b"".join(spoken)
+    size = max(map(len, spoken))
+    padded = [data + b"\xff" * (size - len(data)) for data in spoken]
+    return bytes(
+        functools.reduce(lambda a, b: a & b, column) for column in zip(*padded, strict=True)
+    )

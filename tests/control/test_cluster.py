@@ -1,36 +1,380 @@
-"""A cluster in virtual time, with real local controllers on its bus."""
+"""A cluster in virtual time, with real local controllers on its bus: what keeps the field safe."""
 
 import asyncio
+import dataclasses
 
-from clusters import Field
+import pytest
+
+from clusters import LATER, TOKEN, Board, Field, boards_in, run
+from heliotrope.control._kept import Kept
 from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.protocol import Alarm, Stage
+from heliotrope.control.link import LinkError, running
+from heliotrope.control.protocol import Acknowledge, Alarm, Lease, Stage, Status, encode
 from heliotrope.lcu import states
+from heliotrope.twin.bus import BusFaults
+
+ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 
 
 def test_from_power_on_to_tracking() -> None:
-    async def main(clock: VirtualClock) -> None:
-        async with Field(clock).alive() as field:
-            await field.to_tracking()
-            await asyncio.sleep(30.0)
-            for name in ("A1", "A2"):
-                for identity in ("aim", "approach", "track"):
-                    assert field.plant.stages(identity, name) == [
-                        Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE,
-                    ]  # fmt: skip
-            status = field.plant.status()
-            rows = status.nodes()
-            assert [states.STATES[state] for state in rows["state"]] == ["TRACKING", "TRACKING"]
-            for row, board in zip(rows, field.boards, strict=True):
-                # The sun makes some ten steps a second here.
-                assert abs(int(row["primary"]) - board.timer.made[0]) < 40
-                assert abs(int(row["secondary"]) - board.timer.made[1]) < 40
-                assert row["heard_ms"] < 100
-                assert row["armature_crc"] == board.node.controller.config.armature_crc
-                assert row["asked"] == row["answered"]
-            assert (status.count, status.acts, status.time_quality) == (2, (), "system")
-            assert not field.plant.all(Alarm)
-        # The clean end defocuses.
-        assert set(field.states()) == {"DEFOCUSED"}
+    async def main(field: Field) -> None:
+        await field.to_tracking()
+        await asyncio.sleep(30.0)
+        for name in ("A1", "A2"):
+            for identity in ("aim", "approach", "track"):
+                assert field.plant.stages(identity, name) == ALL_STAGES
+        status = field.plant.status()
+        rows = status.nodes()
+        assert [states.STATES[state] for state in rows["state"]] == ["TRACKING", "TRACKING"]
+        for row, board in zip(rows, field.boards, strict=True):
+            # The sun makes some ten steps a second here.
+            assert abs(int(row["primary"]) - board.timer.made[0]) < 40
+            assert abs(int(row["secondary"]) - board.timer.made[1]) < 40
+            assert row["heard_ms"] < 100
+            assert row["armature_crc"] == board.node.controller.config.armature_crc
+            assert row["asked"] == row["answered"]
+        assert (status.count, status.acts, status.time_quality) == (2, (), "system")
+        assert not field.plant.all(Alarm)
 
-    run_virtual(main)
+    # The clean end defocuses.
+    assert set(run(main).states()) == {"DEFOCUSED"}
+
+
+def test_at_a_start_nothing_moves_by_itself() -> None:
+    async def main(field: Field) -> None:
+        before = [list(board.timer.made) for board in field.boards]
+        await asyncio.sleep(60.0)
+        assert [board.timer.made for board in field.boards] == before
+        assert field.states() == ["STOWED", "STOWED"]
+        # Status comes once a second, and the names once a connection.
+        statuses = field.plant.all(Status)
+        assert 58 <= len(statuses) <= 63
+        assert statuses[0].names == ("A1", "A2")
+        assert not any(status.names for status in statuses[1:])
+
+    run(main)
+
+
+def test_a_lost_plant_ends_the_sun_and_defocuses_and_polling_goes_on() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(4.0)
+        assert field.states() == ["TRACKING", "TRACKING"]
+        field.line.cut()
+        took = await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"])
+        assert took < 5.1  # 3 s of lease, and what is left of a second before and after
+        asked = field.cluster.nodes[0].counts.answered
+        await asyncio.sleep(5.0)
+        assert field.cluster.nodes[0].counts.answered >= asked + 8
+        assert not field.boards[0].node.controller.sun.fresh()
+        # The safety table goes on to stow.
+        await field.until(lambda: set(field.states()) <= {"STOWING", "STOWED"}, 35.0)
+        field.line.heal()
+        await field.until(lambda: field.plant.alarms("plant_link_lost")[-1:] != [], 5.0)
+        assert field.plant.alarms("plant_link_lost")[0].active
+        await field.until(lambda: not field.plant.alarms("plant_link_lost")[-1].active, 10.0)
+        # That the plant is back moves nothing.
+        assert set(field.states()) <= {"STOWING", "STOWED"}
+
+    run(main, "TRACKING")
+
+
+def test_traffic_other_than_a_lease_renews_nothing() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.plant.leases = False
+        for _ in range(6):
+            await asyncio.sleep(0.5)
+            await field.order("more", "AIM", 0.0, 0.0, 51.0)
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 3.0)
+
+    run(main, "TRACKING")
+
+
+def test_it_goes_on_alone_within_its_autonomy() -> None:
+    async def main(field: Field) -> None:
+        field.plant.autonomy = 60.0
+        await asyncio.sleep(3.0)
+        (alarm,) = field.plant.alarms("autonomy_limited")
+        assert "the plant grants 60 s of autonomy; cluster C1 is configured for 20 s" in alarm.text
+        field.plant.leases = False
+        await asyncio.sleep(20.0)
+        assert field.states() == ["TRACKING", "TRACKING"]
+        await field.order("late", "AIM", 0.0, 0.0, 51.0)
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 5.0)
+
+    run(main, "TRACKING", longest_autonomy=20.0)
+
+
+@pytest.mark.parametrize(
+    ("lease", "text"),
+    [
+        (Lease(TOKEN, lifetime=60.0), "lease of 60 s: give 1 to 3 s"),
+        (Lease(TOKEN, lifetime=0.5), "lease of 0.5 s: give 1 to 3 s"),
+        (Lease(-1), "token -1 and autonomy 0 s: out of range"),
+        (Lease(TOKEN, autonomy=-1.0), "autonomy -1 s: out of range"),
+    ],
+)
+def test_a_lease_out_of_range_is_refused(lease: Lease, text: str) -> None:
+    async def main(field: Field) -> None:
+        field.plant.leases = False
+        await asyncio.sleep(5.0)
+        await field.plant.send(lease)
+        await field.until(lambda: bool(field.plant.alarms("lease_refused")))
+        assert text in field.plant.alarms("lease_refused")[0].text
+        assert field.plant.status().lease_left < 0.0
+
+    run(main)
+
+
+def test_a_clock_that_jumps_defocuses_until_somebody_acknowledges() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.clock.jump(5.0)
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 3.0)
+        second = field.boards[0].node.controller.clock.second
+        await asyncio.sleep(5.0)
+        # The jumped time is not passed on while it settles.
+        assert field.boards[0].node.controller.clock.second == second + 5
+        await field.order("soon", "TRACK")
+        await field.until(lambda: bool(field.plant.stages("soon", "A1") or "soon" in [
+            each.identity for each in field.plant.heard if hasattr(each, "identity")]))  # fmt: skip
+        assert "clock_jump" in field.plant.text("soon")
+        await field.plant.send(Acknowledge("early", "clock_jump", "Ada", "operator"))
+        await asyncio.sleep(1.5)
+        assert "the cause has not gone" in field.plant.text("early")
+        await asyncio.sleep(25.0)
+        await field.plant.send(Acknowledge("wrong", "clock_jump", "Ada", "visitor"))
+        await field.plant.send(Acknowledge("ack", "clock_jump", "Ada", "operator"))
+        await asyncio.sleep(1.5)
+        assert "role 'visitor' is not known; give operator or supervisor" in field.plant.text(
+            "wrong"
+        )
+        assert field.plant.status().acts == ()
+        await field.until(field.sun_is_fresh, 5.0)
+
+    run(main, "TRACKING")
+
+
+def test_a_time_without_a_source_sends_no_sun() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        good = field.time.time
+        field.time.time = lambda: dataclasses.replace(good(), quality="none", error=float("inf"))
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 3.0)
+        assert any("holdover_exhausted" in act for act in field.plant.status().acts)
+        field.time.time = good
+        await field.until(lambda: field.plant.status().acts == (), 20.0)
+        await field.order("again", "TRACK")
+        await field.until(lambda: field.states() == ["TRACKING", "TRACKING"], 5.0)
+
+    run(main, "TRACKING")
+
+
+def test_an_open_emergency_line_defocuses() -> None:
+    closed = [True]
+
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        closed[0] = False
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 2.5)
+        assert field.plant.alarms("emergency_line")[0].severity == "EMERGENCY"
+
+    run(main, "TRACKING", line=lambda: closed[0])
+
+
+def test_an_emergency_reaches_all_at_once_and_names_who_does_not_answer() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.3)
+        field.boards[1].on = False
+        begin = field.clock.monotonic()
+        await field.emergency("stop", "DEFOCUS")
+        await field.until(lambda: field.states()[0] == "DEFOCUSED", 0.3)
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("stop", "A1"), 0.6)
+        assert field.clock.monotonic() - begin < 1.0
+        await field.until(lambda: bool(field.plant.alarms("order_unacknowledged")), 3.0)
+        (alarm,) = field.plant.alarms("order_unacknowledged")
+        assert (alarm.subject, alarm.severity) == ("A2", "EMERGENCY")
+        assert "A2 has not acknowledged DEFOCUS" in alarm.text
+        # It comes back with its motors where they were, and is told at once.
+        await asyncio.sleep(10.0)
+        field.boards[1].on = True
+        field.boards[1].node.controller.sun.end()
+        await field.until(lambda: Stage.DONE in field.plant.stages("stop", "A2"), 12.0)
+        await field.until(lambda: not field.plant.alarms("order_unacknowledged")[-1].active)
+        assert Stage.DONE in field.plant.stages("stop", "A1")
+
+    run(main, "TRACKING")
+
+
+def test_an_emergency_is_given_up_for_the_plant_but_asked_further() -> None:
+    async def main(field: Field) -> None:
+        field.boards[1].on = False
+        await field.emergency("stop", "STOW")
+        await field.until(lambda: Stage.FAILED in field.plant.stages("stop", "A2"), 35.0)
+        assert "STOW not acknowledged within 30 s; it is asked further" in field.plant.text("stop")
+        field.boards[1].boot(field.clock.monotonic())
+        await field.until(lambda: not field.plant.alarms("order_unacknowledged")[-1].active, 10.0)
+
+    run(main)
+
+
+def test_an_emergency_goes_before_orders_and_needs_no_token() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.plant.leases = False
+        for k in range(40):
+            await field.order(f"aim{k}", "AIM", 0.0, 0.0, 50.0 + k)
+        await field.emergency("one", "STOW", "A2")
+        await field.until(lambda: field.states() == ["TRACKING", "STOWING"], 0.2)
+        await field.emergency("wrong", "TRACK")
+        await field.emergency("nobody", "STOW", "A9")
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("one", "A2"), 1.0)
+        await asyncio.sleep(1.0)
+        assert "'TRACK' is no emergency" in field.plant.text("wrong")
+        assert "cluster C1 has no heliostat 'A9'" in field.plant.text("nobody")
+        assert "STOW came before it" in field.plant.text("aim39", "A2")
+
+    run(main, "TRACKING")
+
+
+def test_a_heliostat_that_falls_silent_is_reported_with_its_beam() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.boards[0].on = False
+        await field.until(lambda: bool(field.plant.alarms("node_silent")), 13.0)
+        (alarm,) = field.plant.alarms("node_silent")
+        assert alarm.text == (
+            "A1: no answer for 10 s; it was TRACKING; where its beam is, is not known"
+        )
+        rows = field.plant.status().nodes()
+        assert rows["heard_ms"][0] > 9000
+        assert rows["heard_ms"][1] < 200
+        field.boards[0].boot(field.clock.monotonic())
+        await field.until(lambda: not field.plant.alarms("node_silent")[-1].active, 8.0)
+
+    run(main, "TRACKING")
+
+
+def test_damaged_answers_are_counted_and_never_believed() -> None:
+    async def main(field: Field) -> None:
+        field.bus.faults = BusFaults(corruption=0.2, burst=0.1, duplication=0.1, late=0.1)
+        await asyncio.sleep(60.0)
+        for node in field.cluster.nodes:
+            counts = node.counts
+            assert counts.corrupt > 0
+            assert counts.late + counts.silent > 0
+            missed = counts.corrupt + counts.late + counts.silent
+            assert counts.asked == counts.answered + missed
+            assert node.state == states.STOWED
+        assert any("bus_errors" in act for act in field.plant.status().acts)
+        field.bus.faults = BusFaults()
+        await field.until(lambda: field.plant.status().acts == (), 60.0)
+
+    run(main)
+
+
+def test_a_bus_that_is_gone_is_an_alarm_and_comes_back() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.bus.plugged = False
+        # No sun reaches them: each defocuses by itself.
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 8.0)
+        await field.until(lambda: bool(field.plant.alarms("bus_failed")), 5.0)
+        assert field.cluster.nodes[0].missed == 0
+        await asyncio.sleep(3.0)
+        field.bus.plugged = True
+        await field.until(lambda: field.plant.status().acts == (), 45.0)
+        assert field.plant.status().nodes()["heard_ms"].max() < 200
+        await asyncio.sleep(1.0)
+        assert not field.plant.alarms("bus_failed")[-1].active
+
+    run(main, "TRACKING")
+
+
+def test_who_misses_the_call_is_told_again() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        # The second hears nothing of the cluster for a moment, but keeps its lease.
+        field.line.cut()
+        deaf = field.boards[1]
+        await asyncio.sleep(2.0)
+        deaf.on = False
+        await asyncio.sleep(2.5)
+        deaf.on = True
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 3.0)
+
+    run(main, "TRACKING")
+
+
+def test_after_a_restart_frames_of_before_are_void(tmp_path: pytest.TempPathFactory) -> None:
+    path = tmp_path / "C1.state.json"  # type: ignore[operator]
+    boards = [Board(1), Board(2)]
+    old: list[bytes] = []
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        sender = field.cluster._exchange.sender
+        expires = int(field.cluster._bus_time() or 0) + 25
+        await asyncio.sleep(0.0)
+        old.append(sender.frame(1, "AIM", TOKEN, expires, 1.0, 2.0, 3.0))
+
+    run(main, boards=boards, kept=Kept(path))
+    first = Kept(path).epoch
+
+    async def again(field: Field) -> None:
+        assert Kept(path).epoch > first
+        await field.until(field.sun_is_fresh)
+        board = field.boards[0]
+        motion = board.node.controller.motion
+        before = motion.aim
+        answer = board.hear(old[0], field.clock.monotonic())
+        assert answer
+        assert motion.aim == before
+        await field.order("aim", "AIM", 0.0, 0.0, 50.0)
+        await field.until(lambda: field.plant.stages("aim", "A1") == ALL_STAGES, 3.0)
+
+    run(again, boards=boards, kept=Kept(path))
+
+
+def test_a_node_that_starts_anew_is_taken_in() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        boots = field.plant.status().nodes()["boots"][0]
+        field.boards[0].on = False
+        await asyncio.sleep(2.0)
+        field.boards[0].boot(field.clock.monotonic())
+        await field.until(field.sun_is_fresh, 3.0)
+        await field.until(lambda: field.plant.status().nodes()["boots"][0] == boots + 1, 10.0)
+        assert field.states() == ["DEFOCUSED", "TRACKING"]
+
+    run(main, "TRACKING")
+
+
+def test_a_cluster_runs_once() -> None:
+    async def main(field: Field) -> None:
+        with pytest.raises(LinkError, match="cluster C1: it runs already"):
+            await field.cluster.run()
+
+    run(main)
+
+
+def test_the_bus_may_be_closed_first() -> None:
+    async def main(clock: VirtualClock) -> None:
+        field = Field(clock, boards=boards_in("IDLE"))
+        async with running(field.cluster, field.link):
+            async with running(field.bus):
+                await asyncio.sleep(2.2)
+            await asyncio.sleep(2.0)
+
+    run_virtual(main, start=LATER)
+
+
+def test_what_no_plant_says_is_an_alarm() -> None:
+    async def main(field: Field) -> None:
+        await field.plant.link.send(b"nonsense")
+        await field.until(lambda: bool(field.plant.alarms("plant_unintelligible")))
+        await field.plant.link.send(encode(Status("C9", 0, 0.0, "gps", 0.0, 0.0, 0.0)))
+        await asyncio.sleep(2.0)
+        assert field.states() == ["STOWED", "STOWED"]
+
+    run(main)

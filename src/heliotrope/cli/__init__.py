@@ -11,6 +11,7 @@ import typer
 from heliotrope import __version__
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
+from heliotrope.cli.cluster import cluster
 from heliotrope.cli.demo import demo
 from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
@@ -55,6 +56,7 @@ app.command()(image)
 app.command()(calibrate)
 app.command()(plan)
 app.command()(evaluate)
+app.command()(cluster)
 app.command()(fetch)
 app.command()(demo)
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
+from heliotrope.control._discovery import Discovery
 from heliotrope.control._exchange import Exchange
 from heliotrope.control._nodes import Node
 from heliotrope.control._orders import stored
@@ -27,6 +28,7 @@ class Asked:
         self._config, self._nodes, self._exchange = config, nodes, exchange
         self._reports, self._clock = reports, clock
         self._waiting: deque[Ask] = deque(maxlen=64)
+        self._discovery: Discovery | None = None
 
     @property
     def ready(self) -> bool:
@@ -40,7 +42,7 @@ class Asked:
             self._reports.answer(Answer(ask.identity, data))
         elif ask.what == "statistics":
             self._reports.answer(Answer(ask.identity, self.statistics()))
-        elif ask.what == "stored":
+        elif ask.what in ("stored", "discover"):
             self._waiting.append(ask)
         else:
             known = "checksums, stored, statistics, discover"
@@ -56,8 +58,22 @@ class Asked:
         }
 
     async def serve(self) -> None:
-        """Answer the first question that waits."""
-        ask = self._waiting.popleft()
+        """Go on with the first question that waits."""
+        if self._waiting[0].what == "discover":
+            await self._discover(self._waiting[0])
+        else:
+            await self._recall(self._waiting.popleft())
+
+    async def _discover(self, ask: Ask) -> None:
+        if self._discovery is None:
+            self._discovery = Discovery(self._nodes, self._exchange)
+        await self._discovery.step()
+        if self._discovery.done:
+            self._waiting.popleft()
+            self._reports.answer(Answer(ask.identity, self._discovery.result()))
+            self._discovery = None
+
+    async def _recall(self, ask: Ask) -> None:
         node = next((each for each in self._nodes if each.name == ask.heliostat), None)
         if node is None:
             self._error(ask, f"cluster {self._config.name} has no heliostat {ask.heliostat!r}")

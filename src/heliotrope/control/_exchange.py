@@ -1,7 +1,11 @@
 """Questions and commands of a cluster over its bus, counted by node; one thing at a time."""
 
+import asyncio
 import hashlib
+import struct
+from binascii import crc32
 from collections import deque
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from heliotrope.control._nodes import Node, Question, answer_in
@@ -47,6 +51,7 @@ class Exchange:
     def __init__(self, bus: Bus, clock: Clock, epoch: int, answer: float) -> None:
         self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
         self._bus, self._clock, self._answer = bus, clock, answer
+        self._gathering: asyncio.Timeout | None = None
         self._asked = self._bad = self._answered = 0
         self._seconds: deque[tuple[int, int, int]] = deque(maxlen=_WINDOW)
 
@@ -54,6 +59,16 @@ class Exchange:
     def connected(self) -> bool:
         """Whether the port is open."""
         return self._bus.connected
+
+    def token(self, token: int) -> int:
+        """Return the token of the wire for that of the authority.
+
+        It changes with the epoch, so that commands of before a restart, which nodes may hear late,
+        are void although the same authority still commands.
+        """
+        if token == 0:
+            return 0
+        return crc32(struct.pack("<II", token, self.sender.epoch)) or 1
 
     async def broadcast(
         self, name: str, *values: Any, life: float = 0.5, urgent: bool = False
@@ -119,10 +134,28 @@ class Exchange:
             self._spoilt(node, data, begin)
         return None
 
-    async def gather(self, name: str, *values: Any, span: float) -> bytes:
-        """Ask everybody, and return all that comes within a time in s."""
-        frame = self.sender.frame(wire.BROADCAST, name, *values)
-        return await self._bus.transact(frame, span, complete=lambda _: False)
+    async def gather(
+        self, name: str, *values: Any, span: float, key: bytes = b"",
+        complete: Callable[[bytes], bool] = lambda _: False,
+    ) -> tuple[bytes | None, int]:  # fmt: skip
+        """Ask everybody, and return all that comes within a time in s, and the sequence.
+
+        None instead of the bytes if `interrupt` was called meanwhile.
+        """
+        frame = self.sender.frame(wire.BROADCAST, name, *values, key=key)
+        sequence = self.sender.count & 0xFFFF
+        try:
+            async with asyncio.timeout(None) as self._gathering:
+                return await self._bus.transact(frame, span, complete=complete), sequence
+        except TimeoutError:
+            return None, sequence
+        finally:
+            self._gathering = None
+
+    def interrupt(self) -> None:
+        """Give up waiting for answers that may take long: something urgent has come."""
+        if self._gathering is not None:
+            self._gathering.reschedule(asyncio.get_running_loop().time())
 
     def _spoilt(self, node: Node, data: bytes, now: float) -> None:
         node.spoilt(data)

@@ -33,6 +33,8 @@ _DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
 #: A STATUS asked for sooner after the ACK may not show the motion yet, s: a few ticks of a board.
 _SETTLE = 0.2
+#: Of the step counts from where they are going: a few ticks' worth of the sun.
+_NEAR = 20
 #: For the longest way from stow to standby, s.
 _LONGEST = 900.0
 
@@ -47,6 +49,9 @@ class Goal:
         States.
     clear, needed
         Flags that must be clear, and set, in one of ``there``; until then it is on its way.
+    near
+        The step counts must be near their goal: a mirror that is defocused goes on with the sun,
+        beside the receiver, so that it never stands still.
     limit
         For getting there, s.
     """
@@ -55,12 +60,17 @@ class Goal:
     on_way: frozenset[int] = frozenset()
     clear: int = 0
     needed: int = 0
+    near: bool = False
     limit: float = _LONGEST
 
-    def reached(self, state: int, flags: int) -> bool | None:
-        """Return True if it is there, None if it is on its way, False if it is neither."""
+    def reached(self, state: int, flags: int, off: int) -> bool | None:
+        """Return True if it is there, None if it is on its way, False if it is neither.
+
+        ``off`` is how far the step counts are from where they are going.
+        """
         if state in self.there:
-            return True if not flags & self.clear and flags & self.needed == self.needed else None
+            clear = not flags & self.clear and (not self.near or off <= _NEAR)
+            return True if clear and flags & self.needed == self.needed else None
         return None if state in self.on_way else False
 
 
@@ -76,7 +86,7 @@ GOALS = {
     "JOG": Goal(frozenset({IDLE}), clear=_MOVING),
     "GOTO": Goal(frozenset({IDLE}), clear=_MOVING),
     "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING),
-    "DEFOCUS": Goal(_ALL - BEAM_OUT, clear=_MOVING, limit=DEFOCUS_BUDGET),
+    "DEFOCUS": Goal(_ALL - BEAM_OUT, near=True, limit=DEFOCUS_BUDGET),
     "STOW": Goal(
         _ALL - BEAM_OUT - {states.DEFOCUSED}, clear=_MOVING, needed=_AT_STOW, limit=STOW_BUDGET
     ),
@@ -117,7 +127,7 @@ class Goals:
             self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
 
     def heard(self, node: Node, asked_at: float) -> None:
-        """Judge a STATUS that was asked for at an instant."""
+        """Judge STATUS and STEPS, the first of which was asked for at an instant."""
         watches = self._watches.get(node.index)
         if watches is None:
             return
@@ -157,7 +167,12 @@ class Goals:
         """Return "" if it is done, a text if it cannot be any more, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
-        reached = GOALS[watch.name].reached(node.state, node.flags)
+        goal = GOALS[watch.name]
+        if goal.near and node.steps_at < watch.since + _SETTLE:
+            return None
+        primary, secondary, primary_goal, secondary_goal = node.steps
+        off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
+        reached = goal.reached(node.state, node.flags, off)
         if reached is None:
             return None
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""

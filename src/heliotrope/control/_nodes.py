@@ -112,6 +112,8 @@ class Node:
         See `Counts`.
     status, steps
         Values of the last STATUS and STEPS.
+    steps_at
+        When STEPS were last told, monotonic s.
     heard_at
         When it last answered, monotonic s; -inf: never.
     missed
@@ -124,6 +126,7 @@ class Node:
         self.counts = Counts()
         self.status: tuple[Any, ...] = _NO_STATUS
         self.steps: tuple[Any, ...] = _NO_STEPS
+        self.steps_at = -math.inf
         self.heard_at = -math.inf
         self.missed = 0
         self._frames: dict[tuple[int, int], bytes] = {}

@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from heliotrope.control._discovery import SPAN, heard
 from heliotrope.control._exchange import Exchange
 from heliotrope.control._goals import GOALS, Goals
 from heliotrope.control._kept import Kept
@@ -252,12 +253,14 @@ class Orders:
         gps = self._gps()
         if gps is None:
             return self._again(job, "the local controllers have lost the time")
-        head: tuple[int, ...] = (order.token, self._expiry(gps, order))
+        head: tuple[int, ...] = (self._exchange.token(order.token), self._expiry(gps, order))
         key = b""
         if messages.who_of(messages.NUMBER_OF[step.name]) == messages.KEY:
-            if not await self._knows_edition(job):
+            if step.name != "SET_ADDRESS" and not await self._knows_edition(job):
                 return self._again(job, "no answer to QUERY_STORED before it expired")
             head, key = (*head, self._kept.next_edition(job.edition)), node.member.key
+        if step.name == "SET_ADDRESS":
+            return await self._give_address(job, head, key)
         slow = bool(key) or step.name in _STORED
         answer = await self._exchange.ask(
             node, step.name, *head, *step.values, key=key, expires=order.deadline, tries=TRIES,
@@ -269,6 +272,27 @@ class Orders:
         if step.name in _RELATIVE:
             return self._fail(job, f"no answer to {step.name}; it may have been taken")
         return self._again(job, f"no answer to {step.name} before it expired")
+
+    async def _give_address(self, job: Job, head: tuple[int, ...], key: bytes) -> None:
+        """Tell everybody, since nobody knows where it is now; then ask it by its serial number."""
+        serial, address = job.step.values
+        frame = self._exchange.sender.frame(
+            wire.BROADCAST, "SET_ADDRESS", *head, serial, address, key=key
+        )
+        await self._exchange.transmit(frame, life=job.order.deadline - self._clock())
+        data, sequence = await self._exchange.gather(
+            "DISCOVER", serial, serial, span=SPAN + self._config.stored_answer,
+            complete=lambda data: data.endswith(b"\0") and bool(data.strip(b"\0")),
+        )  # fmt: skip
+        found = [] if data is None else heard(data, sequence)[0]
+        if not found:
+            return self._again(job, f"no answer of serial number {serial} before it expired")
+        if found[0].address != address:
+            return self._again(
+                job, f"serial number {serial} stays at address {found[0].address}: its key or "
+                "edition is another, or its state forbids it"
+            )  # fmt: skip
+        return self._advance(job)
 
     def _expiry(self, gps: float, order: Order) -> int:
         life = min(order.deadline - self._clock(), _WIRE_LIFE)

@@ -195,9 +195,10 @@ class Cluster:
                 async with asyncio.timeout(max(left, 1e-6)):
                     await self._wake.wait()
 
-    def _busy(self) -> bool:
+    def _busy(self, *, patient: bool = True) -> bool:
+        """Whether something is to be done; questions wait until polling is over."""
         return self._exchange.connected and (
-            self._urgent.pressing or self._orders.ready or self._asked.ready
+            self._urgent.pressing or self._orders.ready or (patient and self._asked.ready)
         )
 
     async def _serve(self) -> None:
@@ -251,7 +252,7 @@ class Cluster:
         sound = _known(present) and not present.jumped
         if sound and not self._epoch_of_time:
             self._new_epoch(int(present.gps_s))
-        await exchange.transmit(exchange.sender.session(self._watch.token))
+        await exchange.transmit(exchange.sender.session(exchange.token(self._watch.token)))
         if sound:
             gps = present.gps_s + self._clock.monotonic() - now
             week, seconds = divmod(gps, WEEK)
@@ -291,28 +292,30 @@ class Cluster:
             node = nodes[place % count]
             if node.missed < _ABSENT or (self._number + node.index) % _PROBE == 0:
                 await self._poll(node, sequence)
-            if self._busy():
+            if self._busy(patient=False):
                 await self._serve()
 
     async def _look(self, node: Node) -> None:
         """Ask a node for its state, between two rounds."""
-        await self._ask_status(node, SEQUENCES[self._number % len(SEQUENCES)])
+        await self._poll(node, SEQUENCES[self._number % len(SEQUENCES)])
 
     async def _poll(self, node: Node, sequence: int) -> None:
+        asked_at = self._clock.monotonic()
         if not await self._ask_status(node, sequence):
             return
-        if (self._number + node.index) % self.config.steps_every == 0:
+        waits = self._goals.waits(node)
+        if waits or (self._number + node.index) % self.config.steps_every == 0:
             steps = await self._exchange.poll(node, STEPS, sequence)
             if steps is not None:
-                node.steps = steps
+                node.steps, node.steps_at = steps, node.heard_at
+        if waits:
+            self._goals.heard(node, asked_at)
 
     async def _ask_status(self, node: Node, sequence: int) -> bool:
-        asked_at = self._clock.monotonic()
         status = await self._exchange.poll(node, STATUS, sequence)
         if status is None:
             return False
         before, node.status = node.status, status
-        self._goals.heard(node, asked_at)
         if before[2] != status[2]:
             self._fault(node)
         if self._watch.verdict.dark and status[0] in BEAM_OUT:
@@ -407,6 +410,7 @@ class Cluster:
             return
         self._orders.cancel(nodes, f"{name} came before it")
         self._urgent.begin(identity, name, nodes)
+        self._exchange.interrupt()
 
     def _take_acknowledgement(self, message: Acknowledge) -> None:
         try:

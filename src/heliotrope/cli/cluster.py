@@ -1,0 +1,123 @@
+"""``heliotrope cluster``: the controller of a cluster, for real."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from heliotrope.control.clock import Clock
+    from heliotrope.control.cluster import Cluster
+    from heliotrope.control.cluster_file import Installation
+    from heliotrope.control.link import Link
+    from heliotrope.control.timekeeping import TimeKeeper
+
+
+def cluster(
+    config: Annotated[Path, typer.Argument(help="Cluster file (TOML).")],
+    check: Annotated[bool, typer.Option("--check", help="Only read the file.")] = False,
+    every: Annotated[float, typer.Option(help="Seconds between lines of the log.")] = 10.0,
+) -> None:
+    """Run a cluster of heliostats until it is told to end; it then defocuses them."""
+    from heliotrope.errors import InputError
+
+    if not 1.0 <= every <= 86400.0:
+        raise InputError(f"--every {every:g} s is not within 1 to 86400 s")
+    try:
+        from heliotrope.control.cluster_file import read_cluster
+    except ImportError as error:
+        raise InputError(
+            f"cluster: {error.name} is not installed; say pip install 'heliotrope[control]'"
+        ) from None
+    installation = read_cluster(config)
+    if check:
+        count = len(installation.config.heliostats)
+        print(f"{config}: cluster {installation.config.name} of {count} heliostats")
+        return
+    import asyncio
+
+    asyncio.run(_run(installation, every))
+
+
+async def _run(installation: "Installation", every: float) -> None:
+    """Run everything until SIGTERM or SIGINT."""
+    import asyncio
+    import signal
+
+    from heliotrope.control._kept import Kept
+    from heliotrope.control.clock import SystemClock
+    from heliotrope.control.cluster import Cluster
+    from heliotrope.control.link import running
+    from heliotrope.control.serial_bus import SerialBus
+
+    clock = SystemClock()
+    bus = SerialBus(installation.bus_url, clock, installation.bus)
+    link, time = _link(installation, clock), _time(installation, clock)
+    file = installation.emergency_line
+    cluster = Cluster(
+        installation.config, bus, link, clock, time, Kept(installation.state),
+        None if file is None else lambda: _line(file),
+    )  # fmt: skip
+    ending = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        loop.add_signal_handler(number, ending.set)
+    async with running(bus, link, time), running(cluster):
+        await _log(cluster, ending, every)
+    print(f"{installation.config.name}: ended, DEFOCUS sent", flush=True)
+
+
+async def _log(cluster: "Cluster", ending: "asyncio.Event", every: float) -> None:
+    import asyncio
+
+    while not ending.is_set():
+        try:
+            async with asyncio.timeout(every):
+                await ending.wait()
+        except TimeoutError:
+            print(cluster.line(), flush=True)
+
+
+def _line(file: Path) -> bool:
+    """Whether current flows in the emergency line; what cannot be read is an open line."""
+    try:
+        return file.read_bytes()[:1] == b"1"
+    except OSError:
+        return False
+
+
+def _link(installation: "Installation", clock: "Clock") -> "Link":
+    name, key = installation.config.name, installation.plant_key
+    if installation.scheme == "tcp":
+        from heliotrope.control.tcp import client_tls, tcp_link
+
+        authority = installation.plant.authority
+        tls = None if authority is None else client_tls(authority)
+        return tcp_link(installation.host, installation.port, name, key, clock, tls=tls)
+    from heliotrope.control.mqtt import Broker, mqtt_link
+    from heliotrope.control.tcp import client_tls
+
+    authority = installation.plant.authority
+    tls = None
+    if installation.scheme == "mqtts":
+        import ssl
+
+        tls = ssl.create_default_context() if authority is None else client_tls(authority)
+    broker = Broker(
+        installation.host, installation.port, installation.plant.username,
+        installation.password or None, tls,
+    )  # fmt: skip
+    return mqtt_link(broker, installation.prefix, name, key, clock, plant=False)
+
+
+def _time(installation: "Installation", clock: "Clock") -> "TimeKeeper":
+    time = installation.time
+    if time.source == "system":
+        from heliotrope.control.timekeeping import SystemTime
+
+        return SystemTime(clock, time.error_s)
+    from heliotrope.control.gps import GpsSettings, GpsTime
+
+    return GpsTime(time.url, clock, GpsSettings(baud_rate=time.baud_rate))

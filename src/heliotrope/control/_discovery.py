@@ -1,0 +1,134 @@
+"""Who is on the bus: by serial number, in halves where answers collide.
+
+All whose serial number lies in a range answer in slots drawn by chance. Where two spoke at once,
+what comes is damaged: the range is asked in two halves. A range is done when it came clean twice in
+a row with nobody new.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from heliotrope.control._exchange import Exchange
+from heliotrope.control._nodes import Node
+from heliotrope.lcu import messages, wire
+from heliotrope.lcu.node import HERE_SLOT_MS, HERE_SLOTS
+
+#: All slots, and the last answer.
+SPAN = 1e-3 * HERE_SLOTS * HERE_SLOT_MS + 0.06
+_LARGEST = 0xFFFFFFFF
+_HERE = messages.NUMBER_OF["HERE"]
+_CLEAN = 2
+#: One serial number alone that is still garbled after so many questions is noise.
+_GARBLED = 4
+
+
+@dataclass(frozen=True)
+class Here:
+    """Who answered."""
+
+    serial: int
+    firmware: int
+    address: int
+
+
+@dataclass
+class _Range:
+    low: int
+    high: int
+    clean: int = 0
+    garbled: int = 0
+
+
+def heard(data: bytes, sequence: int) -> tuple[list[Here], bool]:
+    """Return who answered a question, and whether anything came that is no answer to it."""
+    reader = wire.Reader()
+    # A zero ends what was cut off.
+    frames = reader.feed(data + b"\0")
+    found = []
+    for frame in frames:
+        values = frame.values()
+        if frame.number == _HERE and frame.sequence == sequence and values is not None:
+            found.append(Here(*values))
+    damaged = reader.crc + reader.cobs + reader.length + reader.version > 0
+    return found, damaged or len(found) < len(frames)
+
+
+class Discovery:
+    """One search of the bus, question by question.
+
+    Parameters
+    ----------
+    nodes
+        As configured: where they are expected, the search begins.
+    exchange
+        The bus.
+
+    Attributes
+    ----------
+    questions
+        Asked so far.
+    """
+
+    def __init__(self, nodes: Sequence[Node], exchange: Exchange) -> None:
+        self._nodes, self._exchange = nodes, exchange
+        self._found: dict[int, Here] = {}
+        self._garbled: list[int] = []
+        serials = [node.member.serial for node in nodes if node.member.serial is not None]
+        low, high = min(serials, default=0), max(serials, default=_LARGEST)
+        ranges = [_Range(low, high), _Range(0, low - 1), _Range(high + 1, _LARGEST)]
+        self._ranges = [each for each in reversed(ranges) if each.low <= each.high]
+        self.questions = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the whole range of serial numbers has been asked."""
+        return not self._ranges
+
+    async def step(self) -> None:
+        """Ask one question."""
+        now = self._ranges[-1]
+        data, sequence = await self._exchange.gather("DISCOVER", now.low, now.high, span=SPAN)
+        if data is None:
+            return  # something urgent came between
+        self.questions += 1
+        found, garbled = heard(data, sequence)
+        fresh = [here for here in found if self._found.get(here.serial) != here]
+        self._found.update((here.serial, here) for here in found)
+        if not garbled:
+            now.clean = 0 if fresh else now.clean + 1
+            if now.clean >= _CLEAN:
+                self._ranges.pop()
+        elif now.low < now.high:
+            middle = (now.low + now.high) // 2
+            self._ranges[-1:] = [_Range(middle + 1, now.high), _Range(now.low, middle)]
+        else:
+            now.garbled += 1
+            if now.garbled >= _GARBLED:
+                self._garbled.append(now.low)
+                self._ranges.pop()
+
+    def result(self) -> dict[str, Any]:
+        """Return what was found: each with its name, if it has one, and the address it should have.
+
+        ``missing`` names configured heliostats that did not answer; ``garbled`` lists serial
+        numbers whose answers were always damaged (two with the same number).
+        """
+        named = {node.member.serial: node for node in self._nodes}
+        found = [
+            {
+                "serial": here.serial, "firmware": here.firmware, "address": here.address,
+                "name": named[here.serial].name if here.serial in named else "",
+                "expected": named[here.serial].address if here.serial in named else 0,
+            }
+            for here in sorted(self._found.values(), key=lambda here: here.serial)
+        ]  # fmt: skip
+        missing = [
+            node.name
+            for node in self._nodes
+            if node.member.serial is not None and node.member.serial not in self._found
+        ]
+        return {
+            "found": found, "missing": missing, "garbled": self._garbled,
+            "questions": self.questions,
+        }  # fmt: skip

@@ -1,0 +1,330 @@
+"""The file that a cluster controller starts from (TOML), and its keys beside it.
+
+Addresses, sites and limits may be shared and kept under version control; keys may not: they stand
+in a file of their own that nobody else may read.
+"""
+
+import string
+import tomllib
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from heliotrope.control.cluster_config import MOST_MEMBERS, ClusterConfig, Member
+from heliotrope.control.serial_bus import BusSettings
+from heliotrope.errors import FormatError, InputError
+from heliotrope.sun import Site
+
+Seconds = Annotated[float, Field(ge=0.0, le=86400.0, allow_inf_nan=False)]
+_SHORTEST_KEY, _LONGEST_KEY = 16, 64
+_OTHERS = 0o077
+_PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
+
+
+class Table(BaseModel):
+    """A table of the file: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class SiteTable(Table):
+    """``[site]``: the origin of ENU, and its air."""
+
+    latitude_deg: float = Field(ge=-90.0, le=90.0, description="North positive.")
+    longitude_deg: float = Field(ge=-180.0, le=180.0, description="East positive.")
+    height_m: float = Field(0.0, ge=-500.0, le=9000.0, description="Above the ellipsoid.")
+    pressure_pa: float | None = Field(
+        None, ge=30e3, le=120e3, description="At the site; default from the height."
+    )
+    temperature_c: float = Field(12.0, ge=-80.0, le=60.0, description="Of the air.")
+    delta_t_s: float | None = Field(None, description="TT − UT1; default from the date.")
+
+
+class BusTable(Table):
+    """``[bus]``: the serial port to the heliostats."""
+
+    url: str = Field(min_length=1, description="`/dev/ttyUSB0` or `socket://host:port`.")
+    baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits in a second.")
+    echo: bool = Field(False, description="The adapter hears its own frames.")
+    answer_s: Seconds = Field(
+        0.05, description="Longest time from the end of a question to the whole answer."
+    )
+    stored_answer_s: Seconds = Field(
+        0.6, description="The same where flash is written before the answer."
+    )
+
+
+class PlantTable(Table):
+    """``[plant]``: the link to the central controller."""
+
+    url: str = Field(
+        min_length=1,
+        description="`tcp://host:port`, `mqtt://host:port/prefix`, or `mqtts://…` with TLS.",
+    )
+    authority: str | None = Field(
+        None, description="PEM file of who signs the other end's certificate: TLS for `tcp://`."
+    )
+    username: str | None = Field(None, description="At the MQTT broker; password: the keys' file.")
+
+
+class TimeTable(Table):
+    """``[time]``: where the time comes from."""
+
+    source: Literal["system", "gps"] = Field("system", description="This computer, or a receiver.")
+    url: str = Field("", description="Of the receiver's port (NMEA 0183).")
+    baud_rate: int = Field(9600, ge=1200, le=4_000_000, description="Of the receiver's port.")
+    error_s: float = Field(
+        0.5, gt=0.0, lt=1.0, description="What the operator vouches for with `system`."
+    )
+
+
+class PollingTable(Table):
+    """``[polling]``."""
+
+    steps_every_s: int = Field(1, ge=1, le=60, description="Between questions for step counts.")
+    silence_s: Seconds = Field(10.0, description="A heliostat not heard for so long is reported.")
+    phase_s: Seconds = Field(0.0, lt=1.0, description="Of the seconds, after those of GPS.")
+
+
+class SafetyTable(Table):
+    """``[safety]``."""
+
+    longest_autonomy_s: Seconds = Field(
+        0.0,
+        description="Most that the plant may grant; above 0 only with a hard-wired emergency line.",
+    )
+    emergency_line: str = Field(
+        "", description="File whose first byte is 1 while current flows in the line (GPIO)."
+    )
+
+
+class HeliostatTable(Table):
+    """``[[heliostats]]``: one for each, up to 32."""
+
+    name: str = Field(min_length=1, description="As the plant knows it.")
+    address: int = Field(ge=1, le=65534, description="On the bus.")
+    serial: int | None = Field(
+        None, ge=0, le=0xFFFFFFFF, description="Of its local controller, to be found by."
+    )
+
+
+class ClusterDocument(Table):
+    """The whole file."""
+
+    format: Literal["heliotrope-cluster"]
+    version: Literal[1]
+    name: str = Field(min_length=1, description="Of the cluster, as the plant knows it.")
+    keys: str = Field("", description="File of the keys, beside this one.")
+    state: str = Field(
+        "", description="File for epoch and editions, beside this one; default NAME.state.json."
+    )
+    site: SiteTable
+    bus: BusTable
+    plant: PlantTable
+    time: TimeTable = Field(default_factory=TimeTable)  # type: ignore[arg-type]
+    polling: PollingTable = Field(default_factory=PollingTable)  # type: ignore[arg-type]
+    safety: SafetyTable = Field(default_factory=SafetyTable)  # type: ignore[arg-type]
+    heliostats: list[HeliostatTable] = Field(min_length=1, max_length=MOST_MEMBERS)
+
+
+#: The tables, for the reference and for hints.
+TABLES: tuple[type[Table], ...] = (
+    ClusterDocument, SiteTable, BusTable, PlantTable, TimeTable, PollingTable, SafetyTable,
+    HeliostatTable,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Installation:
+    """A cluster as it is installed: what it is, and where its ports lead.
+
+    Attributes
+    ----------
+    config
+        See `ClusterConfig`.
+    bus_url, bus
+        Of the serial port.
+    plant
+        ``[plant]``.
+    scheme, host, port, prefix
+        Of the plant's URL; ``prefix`` of MQTT topics.
+    plant_key, password
+        Of the link; of the MQTT broker.
+    time
+        ``[time]``.
+    state
+        File for epoch and editions.
+    emergency_line
+        File of the line's GPIO; None: there is no line.
+    """
+
+    config: ClusterConfig
+    bus_url: str
+    bus: BusSettings
+    plant: PlantTable
+    scheme: str
+    host: str
+    port: int
+    prefix: str
+    plant_key: bytes
+    password: str
+    time: TimeTable
+    state: Path
+    emergency_line: Path | None
+
+
+def read_cluster(path: str | Path) -> Installation:
+    """Return the cluster of a TOML file and its keys.
+
+    Raises
+    ------
+    FormatError
+        If something cannot be used; the text names file, place, value and limit.
+    """
+    path = Path(path)
+    raw = _toml(path, "a cluster file")
+    if raw.get("format") != "heliotrope-cluster":
+        raise FormatError(
+            path, f"format is {raw.get('format')!r}; a cluster file says "
+            'format = "heliotrope-cluster" and version = 1'
+        )  # fmt: skip
+    try:
+        document = ClusterDocument.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise FormatError(path, _explain(first), where) from None
+    secrets = _Secrets(path.parent / document.keys if document.keys else None)
+    try:
+        return _install(path, document, secrets)
+    except FormatError:
+        raise
+    except InputError as error:
+        raise FormatError(path, str(error)) from None
+
+
+def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Installation:
+    site, bus, polling = document.site, document.bus, document.polling
+    names = [each.name for each in document.heliostats]
+    secrets.check(names)
+    config = ClusterConfig(
+        name=document.name,
+        site=Site(
+            site.latitude_deg, site.longitude_deg, site.height_m, site.pressure_pa,
+            site.temperature_c, document.name, site.delta_t_s,
+        ),
+        heliostats=tuple(
+            Member(each.name, each.address, each.serial, secrets.heliostats.get(each.name, b""))
+            for each in document.heliostats
+        ),
+        answer=bus.answer_s, stored_answer=bus.stored_answer_s,
+        steps_every=polling.steps_every_s, silence=polling.silence_s, phase=polling.phase_s,
+        longest_autonomy=document.safety.longest_autonomy_s,
+    )  # fmt: skip
+    if document.time.source == "gps" and not document.time.url:
+        raise FormatError(path, "source is gps, and no url is given; add it", "time")
+    line = document.safety.emergency_line
+    scheme, host, port, prefix = _place(path, document.plant.url)
+    return Installation(
+        config=config, bus_url=bus.url, bus=BusSettings(baud_rate=bus.baud_rate, echo=bus.echo),
+        plant=document.plant, scheme=scheme, host=host, port=port, prefix=prefix,
+        plant_key=secrets.plant, password=secrets.password, time=document.time,
+        state=path.parent / (document.state or f"{document.name}.state.json"),
+        emergency_line=path.parent / line if line else None,
+    )  # fmt: skip
+
+
+def _place(path: Path, url: str) -> tuple[str, str, int, str]:
+    """Return scheme, host, port and prefix of the plant's URL."""
+    try:
+        parts = urlsplit(url)
+        port = parts.port
+    except ValueError:
+        raise FormatError(path, f"{url!r} is no URL; give tcp://host:port", "plant.url") from None
+    if parts.scheme not in _PORTS or not parts.hostname:
+        raise FormatError(
+            path, f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
+            "plant.url",
+        )  # fmt: skip
+    port = port or _PORTS[parts.scheme]
+    prefix = parts.path.strip("/")
+    if port is None or (parts.scheme != "tcp" and not prefix):
+        missing = "port: tcp://host:port" if port is None else "prefix: mqtt://host/prefix"
+        raise FormatError(path, f"{url!r} has no {missing}", "plant.url")
+    return parts.scheme, parts.hostname, port, prefix
+
+
+class _Secrets:
+    """The keys' file: ``plant``, ``password`` and a table ``heliostats``, keys in hexadecimal."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._path = path
+        self.plant, self.password = b"", ""
+        self.heliostats: dict[str, bytes] = {}
+        if path is None:
+            return
+        raw = _toml(path, "a file of keys")
+        if path.stat().st_mode & _OTHERS:
+            mode = path.stat().st_mode & 0o777
+            raise FormatError(path, f"others may read it (mode {mode:o}); say chmod 600")
+        for key in raw:
+            if key not in ("plant", "password", "heliostats"):
+                raise FormatError(path, f"{key!r} is not known; give plant, password, heliostats")
+        if "plant" in raw:
+            self.plant = self._key("plant", raw["plant"])
+        password, table = raw.get("password", ""), raw.get("heliostats", {})
+        if not isinstance(password, str) or not isinstance(table, dict):
+            raise FormatError(path, "password must be a text, and heliostats a table of keys")
+        self.password = password
+        self.heliostats = {name: self._key(name, value) for name, value in table.items()}
+
+    def _key(self, name: str, value: object) -> bytes:
+        text = value if isinstance(value, str) else ""
+        good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
+        if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
+            # The value itself is not told: it would stand in a log.
+            raise FormatError(
+                self._path, f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "
+                f"{_LONGEST_KEY} bytes in hexadecimal, as of: openssl rand -hex 32", name
+            )  # fmt: skip
+        return bytes.fromhex(text)
+
+    def check(self, names: list[str]) -> None:
+        """Refuse keys of heliostats that are not in the cluster."""
+        for name in self.heliostats:
+            if name not in names:
+                close = get_close_matches(name, names, n=1)
+                hint = f"; did you mean {close[0]!r}?" if close else "; remove it"
+                raise FormatError(
+                    self._path, f"the cluster has no such heliostat{hint}", f"heliostats.{name}"
+                )
+
+
+def _toml(path: Path, what: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise FormatError(path, f"there is no such file; give the path of {what}") from None
+    except OSError as error:
+        raise FormatError(path, f"cannot be read as {what}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise FormatError(path, f"is no text; give the path of {what}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(path, f"no TOML: {error}") from None
+
+
+def _explain(error: Any) -> str:
+    """One line from pydantic's description of an error."""
+    key = str(error["loc"][-1]) if error["loc"] else ""
+    if error["type"] == "missing":
+        return f"{key!r} is missing; add it"
+    if error["type"] == "extra_forbidden":
+        known = sorted({name for table in TABLES for name in table.model_fields})
+        close = get_close_matches(key, known, n=1)
+        return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
+    message = error["msg"][0].lower() + error["msg"][1:]
+    return f"{error.get('input')!r:.80}: {message}"

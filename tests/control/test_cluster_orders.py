@@ -1,0 +1,360 @@
+"""Commands, parameters and questions on their way through a cluster to real local controllers."""
+
+import asyncio
+import struct
+from binascii import crc32
+from collections.abc import Callable
+
+import pytest
+
+from clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
+from heliotrope.control._kept import Kept
+from heliotrope.control.protocol import Answer, Ask, Command, Parameters, Stage
+from heliotrope.lcu import messages, wire
+from heliotrope.lcu.journal import CODES_OF
+from heliotrope.twin.bus import TwinBus
+from lcu_machines import heliostat, items_of_heliostat
+
+ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
+
+
+class Interrupted(TwinBus):
+    """A bus that loses the answers to the next frames of some messages."""
+
+    def lose(self, name: str, count: int) -> None:
+        self.number, self.left = messages.NUMBER_OF[name], count
+        self.lost: list[bytes] = []
+
+    def carry(self, frame: bytes) -> bytes:
+        answer = super().carry(frame)
+        if getattr(self, "left", 0) and wire.Reader().feed(frame)[0].number == self.number:
+            self.left -= 1
+            self.lost.append(frame)
+            return b""
+        return answer
+
+
+def interrupted(clock: object, boards: list[Board]) -> Interrupted:
+    return Interrupted(clock, [*boards])  # type: ignore[arg-type]
+
+
+async def final(field: Field, identity: str, name: str = "A1", limit: float = 15.0) -> Stage:
+    """Wait for the last stage of a command."""
+    ends = (Stage.DONE, Stage.REFUSED, Stage.FAILED)
+    await field.until(lambda: field.plant.stages(identity, name)[-1:] and
+                      field.plant.stages(identity, name)[-1] in ends, limit)  # fmt: skip
+    return field.plant.stages(identity, name)[-1]
+
+
+@pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        (Command("c", "TRACK", token=TOKEN + 1), "not the authority: the token is another one's"),
+        (Command("c", "TRACK"), "not the authority"),
+        (Command("c", "FLY", token=TOKEN), "'FLY' is no command of the wire"),
+        (Command("c", "SESSION", token=TOKEN), "'SESSION' is no command of the wire"),
+        (Command("c", "TRACK", heliostats=("A1", "B7"), token=TOKEN), "has no heliostat 'B7'"),
+        (Command("c", "AIM", (1.0, 2.0), token=TOKEN), "AIM: 4 values, 5 needed"),
+        (Command("c", "JOG", (0.0, 1.5), token=TOKEN), "JOG, value 4: 1.5 is not a whole number"),
+        (Command("c", "LOCK_AIM", (300.0,), token=TOKEN), "300 is not within 0 to 255"),
+        (Command("c", "TRACK", token=TOKEN, lifetime=-1.0), "a lifetime of -1 s"),
+    ],
+)
+def test_a_command_that_cannot_be_is_refused(command: Command, text: str) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.plant.send(command)
+        await field.until(lambda: any(getattr(m, "identity", "") == "c" for m in field.plant.heard))
+        assert text in field.plant.text("c")
+        assert field.states() == ["STOWED", "STOWED"]
+
+    run(main)
+
+
+def test_without_a_lease_nobody_may_command() -> None:
+    async def main(field: Field) -> None:
+        field.plant.token = 0
+        await asyncio.sleep(2.0)
+        await field.order("c", "LOCK")
+        await asyncio.sleep(0.5)
+        assert "nobody has the authority" in field.plant.text("c")
+
+    run(main)
+
+
+def test_a_state_that_forbids_it_is_said_in_words() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.order("c", "TRACK", heliostats=("A1",))
+        assert await final(field, "c") is Stage.REFUSED
+        assert field.plant.text("c") == "TRACK: not in this state (STOWED)"
+
+    run(main)
+
+
+def test_stages_go_on_to_the_state_that_is_asked_for() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.order("track", "TRACK", heliostats=("A1",))
+        assert await final(field, "track") is Stage.DONE
+        await field.order("go", "GOTO", 100.0, 200.0, heliostats=("A2",))
+        await asyncio.sleep(2.5)
+        # It is under way.
+        assert field.plant.stages("go", "A2") == ALL_STAGES[:3]
+        await field.order("stop", "LOCK", heliostats=("A2",))
+        assert await final(field, "go", "A2") is Stage.FAILED
+        assert "LOCK came after it" in field.plant.text("go")
+        assert await final(field, "stop", "A2") is Stage.DONE
+        assert field.states() == ["TRACKING", "LOCKED"]
+
+    run(main, "IDLE")
+
+
+def test_a_lost_answer_is_asked_for_again_and_nothing_acts_twice() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        motion = field.boards[0].node.controller.motion
+        await field.order("idle", "LOCK", heliostats=("A1",))
+        await final(field, "idle")
+        await field.order("free", "UNLOCK", heliostats=("A1",))
+        assert await final(field, "free") is Stage.DONE
+        before = motion.goal(0)
+        field.bus.lose("JOG", 2)
+        await field.order("jog", "JOG", 0.0, 500.0, heliostats=("A1",))
+        # The third frame is the first: "duplicate" says that it was taken.
+        assert await final(field, "jog") is Stage.DONE
+        assert motion.goal(0) == before + 500
+        assert len(set(field.bus.lost)) == 1
+        assert field.cluster.nodes[0].counts.retries == 2
+        # A fourth would be a new frame, which might act again: rather give up.
+        field.bus.lose("JOG", 3)
+        await field.order("more", "JOG", 0.0, 500.0, heliostats=("A1",))
+        assert await final(field, "more") is Stage.FAILED
+        assert "no answer to JOG; it may have been taken" in field.plant.text("more")
+        await asyncio.sleep(3.0)
+        assert motion.goal(0) == before + 1000
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_where_the_answer_was_lost_the_state_decides() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("TRACK", 4)
+        await field.order("track", "TRACK", heliostats=("A1",))
+        assert await final(field, "track") is Stage.DONE
+        assert len(set(field.bus.lost)) == 2
+        # An aim is set again, until the answer to one has come.
+        field.bus.lose("AIM", 4)
+        await field.order("aim", "AIM", 0.0, 0.0, 52.0, heliostats=("A1",))
+        assert await final(field, "aim") is Stage.DONE
+        assert field.boards[0].node.controller.motion.aim == (0.0, 0.0, 52.0)
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_a_command_that_nobody_answers_expires() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.boards[0].on = False
+        begin = field.clock.monotonic()
+        await field.order("aim", "AIM", *AIM, heliostats=("A1",), lifetime=4.0)
+        assert await final(field, "aim") is Stage.FAILED
+        assert 4.0 <= field.clock.monotonic() - begin < 5.5
+        assert "no answer to AIM before it expired" in field.plant.text("aim")
+        field.boards[0].on = True
+        await asyncio.sleep(3.0)
+        assert field.boards[0].node.controller.motion.aim is None
+
+    run(main)
+
+
+def test_the_authority_that_changes_voids_what_waits() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.boards[0].on = False
+        await field.order("aim", "AIM", *AIM, heliostats=("A1",), lifetime=9.0)
+        await asyncio.sleep(1.5)
+        field.plant.token = 77
+        assert await final(field, "aim") is Stage.FAILED
+        assert "the authority has changed" in field.plant.text("aim")
+
+    run(main)
+
+
+def test_nodes_out_of_step_get_a_new_epoch() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        node = field.boards[0].node
+        epoch = node.controller.gate.replay.epoch
+        # As if it had heard frames of another sender that numbers far ahead.
+        node.controller.gate.replay.count += 30000
+        await field.order("aim", "AIM", *AIM, heliostats=("A1",))
+        assert await final(field, "aim") is Stage.DONE
+        assert node.controller.gate.replay.epoch > epoch
+
+    run(main)
+
+
+# -- parameters ------------------------------------------------------------------------
+
+
+def new_items() -> dict[str, bytes]:
+    items = items_of_heliostat(heliostat())
+    numbers = list(struct.unpack(CODES_OF["armature"], items["armature"]))
+    numbers[15] += 1e-4
+    changed = {name: items[name] for name in ("limits_primary", "drive_secondary", "standby")}
+    return changed | {
+        "armature": struct.pack(CODES_OF["armature"], *numbers),
+        "biases": struct.pack("<ff", 0.001, -0.002),
+        "location": struct.pack("<ddd", 40.5, 80.0, 0.25),
+    }
+
+
+def test_parameters_are_written_item_by_item_and_read_back() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        items = new_items()
+        await field.order("lock", "LOCK", heliostats=("A1",))
+        await final(field, "lock")
+        field.bus.lose("SET_ARMATURE", 2)
+        await field.plant.send(Parameters.of("p", "A1", items, TOKEN))
+        assert await final(field, "p") is Stage.DONE
+        assert field.plant.stages("p", "A1") == ALL_STAGES
+        journal = field.boards[0].node.journal
+        assert {name: journal.items[name] for name in items} == items
+        await field.plant.send(Ask("sums", "checksums"))
+        await field.plant.send(Ask("all", "stored", "A1"))
+        await field.until(lambda: len(field.plant.all(Answer)) == 2, 3.0)
+        sums, all_ = field.plant.all(Answer)
+        assert sums.data["A1"] == crc32(items["armature"]) != sums.data["A2"]
+        place = sum(all_.data["sizes"][: all_.data["names"].index("biases")])
+        assert all_.block[place : place + 8] == items["biases"]
+
+    run(main, bus=interrupted)
+
+
+def test_editions_rise_over_restarts_and_above_what_the_node_holds() -> None:
+    kept = Kept(None)
+    boards = [Board(1), Board(2)]
+
+    async def main(field: Field) -> None:
+        field.boards[0].node.controller.gate.edition = 500
+        field.boards[0].node.journal.store({"edition": struct.pack("<I", 500)})
+        await field.until(field.sun_is_fresh)
+        await field.order("lock", "LOCK", heliostats=("A1",))
+        await final(field, "lock")
+        items = {"biases": struct.pack("<ff", 0.003, 0.0)}
+        await field.plant.send(Parameters.of("p", "A1", items, TOKEN))
+        assert await final(field, "p") is Stage.DONE
+        assert field.boards[0].node.controller.gate.edition == 501
+
+    run(main, boards=boards, kept=kept)
+    assert kept.next_edition() == 502
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda items: items | {"colour": b"red"}, "item 'colour' cannot be set"),
+        (lambda items: items | {"edition": bytes(4)}, "item 'edition' cannot be set"),
+        (lambda items: items | {"stow": b"\0"}, "item stow: 1 bytes, 8 needed"),
+        (lambda items: {}, "no items"),
+        (
+            lambda items: {"biases": struct.pack("<ff", float("nan"), 0.0)},
+            "item biases: a number that is not finite",
+        ),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(
+    change: Callable[[dict[str, bytes]], dict[str, bytes]], text: str
+) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.plant.send(Parameters.of("p", "A1", change({}), TOKEN))
+        await asyncio.sleep(1.5)
+        assert text in field.plant.text("p")
+
+    run(main)
+
+
+def test_parameters_are_refused_where_state_or_key_forbid_them() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        items = {"limits_primary": new_items()["limits_primary"]}
+        await field.plant.send(Parameters.of("p", "A1", items, TOKEN))
+        await field.plant.send(Parameters.of("q", "A2", items, TOKEN))
+        assert await final(field, "p") is Stage.REFUSED
+        assert field.plant.text("p") == "SET_LIMITS: not in this state (STOWED)"
+        assert "A2: no key is configured" in field.plant.text("q")
+        await field.order("zero", "ZERO", 0.0, 0.0, heliostats=("A2",))
+        await asyncio.sleep(1.0)
+        assert "A2: no key is configured" in field.plant.text("zero")
+
+    config = config_of(2)
+    first, second = config.heliostats
+    keyless = type(second)(second.name, second.address, second.serial)
+    run(main, heliostats=(first, keyless))
+
+
+# -- questions -------------------------------------------------------------------------
+
+
+def test_statistics_tell_of_each_node() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(5.0)
+        await field.plant.send(Ask("s", "statistics"))
+        await field.plant.send(Ask("w", "weather"))
+        await field.plant.send(Ask("n", "stored", "A9"))
+        await field.until(lambda: len(field.plant.all(Answer)) == 3, 3.0)
+        answers = {answer.identity: answer.data for answer in field.plant.all(Answer)}
+        counts = answers["s"]["A1"]
+        assert counts["asked"] == counts["answered"] > 8
+        assert 0.005 < counts["round_trip"] < 0.02
+        assert "question 'weather' is not known" in answers["w"]["error"]
+        assert "has no heliostat 'A9'" in answers["n"]["error"]
+
+    run(main)
+
+
+def test_all_on_the_bus_are_found_although_answers_collide() -> None:
+    boards = [Board(n) for n in range(1, 8)]
+    boards[3] = Board(4, address=6)  # two on one address
+    boards[6] = Board(7, configured=False)
+
+    async def main(field: Field) -> None:
+        await field.plant.send(Ask("d", "discover"))
+        await field.until(lambda: bool(field.plant.all(Answer)), 200.0)
+        (answer,) = field.plant.all(Answer)
+        data = answer.data
+        expected = {board.serial: board.node.controller.config.address for board in boards}
+        assert {each["serial"]: each["address"] for each in data["found"]} == expected
+        assert data["garbled"] == []
+        assert data["missing"] == []
+        wrong = [each["name"] for each in data["found"] if each["address"] != each["expected"]]
+        assert wrong == ["A4", "A7"]
+        # The sun is sent all the while.
+        assert field.sun_is_fresh()
+        # Each gets its address by its serial number.
+        await field.order("a", "SET_ADDRESS", heliostats=("A4", "A7"), lifetime=20.0)
+        assert await final(field, "a", "A4", 20.0) is Stage.DONE
+        assert await final(field, "a", "A7", 20.0) is Stage.DONE
+        assert [board.node.controller.config.address for board in boards] == list(range(1, 8))
+        await field.until(lambda: field.plant.status().nodes()["heard_ms"].max() < 500, 10.0)
+
+    run(main, boards=boards, bus=lambda clock, boards: SlotBus(clock, [*boards]))
+
+
+def test_an_emergency_does_not_wait_for_a_search_of_the_bus() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.plant.send(Ask("d", "discover"))
+        await field.until(lambda: field.cluster._exchange._gathering is not None)
+        await asyncio.sleep(0.1)
+        begin = field.clock.monotonic()
+        await field.emergency("stop", "DEFOCUS")
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 0.3)
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("stop", "A2"), 1.0)
+        assert field.clock.monotonic() - begin < 0.5
+
+    run(main, "IDLE", bus=lambda clock, boards: SlotBus(clock, [*boards]))
