@@ -25,6 +25,7 @@ COLUMNS = {
     "sun": {"times", "contender", "processor_ms", "ratio_to_first", "apart_rad"} | TIMES,
     "field": {"heliostats", "table", "work", "ratio_to_pandas"} | TIMES,
     "startup": {"command", "best_s", "median_s", "ratio_to_first"},
+    "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
     "name", "headline", "within_budget", "quick", "seconds", "others_cores", "machine", "rows",
@@ -79,6 +80,15 @@ def test_tracking_covers_what_is_claimed() -> None:
     for row in rows:
         assert row["apart_rad"] <= 1e-9
         assert (row["growth_exponent"] is None) == (row["heliostats"] == 1)
+
+
+def test_bus_takes_no_less_than_the_wire() -> None:
+    rows = _quick("bus")["rows"]
+    assert {row["line"] for row in rows} == {"unpaced", "115,200 baud"}
+    for row in rows:
+        paced = row["line"] != "unpaced"
+        assert row["wire_ms"] == pytest.approx(row["bytes"] * 1e4 / 115_200 if paced else 0.0)
+        assert row["median_ms"] > row["wire_ms"]
 
 
 def test_table_names_machine_and_headline() -> None:
