@@ -110,24 +110,27 @@ class Proof:
 
     def with_acknowledged(self, node: str, at: float) -> "Proof":
         """Return the proof with a node's acknowledgement; only the first one counts."""
-        return self.with_news(acknowledged=(node,), at=at)
+        return self.with_news(acknowledged={node: at})
 
     def with_done(self, node: str, at: float) -> "Proof":
         """Return the proof with a node's report that it is done, which acknowledges too."""
-        return self.with_news(done=(node,), at=at)
+        return self.with_news(done={node: at})
 
     def with_news(
-        self, *, acknowledged: Iterable[str] = (), done: Iterable[str] = (), at: float
+        self,
+        *,
+        acknowledged: Mapping[str, float] | None = None,
+        done: Mapping[str, float] | None = None,
     ) -> "Proof":
-        """Return the proof with the reports of many nodes of one time: one copy for all."""
-        told, ready = tuple(acknowledged), tuple(done)
-        good_told = [node for node in told if self._counts(node, at)]
-        good_ready = [node for node in ready if self._counts(node, at)]
+        """Return the proof with the reports of many nodes, each with its time: one copy for all."""
+        told, ready = dict(acknowledged or {}), dict(done or {})
+        good_told = {node: at for node, at in told.items() if self._counts(node, at)}
+        good_ready = {node: at for node, at in ready.items() if self._counts(node, at)}
         wrong = len(told) + len(ready) - len(good_told) - len(good_ready)
         return replace(
             self,
-            acknowledged={**dict.fromkeys(good_told + good_ready, at), **self.acknowledged},
-            done={**dict.fromkeys(good_ready, at), **self.done} if good_ready else self.done,
+            acknowledged={**good_ready, **good_told, **self.acknowledged},
+            done={**good_ready, **self.done},
             refused=self.refused + wrong,
         )
 

@@ -175,7 +175,7 @@ class Sentinel:
         order = self.order
         if order is None or not self.on:
             return
-        rows = [self._field.index[n] for n in end.members if n not in order.proof.done]
+        rows = [self._field.index[n] for n in end.members if not order.is_done(n)]
         if rows:
             index = np.array(rows, dtype=np.intp)
             order.take_rows(

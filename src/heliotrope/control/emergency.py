@@ -42,13 +42,38 @@ class EmergencyOrder:
         Monotonic s.
     ticket
         Its stages, heliostat by heliostat.
-    proof
-        See `safety.Proof`.
     """
 
     def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
-        self.proof = Proof.of(act.name, ticket.heliostats, at)
+        self._proof = Proof.of(act.name, ticket.heliostats, at)
+        # A proof is a value: reports of a whole field are put into it together.
+        self._told: dict[str, float] = {}
+        self._ready: dict[str, float] = {}
+
+    @property
+    def proof(self) -> Proof:
+        """What is proven; see `safety.Proof`."""
+        if self._told or self._ready:
+            self._proof = self._proof.with_news(acknowledged=self._told, done=self._ready)
+            self._told, self._ready = {}, {}
+        return self._proof
+
+    def take_flux(self, share: float, at: float) -> None:
+        """Take the flux on the receiver, as a share of the nominal."""
+        self._proof = self.proof.with_flux(share, at)
+
+    def is_acknowledged(self, heliostat: str) -> bool:
+        """Whether a heliostat has acknowledged it."""
+        return (
+            heliostat in self._told
+            or heliostat in self._ready
+            or (heliostat in self._proof.acknowledged)
+        )
+
+    def is_done(self, heliostat: str) -> bool:
+        """Whether a heliostat has carried it out."""
+        return heliostat in self._ready or heliostat in self._proof.done
 
     def report(self, now: float) -> ProofReport:
         """Return how far it has come."""
@@ -56,17 +81,16 @@ class EmergencyOrder:
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of some heliostats have not acknowledged it."""
-        return tuple(name for name in heliostats if name not in self.proof.acknowledged)
+        return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
         """Take a cluster's progress."""
-        new = tuple(name for name in heliostats if name not in self.proof.acknowledged)
-        if stage is Stage.ACKNOWLEDGED and new:
-            self.proof = self.proof.with_news(acknowledged=new, at=now)
+        if stage is Stage.ACKNOWLEDGED:
+            for name in heliostats:
+                self._told.setdefault(name, now)
         elif stage is Stage.DONE:
-            left = tuple(name for name in heliostats if name not in self.proof.done)
-            if left:
-                self.proof = self.proof.with_news(done=left, at=now)
+            for name in heliostats:
+                self._ready.setdefault(name, now)
 
     def take_rows(
         self,
@@ -79,9 +103,9 @@ class EmergencyOrder:
         """Take what is heard of heliostats (K,): rows of `NODE`, when they were true, drives."""
         fresh = heard >= self.at
         fulfilled = fresh & done(self.act, rows, drives, heard >= self.at + LEAVING)
-        ready = [names[i] for i in np.flatnonzero(fulfilled) if names[i] not in self.proof.done]
+        ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
-            self.proof = self.proof.with_news(done=ready, at=now)
+            self.take_stage(ready, Stage.DONE, now)
             self.ticket.advance(ready, Stage.DONE)
 
 

@@ -333,7 +333,7 @@ class PlantController:
         """Take the flux on the receiver as a share of the nominal, measured now, as proof."""
         order = self._sentinel.order
         if order is not None:
-            order.proof = order.proof.with_flux(share, self._clock.monotonic())
+            order.take_flux(share, self._clock.monotonic())
 
     @property
     def emergency(self) -> EmergencyOrder | None:
