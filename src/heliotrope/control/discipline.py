@@ -52,7 +52,8 @@ class DisciplineSettings:
     largest_error
         Above this error bound there is no time, in s.
     confirm
-        How long a receiver must agree with itself before it is believed, in s.
+        How long a receiver must agree with itself, without a pause longer than ``fresh``, before
+        it is believed, in s.
     insist
         The same where it contradicts the time kept so far and nobody else takes its side, in s.
     system_tolerance
@@ -231,6 +232,8 @@ class DisciplinedClock:
     def _consider(self, new: Bounds, kept: Bounds | None) -> None:
         """Follow what the receiver says if it says so long enough and others agree."""
         claim = self._claim
+        if claim is not None and new.at - claim.bounds.at > self._settings.fresh:
+            claim = None  # who is silent meanwhile doesn't insist
         said = None if claim is None else claim.bounds.later(new.at, self._drift)
         if claim is None or said is None or not said.meet(new):
             self._claim, self._doubt = _Claim(new, new.at), ""
