@@ -5,9 +5,10 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= auto
+BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test soak lint docs bench clean
+.PHONY: help setup run test soak lint docs bench firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -40,6 +41,9 @@ docs: $(STAMP)  ## build the documentation into site/
 
 bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
 	@$(BIN)/python -m benchmarks all
+
+firmware: $(STAMP)  ## compile the firmware of a board: BOARD=rp2, esp32 or stm32
+	@$(BIN)/python scripts/firmware.py $(BOARD)
 
 clean:  ## remove what was built, but not the environment
 	rm -rf build dist site out .pytest_cache .mypy_cache .ruff_cache .hypothesis

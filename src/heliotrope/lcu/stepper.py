@@ -79,10 +79,13 @@ class Axis:
             raise ValueError("axis: rate and acceleration must be above 0")
         self.low, self.high, self.backlash = low, high, backlash
         self.rate, self.acceleration = rate, acceleration
-        self.top = max(1, rate * slot_ms * SCALE // 1000)
-        self.change = max(1, acceleration * slot_ms * slot_ms * SCALE // 1_000_000)
         self.slot_us = 1000 * slot_ms
         self.shortest_us = -(-1_000_000 // rate)
+        # Intervals are whole microseconds: a slot holds no more steps than have room in it, or
+        # the hardware would fall behind.
+        room = self.slot_us * SCALE // self.shortest_us
+        self.top = max(1, min(rate * slot_ms * SCALE // 1000, room))
+        self.change = max(1, acceleration * slot_ms * slot_ms * SCALE // 1_000_000)
         self.count = self.goal = self.leg = 0
         self.speed = self.phase = 0
         self.direction = 1

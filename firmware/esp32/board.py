@@ -1,0 +1,66 @@
+"""Boards with an ESP32, ESP32-S3 or another of the family that has the RMT peripheral."""
+
+import hashlib
+from binascii import crc32
+
+import esp32
+import machine
+from machine import ADC, SPI, UART, Pin
+from nor import Blocks, SpiNor
+from rs485 import Port
+from steps import Timer
+
+#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
+DIVIDER = 11
+
+
+def storage():
+    """The partition "journal", where the board was given one; else a chip on the SPI bus."""
+    found = esp32.Partition.find(esp32.Partition.TYPE_DATA, label="journal")
+    if found:
+        return Blocks(found[0])
+    spi = SPI(2, baudrate=10_000_000, sck=Pin(18), mosi=Pin(23), miso=Pin(19))
+    return SpiNor(spi, Pin(5, Pin.OUT, value=1))
+
+
+class Board:
+    def __init__(self, settings):
+        pins = settings.PINS
+        self.firmware, self.key = settings.FIRMWARE, settings.KEY
+        self.serial = crc32(machine.unique_id())
+        self.storage = storage()
+        uart = UART(2, settings.BAUD, tx=17, rx=16, rxbuf=512)
+        self.port = Port(uart, Pin(pins["drive"], Pin.OUT, value=0))
+        self.timer = Timer(pins["steps"])
+        self.good = Pin(pins["supply_good"], Pin.IN)
+        self.limits = [Pin(number, Pin.IN) for number in pins["limits"]]
+        self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
+        self.supply = ADC(Pin(pins["supply"]), atten=ADC.ATTN_11DB)
+        self.dog = machine.WDT(timeout=2000)
+
+    def sha256(self, data):
+        return hashlib.sha256(data).digest()
+
+    def feed(self):
+        self.dog.feed()
+
+    def tilt(self):
+        return None
+
+    def switches(self):
+        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
+
+    def supply_good(self):
+        return self.good() == 1
+
+    def limit_hit(self):
+        # Switches open when they are hit, so that a broken wire stops the axis too.
+        return any([pin() for pin in self.limits])
+
+    def supply_mv(self):
+        return self.supply.read_uv() * DIVIDER // 1000
+
+    def temperature_degc(self):
+        if hasattr(esp32, "mcu_temperature"):
+            return int(esp32.mcu_temperature())
+        return (esp32.raw_temperature() - 32) * 5 // 9  # the first ESP32 tells Fahrenheit

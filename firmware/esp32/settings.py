@@ -1,0 +1,10 @@
+"""What differs from board to board; docs/how-to/firmware.md tells what each pin is for."""
+
+FIRMWARE = 1
+BAUD = 115200
+#: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
+KEY = b""
+PINS = {
+    "drive": 4, "steps": (25, 26, 27, 14), "supply_good": 35, "limits": (34, 39),
+    "switches": (32, 33, 13, 21, 22), "supply": 36,
+}  # fmt: skip

@@ -1,0 +1,57 @@
+"""Raspberry Pi Pico, Pico 2 and other boards with an RP2040 or RP2350."""
+
+import hashlib
+from binascii import crc32
+
+import machine
+from machine import ADC, SPI, UART, Pin
+from nor import SpiNor
+from rs485 import Port
+from steps import Timer
+
+#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
+DIVIDER = 11
+
+
+class Board:
+    def __init__(self, settings):
+        pins = settings.PINS
+        self.firmware, self.key = settings.FIRMWARE, settings.KEY
+        self.serial = crc32(machine.unique_id())
+        spi = SPI(0, baudrate=10_000_000, sck=Pin(18), mosi=Pin(19), miso=Pin(16))
+        self.storage = SpiNor(spi, Pin(17, Pin.OUT, value=1))
+        uart = UART(0, settings.BAUD, tx=Pin(0), rx=Pin(1), rxbuf=512)
+        self.port = Port(uart, Pin(pins["drive"], Pin.OUT, value=0))
+        self.timer = Timer(pins["steps"])
+        self.good = Pin(pins["supply_good"], Pin.IN, Pin.PULL_UP)
+        self.limits = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["limits"]]
+        self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
+        self.supply, self.warmth = ADC(pins["supply"]), ADC(ADC.CORE_TEMP)
+        self.dog = machine.WDT(timeout=2000)
+
+    def sha256(self, data):
+        return hashlib.sha256(data).digest()
+
+    def feed(self):
+        self.dog.feed()
+
+    def tilt(self):
+        return None
+
+    def switches(self):
+        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
+
+    def supply_good(self):
+        return self.good() == 1
+
+    def limit_hit(self):
+        # Switches open when they are hit, so that a broken wire stops the axis too.
+        return any([pin() for pin in self.limits])
+
+    def supply_mv(self):
+        return self.supply.read_u16() * 3300 * DIVIDER // 65535
+
+    def temperature_degc(self):
+        # The sensor of the chip: 0.706 V at 27 °C, -1.721 mV/K.
+        volts = self.warmth.read_u16() * 3.3 / 65535
+        return round(27 - (volts - 0.706) / 0.001721)

@@ -1,0 +1,10 @@
+"""What differs from board to board; docs/how-to/firmware.md tells what each pin is for."""
+
+FIRMWARE = 1
+BAUD = 115200
+#: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
+KEY = b""
+PINS = {
+    "drive": 2, "steps": (6, 7, 8, 9), "supply_good": 3, "limits": (10, 11),
+    "switches": (20, 21, 22, 14, 15), "supply": 26,
+}  # fmt: skip

@@ -1,0 +1,58 @@
+"""Boards with an STM32F4, F7 or H7 that have TIM1 and TIM8 (pyboard, many Nucleo-64 and -144)."""
+
+import hashlib
+from binascii import crc32
+
+import machine
+import pyb
+from machine import SPI, UART
+from nor import SpiNor
+from pyb import Pin
+from rs485 import Port
+from steps import Timer
+
+#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
+DIVIDER = 11
+
+
+class Board:
+    def __init__(self, settings):
+        pins = settings.PINS
+        self.firmware, self.key = settings.FIRMWARE, settings.KEY
+        self.serial = crc32(machine.unique_id())
+        spi = SPI(2, baudrate=10_000_000)
+        self.storage = SpiNor(spi, Pin(pins["flash"], Pin.OUT_PP, value=1))
+        uart = UART(2, settings.BAUD, rxbuf=512)
+        self.port = Port(uart, Pin(pins["drive"], Pin.OUT_PP, value=0))
+        self.timer = Timer(pins["steps"])
+        self.good = Pin(pins["supply_good"], Pin.IN, Pin.PULL_UP)
+        self.limits = [Pin(name, Pin.IN, Pin.PULL_UP) for name in pins["limits"]]
+        self.address = [Pin(name, Pin.IN, Pin.PULL_UP) for name in pins["switches"]]
+        self.supply = pyb.ADC(Pin(pins["supply"]))
+        self.chip = pyb.ADCAll(12, 0x70000)
+        self.dog = machine.WDT(timeout=2000)
+
+    def sha256(self, data):
+        return hashlib.sha256(data).digest()
+
+    def feed(self):
+        self.dog.feed()
+
+    def tilt(self):
+        return None
+
+    def switches(self):
+        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
+
+    def supply_good(self):
+        return self.good() == 1
+
+    def limit_hit(self):
+        # Switches open when they are hit, so that a broken wire stops the axis too.
+        return any([pin() for pin in self.limits])
+
+    def supply_mv(self):
+        return self.supply.read() * 3300 * DIVIDER // 4095
+
+    def temperature_degc(self):
+        return int(self.chip.read_core_temp())

@@ -1,0 +1,10 @@
+"""What differs from board to board; docs/how-to/firmware.md tells what each pin is for."""
+
+FIRMWARE = 1
+BAUD = 115200
+#: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
+KEY = b""
+PINS = {
+    "drive": "A1", "steps": ("A8", "B0", "C6", "B1"), "supply_good": "C0", "limits": ("C1", "C2"),
+    "switches": ("A4", "A5", "A6", "A7", "C5"), "supply": "C3", "flash": "B12",
+}  # fmt: skip

