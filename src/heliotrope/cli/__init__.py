@@ -18,6 +18,7 @@ from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
 from heliotrope.cli.image import image
 from heliotrope.cli.plan import plan
+from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
 from heliotrope.errors import HeliotropeError
@@ -57,6 +58,7 @@ app.command()(calibrate)
 app.command()(plan)
 app.command()(evaluate)
 app.command()(cluster)
+app.command()(simulate)
 app.command()(fetch)
 app.command()(demo)
 

@@ -15,6 +15,9 @@ def simulate(
     hours: Annotated[float, typer.Option(help="Simulated time of a run.")] = 0.1,
     heliostats: Annotated[int, typer.Option(help="On the bus, 1 to 32.")] = 4,
     pause: Annotated[float, typer.Option(help="Mean time between two faults, s.")] = 12.0,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Only faults of this kind; may be given again.")
+    ] = None,
     runs: Annotated[int, typer.Option(help="Runs, with seeds one after the other.")] = 1,
     processes: Annotated[int, typer.Option(help="Runs at a time.")] = 1,
     minutes: Annotated[
@@ -38,7 +41,9 @@ def simulate(
 
     if runs < 1 or (minutes is not None and not minutes > 0.0):
         raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
-    plans = [Plan(seed + i, 3600.0 * hours, heliostats, pause) for i in range(runs)]
+    plans = [
+        Plan(seed + i, 3600.0 * hours, heliostats, pause, tuple(only or ())) for i in range(runs)
+    ]
     found = soak(
         plans,
         processes=processes,

@@ -193,7 +193,7 @@ class Account:
                 return ""
             wrong = self.place()[1] != STOW[1]
             return f"azimuth moves to stow while elevation is at {self.place()[1]}" if wrong else ""
-        if self._leg == 0 or self.state != states.APPROACHING:
+        if self._leg == 0 or board.state != states.APPROACHING:
             return None
         if axis == 1:
             early = self._leg == 1

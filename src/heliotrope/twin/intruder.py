@@ -14,6 +14,8 @@ from heliotrope.twin.outfit import sha256
 #: What he would like to command.
 WANTED = ("TRACK", "APPROACH", "REFOCUS", "IDLE", "AIM", "UNLOCK", "CLEAR_FAULT", "LOCK", "GOTO",
           "SET_BIAS", "ZERO", "SET_DEFOCUS")  # fmt: skip
+#: So many commands are sent in some ten seconds.
+_LATELY = 8
 _NUMBERS: dict[str, tuple[float, ...]] = {
     "AIM": (0.0, 0.0, 50.0), "GOTO": (1000, 1000), "SET_BIAS": (0.1, 0.1), "ZERO": (0, 0),
     "SET_DEFOCUS": (0.05, 0.05),
@@ -36,9 +38,15 @@ class Intruder:
         self._addresses = addresses
 
     def recorded(self, size: float) -> bytes:
-        """Return a frame of before, b"" if there is none; ``size`` (0 to 1) says how long ago."""
+        """Return a frame of before, b"" if there is none; ``size`` (0 to 1) says which.
+
+        Every second one is one of the last commands, which may not have expired.
+        """
+        commands, part = self._frames.commands[-_LATELY:], 2.0 * size % 1.0
+        if size >= 0.5 and commands:
+            return self._frames.data(commands[int(part * len(commands))])
         count = len(self._frames)
-        return self._frames.data(min(count - 1, int(size * count))) if count else b""
+        return self._frames.data(int(part * count)) if count else b""
 
     def forged(self, target: int, size: float) -> bytes:
         """Return a command to a heliostat by its place, with a token and a key of his own."""

@@ -481,6 +481,8 @@ class Observer:
             slack = STATUS_LIFE + AGE_ROUNDING
             saw = f"told to be heard {now - claimed:.2f} s ago, it was {now - last:.2f} s ago"
             self.check(11, claimed <= last + slack, now, name, saw)
+            if int(row["boots"]) == 0:
+                continue  # every board has booted: this row is of one that has told no state yet
             told = {state for at, state in account.answers if state >= 0}
             state = int(row["state"])
             saw = f"told to be {states.STATES[state]}, which it has not answered of late"

@@ -72,12 +72,15 @@ class FrameLedger:
     ----------
     last
         The last frame of each name.
+    commands
+        Places of the frames that need authority.
     """
 
     def __init__(self) -> None:
         self._frames: dict[bytes, Sent] = {}
         self._order: list[bytes] = []
         self.last: dict[str, Sent] = {}
+        self.commands: list[int] = []
 
     def __len__(self) -> int:
         return len(self._order)
@@ -97,6 +100,8 @@ class FrameLedger:
         )  # fmt: skip
         self._frames[data] = self.last[frame.name] = sent
         self._order.append(data)
+        if sent.who in (messages.AUTHORITY, messages.KEY):
+            self.commands.append(sent.index)
         return sent
 
     def of(self, data: bytes) -> Sent | None:

@@ -37,7 +37,7 @@ TOKEN = 0x5EED0001
 LEASE_EXPIRY = 1.0
 #: What leads on from a state.
 ONWARDS = {
-    states.STOWED: ("APPROACH",), states.IDLE: ("TRACK", "TRACK", "SEARCH"),
+    states.STOWED: ("APPROACH",), states.IDLE: ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
     states.TRACKING: ("AIM", "AIM", "IDLE", "ROUGH"), states.DEFOCUSED: ("REFOCUS", "IDLE"),
     states.SEARCHING: ("TRACK", "IDLE"), states.LOCKED: ("UNLOCK",),
     states.FAULT: ("CLEAR_FAULT",),
@@ -179,6 +179,8 @@ class Operator:
             return tuple(x + chance.uniform(-0.5, 0.5) for x in STANDBY)
         if name == "SEARCH":
             return 2e-3, chance.choice([4e-3, 8e-3])
+        if name == "JOG":
+            return float(chance.randrange(2)), float(chance.choice([-100, 100]))
         if name == "ROUGH":
             return (float(chance.randrange(2)),)
         return ()

@@ -65,6 +65,8 @@ class Plan:
         On the one bus, 1 to 32.
     pause
         Mean time between two faults, s.
+    only
+        Kinds of faults to draw from, () for all.
     faults
         None: drawn by the seed.
 
@@ -78,6 +80,7 @@ class Plan:
     seconds: float = 600.0
     heliostats: int = 4
     pause: float = 12.0
+    only: tuple[str, ...] = ()
     faults: tuple[Fault, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -89,14 +92,16 @@ class Plan:
         if not 1 <= self.heliostats <= 32:
             raise InputError(f"simulation of {self.heliostats} heliostats; a cluster has 1 to 32")
         if self.faults is None:
-            kinds.drawn(0, 1.0, 1, pause=self.pause)
+            kinds.drawn(0, 1.0, 1, pause=self.pause, only=self.only)
 
     @property
     def drawn(self) -> tuple[Fault, ...]:
         """The faults of the run."""
         if self.faults is not None:
             return self.faults
-        return tuple(kinds.drawn(self.seed, self.seconds, self.heliostats, pause=self.pause))
+        return tuple(
+            kinds.drawn(self.seed, self.seconds, self.heliostats, pause=self.pause, only=self.only)
+        )
 
 
 @dataclass
@@ -143,7 +148,8 @@ class Outcome:
         plan = self.plan
         return (
             f"heliotrope simulate --seed {plan.seed} --hours {plan.seconds / 3600.0!r} "
-            f"--heliostats {plan.heliostats} --pause {plan.pause:g}"
+            f"--heliostats {plan.heliostats} --pause {plan.pause!r}"
+            + "".join(f" --only {kind}" for kind in plan.only)
         )
 
     @property

@@ -1,0 +1,126 @@
+"""Deterministic simulation: no invariant broken; each planted defect found, replayed, shrunk."""
+
+from dataclasses import replace
+
+import pytest
+from typer.testing import CliRunner
+
+from heliotrope.cli import app
+from heliotrope.errors import InputError
+from heliotrope.lcu import states
+from heliotrope.twin import faults as kinds
+from heliotrope.twin.faults import Fault
+from heliotrope.twin.invariants import TITLES
+from heliotrope.twin.simulation import Outcome, Plan, run, shrink
+from twin_defects import DEFECTS, Defect
+
+#: Seeds that may be spent on a defect.
+SEEDS = 8
+
+
+def searched(defect: Defect) -> Outcome:
+    """Run with a defect until it is found."""
+    for seed in range(SEEDS):
+        with pytest.MonkeyPatch.context() as patch:
+            defect.plant(patch)
+            outcome = run(defect.plan(seed))
+        if outcome.violation is not None and outcome.violation.number in defect.numbers:
+            return outcome
+    pytest.fail(f"{defect.name}: not found with {SEEDS} seeds; the last: {outcome.text}")
+
+
+@pytest.mark.parametrize("defect", DEFECTS, ids=lambda each: each.name.replace(" ", "_"))
+def test_a_planted_defect_is_found_and_nothing_without_it(defect: Defect) -> None:
+    found = searched(defect)
+    sound = run(replace(found.plan, seconds=max(20.0, found.seconds + 1.0)))
+    assert sound.good, f"{sound.text}; {sound.command}"
+    assert sum(sound.checks.values()) > 100
+
+
+def test_there_is_a_defect_for_each_invariant() -> None:
+    assert {number for defect in DEFECTS for number in defect.numbers} == set(TITLES)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_invariant_is_broken(seed: int) -> None:
+    outcome = run(Plan(seed, 240.0, 3))
+    assert outcome.good, f"{outcome.text}; {outcome.command}"
+    assert sum(outcome.faults.values()) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("block", range(10))
+def test_no_invariant_is_broken_for_long(block: int) -> None:
+    reached: set[int] = set()
+    checked: set[int] = set()
+    for seed in range(10_000 + 6 * block, 10_006 + 6 * block):
+        outcome = run(Plan(seed, 900.0, 4))
+        assert outcome.good, f"{outcome.text}; {outcome.command}"
+        reached |= set(outcome.states)
+        checked |= {number for number, count in outcome.checks.items() if count}
+    assert checked == set(TITLES)
+    assert {states.TRACKING, states.DEFOCUSED, states.STOWED, states.STOWING} <= reached
+
+
+def test_a_seed_gives_the_same_run_again() -> None:
+    first, second = run(Plan(5, 90.0, 2)), run(Plan(5, 90.0, 2))
+    assert (first.checks, first.counts, first.states) == (
+        second.checks, second.counts, second.states
+    )  # fmt: skip
+    assert run(Plan(6, 90.0, 2)).counts != first.counts
+
+
+def test_a_failing_seed_is_replayed_by_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    defect = next(each for each in DEFECTS if each.name == "authority unchecked")
+    defect.plant(monkeypatch)
+    outcome = run(defect.plan(0))
+    assert outcome.violation is not None
+    assert outcome.command.startswith("heliotrope simulate --seed 0 --hours ")
+    replayed = CliRunner().invoke(app, outcome.command.split()[1:])
+    assert replayed.exit_code == 1
+    assert str(outcome.violation) in replayed.output
+    assert outcome.command in replayed.output
+
+
+def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch) -> None:
+    defect = next(each for each in DEFECTS if each.name == "DEFOCUS refused to strangers")
+    defect.plant(monkeypatch)
+    drawn = kinds.drawn(1, 60.0, 2, pause=3.0, only=("noise", "replay", "line_drop"))
+    strangers = [Fault("stranger_safe", 20.0 + i, 0.0, i % 2, i / 20) for i in range(20)]
+    outcome = run(Plan(1, 60.0, 2, faults=(*drawn, *strangers)))
+    assert outcome.violation is not None
+    less = shrink(outcome)
+    assert [fault.kind for fault in less.plan.drawn] == ["stranger_safe"]
+    assert less.violation is not None
+    assert less.violation.number == 4
+    with pytest.raises(InputError, match="seed 3: nothing is broken, so there is nothing to shr"):
+        shrink(run(Plan(3, 5.0, 1, faults=())))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"seconds": 0.0}, "simulation of 0 h; give above 0 and at most 8 h"),
+        ({"seconds": 1e6}, "as long as the sun is up"),
+        ({"heliostats": 33}, "simulation of 33 heliostats; a cluster has 1 to 32"),
+        ({"pause": 0.0}, "a pause of 0.0 s between faults; it must be above 0"),
+        ({"only": ("quake",)}, "fault 'quake' is not known; known: line_cut"),
+    ],
+)
+def test_a_plan_that_cannot_be_run(arguments: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Plan(0, **arguments)  # type: ignore[arg-type]
+
+
+def test_faults_are_left_out_as_long_as_it_fails() -> None:
+    faults = [Fault("noise", float(i), 0.0, i, 0.0) for i in range(20)]
+    tried = []
+
+    def fails(some: list[Fault]) -> bool:
+        tried.append(len(some))
+        return {3, 11} <= {fault.target for fault in some}
+
+    assert [fault.target for fault in kinds.shrunk(faults, fails)] == [3, 11]
+    assert len(tried) < 80
+    assert kinds.shrunk(faults, lambda some: True) == []
+    assert kinds.shrunk(faults, lambda some: len(some) == 20, most=3) == faults

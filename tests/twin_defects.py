@@ -1,0 +1,212 @@
+"""Defects to plant in the code that the simulation runs: one or more for each invariant."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from heliotrope.control import _nodes, _reports, _watch
+from heliotrope.control.protocol import Stage
+from heliotrope.lcu import (
+    controller,
+    journal,
+    lease,
+    messages,
+    motion,
+    states,
+    stepper,
+    ticks,
+    wire,
+)
+from heliotrope.twin.faults import Fault
+from heliotrope.twin.simulation import Plan
+
+#: The plant stands still for a minute when mirrors track.
+STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+@dataclass(frozen=True)
+class Defect:
+    """A defect, the invariants by which it may be found, and where to look for it."""
+
+    numbers: tuple[int, ...]
+    name: str
+    plant: Plant
+    only: tuple[str, ...] = ()
+    pause: float = 12.0
+    seconds: float = 240.0
+    faults: tuple[Fault, ...] | None = None
+
+    def plan(self, seed: int) -> Plan:
+        """Where it is looked for."""
+        return Plan(seed, self.seconds, 3, self.pause, self.only, self.faults)
+
+
+def _lease_by_any_frame(patch: pytest.MonkeyPatch) -> None:
+    message = controller.Controller._message
+
+    def renewing(self: Any, *values: Any) -> None:
+        message(self, *values)
+        if self.sun._left.left > 0:
+            self.sun._left.start(values[5], self.sun.span_ms)
+
+    patch.setattr(controller.Controller, "_message", renewing)
+
+
+def _defocus_holds(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(motion.Motion, "defocus", motion.Motion.hold)
+
+
+def _plant_forgotten(patch: pytest.MonkeyPatch) -> None:
+    """No lease, and no row of the safety table that tells of its end."""
+    patch.setattr(_watch.Watch, "alone", lambda self, now: False)
+    patch.setattr(_watch.Watch, "_table", lambda self: ())
+
+
+def _tracks_by_itself(patch: pytest.MonkeyPatch) -> None:
+    line = "APPROACHING ARRIVED IDLE standby"
+    assert line in states.TABLE
+    patch.setattr(states, "TABLE", states.TABLE.replace(line, "APPROACHING ARRIVED TRACKING track"))
+
+
+def _defocus_from_cluster_only(patch: pytest.MonkeyPatch) -> None:
+    on_frame = controller.Controller.on_frame
+
+    def choosy(self: Any, frame: Any, now_ms: int) -> Any:
+        if frame.sender != 0 and messages.who_of(frame.number) == messages.ANYONE:
+            self.out.clear()
+            return self.out
+        return on_frame(self, frame, now_ms)
+
+    patch.setattr(controller.Controller, "on_frame", choosy)
+
+
+def _authority_unchecked(patch: pytest.MonkeyPatch) -> None:
+    judge = wire.Gate.judge
+
+    def trusting(self: Any, frame: Any, tick: int, now_s: int | None) -> int:
+        found = judge(self, frame, tick, now_s)
+        values = frame.values()
+        if found == messages.REFUSED_AUTHORITY and frame.sender == 0 and values is not None:
+            return messages.EXPIRED if wire.expired(values[1], now_s) else messages.DONE
+        return found
+
+    patch.setattr(wire.Gate, "judge", trusting)
+
+
+def _duplicates_accepted(patch: pytest.MonkeyPatch) -> None:
+    def fresh(self: Any, sequence: int, tick: int) -> bool:
+        self.count += (sequence - self.count) & 0xFFFF
+        return bool(self.look(tick))
+
+    patch.setattr(wire.Replay, "fresh", fresh)
+
+
+def _damage_accepted(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(wire, "crc32", lambda data: 0)
+
+
+def _journal_in_place(patch: pytest.MonkeyPatch) -> None:
+    store = journal.Journal.store
+
+    def over_the_old(self: Any, changes: dict[str, bytes]) -> None:
+        if any(self.items.get(name) != data for name, data in changes.items()):
+            self._slot = 1 - self._slot
+        store(self, changes)
+
+    patch.setattr(journal.Journal, "store", over_the_old)
+
+
+def _counts_late(patch: pytest.MonkeyPatch) -> None:
+    """Step counts are kept at rest only: nothing is written before the steps."""
+    patch.setattr(journal.Journal, "before_steps", lambda self, *counts: None)
+
+
+def _idle_after_boot(patch: pytest.MonkeyPatch) -> None:
+    line = "UNCONFIGURED BOOT_AWAY DEFOCUSED defocus"
+    assert line in states.TABLE
+    patch.setattr(states, "TABLE", states.TABLE.replace(line, "UNCONFIGURED BOOT_AWAY IDLE hold"))
+
+
+def _counts_slip(patch: pytest.MonkeyPatch) -> None:
+    slot = stepper.Axis.slot
+
+    def slipping(self: Any, held: bool) -> int:
+        steps = slot(self, held)
+        if steps > 100:
+            self.count -= self.direction
+        return steps
+
+    patch.setattr(stepper.Axis, "slot", slipping)
+
+
+def _jump_extends_lease(patch: pytest.MonkeyPatch) -> None:
+    def signed(self: Any, now: int) -> int:
+        step = ticks.diff(now, self._seen)
+        self._seen = now
+        self.left = max(0, self.left - step)
+        return int(self.left)
+
+    patch.setattr(ticks.Deadline, "look", signed)
+    patch.setattr(lease.SunLease, "end", lambda self: None)
+
+
+def _approach_swapped(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(motion, "PRIMARY_FIRST", stepper.SECONDARY_FIRST)
+    patch.setattr(motion, "SECONDARY_FIRST", stepper.PRIMARY_FIRST)
+
+
+def _acceptance_lost(patch: pytest.MonkeyPatch) -> None:
+    add = _reports.Reports.add
+
+    def losing(self: Any, identity: str, stage: Stage, *rest: str, **more: str) -> None:
+        if stage is not Stage.ACCEPTED:
+            add(self, identity, stage, *rest, **more)
+
+    patch.setattr(_reports.Reports, "add", losing)
+
+
+def _always_new(patch: pytest.MonkeyPatch) -> None:
+    pack_into = _nodes.Node.pack_into
+
+    def fresh(self: Any, block: bytearray, now: float) -> None:
+        heard = self.heard_at
+        if heard > -math.inf:
+            self.heard_at = now
+        pack_into(self, block, now)
+        self.heard_at = heard
+
+    patch.setattr(_nodes.Node, "pack_into", fresh)
+
+
+def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(lease.SunLease, "fresh", lambda self: True)
+    patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
+
+
+DEFECTS = (
+    Defect((1, 4, 5), "lease renewed by any frame", _lease_by_any_frame,
+           ("cluster_crash", "replay", "stranger_safe", "forgery"), 1.5),
+    Defect((1,), "lease that never ends", _lease_too_long, ("cluster_crash",), 20.0),
+    Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0),
+    Defect((2,), "cluster goes on without the plant", _plant_forgotten, ("plant_silent",), 20.0),
+    Defect((3,), "tracking follows approach by itself", _tracks_by_itself, ("line_drop",), 60.0),
+    Defect((4,), "DEFOCUS refused to strangers", _defocus_from_cluster_only,
+           ("stranger_safe",), 5.0),
+    Defect((4,), "authority unchecked", _authority_unchecked, ("forgery",), 1.0),
+    Defect((5,), "duplicate accepted", _duplicates_accepted, ("replay",), 0.4),
+    Defect((6,), "damaged frame accepted", _damage_accepted, ("bus_bad",), 5.0),
+    Defect((7,), "journal written in place", _journal_in_place, ("flash_cut",), 3.0),
+    Defect((7,), "step counts kept at rest only", _counts_late, ("power_cut",), 8.0),
+    Defect((7,), "idle after a boot", _idle_after_boot, ("power_cut",), 8.0),
+    Defect((8,), "counts slip from what is emitted", _counts_slip, ("line_drop",), 60.0),
+    Defect((9,), "a jump back extends the lease", _jump_extends_lease,
+           ("tick_jump", "cluster_crash"), 3.0),
+    Defect((10,), "approach with elevation first", _approach_swapped, ("line_drop",), 60.0),
+    Defect((11,), "acceptance never reported", _acceptance_lost, ("line_drop",), 60.0),
+    Defect((11,), "every value told as new", _always_new, ("bus_bad", "power_cut"), 10.0),
+)  # fmt: skip
