@@ -126,6 +126,8 @@ class Cluster:
             clock.monotonic, self._bus_time, self._look,
         )  # fmt: skip
         self._asked = Asked(config, self.nodes, self._exchange, self._reports, clock.monotonic)
+        # The first call loads the libraries, which takes longer than a second may.
+        sun_values(0, present.utc_s if self._epoch_of_time else 0.0, config.site)
         self._started = now
         self._number = 0  # of the second
         self._next = 0  # whom the last round did not reach

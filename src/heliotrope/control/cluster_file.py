@@ -9,7 +9,7 @@ import tomllib
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -19,7 +19,6 @@ from heliotrope.control.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.sun import Site
 
-Seconds = Annotated[float, Field(ge=0.0, le=86400.0, allow_inf_nan=False)]
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
 _OTHERS = 0o077
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
@@ -28,7 +27,7 @@ _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 class Table(BaseModel):
     """A table of the file: unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class SiteTable(Table):
@@ -50,11 +49,14 @@ class BusTable(Table):
     url: str = Field(min_length=1, description="`/dev/ttyUSB0` or `socket://host:port`.")
     baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits in a second.")
     echo: bool = Field(False, description="The adapter hears its own frames.")
-    answer_s: Seconds = Field(
-        0.05, description="Longest time from the end of a question to the whole answer."
+    answer_s: float = Field(
+        0.05,
+        ge=0.001,
+        le=1.0,
+        description="Longest time from the end of a question to the whole answer.",
     )
-    stored_answer_s: Seconds = Field(
-        0.6, description="The same where flash is written before the answer."
+    stored_answer_s: float = Field(
+        0.6, ge=0.001, le=2.0, description="The same where flash is written before the answer."
     )
 
 
@@ -78,7 +80,7 @@ class TimeTable(Table):
     url: str = Field("", description="Of the receiver's port (NMEA 0183).")
     baud_rate: int = Field(9600, ge=1200, le=4_000_000, description="Of the receiver's port.")
     error_s: float = Field(
-        0.5, gt=0.0, lt=1.0, description="What the operator vouches for with `system`."
+        0.5, gt=0.0, le=0.5, description="What the operator vouches for with `system`."
     )
 
 
@@ -86,15 +88,19 @@ class PollingTable(Table):
     """``[polling]``."""
 
     steps_every_s: int = Field(1, ge=1, le=60, description="Between questions for step counts.")
-    silence_s: Seconds = Field(10.0, description="A heliostat not heard for so long is reported.")
-    phase_s: Seconds = Field(0.0, lt=1.0, description="Of the seconds, after those of GPS.")
+    silence_s: float = Field(
+        10.0, ge=2.0, le=3600.0, description="A heliostat not heard for so long is reported."
+    )
+    phase_s: float = Field(0.0, ge=0.0, lt=1.0, description="Of the seconds, after those of GPS.")
 
 
 class SafetyTable(Table):
     """``[safety]``."""
 
-    longest_autonomy_s: Seconds = Field(
+    longest_autonomy_s: float = Field(
         0.0,
+        ge=0.0,
+        le=86400.0,
         description="Most that the plant may grant; above 0 only with a hard-wired emergency line.",
     )
     emergency_line: str = Field(

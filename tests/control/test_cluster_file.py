@@ -1,0 +1,276 @@
+"""The cluster's file and its keys, and the parts of a cluster that stand alone."""
+
+import json
+import math
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from clusters import SITE, config_of
+from heliotrope import sun
+from heliotrope.control._kept import Kept
+from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
+from heliotrope.control._sun_line import HORIZON, sun_at, sun_values
+from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.cluster_file import TABLES, read_cluster
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.lcu import messages, wire
+from heliotrope.sun import Site
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "cluster"
+URAD = 1e-6
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("C1.toml", "C1.keys.toml"):
+        shutil.copy(EXAMPLE / name, tmp_path / name)
+    (tmp_path / "C1.keys.toml").chmod(0o600)
+    return tmp_path
+
+
+def changed(folder: Path, old: str, new: str, name: str = "C1.toml") -> Path:
+    text = (folder / name).read_text()
+    assert old in text
+    (folder / name).write_text(text.replace(old, new))
+    return folder / "C1.toml"
+
+
+def test_the_example_is_read(folder: Path) -> None:
+    found = read_cluster(folder / "C1.toml")
+    config = found.config
+    assert [member.name for member in config.heliostats] == ["AA1", "AA2", "AA3"]
+    assert config.heliostats[1].key == bytes(range(0x20, 0x40))
+    assert (found.scheme, found.host, found.port) == ("tcp", "10.0.0.2", 4840)
+    assert (found.time.source, found.bus.baud_rate) == ("gps", 115200)
+    assert found.state == folder / "C1.state.json"
+    assert config.longest_autonomy == 0.0
+    assert config.site.latitude_deg == -33.9281
+    assert config.member("AA3").address == 3
+    with pytest.raises(UnknownNameError, match="there is no heliostat 'AA4'"):
+        config.member("AA4")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ("heliotrope-cluster", "heliotrope-plant", "format is 'heliotrope-plant'"),
+        ("version = 1", "version = 2", "version: 2: input should be 1"),
+        ("baud_rate = 115200", "baud = 115200", "bus.baud: 'baud' is not known; did you mean"),
+        ("baud_rate = 115200", "baud_rate = 1", "bus.baud_rate: 1: input should be greater"),
+        ('name = "AA2"', 'name = ""', "heliostats.1.name: '': string should have at least 1"),
+        ("address = 2", "address = 1", "two heliostats have the address 1"),
+        ("serial = 1002", "serial = 1001", "two heliostats have the serial 1001"),
+        ("address = 2\n", "", "heliostats.1.address: 'address' is missing"),
+        ("tcp://10.0.0.2:4840", "tcp://10.0.0.2", "has no port"),
+        ("tcp://10.0.0.2:4840", "mqtt://10.0.0.2", "has no prefix"),
+        ("tcp://10.0.0.2:4840", "http://10.0.0.2:80", "give tcp://host:port, mqtt://"),
+        ("tcp://10.0.0.2:4840", "tcp://host:99999", "is no URL"),
+        ('url = "/dev/ttyACM0"\n', "", "time: source is gps, and no url is given"),
+        ("latitude_deg = -33.9281", "latitude_deg = 133", "site.latitude_deg: 133"),
+        ("[site] ", "[site", "no TOML"),
+        ('"C1.keys.toml" ', '"none.toml" ', "none.toml: there is no such file"),
+        ("version = 1\n", "version = 1\nkeys2 = 3\n", "'keys2' is not known; did you mean 'keys'"),
+    ],
+)
+def test_what_is_wrong_in_the_file_is_named(folder: Path, old: str, new: str, text: str) -> None:
+    with pytest.raises(FormatError) as caught:
+        read_cluster(changed(folder, old, new))
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('AA1 = "1011', 'AA9 = "1011', "heliostats.AA9: the cluster has no such heliostat; did"),
+        ('AA1 = "1011', 'AA1 = "1', "AA1: a key of 61 characters"),
+        ('AA1 = "1011', 'AA1 = "xy', "AA1: a key of 62 characters"),
+        ('plant = "00', 'plant = 5 # "00', "plant: a key of 0 characters"),
+        ('plant = "00', 'plaint = "00', "'plaint' is not known"),
+        ("[heliostats]\n", "", "'AA1' is not known"),
+        ("[heliostats]\n", "heliostats = 3\n[password]\n", "password must be a text, and"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_the_keys_is_named_without_the_key(
+    folder: Path, old: str, new: str, text: str
+) -> None:
+    changed(folder, old, new, "C1.keys.toml")
+    with pytest.raises(FormatError) as caught:
+        read_cluster(folder / "C1.toml")
+    assert text in str(caught.value)
+    assert "1213141516" not in str(caught.value)
+
+
+def test_keys_that_others_may_read_are_refused(folder: Path) -> None:
+    (folder / "C1.keys.toml").chmod(0o644)
+    with pytest.raises(FormatError, match=r"others may read it \(mode 644\); say chmod 600"):
+        read_cluster(folder / "C1.toml")
+
+
+def test_the_reference_names_every_setting() -> None:
+    text = (ROOT / "docs" / "reference" / "cluster-format.md").read_text()
+    for table in TABLES:
+        for name, field in table.model_fields.items():
+            row = next((line for line in text.splitlines() if line.startswith(f"| `{name}` ")), "")
+            assert row, f"{name} is not in the reference"
+            if field.description:
+                assert field.description in text, f"{name}: {field.description}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"heliostats": ()}, "0 heliostats; one bus carries 1 to 32"),
+        ({"name": ""}, "it has no name"),
+        ({"heliostats": (Member("X", 1), Member("X", 2))}, "two heliostats have the name X"),
+        ({"answer": 5.0}, "answer 5.0 s is not within 0.001 to 1 s"),
+        ({"steps_every": 0}, "steps_every 0 s"),
+        ({"phase": 1.0}, "phase 1.0 s"),
+        ({"longest_autonomy": -1.0}, "longest_autonomy -1.0 s"),
+    ],
+)
+def test_a_cluster_that_cannot_be_is_refused(changes: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        config_of(2, **changes)
+
+
+def test_a_heliostat_that_cannot_be_is_refused() -> None:
+    with pytest.raises(InputError, match="heliostat X: address 65535 is not within 1 to 65534"):
+        Member("X", 0xFFFF)
+    with pytest.raises(InputError, match="heliostat at address 3: it has no name"):
+        Member("", 3)
+    with pytest.raises(InputError, match="33 heliostats"):
+        ClusterConfig("C", SITE, tuple(Member(f"H{n}", n) for n in range(1, 34)))
+
+
+# -- epoch and editions ----------------------------------------------------------------
+
+
+def test_epoch_and_editions_only_rise(tmp_path: Path) -> None:
+    path = tmp_path / "state.json"
+    first = Kept(path)
+    assert first.start(1000) == 1000
+    assert [first.next_edition() for _ in range(3)] == [1, 2, 3]
+    second = Kept(path)
+    assert second.start(0) == 1001
+    edition = second.next_edition()
+    assert edition > 3
+    assert second.next_edition(above=5000) == 5001
+    third = Kept(path)
+    assert third.next_edition() > 5001
+    assert json.loads(path.read_text())["epoch"] == 1001
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"epoch": -1, "edition": 0}', '{"epoch": 1}', "[1]"])
+def test_a_state_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "state.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match="holds no epoch and edition"):
+        Kept(path)
+
+
+def test_an_edition_that_cannot_be_kept_is_not_used(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "gone" / "state.json")
+    with pytest.raises(FileNotFoundError):
+        kept.next_edition()
+
+
+# -- the sun ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("begin", [1782036000.0, 1798000000.0])  # a day of June, one of December
+def test_the_sun_between_its_knots_is_that_of_spa(begin: float) -> None:
+    times = begin + np.random.default_rng(7).uniform(0.0, 86400.0, 120)
+    exact = sun.vector(times, SITE)
+    up = exact[:, 2] > HORIZON + 1e-3
+    assert 30 < up.sum() < 110
+    later = sun.vector(times + 1.0, SITE)
+    for time, vector, there in zip(times[up], exact[up], later[up], strict=True):
+        here, rate = sun_at(float(time), SITE)
+        assert np.linalg.norm(np.subtract(here, vector)) < 0.01 * URAD
+        assert abs(math.hypot(*here) - 1.0) < 1e-9
+        assert np.linalg.norm(np.add(here, rate) - there) < 0.1 * URAD
+
+
+def test_sun_on_the_wire_is_within_a_nanoradian_and_none_is_sent_at_night() -> None:
+    noon = 1782043200.0
+    values = sun_values(1_466_078_418, noon, SITE)
+    assert values is not None
+    assert values[0] == 1_466_078_418
+    vector = np.array(values[1:4]) / 2**30
+    assert np.linalg.norm(vector - sun.vector(noon, SITE)) < 2e-9
+    ahead = vector + np.array(values[4:7]) / 2**28
+    assert np.linalg.norm(ahead - sun.vector(noon + 1.0, SITE)) < 1e-8
+    assert wire.pack("SUN", *values)
+    assert sun_values(1, noon + 43200.0, SITE) is None
+    assert sun_values(1, noon, Site(-89.0, 0.0, 2800.0)) is None  # the polar night
+
+
+# -- reading answers -------------------------------------------------------------------
+
+STATUS_VALUES = (5, 0x101F, 0, 12345, 600, 24000, -5, 0xDEADBEEF, 3)
+STEPS_VALUES = (-123456, 0, 2**31 - 1, -(2**31))
+
+
+def answer(name: str, values: tuple[int, ...], sender: int = 9, sequence: int = 2) -> bytes:
+    payload = wire.pack(name, *values)
+    return wire.encode(wire.Frame(0, sender, sequence, messages.NUMBER_OF[name], payload))
+
+
+def test_the_quick_reading_reads_what_the_slow_one_does() -> None:
+    chance = np.random.default_rng(3)
+    for _ in range(300):
+        raw = [int(x) for x in chance.integers(0, 2, 9) * chance.integers(0, 2**31, 9)]
+        values = (raw[0] % 256, raw[1], raw[2] % 256, raw[3], raw[4], raw[5] % 65536,
+                  raw[6] % 256 - 128, raw[7], raw[8] % 65536)  # fmt: skip
+        sender, sequence = int(chance.integers(1, 65535)), int(chance.integers(0, 5))
+        data = answer("STATUS", values, sender, sequence)
+        assert STATUS.read(data, sender, sequence) == values
+    assert STEPS.read(answer("STEPS", STEPS_VALUES), 9, 2) == STEPS_VALUES
+
+
+def test_the_quick_reading_takes_nothing_else() -> None:
+    good = answer("STATUS", STATUS_VALUES)
+    assert STATUS.read(good, 9, 2) == STATUS_VALUES
+    assert STATUS.read(good, 8, 2) is None
+    assert STATUS.read(good, 9, 3) is None
+    assert STEPS.read(good, 9, 2) is None
+    assert STATUS.read(b"", 9, 2) is None
+    assert STATUS.read(b"\0" + good, 9, 2) is None
+    assert STATUS.read(good[:-1], 9, 2) is None
+    to_other = wire.Frame(
+        5, 9, 2, messages.NUMBER_OF["STATUS"], wire.pack("STATUS", *STATUS_VALUES)
+    )
+    assert STATUS.read(wire.encode(to_other), 9, 2) is None
+    # Every change of one bit, and every byte replaced.
+    for place in range(len(good)):
+        for bit in range(8):
+            bad = bytearray(good)
+            bad[place] ^= 1 << bit
+            assert STATUS.read(bytes(bad), 9, 2) is None
+        for value in range(0, 256, 5):
+            bad = bytearray(good)
+            bad[place] = value
+            assert STATUS.read(bytes(bad), 9, 2) in (None, STATUS_VALUES if bad == good else None)
+
+
+def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
+    nodes = [Node(Member("A", 9), 0), Node(Member("B", 10), 1)]
+    nodes[0].status, nodes[0].steps = STATUS_VALUES, (1, -2, 3, -4)
+    nodes[0].counts.asked = 7
+    nodes[0].answered(99.0, 0.01)
+    table = np.frombuffer(rows(nodes, 100.5), dtype=NODE)
+    assert table["heard_ms"][0] == 1500
+    assert table["heard_ms"][1] == 2**32 - 1
+    first = table[0]
+    named = ("state", "flags", "fault", "sun_age_ms", "supply_mv", "temperature_degc",
+             "armature_crc", "boots")  # fmt: skip
+    assert tuple(first[list(named)].item()) == STATUS_VALUES[:3] + STATUS_VALUES[4:]
+    steps = ("primary", "secondary", "primary_goal", "secondary_goal")
+    assert tuple(first[list(steps)].item()) == (1, -2, 3, -4)
+    assert (first["asked"], first["answered"]) == (7, 1)
