@@ -277,6 +277,34 @@ def test_a_mad_receiver_moves_nothing(offs: list[float]) -> None:
         assert not sky.now().jumped
 
 
+@pytest.mark.parametrize("step", [2.0, -2.0, 1e4])
+def test_a_receiver_that_is_mad_from_the_start_is_never_believed(step: float) -> None:
+    sky = Sky(ALONE)
+    for number in range(100):
+        sky.tell(said=START + timedelta(days=1.0, seconds=step * number))
+    assert sky.now().quality == "none"
+
+
+def test_two_times_are_too_few() -> None:
+    sky = Sky(ALONE)
+    sky.tell()
+    sky.passes(3.0)
+    sky.tell()
+    assert sky.now().quality == "none"
+    sky.tell()
+    assert sky.now().quality == "gps"
+
+
+def test_the_quickest_of_the_first_sentences_decides() -> None:
+    sky = Sky()
+    sky.tell(latency=0.58)  # beyond what is allowed: a port that has just been opened
+    sky.tells(5, latency=0.09)
+    now = sky.now()
+    assert now.quality == "gps"
+    assert abs(sky.wrong_by()) <= now.error
+    assert now.error == pytest.approx(0.255, abs=0.001)
+
+
 def test_a_receiver_that_runs_away_slowly_takes_the_time_no_further_than_its_latency() -> None:
     sky = Sky(ALONE)
     sky.tells(6)
