@@ -231,6 +231,8 @@ def test_who_waits_to_join_is_dropped_when_things_change(tmp_path: Path) -> None
         assert not await first.reached(Stage.DONE, timeout=1.0)
         plant.defocus("Olga", ("P1C",))
         assert first.refusals == {"P1C": "DEFOCUS by Olga"}
+        plant.command(OPERATOR, token, "IDLE", ("P1B",))
+        assert first.stage("P1B") in (Stage.DONE, Stage.FAILED)
         plant.release_authority(OPERATOR, token)
         await bench.wait(1.0)
         assert first.finished
@@ -239,6 +241,37 @@ def test_who_waits_to_join_is_dropped_when_things_change(tmp_path: Path) -> None
 
     bench = play(tmp_path, scene, settings=settings)
     assert bench.count(states.TRACKING) <= 2
+
+
+def test_a_later_command_takes_the_place_of_one_that_waits(tmp_path: Path) -> None:
+    settings = PlantSettings(join_rate=0.0)
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        cluster = bench.cluster_of("P1A")
+        cluster.set(states.TRACKING, "P1A")
+        cluster.set(states.IDLE, "P1B")
+        token = await bench.commanded()
+        track = plant.command(OPERATOR, token, "TRACK", ("P1B",))
+        first = plant.aim(OPERATOR, token, {"P1A": (0.0, 0.0, 16.0), "P1B": (0.0, 0.0, 16.0)})
+        # The one at standby takes its aim at once, the one that tracks has to wait.
+        assert await first.reached(Stage.DONE, timeout=2.0) is False
+        assert (first.stage("P1A"), first.stage("P1B")) == (None, Stage.DONE)
+        second = plant.aim(OPERATOR, token, {"P1A": (0.0, 0.0, 17.0)})
+        assert first.refusals == {"P1A": "another AIM came after it"}
+        plant.command(OPERATOR, token, "LOCK_AIM", ("P1A", "P1B"), (1,))
+        assert not track.finished
+        assert plant.waiting == 2
+        assert await plant.command(OPERATOR, token, "LOCK", ("P1A", "P1B")).end(2.0)
+        assert track.refusals == {"P1B": "LOCK came after it"}
+        assert second.refusals == {"P1A": "LOCK came after it"}
+        assert plant.waiting == 0
+        for bad, said in ((np.nan, "nan is not a finite number"), (2e5, "at most 100000 m")):
+            with pytest.raises(InputError, match=said):
+                plant.aim(OPERATOR, token, {"P1A": (bad, 0.0, 0.0)})
+
+    bench = play(tmp_path, scene, settings=settings)
+    assert not bench.cluster_of("P1A").commands("TRACK")
 
 
 def test_aims_are_spread_and_beams_are_checked(tmp_path: Path) -> None:

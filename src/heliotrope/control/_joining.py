@@ -63,10 +63,11 @@ class JoinQueue:
                 self._jobs.popleft()
         return admitted
 
-    def drop(self, text: str, heliostats: frozenset[str] | None = None) -> None:
-        """Give up all who wait, or some; ``text`` says why."""
+    def drop(self, text: str, heliostats: frozenset[str] | None = None, name: str = "") -> None:
+        """Give up all who wait, or some, or those of one command; ``text`` says why."""
         for job in self._jobs:
-            self._fail(job, text, heliostats)
+            if name in ("", job.name):
+                self._fail(job, text, heliostats)
         self._jobs = deque(job for job in self._jobs if job.waiting)
 
     @staticmethod

@@ -74,6 +74,11 @@ class PlantOrders:
         """Commands that have not come to their end."""
         return tuple(self._open.values())
 
+    @property
+    def owing(self) -> bool:
+        """Whether records wait to be written, and the audit took the last one."""
+        return bool(self._owed) and not self.problem
+
     def accept(
         self, record: tuple[str, str, str], values: Sequence[float], heliostats: Sequence[str],
         note: str = "", *, late: bool = False,

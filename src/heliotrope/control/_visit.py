@@ -16,6 +16,8 @@ from heliotrope.mechanism.drives import Drive
 
 #: A mirror has arrived when both axes are this close (rad) to where they go, in two rows running.
 ARRIVED = 3e-4
+#: After a command is done a mirror must be heard within this time, s.
+SILENT = 10.0
 #: Looks at the field, s apart.
 _LOOK = 0.25
 
@@ -64,15 +66,23 @@ class Visit:
         return int(self.plant.field.rows["state"][self.row])
 
     async def obey(self, ticket: Ticket, limit: float) -> None:
-        """Wait until a command is done.
+        """Wait until a command is done and the field's table shows what came after it.
 
         Raises
         ------
         RefusedError
-            If it is refused, or not done within ``limit`` s.
+            If it is refused, or not done within ``limit`` s, or nothing is heard after it.
         """
         if not await ticket.end(limit):
             raise RefusedError(f"{self.heliostat}: {ticket.text}")
+        # The row in the table may be older than the end of the command.
+        ended = self.plant.now()
+        while self.plant.field.heard[self.row] <= ended:
+            if self.plant.now() - ended > SILENT:
+                raise RefusedError(
+                    f"{self.heliostat}: not heard within {SILENT:g} s after {ticket.name}"
+                )
+            await self.look()
 
     async def command(
         self, name: str, values: tuple[float, ...] = (), limit: float = 120.0

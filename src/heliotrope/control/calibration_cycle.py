@@ -80,6 +80,8 @@ class CycleSettings:
         Deviation of a parameter, in standard deviations of its prior, that is believed.
     gain
         Largest share of the error before, RMS over all sightings, that may be left.
+    left
+        Beam error that a believable fit may leave, rad RMS: a robust fit settles on nonsense too.
     """
 
     shots: int = 3
@@ -90,6 +92,7 @@ class CycleSettings:
     sigma: float = 5e-4
     most: float = 6.0
     gain: float = 1.0
+    left: float = 3e-3
 
     def __post_init__(self) -> None:
         if self.shots < 1 or self.least < 1 or not self.interval >= 0.0:
@@ -277,6 +280,11 @@ class CalibrationCycle:
             return (
                 f"{fitted.names[p]} would be {far[p]:.1f} standard deviations of its prior, "
                 f"above {settings.most:g}; look at the photographs and the installation"
+            )
+        if not after <= settings.left:
+            return (
+                f"the fit leaves {1e3 * after:.1f} mrad RMS, above {1e3 * settings.left:g} mrad; "
+                "look at the photographs: is it this heliostat's beam?"
             )
         if not after <= settings.gain * before:
             return (

@@ -55,9 +55,12 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
+from heliotrope.lcu.config import FAR
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
+#: Commands that move nothing.
+SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that points are given with; `PlantController.aim` and `standby` check their beams.
 POINTS = frozenset({"AIM", "STANDBY"})
 #: In these states a beam is at its aim, or at its standby point.
@@ -275,9 +278,10 @@ class PlantController:
         for job, part in self._joining.admit(now, token):
             self._orders.command(job.ticket, job.name, job.values, part, token)
         self._orders.beat(now)
+        if self._orders.owing or now - self._paid_at >= 1.0:
+            self._orders.pay()
         if now - self._paid_at >= 1.0:
             self._paid_at = now
-            self._orders.pay()
             allowed = not self._sentinel.refusal(self.field.clusters)
             self._pusher.beat(now, token, allowed)
 
@@ -492,6 +496,9 @@ class PlantController:
         numbers = whole(values, row[3], name)
         whom = tuple(dict.fromkeys(heliostats)) or self.field.names
         ticket = self._accept(person, token, name, numbers, whom)
+        if name not in SETTINGS:
+            # What still waits to join must not undo what is commanded after it.
+            self._joining.drop(f"{name} came after it", frozenset(whom))
         if name in JOINING:
             self._join(ticket, name, numbers, whom, token)
         else:
@@ -585,6 +592,8 @@ class PlantController:
         wanted = as_vectors(
             np.stack([as_vectors(points[n], f"{n}: point") for n in whom]), "points"
         )
+        if np.abs(wanted).max() > FAR:
+            raise InputError(f"{name}: a point {np.abs(wanted).max():g} m away; at most {FAR:g} m")
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         start = np.where(tracking[:, None], self.aims[rows], self.standbys[rows])
         stopped = name == "AIM"
@@ -599,6 +608,7 @@ class PlantController:
         values = next(iter(groups)) if len(groups) == 1 else ()
         ticket = self._accept(person, token, name, values, whom, f"{len(groups)} points")
         (self.aims if stopped else self.standbys)[rows] = wanted
+        self._joining.drop(f"another {name} came after it", frozenset(whom), name)
         moving = {whom[i] for i in np.flatnonzero(tracking)} if stopped else set()
         for point, members in groups.items():
             still = [n for n in members if n not in moving]

@@ -1,0 +1,337 @@
+"""Parts of the plant by themselves: audit, items, tickets, joining, aims, table of the field."""
+
+import json
+import struct
+from collections import deque
+from datetime import UTC, datetime
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from heliotrope.control._aims import spread
+from heliotrope.control._joining import Job, JoinQueue
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.audit import STOPPED, AuditError, JsonLines, Record, read
+from heliotrope.control.authority import Authority, Person, RefusedError, Role
+from heliotrope.control.clock import VirtualClock
+from heliotrope.control.field_state import FieldState
+from heliotrope.control.parameters import (
+    Axis,
+    Machine,
+    Wanted,
+    checksums,
+    differing,
+    drive_numbers,
+    items_of,
+    packed,
+)
+from heliotrope.control.plant_settings import clusters_of
+from heliotrope.control.protocol import NODE, ProtocolError, Stage, Status
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.example import prototype
+from heliotrope.lcu import drives, states
+from heliotrope.lcu.config import Config
+from lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
+from machines import every_kind, imperfect, jacks
+
+AT = datetime(2026, 6, 21, 10, tzinfo=UTC)
+
+
+def record(identity: str) -> Record:
+    return Record(identity, "Olga", "operator", "TRACK", AT.isoformat(), (1.0,), ("Ü 1",), "note")
+
+
+# -- audit -----------------------------------------------------------------------------
+
+
+def test_records_come_back_and_open_ones_are_ended_at_the_next_start(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    audit = JsonLines(path, AT)
+    audit.begin(record("1"))
+    audit.finish("1", "done", "later")
+    audit.begin(record("2"))
+    audit.confirm()
+    with pytest.raises(InputError, match="a record 1 exists"):
+        audit.begin(record("1"))
+    with pytest.raises(InputError, match="no record 1 waits"):
+        audit.finish("1", "done", "later")
+    audit.close()
+    again = JsonLines(path, AT)
+    with pytest.raises(InputError, match="a record 2 exists"):
+        again.begin(record("2"))
+    again.close()
+    found, torn = read(path)
+    assert torn == 0
+    assert [(r.identity, r.result) for r in found] == [("1", "done"), ("2", STOPPED)]
+    assert found[0].heliostats == ("Ü 1",)
+    assert (found[0].values, found[0].note, found[0].finished) == ((1.0,), "note", "later")
+
+
+def test_a_file_cut_at_any_byte_loses_at_most_its_last_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.jsonl"
+    audit = JsonLines(path, AT)
+    for i in range(3):
+        audit.begin(record(str(i)))
+        audit.finish(str(i), "done", "later")
+    audit.close()
+    whole = path.read_bytes()
+    for cut in range(len(whole)):
+        path.write_bytes(whole[:cut])
+        begun = sum('"accepted"' in line for line in whole[:cut].decode(errors="ignore").split("\n")
+                    if line.endswith("}"))  # fmt: skip
+        audit = JsonLines(path, AT)
+        audit.begin(record("new"))
+        audit.finish("new", "done", "later")
+        audit.close()
+        found, torn = read(path)
+        assert len(found) == begun + 1
+        assert all(r.result in ("done", STOPPED) for r in found)
+        assert torn <= 1
+        assert path.read_bytes().startswith(whole[:cut])
+
+
+def test_only_one_plant_writes(tmp_path: Path) -> None:
+    audit = JsonLines(tmp_path / "a.jsonl", AT)
+    with pytest.raises(AuditError, match="another process writes to it"):
+        JsonLines(tmp_path / "a.jsonl", AT)
+    audit.close()
+    with pytest.raises(AuditError, match=r"Is a directory; give a file to write"):
+        JsonLines(tmp_path, AT)
+
+
+def test_a_disk_that_fails_is_an_error_and_the_line_is_not_glued_to_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    audit = JsonLines(tmp_path / "a.jsonl", AT)
+
+    def fail(_: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.fsync", fail)
+        with pytest.raises(AuditError, match="Input/output error; see to its disk"):
+            audit.begin(record("1"))
+        with pytest.raises(AuditError, match="Input/output error"):
+            audit.confirm()
+    # The write had come through although the syncing failed; the second one says the same.
+    audit.begin(record("1"))
+    audit.finish("1", "done", "later")
+    audit.close()
+    assert [(r.identity, r.result) for r in read(audit.path)[0]] == [("1", "done")]
+
+
+def test_a_full_disk_is_no_confirmation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("heliotrope.control.audit.LEAST_FREE", 1 << 62)
+    audit = JsonLines(tmp_path / "a.jsonl", AT)
+    with pytest.raises(AuditError, match="bytes are left on its disk"):
+        audit.confirm()
+    audit.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"who": "Egon"}, "'accepted' of record 1 does not fit"),
+        ({"event": "result", "result": "failed", "finished": "x"}, "'result' of record 1 does not"),
+        ({"event": "result", "identity": "9", "result": "x", "finished": "x"}, "of record 9"),
+        ({"identity": "5", "colour": "blue"}, "line 3: no record: .*colour"),
+    ],
+)
+def test_records_that_contradict_each_other_are_refused(
+    tmp_path: Path, change: dict[str, str], said: str
+) -> None:
+    path = tmp_path / "a.jsonl"
+    audit = JsonLines(path, AT)
+    audit.begin(record("1"))
+    audit.finish("1", "done", "later")
+    audit.close()
+    fields = {**json.loads(path.read_text(encoding="utf-8").splitlines()[0]), **change}
+    with path.open("a", encoding="utf-8") as file:
+        file.write(json.dumps(fields) + "\n")
+    with pytest.raises(FormatError, match=said):
+        JsonLines(path, AT)
+
+
+# -- items of the journal --------------------------------------------------------------
+
+
+def test_items_are_those_that_local_controllers_are_tested_with() -> None:
+    axes = (Axis(-100_000, 1_950_000, 8000, 16_000, 40), Axis(-20_000, 500_000, 8000, 16_000, 40))
+    made = items_of(heliostat(), Machine(axes, STOW, STANDBY, (0.1, 0.05)))
+    known = items_of_heliostat(heliostat())
+    assert {name: made[name] for name in known if name != "address"} == {
+        name: data for name, data in known.items() if name != "address"
+    }
+    assert Config().load(made)
+
+
+@pytest.mark.parametrize("name", ["azimuth_elevation", "two_jacks", "tilt_roll"])
+def test_a_controller_computes_the_angles_of_the_mechanism(name: str) -> None:
+    machine = imperfect(every_kind()[name], seed=4)
+    machine.drives.table[..., 13] = 0.3  # phase of the sag
+    counts = np.array([[1000.0, 2000.0], [30_000.0, 45_000.0], [60_000.0, 20_000.0]])
+    wanted = machine.drives.angles(counts)
+    for i in (0, 1):
+        own = drives.Drive(*drive_numbers(machine.drives[i]))
+        found = [own.angle(float(c)) for c in counts[:, i]]
+        np.testing.assert_allclose(found, wanted[:, i], atol=1e-12)
+
+
+def test_what_no_controller_takes_is_refused() -> None:
+    kinds = every_kind()
+    with pytest.raises(InputError, match="with 1 drives; give one heliostat with two"):
+        items_of(kinds["single_axis"])
+    with pytest.raises(InputError, match=r"drives of shape \(2,\)"):
+        drive_numbers(kinds["two_jacks"].drives)
+    assert drive_numbers(jacks()[0])[0] == drives.JACK_FALLING
+    with pytest.raises(UnknownNameError, match="item of the journal 'arm'"):
+        packed("arm", (1.0,))
+    with pytest.raises(InputError, match=r"biases: .* cannot be stored"):
+        packed("biases", (1.0,))
+    with pytest.raises(InputError, match="a local controller refuses"):
+        packed("biases", (8.0, 0.0))
+    axis = Axis(0, 10_000, 5, 5)
+    with pytest.raises(InputError, match="way: 5 points; a controller keeps 4"):
+        items_of(heliostat(), Machine((axis, axis), (0, 0), way=((0.0, 0.0, 0.0),) * 5))
+
+
+def test_what_differs_is_found() -> None:
+    items = {"biases": struct.pack("<ff", 0.1, 0.2), "stow": struct.pack("<ii", 1, 2)}
+    assert checksums(items)["biases"] == crc32(items["biases"])
+    assert differing(items, {}) == ("biases", "stow")
+    assert differing(items, {**checksums(items), "edition": 7}) == ()
+    wanted = Wanted()
+    wanted.set("A", items)
+    assert wanted.compare("A", {"stow": crc32(items["stow"])}) == ("biases",)
+    assert wanted.missing == {"A": ("biases",)}
+    assert wanted.compare("A", checksums(items)) == ()
+    assert wanted.missing == {}
+    assert wanted.compare("B", {}) == ()
+    with pytest.raises(InputError, match="A: no items"):
+        wanted.set("A", {})
+    with pytest.raises(InputError, match="A: item 'stow' of 3 bytes"):
+        wanted.set("A", {"stow": b"123"})
+
+
+# -- authority, tickets, joining -------------------------------------------------------
+
+
+def test_a_token_is_never_zero_nor_the_last_one() -> None:
+    clock = VirtualClock()
+    drawn = iter([b"\0\0\0\0", b"\1\0\0\0", b"\1\0\0\0", b"\0\0\0\0", b"\2\0\0\0"])
+    authority = Authority(clock, 10.0, lambda _: next(drawn))
+    olga, egon = Person("Olga", Role.OPERATOR), Person("Egon", Role.ENGINEER)
+    assert authority.take(olga).token == 1
+    clock.advance(9.0)
+    assert authority.take(olga).token == 1
+    clock.advance(9.9)
+    assert authority.token == 1
+    clock.advance(0.1)
+    assert (authority.token, authority.grant) == (0, None)
+    assert authority.silent_for == pytest.approx(10.0)
+    assert authority.take(egon).token == 2
+    authority.release(egon, 2)
+    assert authority.token == 0
+    with pytest.raises(RefusedError, match="nobody has it"):
+        authority.keep(egon, 2)
+    with pytest.raises(InputError, match=r"a lifetime of 0.0 s"):
+        Authority(clock, 0.0)
+    with pytest.raises(InputError, match="the name is empty"):
+        Person(" ", Role.VIEWER)
+
+
+def test_stages_never_go_back_and_nothing_follows_the_end() -> None:
+    clock = VirtualClock()
+    ticket = Ticket("1", "TRACK", ("A", "B", "C"), clock, patience=60.0)
+    ticket.expect(("A", "B", "C"), clock.monotonic() + 10.0)
+    ticket.advance(("A", "B", "stranger"), Stage.ACKNOWLEDGED)
+    ticket.advance(("A",), Stage.SENT)
+    ticket.advance(("B",), Stage.REFUSED, "no")
+    ticket.advance(("B",), Stage.DONE)
+    assert [ticket.stage(n) for n in "ABC"] == [Stage.ACKNOWLEDGED, Stage.REFUSED, None]
+    clock.advance(10.0)
+    ticket.expire(clock.monotonic())
+    assert ticket.refusals == {"B": "no", "C": "no answer before it expired"}
+    clock.advance(49.0)
+    ticket.expire(clock.monotonic())
+    assert not ticket.finished
+    clock.advance(1.0)
+    ticket.expire(clock.monotonic())
+    assert ticket.refusals["A"] == "acknowledged, but not done within 60 s"
+    assert ticket.text.startswith("TRACK: 1 refused, 2 failed (")
+    assert "1 refused" in repr(ticket)
+
+
+def test_who_waits_too_long_to_join_is_given_up() -> None:
+    clock = VirtualClock()
+    queue = JoinQueue(1.0, 1)
+    ticket = Ticket("1", "TRACK", ("A", "B", "C"), clock, 60.0)
+    queue.put(Job(ticket, "TRACK", (), 7, deque(("A", "B", "C")), until=2.0))
+    assert queue.admit(0.0, 7) == []
+    ((job, part),) = queue.admit(1.0, 7)
+    assert (job.ticket, part) == (ticket, ("A",))
+    assert queue.admit(2.0, 7) == []
+    assert "waited too long" in ticket.refusals["B"]
+    assert len(queue) == 0
+
+
+# -- aims and the table ----------------------------------------------------------------
+
+
+def test_aim_points_are_given_out_evenly_and_neighbours_differ() -> None:
+    rng = np.random.default_rng(1)
+    bearing = rng.uniform(-1.0, 1.0, 1000)
+    places = 500.0 * np.stack([np.sin(bearing), np.cos(bearing), 0.0 * bearing], axis=-1)
+    points = np.array([[-2.0, 0.0, 100.0], [0.0, 0.0, 100.0], [2.0, 0.0, 100.0]])
+    given = spread(places, points)
+    which = np.argmin(np.linalg.norm(given[:, None] - points, axis=-1), axis=-1)
+    assert sorted(np.bincount(which)) == [333, 333, 334]
+    # Every thirtieth part of the field, as a cloud covers it, keeps the mixture.
+    for part in np.array_split(which[np.argsort(bearing)], 30):
+        assert np.ptp(np.bincount(part, minlength=3)) <= 1
+    with pytest.raises(InputError, match="aim points: 0 of them"):
+        spread(places, np.empty((0, 3)))
+    with pytest.raises(InputError, match="aim points"):
+        spread(places, (np.nan, 0.0, 0.0))
+
+
+def test_a_field_that_does_not_hold_together_is_refused() -> None:
+    with pytest.raises(InputError, match="heliostat A is in two clusters"):
+        FieldState({"K": ("A",), "L": ("A",)})
+    with pytest.raises(InputError, match="no cluster has a heliostat"):
+        FieldState({"K": ()})
+    assert set(clusters_of(prototype())) == {f"pod-{i}" for i in range(1, 7)}
+
+
+def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
+    field = FieldState({"K": ("A", "B"), "L": ("C",)})
+    rows = np.zeros(3, NODE)
+    rows["state"] = (states.IDLE, states.TRACKING, states.FAULT)
+
+    def status(count: int, names: tuple[str, ...] = ()) -> Status:
+        return Status("K", count, 0.0, "gps", 0.0, 3.0, 0.1, names=names,
+                      block=rows[:count].tobytes())  # fmt: skip
+
+    assert "status without names" in field.take("K", status(3), 10.0)[0]
+    problems = field.take("K", status(3, ("B", "A", "C")), 10.0)
+    assert problems == ["cluster K: it reports C, which is not its own; correct a configuration"]
+    assert field.of("A", 10.0).state == "TRACKING"
+    assert field.of("B", 10.0).state == "IDLE"
+    assert not field.of("C", 10.0).live
+    assert field.take("K", status(2), 11.0) == ["cluster K: 2 rows for 3 names"]
+    with pytest.raises(ProtocolError, match="are no rows"):
+        field.take("K", Status("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)
+    # Who falls into FAULT or silent counts as failed for ten minutes.
+    assert field.failed_share(11.0) == 0.0
+    rows["state"][0] = states.FAULT
+    rows["heard_ms"][1] = 4000
+    field.take("K", status(3, ("B", "A", "C")), 12.0)
+    assert field.failed_share(12.0) == pytest.approx(2.0 / 3.0)
+    assert field.failed_share(611.0) == pytest.approx(2.0 / 3.0)
+    assert field.failed_share(613.0) == 0.0
+    rows["state"][0] = 77
+    rows["heard_ms"][1] = 0
+    field.take("K", status(3, ("B", "A", "C")), 13.0)
+    assert field.of("B", 13.0).state == "FAULT"
