@@ -13,7 +13,7 @@ from typing import Any
 from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 
 #: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
-NAMES = ("tracking", "calibration", "imaging", "sun", "field", "startup", "bus")
+NAMES = ("tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames")
 #: Columns of a table that goes to a file or a pipe.
 WIDTH = 180
 

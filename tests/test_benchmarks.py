@@ -25,6 +25,9 @@ COLUMNS = {
     "sun": {"times", "contender", "processor_ms", "ratio_to_first", "apart_rad"} | TIMES,
     "field": {"heliostats", "table", "work", "ratio_to_pandas"} | TIMES,
     "startup": {"command", "best_s", "median_s", "ratio_to_first"},
+    "frames": {
+        "format", "way", "trials", "refused", "survived", "unhurt", "false", "one_false_in",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
@@ -89,6 +92,20 @@ def test_bus_takes_no_less_than_the_wire() -> None:
         paced = row["line"] != "unpaced"
         assert row["wire_ms"] == pytest.approx(row["bytes"] * 1e4 / 115_200 if paced else 0.0)
         assert row["median_ms"] > row["wire_ms"]
+
+
+def test_no_damaged_frame_is_taken_for_true_and_packets_are() -> None:
+    result = _quick("frames")
+    rows = {(row["format"], row["way"]): row for row in result["rows"]}
+    ours = [row for (kind, _), row in rows.items() if kind == "version 2"]
+    assert len(ours) == 5
+    assert sum(row["trials"] for row in ours) == 20_000
+    assert sum(row["false"] for row in ours) == 0
+    assert min(row["refused"] for row in ours) > 3000
+    # The same eyes see what Malan's checksum lets through, so they are not blind.
+    assert rows["12-byte packet", "flip"]["false"] > 30
+    noise = result["noise_bytes"]
+    assert result["packets_found_in_noise_at_every_byte"] == pytest.approx(noise / 256, rel=0.2)
 
 
 def test_table_names_machine_and_headline() -> None:

@@ -14,13 +14,14 @@ from steps import Timer
 DIVIDER = 11
 
 
-def storage():
+def storage(pins):
     """The partition "journal", where the board was given one; else a chip on the SPI bus."""
     found = esp32.Partition.find(esp32.Partition.TYPE_DATA, label="journal")
     if found:
         return Blocks(found[0])
-    spi = SPI(2, baudrate=10_000_000, sck=Pin(18), mosi=Pin(23), miso=Pin(19))
-    return SpiNor(spi, Pin(5, Pin.OUT, value=1))
+    clock, out, back, select = pins
+    spi = SPI(2, baudrate=10_000_000, sck=Pin(clock), mosi=Pin(out), miso=Pin(back))
+    return SpiNor(spi, Pin(select, Pin.OUT, value=1))
 
 
 class Board:
@@ -28,8 +29,9 @@ class Board:
         pins = settings.PINS
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
         self.serial = crc32(machine.unique_id())
-        self.storage = storage()
-        uart = UART(2, settings.BAUD, tx=17, rx=16, rxbuf=512)
+        self.storage = storage(pins["flash"])
+        send, receive = pins["bus"]
+        uart = UART(2, settings.BAUD, tx=send, rx=receive, rxbuf=512)
         self.port = Port(uart, Pin(pins["drive"], Pin.OUT, value=0))
         self.timer = Timer(pins["steps"])
         self.good = Pin(pins["supply_good"], Pin.IN)

@@ -5,6 +5,8 @@ BAUD = 115200
 #: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
 KEY = b""
 PINS = {
-    "drive": 4, "steps": (25, 26, 27, 14), "supply_good": 35, "limits": (34, 39),
+    "bus": (17, 16), "flash": (18, 23, 19, 5),
+    "drive": 4, "steps": (25, 26, 27, 14),
+    "supply_good": 35, "limits": (34, 39),
     "switches": (32, 33, 13, 21, 22), "supply": 36,
 }  # fmt: skip

@@ -18,9 +18,11 @@ class Board:
         pins = settings.PINS
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
         self.serial = crc32(machine.unique_id())
-        spi = SPI(0, baudrate=10_000_000, sck=Pin(18), mosi=Pin(19), miso=Pin(16))
-        self.storage = SpiNor(spi, Pin(17, Pin.OUT, value=1))
-        uart = UART(0, settings.BAUD, tx=Pin(0), rx=Pin(1), rxbuf=512)
+        clock, out, back, select = pins["flash"]
+        spi = SPI(0, baudrate=10_000_000, sck=Pin(clock), mosi=Pin(out), miso=Pin(back))
+        self.storage = SpiNor(spi, Pin(select, Pin.OUT, value=1))
+        send, receive = pins["bus"]
+        uart = UART(0, settings.BAUD, tx=Pin(send), rx=Pin(receive), rxbuf=512)
         self.port = Port(uart, Pin(pins["drive"], Pin.OUT, value=0))
         self.timer = Timer(pins["steps"])
         self.good = Pin(pins["supply_good"], Pin.IN, Pin.PULL_UP)

@@ -5,6 +5,8 @@ BAUD = 115200
 #: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
 KEY = b""
 PINS = {
-    "drive": 2, "steps": (6, 7, 8, 9), "supply_good": 3, "limits": (10, 11),
+    "bus": (0, 1), "flash": (18, 19, 16, 17),
+    "drive": 2, "steps": (6, 7, 8, 9),
+    "supply_good": 3, "limits": (10, 11),
     "switches": (20, 21, 22, 14, 15), "supply": 26,
 }  # fmt: skip

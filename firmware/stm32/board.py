@@ -21,7 +21,7 @@ class Board:
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
         self.serial = crc32(machine.unique_id())
         spi = SPI(2, baudrate=10_000_000)
-        self.storage = SpiNor(spi, Pin(pins["flash"], Pin.OUT_PP, value=1))
+        self.storage = SpiNor(spi, Pin(pins["flash"][3], Pin.OUT_PP, value=1))
         uart = UART(2, settings.BAUD, rxbuf=512)
         self.port = Port(uart, Pin(pins["drive"], Pin.OUT_PP, value=0))
         self.timer = Timer(pins["steps"])

@@ -5,6 +5,9 @@ BAUD = 115200
 #: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
 KEY = b""
 PINS = {
-    "drive": "A1", "steps": ("A8", "B0", "C6", "B1"), "supply_good": "C0", "limits": ("C1", "C2"),
-    "switches": ("A4", "A5", "A6", "A7", "C5"), "supply": "C3", "flash": "B12",
+    # The chip gives these to UART 2 and SPI 2; only the flash's select can be another.
+    "bus": ("A2", "A3"), "flash": ("B13", "B15", "B14", "B12"),
+    "drive": "A1", "steps": ("A8", "B0", "C6", "B1"),
+    "supply_good": "C0", "limits": ("C1", "C2"),
+    "switches": ("A4", "A5", "A6", "A7", "C5"), "supply": "C3",
 }  # fmt: skip

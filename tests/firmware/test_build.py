@@ -152,3 +152,15 @@ def test_the_instructions_are_told(tmp_path: Path) -> None:
     )  # fmt: skip
     assert "mpremote cp lcu/*.mpy :lcu/" in done.stdout
     assert (tmp_path / "out" / "lcu" / "controller.mpy").exists()
+
+
+def test_the_wiring_page_is_current() -> None:
+    wiring = runpy.run_path(str(ROOT / "scripts" / "wiring.py"))
+    told = wiring["PAGE"].read_text(encoding="utf-8")
+    assert told == wiring["page"](told), "run python scripts/wiring.py"
+    assert wiring["PICTURE"].read_text(encoding="utf-8") == wiring["picture"]()
+    for board in BOARDS:
+        pins: list[object] = []
+        for value in wiring["pins"](board).values():
+            pins += value if isinstance(value, tuple) else [value]
+        assert len(pins) == len(set(pins)) == len(wiring["ROWS"])  # each once, and all told
