@@ -10,9 +10,9 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from heliotrope.control._aims import spread
 from heliotrope.control._joining import Job, JoinQueue
 from heliotrope.control._tickets import Ticket
+from heliotrope.control.aims import spread
 from heliotrope.control.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.control.authority import Authority, Person, RefusedError, Role
 from heliotrope.control.clock import VirtualClock

@@ -21,7 +21,6 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.control._aims import BeamCheck, default_aims
 from heliotrope.control._cluster_end import ClusterEnd
 from heliotrope.control._joining import Job, JoinQueue
 from heliotrope.control._plant_orders import PlantOrders, whole
@@ -29,6 +28,7 @@ from heliotrope.control._plant_watch import PlantWatch
 from heliotrope.control._pushing import Pusher, stored_items
 from heliotrope.control._sentinel import Sentinel
 from heliotrope.control._tickets import Ticket
+from heliotrope.control.aims import BeamCheck, default_aims
 from heliotrope.control.audit import Audit, AuditError
 from heliotrope.control.authority import Authority, Grant, Person, RefusedError, Role
 from heliotrope.control.beam_paths import Volume
@@ -508,7 +508,7 @@ class PlantController:
     def default_aims(
         self, heliostats: Sequence[str] = (), points: npt.ArrayLike | None = None
     ) -> dict[str, FloatArray]:
-        """Return an aim for each heliostat (() for all), for `aim`; see `_aims.default_aims`."""
+        """Return an aim for each heliostat (() for all), for `aim`; see `aims.default_aims`."""
         names = tuple(heliostats) or self.field.names
         rows = np.array([self.field.place(name) for name in names], dtype=np.intp)
         vertices = self.beams.armature.origin_1[rows]
