@@ -1,6 +1,8 @@
 """The time of a cluster: what the system says, and whether it was set."""
 
 import asyncio
+import contextlib
+import ctypes
 import math
 from datetime import UTC, datetime, timedelta
 
@@ -8,7 +10,7 @@ import pytest
 
 from heliotrope.control.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.control.link import running
-from heliotrope.control.timekeeping import SystemTime
+from heliotrope.control.timekeeping import SystemTime, kernel_synchronised
 from heliotrope.errors import InputError
 
 START = datetime(2026, 6, 21, 10, tzinfo=UTC)
@@ -73,6 +75,71 @@ def test_a_jump_there_and_back_between_two_questions_is_seen_by_run() -> None:
         return keeper.jumps
 
     assert run_virtual(main) == 2
+
+
+def test_a_clock_that_nobody_keeps_any_more_holds_over_and_ends() -> None:
+    clock, kept = VirtualClock(start=START), True
+    keeper = SystemTime(clock, error=0.4, synchronised=lambda: kept, drift_ppm=100.0)
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.4)
+    kept = False
+    clock.advance(1000.0)
+    now = keeper.time()
+    assert (now.quality, now.jumped) == ("holdover", False)
+    assert now.error == pytest.approx(0.5)
+    clock.advance(4990.0)
+    assert keeper.time().quality == "holdover"
+    clock.advance(20.0)
+    assert (keeper.time().quality, keeper.time().error) == ("none", math.inf)
+    kept = True
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.4)
+
+
+def test_a_clock_that_nobody_ever_kept_is_no_source() -> None:
+    now = SystemTime(VirtualClock(start=START), synchronised=lambda: False).time()
+    assert (now.quality, now.error) == ("none", math.inf)
+
+
+@pytest.mark.parametrize(
+    ("state", "bound_us", "wanted"),
+    [
+        (0, 300_000, True),
+        (1, 1_999_999, True),
+        (4, 10, True),
+        (5, 10, False),
+        (0, 2_000_000, False),
+    ],
+)
+def test_the_kernel_is_asked(
+    monkeypatch: pytest.MonkeyPatch, state: int, bound_us: int, wanted: bool
+) -> None:
+    class Library:
+        """A C library whose kernel is in a state."""
+
+        def adjtimex(self, timex: "ctypes.Array[ctypes.c_long]") -> int:
+            assert not any(timex)  # it changes nothing
+            # modes (padded), offset, freq, maxerror: struct timex of Linux
+            timex[:5] = [0, 12, 34, bound_us, 56]
+            return state
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Library())
+    assert kernel_synchronised() is wanted
+
+
+def test_a_kernel_that_does_not_say_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
+    with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
+        kernel_synchronised()
+
+
+def test_the_kernel_of_this_machine_answers_or_says_that_it_does_not() -> None:
+    with contextlib.suppress(InputError):  # in a container it may be forbidden
+        assert kernel_synchronised() in (True, False)
+
+
+@pytest.mark.parametrize("values", [{"drift_ppm": 0.0}, {"largest_error": 0.4}])
+def test_a_holdover_that_is_none_is_refused(values: dict[str, float]) -> None:
+    with pytest.raises(InputError, match=r"not below the error of 0\.5 s"):
+        SystemTime(VirtualClock(), **values)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])

@@ -10,7 +10,9 @@ and reported.
 """
 
 import asyncio
+import ctypes
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, Protocol
@@ -22,6 +24,11 @@ Quality = Literal["gps", "system", "holdover", "none"]
 
 #: No time before this is believed: a computer without a battery for its clock starts in the past.
 NOT_BEFORE = datetime(2026, 1, 1, tzinfo=UTC)
+#: What adjtimex(2) returns for a clock that is not synchronised.
+_TIME_ERROR = 5
+#: Where timex has the bound of the clock's error, in longs; in µs.
+_MAXERROR = 3
+_LONG_AGO_US = 2_000_000
 #: Two oscillators are believed to run alike within this: twice what NTP slews at most.
 _SLEW = 1e-3
 
@@ -123,6 +130,26 @@ class Steadiness:
         return now - self._jumped_at < self._settle
 
 
+def kernel_synchronised() -> bool:
+    """Return whether the kernel knows of somebody who keeps its clock right.
+
+    chronyd (with ``rtcsync``, as packaged), ntpd and systemd-timesyncd tell it, at least every
+    34 minutes, how far the clock may be off. The kernel adds 0.5 ms to that in each second; above
+    2 s, an hour after they have lost their servers, the answer is no.
+
+    Raises
+    ------
+    InputError
+        On a system that cannot be asked.
+    """
+    ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
+    timex = (ctypes.c_long * 128)()  # of zeros it asks and changes nothing; larger than any is
+    state = -1 if ask is None else int(ask(timex))
+    if state < 0:
+        raise InputError("time: this system does not say whether its clock is synchronised")
+    return state != _TIME_ERROR and timex[_MAXERROR] < _LONG_AGO_US
+
+
 class SystemTime:
     """The time of this computer, for clusters without a receiver and for simulation.
 
@@ -136,6 +163,14 @@ class SystemTime:
         How long a jump is told, in s.
     tolerance
         A step up to this, in s, is no jump.
+    synchronised
+        Says whether somebody keeps the clock right now: `kernel_synchronised`, where NTP runs.
+        While nobody does, the time is of quality "holdover" and its error grows. None: it is not
+        asked, and the operator vouches for the clock always.
+    drift_ppm
+        Of the clock that nobody keeps, at most, in 1e-6.
+    largest_error
+        Above this error bound, in s, a clock that nobody keeps tells no time.
 
     Raises
     ------
@@ -144,12 +179,29 @@ class SystemTime:
     """
 
     def __init__(
-        self, clock: Clock, error: float = 0.5, settle: float = 10.0, tolerance: float = 0.1
+        self,
+        clock: Clock,
+        error: float = 0.5,
+        settle: float = 10.0,
+        tolerance: float = 0.1,
+        *,
+        synchronised: Callable[[], bool] | None = None,
+        drift_ppm: float = 100.0,
+        largest_error: float = 1.0,
     ) -> None:
         if not 0.0 < error < math.inf:
             raise InputError(f"time: an error bound of {error} s; it must be above 0")
+        if not (0.0 < drift_ppm < math.inf and error <= largest_error < math.inf):
+            raise InputError(
+                f"time: a drift of {drift_ppm} ppm, a largest error of {largest_error} s; they "
+                f"must be above 0, and the largest error not below the error of {error} s"
+            )
         self._clock = clock
         self._error = error
+        self._synchronised = synchronised
+        self._drift = drift_ppm * 1e-6
+        self._largest = largest_error
+        self._kept_at = -math.inf
         self._steadiness = Steadiness(clock, tolerance, settle)
         self._closing = asyncio.Event()
 
@@ -159,12 +211,19 @@ class SystemTime:
         return self._steadiness.jumps
 
     def time(self) -> Time:
-        """Return the time; of quality "none" if the clock is before `NOT_BEFORE`."""
+        """Return the time; of quality "none" before `NOT_BEFORE`, or if it was alone too long."""
         utc = self._clock.utc()
         jumped = self._steadiness.see(utc.timestamp())
-        if utc < NOT_BEFORE:
-            return Time(utc.timestamp(), _gps(utc), math.inf, "none", jumped)
-        return Time(utc.timestamp(), _gps(utc), self._error, "system", jumped)
+        now = self._clock.monotonic()
+        quality: Quality = "system"
+        if self._synchronised is None or self._synchronised():
+            self._kept_at = now
+        else:
+            quality = "holdover"
+        error = self._error + self._drift * (now - self._kept_at)
+        if utc < NOT_BEFORE or (quality == "holdover" and error > self._largest):
+            error, quality = math.inf, "none"
+        return Time(utc.timestamp(), _gps(utc), error, quality, jumped)
 
     async def run(self) -> None:
         """Look at the clock each second, so that no jump there and back is missed for long."""
