@@ -293,3 +293,40 @@ def test_a_way_that_is_none_is_refused(axis: int, count: int, east: float) -> No
     assert bench.controller.config.path == []
     assert bench.controller.config.azimuth_axis == 0
     assert bench.journal.items == before
+
+
+def test_tracking_spares_the_flash_and_a_cut_says_what_is_in_doubt() -> None:
+    bench = tracking()
+    written = 0
+    write = bench.flash.write
+
+    def counted(offset: int, data: bytes) -> None:
+        nonlocal written
+        written += 1
+        write(offset, data)
+
+    bench.flash.write = counted  # type: ignore[method-assign]
+    begin = list(bench.made)
+    bench.run(120)
+    steps = max(abs(now - was) for now, was in zip(bench.made, begin, strict=True))
+    assert steps > 1000
+    assert written <= 1 + 2 * steps // bench.journal.stride
+    # A cut without a warning: doubtful, by no more than the stride.
+    made = list(bench.made)
+    bench.start(bench.flash)
+    assert bench.journal.doubt == bench.journal.stride
+    assert max(abs(now - was) for now, was in zip(bench.made, made, strict=True)) <= 1000
+    # With a warning nothing is lost.
+    again = tracking()
+    again.run(30)
+    made = list(again.made)
+    assert again.node.on_supply_failing(again.now)
+    again.start(again.flash)
+    assert again.made == made
+    assert again.journal.doubt == 0
+    # And what stands is told at once.
+    locked = tracking()
+    locked.run(30)
+    assert locked.order("LOCK") == DONE
+    locked.run(3)
+    assert locked.journal.rest

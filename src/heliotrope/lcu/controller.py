@@ -195,7 +195,9 @@ class Controller:
                 steps = (BEFORE_STEPS, one, two, motion.place(0), motion.place(1))
                 self.out.insert(place, steps)
                 self._moving = True
-            elif self._moving and motion.still():
+            elif self._moving and motion.still() and not motion.following():
+                # A mirror that follows the sun stands still several times a second: telling
+                # flash of each would wear it out in a year.
                 self._moving = False
                 self.out.append((AT_REST, one, two))
         if self.state != states.TRACKING or self.sun.fresh():
