@@ -20,6 +20,7 @@ from heliotrope.control.protocol import Ask, Command, Lease, Parameters, Stage
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype
 from heliotrope.lcu import states
+from heliotrope.mechanism.tracking import track
 from plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
@@ -305,6 +306,38 @@ def test_aims_are_spread_and_beams_are_checked(tmp_path: Path) -> None:
     bench = play(tmp_path, scene, volumes=(walkway,))
     sent = {m.values for c in bench.clusters.values() for m in c.commands("AIM")}
     assert sent == {(-0.3, 0.0, 16.5), (0.3, 0.0, 16.5)}
+
+
+def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -> None:
+    walkway = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
+    design = prototype()
+    group, row = design.find("P5A")
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        cluster = bench.cluster_of("P5A")
+        cluster.set(states.IDLE)
+        token = await bench.commanded()
+        assert await plant.aim(OPERATOR, token, {"P5A": (8.0, 0.0, 16.5)}).end(2.0)
+        # From where it stands, its beam east or west of the walkway, to the aim in the east.
+        for east, clear in ((-8.0, False), (9.0, True)):
+            found = track(group.mechanism[row], plant.sun_vector(), (east, 0.0, 8.0))
+            for axis, end in enumerate(("primary", "secondary")):
+                cluster.rows[end][0] = round(float(found.chosen(found.counts)[axis]))
+            await bench.wait(2.0)
+            ticket = plant.command(OPERATOR, token, "TRACK", ("P5A",))
+            assert await ticket.end(10.0) is clear
+            if not clear:
+                assert "enters walkway" in ticket.refusals["P5A"]
+                assert "on its way there" in ticket.refusals["P5A"]
+        other = plant.command(OPERATOR, token, "TRACK", ("P5B",))
+        assert not await other.end(5.0)
+        assert other.refusals == {
+            "P5B": "TRACK: its aim is not known here; give it one (AIM) first"
+        }  # fmt: skip
+
+    bench = play(tmp_path, scene, volumes=(walkway,))
+    assert len(bench.cluster_of("P5A").commands("TRACK")) == 1
 
 
 def test_what_is_stored_is_compared_and_pushed(tmp_path: Path) -> None:

@@ -1,11 +1,18 @@
 """Mirrors that wait to join the receiver: so many a second, and none that waited in vain."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from heliotrope.control._emergency import JoinLimiter
+from heliotrope.control._plant_orders import PlantOrders
 from heliotrope.control._tickets import Ticket
+from heliotrope.control.aims import BeamCheck
+from heliotrope.control.field_state import FieldState
 from heliotrope.control.protocol import Stage
+from heliotrope.geometry import FloatArray
 
 
 @dataclass
@@ -76,3 +83,53 @@ class JoinQueue:
         job.ticket.advance(gone, Stage.FAILED, text)
         left = set(gone)
         job.waiting = deque(name for name in job.waiting if name not in left)
+
+
+class Joiner:
+    """Sends mirrors whose turn has come, if the way of their beams is clear now.
+
+    The sun has moved since the aim was accepted, and the mirror may stand anywhere: what is
+    proven here is the sweep from where it stands to its aim, at the moment it begins.
+
+    Parameters
+    ----------
+    queue, orders, beams, field
+        Of the plant.
+    aims
+        As assigned, ENU, m, (N, 3); NaN where none was.
+    sun
+        Gives the unit vector to the sun now, (3,).
+    """
+
+    def __init__(
+        self, queue: JoinQueue, orders: PlantOrders, beams: BeamCheck, field: FieldState,
+        aims: FloatArray, sun: Callable[[], FloatArray],
+    ) -> None:  # fmt: skip
+        self._queue, self._orders, self._beams, self._field = queue, orders, beams, field
+        self._aims, self._sun = aims, sun
+
+    def beat(self, now: float, token: int) -> None:
+        """Send those whose turn it is."""
+        for job, part in self._queue.admit(now, token):
+            wrong = self._problems(job, part) if self._beams.volumes else {}
+            for name, text in wrong.items():
+                job.ticket.advance((name,), Stage.FAILED, text)
+            clear = [name for name in part if name not in wrong]
+            self._orders.command(job.ticket, job.name, job.values, clear, token)
+
+    def _problems(self, job: Job, part: tuple[str, ...]) -> dict[str, str]:
+        """Return whose beams may not go to their aims now, and why."""
+        rows = np.array([self._field.index[name] for name in part], dtype=np.intp)
+        aims = self._aims[rows]
+        unknown = ~np.isfinite(aims).all(axis=-1)
+        found = {
+            part[i]: f"{job.name}: its aim is not known here; give it one (AIM) first"
+            for i in np.flatnonzero(unknown)
+        }
+        if not unknown.all():
+            known = rows[~unknown]
+            counts = np.stack(
+                [self._field.rows[end][known] for end in ("primary", "secondary")], axis=-1
+            ).astype(np.float64)
+            found |= self._beams.on_the_way(known, counts, aims[~unknown], self._sun())
+        return found

@@ -107,13 +107,17 @@ class BeamCheck:
         self.armature.table[row] = armature
         self.drives.table[row] = drives
 
-    def poses(self, rows: npt.NDArray[np.intp], aims: FloatArray, sun: FloatArray) -> Tracking:
-        """Return the poses for aims (K, 3) of heliostats ``rows`` (K,)."""
+    def poses(
+        self, rows: npt.NDArray[np.intp], aims: FloatArray, sun: FloatArray,
+        counts: FloatArray | None = None,
+    ) -> Tracking:  # fmt: skip
+        """Return the poses for aims (K, 3) of heliostats (K,), the nearest to counts (K, 2)."""
         # By night nothing moves; the pose for a sun overhead tells as much of the beam's way.
         source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
         return track(
-            Armature(self.armature.table[rows]), source, aims, drives=Drive(self.drives.table[rows])
-        )
+            Armature(self.armature.table[rows]), source, aims,
+            drives=Drive(self.drives.table[rows]), current=counts,
+        )  # fmt: skip
 
     def problems(
         self,
@@ -157,21 +161,53 @@ class BeamCheck:
         self._tell(found, rows, rest.entered, rest.first, "at the aim")
         swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == Status.OK))
         if swept.size and sun[2] > 0.0:
-            self._sweep(found, rows[swept], start[swept], solved, swept, sun)
+            self._sweep(found, rows[swept], start[swept], aims[swept], sun)
+        return found
+
+    def on_the_way(
+        self, rows: npt.NDArray[np.intp], counts: FloatArray, aims: FloatArray, sun: FloatArray
+    ) -> dict[str, str]:
+        """Return whose beams would enter a volume on the way to their aims, by name.
+
+        Parameters
+        ----------
+        rows
+            Of the heliostats, (K,).
+        counts
+            Where their axes stand, (K, 2).
+        aims, sun
+            As of `problems`.
+        """
+        found: dict[str, str] = {}
+        solved = self.poses(rows, aims, sun)
+        status = solved.chosen(solved.status)
+        for i in np.flatnonzero(status != Status.OK):
+            found[self.names[rows[i]]] = (
+                f"the aim {_point(aims[i])} m: {Status(int(status[i])).text}"
+            )
+        good = status == Status.OK
+        if good.any() and sun[2] > 0.0:
+            begin = Drive(self.drives.table[rows]).angles(counts)
+            path = np.stack([begin, solved.chosen(solved.angles)], axis=-2)[good]
+            self._check_motion(found, rows[good], path, sun)
         return found
 
     def _sweep(
         self, found: dict[str, str], rows: npt.NDArray[np.intp], start: FloatArray,
-        solved: Tracking, which: npt.NDArray[np.intp], sun: FloatArray,
+        aims: FloatArray, sun: FloatArray,
     ) -> None:  # fmt: skip
-        """Add what is in the way from a start to the solved poses."""
+        """Add what is in the way from one point to another."""
         before = self.poses(rows, start, sun)
+        counts = before.chosen(before.counts)
+        after = self.poses(rows, aims, sun, counts)
         good = before.chosen(before.status) == Status.OK
-        ends = solved.chosen(solved.angles)[which]
-        path = np.stack([before.chosen(before.angles), ends], axis=-2)[good]
-        if not len(path):
-            return
-        rows = rows[good]
+        path = np.stack([before.chosen(before.angles), after.chosen(after.angles)], axis=-2)
+        if good.any():
+            self._check_motion(found, rows[good], path[good], sun)
+
+    def _check_motion(
+        self, found: dict[str, str], rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
+    ) -> None:
         armature, mirrors = Armature(self.armature.table[rows]), _rows_of(self.mirrors, rows)
         motion = move(armature, path, sun, mirrors, self.volumes, reach=FAR)
         self._tell(found, rows, motion.entered, motion.distance, "on its way there")

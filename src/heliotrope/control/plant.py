@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from heliotrope import sun
 from heliotrope.control._cluster_end import ClusterEnd
-from heliotrope.control._joining import Job, JoinQueue
+from heliotrope.control._joining import Job, Joiner, JoinQueue
 from heliotrope.control._plant_orders import PlantOrders, whole
 from heliotrope.control._plant_watch import PlantWatch
 from heliotrope.control._pushing import Pusher, stored_items
@@ -153,6 +153,9 @@ class PlantController:
         self.beams = BeamCheck(design, self.field.names, volumes)
         count = len(self.field)
         self.aims, self.standbys = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+        self._joiner = Joiner(
+            self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector
+        )
         self._sentinel = Sentinel(
             clock, design.site, self.field, self._ends, self._orders, self._joining,
             self.authority, self._watch, self.beams.drives, self.settings.repeat,
@@ -275,8 +278,7 @@ class PlantController:
         for alarm in self._sentinel.beat(now):
             self._tell(alarm)
         token = self.authority.token
-        for job, part in self._joining.admit(now, token):
-            self._orders.command(job.ticket, job.name, job.values, part, token)
+        self._joiner.beat(now, token)
         self._orders.beat(now)
         if self._orders.owing or now - self._paid_at >= 1.0:
             self._orders.pay()
