@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 JOBS ?= auto
+# Of `make soak`: simulated runs of six minutes with some thirty faults each.
+RUNS ?= 2000
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
@@ -29,6 +31,9 @@ test: $(STAMP)  ## run the tests in parallel
 
 soak: $(STAMP)  ## run the slow tests too
 	@$(BIN)/python -m pytest -n $(JOBS) -q
+	@mkdir -p out
+	@$(BIN)/heliotrope simulate --seed 1 --hours 0.1 --runs $(RUNS) --processes $(shell nproc) \
+		--minutes 120 --progress out/soak.jsonl
 
 lint: $(STAMP)  ## check style, types and layers
 	@$(BIN)/ruff check .

@@ -86,6 +86,7 @@ FREE = {
     *((before, states.FAULT) for before in range(len(states.STATES)) if before not in (
         states.UNCONFIGURED, states.LOCKED)),
     (states.STOWING, states.STOWED), (states.APPROACHING, states.IDLE),
+    (states.DEFOCUSED, states.STOWED),  # on its way for no time: it had hardly left
     (states.SEARCHING, states.IDLE), (states.UNCONFIGURED, states.LOCKED),
 }  # fmt: skip
 #: What else needs which command, by the state that is entered.
@@ -99,10 +100,11 @@ BY_COMMAND = {
 AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
 #: What DEFOCUS and STOW never leave a mirror in.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
-#: States that a command asks for: what DONE must mean.
+#: States that a command asks for: what DONE must mean. SEARCH begins and ends in IDLE, so that
+#: states cannot tell whether it has been.
 ASKED = {
     "APPROACH": (states.IDLE,), "IDLE": (states.IDLE,), "TRACK": (states.TRACKING,),
-    "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,), "SEARCH": (states.SEARCHING,),
+    "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,),
 }  # fmt: skip
 
 

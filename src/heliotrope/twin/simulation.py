@@ -534,5 +534,5 @@ def shrink(outcome: Outcome, most: int = 60) -> Outcome:
             best = tried
         return same
 
-    kinds.shrunk([f for f in outcome.plan.drawn if f.at <= outcome.seconds], fails, most)
+    kinds.shrunk([fault for fault in outcome.plan.drawn if fault.at < seconds], fails, most)
     return best
