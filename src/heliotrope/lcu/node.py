@@ -148,11 +148,15 @@ class Node:
 
     def on_bytes(self, data: bytes, now_ms: int) -> None:
         """Take bytes as they came, in pieces of any size."""
-        own = self.controller
         for frame in self.reader.feed(data):
-            # A new address takes effect after the answer.
-            self._address, self._sequence = own.config.address, frame.sequence
-            self._obey(own.on_frame(frame, now_ms), now_ms)
+            self.on_frame(frame, now_ms)
+
+    def on_frame(self, frame: "wire.Frame", now_ms: int) -> None:
+        """Take a frame that came whole; a simulated bus may read it once for many nodes."""
+        own = self.controller
+        # A new address takes effect after the answer.
+        self._address, self._sequence = own.config.address, frame.sequence
+        self._obey(own.on_frame(frame, now_ms), now_ms)
 
     def on_tick(self, now_ms: int) -> None:
         """Go on; to be called every 50 ms or more often."""

@@ -43,6 +43,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has neither mo
 
 VERSION = 2
 CLUSTER_ADDRESS = 0
+SESSION = 0x12
 BROADCAST = 0xFFFF
 
 #: Longest frame with its stuffing and its zero, and the longest payload that it leaves, bytes.
@@ -166,7 +167,10 @@ def pack(name: str, *values: "Any") -> bytes:
 
 def fits(number: int, size: int) -> bool:
     """Return whether a payload of ``size`` bytes can be that of a known message."""
-    codes = messages.codes_of(number)
+    return _fits(messages.codes_of(number), size)
+
+
+def _fits(codes: str, size: int) -> bool:
     if codes.endswith("s"):
         return size >= struct.calcsize("<" + codes[:-1])
     return size == struct.calcsize("<" + codes)
@@ -186,9 +190,11 @@ def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
         The numbers as ``pack`` takes them; None if the message is unknown, the length is wrong,
         or a number is not finite (which no sender means, and which would pass every comparison).
     """
-    if messages.who_of(number) < 0 or not fits(number, len(payload)):
+    if messages.who_of(number) < 0:
         return None
     codes = messages.codes_of(number)
+    if not _fits(codes, len(payload)):
+        return None
     if codes.endswith("s"):
         size = struct.calcsize("<" + codes[:-1])
         head = struct.unpack("<" + codes[:-1], payload[:size])
@@ -220,6 +226,7 @@ class Frame:
         self.number = number
         self.payload = payload
         self.mac = mac
+        self._values: tuple[Any, ...] | None = None
 
     @property
     def name(self) -> str:
@@ -227,8 +234,10 @@ class Frame:
         return messages.name_of(self.number)
 
     def values(self) -> "tuple[Any, ...] | None":
-        """Return the payload's numbers; see ``unpack``."""
-        return unpack(self.number, self.payload)
+        """Return the payload's numbers; see ``unpack``. They are read once."""
+        if self._values is None:
+            self._values = unpack(self.number, self.payload)
+        return self._values
 
     def body(self) -> bytes:
         """Return what the MAC covers: header and payload."""
@@ -380,11 +389,12 @@ class Reader:
             self.version += 1
             return None
         mac = b""
-        if messages.who_of(number) == messages.KEY:
+        who = messages.who_of(number)
+        if who == messages.KEY:
             end = max(HEADER_SIZE, end - MAC_SIZE)
             mac = data[end:-CRC_SIZE]
         payload = data[HEADER_SIZE:end]
-        if messages.who_of(number) >= 0 and not fits(number, len(payload)):
+        if who >= 0 and not fits(number, len(payload)):
             self.length += 1
             return None
         self.good += 1
@@ -517,7 +527,7 @@ class Gate:
             return messages.BAD_VALUE
         if frame.sender != self._sender:
             return messages.REFUSED_AUTHORITY
-        if frame.name == "SESSION":
+        if frame.number == SESSION:
             if not self.replay.session(values[0], values[1], frame.sequence, tick):
                 return messages.DUPLICATE
             self.token = values[2]
