@@ -176,8 +176,12 @@ def test_a_state_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None
 
 def test_an_edition_that_cannot_be_kept_is_not_used(tmp_path: Path) -> None:
     kept = Kept(tmp_path / "gone" / "state.json")
-    with pytest.raises(FileNotFoundError):
-        kept.next_edition()
+    for _ in range(2):
+        with pytest.raises(FileNotFoundError):
+            kept.next_edition()
+        with pytest.raises(FileNotFoundError):
+            kept.start(5)
+    assert kept.epoch == 0
 
 
 # -- the sun ---------------------------------------------------------------------------

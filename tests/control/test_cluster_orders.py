@@ -1,9 +1,11 @@
 """Commands, parameters and questions on their way through a cluster to real local controllers."""
 
 import asyncio
+import dataclasses
 import struct
 from binascii import crc32
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -358,3 +360,83 @@ def test_an_emergency_does_not_wait_for_a_search_of_the_bus() -> None:
         assert field.clock.monotonic() - begin < 0.5
 
     run(main, "IDLE", bus=lambda clock, boards: SlotBus(clock, [*boards]))
+
+
+def test_an_emergency_does_not_wait_for_flash() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("SET_BIAS", 9)
+        items = {"biases": struct.pack("<ff", 0.003, 0.0)}
+        await field.plant.send(Parameters.of("p", "A1", items, TOKEN))
+        await field.until(lambda: field.bus.lost != [])
+        begin = field.clock.monotonic()
+        await asyncio.sleep(0.05)
+        await field.emergency("stop", "DEFOCUS")
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 0.2)
+        assert field.clock.monotonic() - begin < 0.3
+        await asyncio.sleep(1.0)
+        assert "DEFOCUS came before it" in field.plant.text("p")
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_an_edition_that_cannot_be_kept_fails_the_order_and_nothing_else(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "state.json")
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        (tmp_path / "state.json").unlink()
+        tmp_path.rmdir()
+        items = {"biases": struct.pack("<ff", 0.003, 0.0)}
+        message = Parameters.of("p", "A1", items, TOKEN)
+        await field.plant.send(dataclasses.replace(message, lifetime=3.0))
+        assert await final(field, "p") is Stage.FAILED
+        assert "the edition cannot be kept: No such file or directory" in field.plant.text("p")
+        await field.order("lock", "LOCK", heliostats=("A1",))
+        assert await final(field, "lock") is Stage.DONE
+        tmp_path.mkdir()
+
+    run(main, kept=kept)
+
+
+def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        for board in field.boards:
+            board.on = False
+        orders = field.cluster._orders
+        command = Command("c", "AIM", AIM, token=TOKEN, lifetime=20.0)
+        for _ in range(1030):
+            orders.accept(command, "")
+        await asyncio.sleep(1.5)
+        assert "2048 orders wait already; at most 2048" in field.plant.text("c")
+
+    run(main)
+
+
+def test_a_state_of_other_firmware_is_named_and_not_believed() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.boards[0].node.controller.state = 200
+        await field.until(lambda: bool(field.plant.alarms("node_unintelligible")))
+        (alarm,) = field.plant.alarms("node_unintelligible")
+        assert "A1: state 200 is not known; its firmware is another" in alarm.text
+        assert field.cluster.nodes[0].state == 1
+        field.boards[0].node.controller.state = 1
+
+    run(main)
+
+
+def test_what_was_at_work_when_an_emergency_came_is_not_sent_again() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("TRACK", 2)
+        await field.order("track", "TRACK", heliostats=("A1",))
+        await field.until(lambda: field.bus.lost != [])
+        await field.emergency("stop", "DEFOCUS")
+        await asyncio.sleep(8.0)
+        assert field.states() == ["DEFOCUSED", "DEFOCUSED"]
+        assert field.plant.stages("track", "A1")[-1] is Stage.FAILED
+        assert "DEFOCUS came before it" in field.plant.text("track")
+
+    run(main, "IDLE", bus=interrupted)

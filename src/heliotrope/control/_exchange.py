@@ -46,11 +46,17 @@ class Exchange:
     ----------
     sender
         Numbers what is sent.
+    hurry
+        Something urgent waits: nothing is repeated.
+    now
+        When the last poll ended, monotonic s.
     """
 
     def __init__(self, bus: Bus, clock: Clock, epoch: int, answer: float) -> None:
         self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
         self._bus, self._clock, self._answer = bus, clock, answer
+        self.hurry = False
+        self.now = clock.monotonic()
         self._gathering: asyncio.Timeout | None = None
         self._asked = self._bad = self._answered = 0
         self._seconds: deque[tuple[int, int, int]] = deque(maxlen=_WINDOW)
@@ -84,9 +90,10 @@ class Exchange:
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is Outcome.SENT
 
-    async def poll(self, node: Node, question: Question, sequence: int) -> tuple[Any, ...] | None:
-        """Ask a node, and return the values of its answer or None."""
-        begin = self._clock.monotonic()
+    async def poll(
+        self, node: Node, question: Question, sequence: int, begin: float
+    ) -> tuple[Any, ...] | None:
+        """Ask a node at ``begin``, and return the values of its answer or None; see ``now``."""
         node.counts.asked += 1
         self._asked += 1
         data = await self._bus.transact(node.frame(question, sequence), self._answer)
@@ -94,9 +101,10 @@ class Exchange:
         if values is None:
             frame = answer_in(data, node.address, sequence, (question.answer,)) if data else None
             if frame is None or (values := frame.values()) is None:
+                self.now = self._clock.monotonic()
                 self._spoilt(node, data, begin)
                 return None
-        now = self._clock.monotonic()
+        self.now = now = self._clock.monotonic()
         self._answered += 1
         node.answered(now, now - begin)
         return values
@@ -116,14 +124,18 @@ class Exchange:
         wanted = tuple(messages.NUMBER_OF[number] for number in numbers)
         for attempt in range(tries):
             begin = self._clock.monotonic()
-            if begin >= expires:
+            if begin >= expires or (attempt and self.hurry):
                 break
             node.counts.asked += 1
             node.counts.retries += attempt > 0
             self._asked += 1
-            data = await self._bus.transact(
-                frame, timeout or self._answer, expires=expires, urgent=urgent
-            )
+            data: bytes | None
+            if timeout is None:
+                data = await self._bus.transact(frame, self._answer, expires=expires, urgent=urgent)
+            else:
+                data = await self._patiently(frame, timeout, expires, None)
+            if data is None:
+                break
             answer = answer_in(data, node.address, sequence, wanted) if data else None
             found = None if answer is None else answer.values()
             if answer is not None and found is not None:
@@ -144,16 +156,24 @@ class Exchange:
         """
         frame = self.sender.frame(wire.BROADCAST, name, *values, key=key)
         sequence = self.sender.count & 0xFFFF
+        return await self._patiently(frame, span, None, complete), sequence
+
+    async def _patiently(
+        self, frame: bytes, timeout: float, expires: float | None,
+        complete: Callable[[bytes], bool] | None,
+    ) -> bytes | None:  # fmt: skip
+        """Do a transaction that may take long; None if `interrupt` was called meanwhile."""
         try:
             async with asyncio.timeout(None) as self._gathering:
-                return await self._bus.transact(frame, span, complete=complete), sequence
+                return await self._bus.transact(frame, timeout, expires=expires, complete=complete)
         except TimeoutError:
-            return None, sequence
+            return None
         finally:
             self._gathering = None
 
     def interrupt(self) -> None:
-        """Give up waiting for answers that may take long: something urgent has come."""
+        """Give up what may take long, and repeat nothing, until `Urgent` has been served."""
+        self.hurry = True
         if self._gathering is not None:
             self._gathering.reschedule(asyncio.get_running_loop().time())
 

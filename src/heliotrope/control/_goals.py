@@ -110,12 +110,14 @@ class Goals:
         self._watches: dict[int, list[_Watch]] = {}
 
     def begin(self, identity: str, name: str, node: Node, now: float) -> None:
-        """Note that a node has acknowledged a command; older goals of it are void."""
+        """Note that a node has acknowledged a command; goals of other commands are void."""
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
             return
-        self.end(node, f"{name} came after it")
-        self._watches[node.index] = [_Watch(identity, name, now)]
+        same = [watch for watch in self._watches.get(node.index, []) if watch.name == name]
+        if not same:
+            self.end(node, f"{name} came after it")
+        self._watches[node.index] = [*same, _Watch(identity, name, now)]
 
     def waits(self, node: Node) -> bool:
         """Whether a node is to reach something."""

@@ -50,9 +50,10 @@ class Kept:
         OSError
             If it cannot be kept.
         """
-        self.epoch = max(self.epoch + 1, at_least) & _LARGEST
-        self._write()
-        return self.epoch
+        epoch = max(self.epoch + 1, at_least) & _LARGEST
+        self._write(epoch, self._reserved)
+        self.epoch = epoch
+        return epoch
 
     def next_edition(self, above: int = 0) -> int:
         """Return an edition that was never used, above another one.
@@ -64,17 +65,17 @@ class Kept:
         """
         edition = max(self._edition, above) + 1
         if edition > self._reserved:
+            self._write(self.epoch, edition + _BLOCK)
             self._reserved = edition + _BLOCK
-            self._write()
         self._edition = edition
         return edition
 
-    def _write(self) -> None:
+    def _write(self, epoch: int, reserved: int) -> None:
         if self._path is None:
             return
         beside = self._path.with_name(self._path.name + ".new")
         with beside.open("w", encoding="utf-8") as file:
-            json.dump({"epoch": self.epoch, "edition": self._reserved}, file)
+            json.dump({"epoch": epoch, "edition": reserved}, file)
             file.flush()
             os.fsync(file.fileno())
         beside.replace(self._path)

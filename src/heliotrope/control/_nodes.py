@@ -62,8 +62,9 @@ class Question:
             values[-1] != crc32(raw[1 : last - wire.CRC_SIZE])
             or values[2] != address
             or values[3] != sequence
-            or values[:2] != (wire.VERSION, wire.CLUSTER_ADDRESS)
             or values[4] != self.answer
+            or values[0] != wire.VERSION
+            or values[1] != wire.CLUSTER_ADDRESS
         ):
             return None
         return values[5:-1]
@@ -129,11 +130,11 @@ class Node:
         self.steps_at = -math.inf
         self.heard_at = -math.inf
         self.missed = 0
-        self._frames: dict[tuple[int, int], bytes] = {}
+        self._frames: dict[int, bytes] = {}
 
     def frame(self, question: Question, sequence: int) -> bytes:
         """Return a question to this node."""
-        key = question.number, sequence
+        key = question.number << 16 | sequence
         frame = self._frames.get(key)
         if frame is None:
             frame = self._frames[key] = question.frame(self.address, sequence)

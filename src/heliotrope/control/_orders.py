@@ -33,6 +33,8 @@ _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
 #: Would act twice.
 _RELATIVE = ("JOG",)
+#: For all heliostats together; the bus does about a hundred in a second.
+_MOST_JOBS = 2048
 #: Written to flash before they are acknowledged.
 _STORED = ("STANDBY",)
 #: Moves a mirror, or may: refused while a safety row forbids new motion.
@@ -85,6 +87,7 @@ class Job:
         self.unanswered = False  # an earlier frame of this step may have been taken
         self.edition = -1  # that the node holds; not known yet
         self.last = ""  # why it is tried again
+        self.void = ""  # why it is given up as soon as its frame has been answered
 
     @property
     def step(self) -> Step:
@@ -125,6 +128,7 @@ class Orders:
         self._by_name = {node.name: node for node in nodes}
         self._ready: deque[Job] = deque()
         self._later: list[Job] = []
+        self._at_work: Job | None = None
         self.token = 0
         self.out_of_step = 0
 
@@ -156,7 +160,7 @@ class Orders:
         try:
             nodes = self.chosen(command.heliostats)
             steps = self._steps_of(command, nodes, forbidden)
-            self._may(command.token, command.lifetime)
+            self._may(command.token, command.lifetime, len(nodes))
         except Refusal as refusal:
             for name in command.heliostats or ("",):
                 self._reports.add(command.identity, Stage.REFUSED, name, str(refusal))
@@ -185,13 +189,16 @@ class Orders:
             steps.append(Step(command.name, _typed(number, values)))
         return steps
 
-    def _may(self, token: int, lifetime: float) -> None:
+    def _may(self, token: int, lifetime: float, jobs: int) -> None:
         if self.token == 0:
             raise Refusal("nobody has the authority: the lease of the plant is over")
         if token != self.token:
             raise Refusal("not the authority: the token is another one's; take the authority first")
         if not 0.0 < lifetime <= 3600.0:
             raise Refusal(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
+        waiting = len(self._ready) + len(self._later)
+        if waiting + jobs > _MOST_JOBS:
+            raise Refusal(f"{waiting} orders wait already; at most {_MOST_JOBS}: give it later")
         if self._gps() is None:
             raise Refusal("the local controllers have no time yet; nothing could expire there")
 
@@ -200,7 +207,7 @@ class Orders:
         try:
             (node,) = self.chosen((message.heliostat,))
             steps = _steps_of_items(node, message)
-            self._may(message.token, message.lifetime)
+            self._may(message.token, message.lifetime, 1)
         except Refusal as refusal:
             self._reports.add(message.identity, Stage.REFUSED, message.heliostat, str(refusal))
             return
@@ -226,6 +233,8 @@ class Orders:
                 self._fail(job, why)
         self._ready = deque(job for job in self._ready if job.node.index not in chosen)
         self._later = [job for job in self._later if job.node.index not in chosen]
+        if self._at_work is not None and self._at_work.node.index in chosen:
+            self._at_work.void = why
         for index in chosen:
             self._goals.end(self._nodes[index], why)
 
@@ -233,7 +242,11 @@ class Orders:
 
     async def serve(self) -> None:
         """Do one step of one order."""
-        job = self._ready.popleft()
+        self._at_work = self._ready.popleft()
+        await self._work(self._at_work)
+        self._at_work = None
+
+    async def _work(self, job: Job) -> None:
         if job.order.token != self.token:
             return self._fail(job, "the authority has changed or its lease is over")
         if self._clock() >= job.order.deadline:
@@ -258,7 +271,10 @@ class Orders:
         if messages.who_of(messages.NUMBER_OF[step.name]) == messages.KEY:
             if step.name != "SET_ADDRESS" and not await self._knows_edition(job):
                 return self._again(job, "no answer to QUERY_STORED before it expired")
-            head, key = (*head, self._kept.next_edition(job.edition)), node.member.key
+            try:
+                head, key = (*head, self._kept.next_edition(job.edition)), node.member.key
+            except OSError as error:
+                return self._again(job, f"the edition cannot be kept: {error.strerror}")
         if step.name == "SET_ADDRESS":
             return await self._give_address(job, head, key)
         slow = bool(key) or step.name in _STORED
@@ -318,7 +334,7 @@ class Orders:
             return self._again(job, f"no answer to QUERY_STORED of {step.item} before it expired")
         same = data == step.data
         if same and step.item == "armature":
-            status = await self._exchange.poll(node, STATUS, SEQUENCES[0])
+            status = await self._exchange.poll(node, STATUS, SEQUENCES[0], self._clock())
             if status is None:
                 return self._again(job, "no answer to QUERY_STATUS before it expired")
             same = status[7] == crc32(data)
@@ -351,6 +367,8 @@ class Orders:
         return text
 
     def _advance(self, job: Job) -> None:
+        if job.void:
+            return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
         job.place += 1
         job.unanswered = False
@@ -363,10 +381,14 @@ class Orders:
             self._reports.add(order.identity, Stage.DONE, node.name)
         else:
             self._goals.begin(order.identity, done.name, node, self._clock())
+        return None
 
     def _again(self, job: Job, why: str) -> None:
+        if job.void:
+            return self._fail(job, job.void)
         job.last = why
         self._later.append(job)
+        return None
 
     def _fail(self, job: Job, why: str) -> None:
         self._reports.add(job.order.identity, Stage.FAILED, job.node.name, why)

@@ -55,7 +55,9 @@ class Urgent:
         self.pressing = False
 
     def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
-        """Take an emergency, for some heliostats or for all."""
+        """Take an emergency, for some heliostats or for all; one that is repeated counts once."""
+        if identity and any(order.identity == identity for order in self._orders):
+            return
         everybody = len(nodes) == len(self._nodes)
         if name == "STOW" and everybody:
             for older in self._orders:
@@ -76,6 +78,7 @@ class Urgent:
                 await self._round(order)
                 if self.pressing:
                     break
+        self._exchange.hurry = False
         self._orders = [order for order in self._orders if order.waiting or order.calls]
 
     def second(self) -> None:
@@ -85,9 +88,9 @@ class Urgent:
             self._name(order, now)
         self.pressing = bool(self._orders)
 
-    def missing(self) -> list[str]:
-        """Who has not acknowledged, by name."""
-        return sorted({node.name for order in self._orders for node in order.waiting})
+    def waits(self, node: Node) -> bool:
+        """Whether a node has not acknowledged something."""
+        return any(node in order.waiting for order in self._orders)
 
     async def _call(self, order: _Order) -> None:
         while order.calls > 0:
@@ -106,7 +109,9 @@ class Urgent:
         """Ask each that has not acknowledged."""
         begin = self._clock()
         rounds, order.new = (_ROUNDS if order.new else 1), False
-        for _ in range(rounds):
+        for number in range(rounds):
+            if number and self._clock() - begin > ORDER_BUDGET:
+                return
             for _ in range(len(order.waiting)):
                 if self.pressing or not self._exchange.connected:
                     return
@@ -128,6 +133,13 @@ class Urgent:
             order.waiting.append(node)
             return
         self._reports.clear("order_unacknowledged", node.name, f"{node.name} has acknowledged")
+        self._acknowledged(order, node)
+        for other in self._orders:
+            if other.name == order.name and node in other.waiting:
+                other.waiting.remove(node)
+                self._acknowledged(other, node)
+
+    def _acknowledged(self, order: _Order, node: Node) -> None:
         if not order.given_up:
             self._reports.add(order.identity, Stage.ACKNOWLEDGED, node.name)
             self._goals.begin(order.identity, order.name, node, self._clock())

@@ -21,6 +21,7 @@ lease, and then a command.
 import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from heliotrope.control._asked import Asked
 from heliotrope.control._exchange import Exchange
@@ -181,7 +182,7 @@ class Cluster:
         while not self._closing:
             await self._serve_until(due)
             if not self._closing:
-                due = await self._second(due)
+                due = await self._second()
         if self._exchange.connected:
             for _ in range(3):
                 await self._exchange.broadcast("DEFOCUS", urgent=True)
@@ -208,15 +209,20 @@ class Cluster:
         if self._urgent.pressing:
             await self._urgent.serve()
         elif self._orders.ready:
+            self._orders.token = self._authority()
             await self._orders.serve()
         else:
             await self._asked.serve()
         if self._reports.waiting:
             self._news.set()
 
+    def _authority(self) -> int:
+        """Return the token of who commands, 0 once lease and autonomy are over."""
+        return 0 if self._watch.alone(self._clock.monotonic()) else self._watch.token
+
     # -- a second --------------------------------------------------------------------------
 
-    async def _second(self, due: float) -> float:
+    async def _second(self) -> float:
         """Do what is due once a second, and return when the next one begins."""
         begin = self._clock.monotonic()
         present = self._time.time()
@@ -224,7 +230,7 @@ class Cluster:
         verdict = self._watch.second(present, self._exchange.second(), begin)
         if verdict.new is not None:
             self._act(Act.STOW if verdict.new is Act.STOW else Act.DEFOCUS)
-        self._orders.token = self._watch.token
+        self._orders.token = self._authority()
         if self._orders.out_of_step >= _OUT_OF_STEP:
             self._new_epoch(0)
         self._urgent.second()
@@ -238,14 +244,13 @@ class Cluster:
         self._look_for_silence(begin)
         self.cycle = self._clock.monotonic() - begin
         self._report(begin)
-        return self._next_due(due, begin, present)
+        return self._next_due(begin, present)
 
-    def _next_due(self, due: float, begin: float, present: Time) -> float:
+    def _next_due(self, begin: float, present: Time) -> float:
         ahead = 0.0
         if _known(present):
             # Where this second should have begun, as the time says, within half a second.
             ahead = (present.gps_s - self.config.phase + 0.5) % 1.0 - 0.5
-        del due
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
 
     async def _broadcast(self, present: Time, now: float) -> None:
@@ -286,41 +291,49 @@ class Cluster:
         nodes, count = self._by_address, len(self.nodes)
         sequence = SEQUENCES[self._number % len(SEQUENCES)]
         first, self._next = self._next, 0
+        now = self._clock.monotonic()
         for place in range(first, first + count):
-            if self._clock.monotonic() >= until or self._closing:
+            if now >= until or self._closing:
                 self._next = place % count
                 self.overruns += 1
                 return
             node = nodes[place % count]
             if node.missed < _ABSENT or (self._number + node.index) % _PROBE == 0:
-                await self._poll(node, sequence)
+                now = await self._poll(node, sequence, now)
             if self._busy(patient=False):
                 await self._serve()
+                now = self._clock.monotonic()
 
     async def _look(self, node: Node) -> None:
         """Ask a node for its state, between two rounds."""
-        await self._poll(node, SEQUENCES[self._number % len(SEQUENCES)])
+        sequence = SEQUENCES[self._number % len(SEQUENCES)]
+        await self._poll(node, sequence, self._clock.monotonic())
 
-    async def _poll(self, node: Node, sequence: int) -> None:
-        asked_at = self._clock.monotonic()
-        if not await self._ask_status(node, sequence):
-            return
+    async def _poll(self, node: Node, sequence: int, now: float) -> float:
+        """Ask a node for state and step counts; ``now`` at the beginning, returned at the end."""
+        exchange = self._exchange
+        status = await exchange.poll(node, STATUS, sequence, now)
+        if status is None or not self._believes(node, status):
+            return exchange.now
         waits = self._goals.waits(node)
         if waits or (self._number + node.index) % self.config.steps_every == 0:
-            steps = await self._exchange.poll(node, STEPS, sequence)
+            steps = await exchange.poll(node, STEPS, sequence, exchange.now)
             if steps is not None:
                 node.steps, node.steps_at = steps, node.heard_at
         if waits:
-            self._goals.heard(node, asked_at)
+            self._goals.heard(node, now)
+        return exchange.now
 
-    async def _ask_status(self, node: Node, sequence: int) -> bool:
-        status = await self._exchange.poll(node, STATUS, sequence)
-        if status is None:
+    def _believes(self, node: Node, status: tuple[Any, ...]) -> bool:
+        """Take a STATUS; False if its firmware has states that this side doesn't know."""
+        if status[0] >= len(states.STATES):
+            text = f"{node.name}: state {status[0]} is not known; its firmware is another"
+            self._reports.alarm("node_unintelligible", node.name, "ALARM", text)
             return False
         before, node.status = node.status, status
         if before[2] != status[2]:
             self._fault(node)
-        if self._watch.verdict.dark and status[0] in BEAM_OUT:
+        if self._watch.verdict.dark and status[0] in BEAM_OUT and not self._urgent.waits(node):
             # It has missed the call, or came back from somewhere.
             self._urgent.begin("", "DEFOCUS", [node])
         return True
@@ -383,15 +396,17 @@ class Cluster:
                 self._reports.alarm("lease_refused", "", "ALARM", refusal)
             else:
                 self._reports.clear("lease_refused", "")
-                self._orders.token = self._watch.token
+                self._orders.token = self._authority()
         elif isinstance(message, Emergency):
             self._take_emergency(message.identity, message.name, message.heliostats)
         elif isinstance(message, Command):
             if message.name in NAMES:
                 self._take_emergency(message.identity, message.name, message.heliostats)
             else:
+                self._orders.token = self._authority()
                 self._orders.accept(message, self._watch.verdict.forbidden)
         elif isinstance(message, Parameters):
+            self._orders.token = self._authority()
             self._orders.accept_parameters(message)
         elif isinstance(message, Ask):
             self._asked.take(message)
