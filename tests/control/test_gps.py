@@ -57,6 +57,7 @@ class Receiver:
         self.path.symlink_to(os.ttyname(self._far))
 
     def unplug(self) -> None:
+        self.path.unlink()  # the terminal's number may be another test's at once
         near, self._near = self._near, -1
         os.close(near)
         os.close(self._far)

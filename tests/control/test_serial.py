@@ -70,6 +70,7 @@ class Line:
     def unplug(self) -> None:
         self._ending.set()
         self._thread.join()
+        self.path.unlink()  # the terminal's number may be another test's at once
         for end in (self._master, self._slave):
             os.close(end)
 
