@@ -315,6 +315,16 @@ def test_a_receiver_that_runs_away_slowly_takes_the_time_no_further_than_its_lat
     assert sky.now().quality == "holdover"
 
 
+def test_the_last_time_that_can_be_told_is_no_error() -> None:
+    sky = Sky(ALONE, start=datetime(2099, 12, 31, 23, 59, 50, tzinfo=UTC))
+    for _ in range(9):
+        sky.kept.hear(gga(sky.true) + zda(sky.true))
+        sky.passes(1.0)
+    assert sky.now().quality == "gps"
+    sky.passes(1e6)
+    assert sky.now().utc_s == pytest.approx(sky.true.timestamp(), abs=1.0)
+
+
 @pytest.mark.parametrize("weeks", [1024, 2048])
 def test_a_receiver_before_a_rollover_tells_the_right_time(weeks: int) -> None:
     sky = Sky()

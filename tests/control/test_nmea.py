@@ -64,6 +64,10 @@ def test_without_a_fix_there_is_no_time(data: bytes) -> None:
         "GPRMC",
         "GPZDA,100000.00,00,00,0000,00,00",
         "GPZDA,100000.00,21,06",
+        "GPZDA,100000.00,21,06,1979,00,00",
+        "GPZDA,100000.00,21,06,2100,00,00",
+        "GPZDA,100000.00,31,12,9999,00,00",
+        "GPZDA,100000.00,21,06,20260,00,00",
     ],
 )
 def test_values_that_are_no_time_are_none(body: str) -> None:

@@ -36,6 +36,8 @@ _SENTENCE = re.compile(rb"\$[A-Z]{2}(RMC|ZDA|GGA),([ -#%-)+-~]*)\*[0-9A-Fa-f]{2}
 _ANY_SENTENCE = re.compile(rb"\$P?[A-Z]{1,5}[^$*]*\*[0-9A-Fa-f]{2}")
 _TIME = re.compile(r"\d{6}(\.\d{1,6})?")
 _ROLLOVER = timedelta(weeks=1024)
+#: From the beginning of GPS to the end of what two digits of RMC can tell.
+_YEARS = range(1980, 2100)
 #: Autonomous, differential, precise, real-time kinematic (fixed, float). Not: estimated (dead
 #: reckoning), manual, simulated.
 _RMC_MODES = "ADPRF"
@@ -174,6 +176,9 @@ class NmeaReader:
             day = date(message.year, message.month, message.day)
         except (AttributeError, TypeError, ValueError):
             self.unusable += fix
+            return Report(None, fix=False)
+        if day.year not in _YEARS:
+            self.unusable += 1
             return Report(None, fix=False)
         return self._dated(day, of_day, fix=fix)
 
