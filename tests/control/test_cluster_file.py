@@ -10,11 +10,14 @@ import pytest
 
 from clusters import SITE, config_of
 from heliotrope import sun
+from heliotrope.cli.cluster import _line, _link, _time
 from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
 from heliotrope.control._sun_line import HORIZON, sun_at, sun_values
+from heliotrope.control.clock import SystemClock
 from heliotrope.control.cluster_config import ClusterConfig, Member
 from heliotrope.control.cluster_file import TABLES, read_cluster
+from heliotrope.control.gps import GpsTime
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
 from heliotrope.sun import Site
@@ -278,3 +281,33 @@ def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
     steps = ("primary", "secondary", "primary_goal", "secondary_goal")
     assert tuple(first[list(steps)].item()) == (1, -2, 3, -4)
     assert (first["asked"], first["answered"]) == (7, 1)
+
+
+# -- where it leads --------------------------------------------------------------------
+
+
+def test_links_and_times_are_made_as_the_file_says(folder: Path) -> None:
+    clock = SystemClock()
+    installation = read_cluster(folder / "C1.toml")
+    assert _link(installation, clock).name == "plant at 10.0.0.2:4840"
+    assert isinstance(_time(installation, clock), GpsTime)
+    changed(folder, "tcp://10.0.0.2:4840", "mqtt://broker/heliotrope/example")
+    changed(folder, 'source = "gps"', 'source = "system"')
+    installation = read_cluster(folder / "C1.toml")
+    assert (installation.port, installation.prefix) == (1883, "heliotrope/example")
+    assert "broker" in _link(installation, clock).name
+    keeper = _time(installation, clock)
+    assert keeper.time().error == 0.5
+    changed(folder, 'example"', 'example"\nauthority = "no.pem"')
+    changed(folder, "mqtt://", "mqtts://")
+    with pytest.raises(InputError, match=r"no\.pem"):
+        _link(read_cluster(folder / "C1.toml"), clock)
+
+
+def test_an_emergency_line_that_cannot_be_read_is_open(tmp_path: Path) -> None:
+    file = tmp_path / "value"
+    assert not _line(file)
+    file.write_text("1\n")
+    assert _line(file)
+    file.write_text("0\n")
+    assert not _line(file)

@@ -4,6 +4,7 @@ A command is acknowledged when the local controller has taken it, and done when 
 state that it asks for. Commands that are not in the table are done when they are acknowledged.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -133,22 +134,12 @@ class Goals:
         watches = self._watches.get(node.index)
         if watches is None:
             return
-        state = states.STATES[node.state]
-        self._judge(node, lambda watch: self._verdict(node, watch, state, asked_at))
+        self._judge(node, lambda watch: self._verdict(node, watch, asked_at))
 
     def second(self, nodes: list[Node], now: float) -> None:
         """Give up what takes too long."""
         for index in list(self._watches):
-            node = nodes[index]
-            state = states.STATES[node.state]
-            self._judge(
-                node,
-                lambda watch, state=state: (  # type: ignore[misc]
-                    f"still {state} after {now - watch.since:.0f} s"
-                    if now - watch.since > GOALS[watch.name].limit
-                    else None
-                ),
-            )
+            self._judge(nodes[index], functools.partial(_late, nodes[index], now))
 
     def _judge(self, node: Node, verdict: "Callable[[_Watch], str | None]") -> None:
         left = []
@@ -165,7 +156,7 @@ class Goals:
         else:
             self._watches.pop(node.index, None)
 
-    def _verdict(self, node: Node, watch: _Watch, state: str, asked_at: float) -> str | None:
+    def _verdict(self, node: Node, watch: _Watch, asked_at: float) -> str | None:
         """Return "" if it is done, a text if it cannot be any more, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
@@ -178,4 +169,10 @@ class Goals:
         if reached is None:
             return None
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
-        return "" if reached else f"went to {state}{fault}"
+        return "" if reached else f"went to {states.STATES[node.state]}{fault}"
+
+
+def _late(node: Node, now: float, watch: _Watch) -> str | None:
+    if now - watch.since <= GOALS[watch.name].limit:
+        return None
+    return f"still {states.STATES[node.state]} after {now - watch.since:.0f} s"

@@ -9,6 +9,7 @@ from heliotrope.control.protocol import Lease
 from heliotrope.control.safety import (
     Act,
     Action,
+    Condition,
     Reading,
     Role,
     SafetyState,
@@ -95,7 +96,7 @@ class Watch:
         self.token = 0
         self.verdict = Verdict()
 
-    def _table(self) -> tuple:  # type: ignore[type-arg]
+    def _table(self) -> tuple[Condition, ...]:
         rows = watched_by(conditions(self._autonomy), Watcher.CLUSTER)
         return tuple(row for row in rows if self._line is not None or row.name != _LINE)
 
