@@ -24,6 +24,8 @@ RANGES = ((-20_000, 406_000), (-4000, 104_000))
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
+#: Imperfections that are drawn.
+CAUSES = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
 #: A cluster has no more.
 MOST = 32
 
@@ -34,6 +36,8 @@ class Outfit:
 
     Attributes
     ----------
+    causes
+        Its imperfections, by the names of parameters, rad.
     items
         What its journal holds, by name: `lcu.journal.ITEMS`.
     """
@@ -43,6 +47,7 @@ class Outfit:
     serial: int
     key: bytes
     mechanism: Mechanism
+    causes: dict[str, float]
     items: dict[str, bytes]
 
 
@@ -78,12 +83,20 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
         perfect = kinds.azimuth_elevation(
             place, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
         )
-        causes = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
-        mechanism = perfect.with_parameters({name: chance.gauss(0.0, 3e-3) for name in causes})
+        causes = {name: chance.gauss(0.0, 3e-3) for name in CAUSES}
+        mechanism = perfect.with_parameters(causes)
         address = 11 + i
         key = sha256(b"key %d" % address)
         found.append(
-            Outfit(f"H{i + 1:02d}", address, 5000 + i, key, mechanism, items_of(mechanism, address))
+            Outfit(
+                f"H{i + 1:02d}",
+                address,
+                5000 + i,
+                key,
+                mechanism,
+                causes,
+                items_of(mechanism, address),
+            )
         )
     return found
 

@@ -1,0 +1,526 @@
+"""A whole field of local controllers as arrays: the states and steps of `lcu`, without frames.
+
+What a board does from stow to standby, tracking, defocused and back is done here for all
+heliostats of a field at once, in the same integers: poses come from the vectorised tracking of
+`mechanism`, steps from the kernels of `twin._field_kernels`. Where both overlap, step counts are
+those of the firmware-true board.
+
+It knows STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED and STOWING, the lease, and the
+way by itself to defocus and to stow. Locks, faults, settings, searching and moving by hand are
+the board's (`twin.board`).
+"""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.lcu.lease import RATE_FACTOR, UNIT
+from heliotrope.lcu.motion import (
+    APPROACH,
+    DEFOCUS,
+    HOLD,
+    KNOT_LIMIT,
+    KNOT_MS,
+    PIECE,
+    RENEW_MS,
+    RETURN,
+    STANDBY,
+    STOW,
+    TRACK,
+)
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import Status, track
+from heliotrope.twin import _field_kernels as kernels
+
+Rows = npt.NDArray[np.intp]
+Bools = npt.NDArray[np.bool_]
+
+AXIS = np.dtype(
+    [(name, "<i8") for name in (
+        "count", "goal", "leg", "speed", "phase", "direction", "led", "braking", "low", "high",
+        "top", "change", "backlash")]
+)  # fmt: skip
+#: Of `lcu.config.Config`.
+LEASE_MS, STOW_WAIT_MS, SLOT_MS, AHEAD_MS = 6000, 30_000, 50, 100
+#: A field is advanced by so much at a time, as a board's main loop does at least, ms.
+TICK_MS = 50
+
+
+class Field:
+    """Heliostats with their local controllers.
+
+    Parameters
+    ----------
+    mechanism
+        The true ones, batch shape (N,), each with two drives.
+    believed
+        What the controllers are told of them; None: the truth.
+    stow
+        Step counts, (2,) or (N, 2).
+    ranges
+        Lowest and highest step counts of both axes, (2, 2).
+    limits
+        Rate (steps/s), acceleration (steps/s²), backlash (steps).
+    standby
+        Points, (3,) or (N, 3), m.
+    defocus
+        Angles of both axes, rad.
+
+    Attributes
+    ----------
+    state, kind
+        Of `lcu.states` and `lcu.motion`, (N,).
+    axes
+        Of dtype `AXIS`, (N, 2).
+    aim, standby
+        (N, 3), m.
+
+    Raises
+    ------
+    InputError
+        Mechanisms that are no array of two drives each.
+    """
+
+    def __init__(
+        self,
+        mechanism: Mechanism,
+        *,
+        stow: npt.ArrayLike,
+        ranges: npt.ArrayLike,
+        limits: tuple[int, int, int],
+        standby: npt.ArrayLike,
+        defocus: tuple[float, float] = (0.1, 0.05),
+        believed: Mechanism | None = None,
+    ) -> None:
+        if len(mechanism.shape) != 1 or len(mechanism.driven) != 2:
+            raise InputError(
+                f"field: mechanisms of shape {mechanism.shape} with {len(mechanism.driven)} "
+                "drives; give an array of one dimension, with two drives each"
+            )
+        count = mechanism.shape[0]
+        self.mechanism = mechanism
+        self._told = believed if believed is not None else mechanism
+        self._stow = np.broadcast_to(np.asarray(stow, dtype=np.int64), (count, 2))
+        self._defocus = np.asarray(defocus)
+        self.axes = np.zeros((count, 2), dtype=AXIS)
+        rate, acceleration, backlash = limits
+        low, high = np.asarray(ranges, dtype=np.int64).T
+        self.axes["low"], self.axes["high"] = low, high
+        # As `lcu.stepper.Axis`: intervals are whole microseconds.
+        room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // rate)
+        self.axes["top"] = max(1, min(rate * SLOT_MS * kernels.SCALE // 1000, room))
+        self.axes["change"] = max(1, acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000)
+        self.axes["backlash"], self.axes["direction"] = backlash, 1
+        for name in ("count", "goal", "leg"):
+            self.axes[name] = self._stow
+        ends = np.stack([self._angles_at(self.axes[name]) for name in ("low", "high")])
+        self._low, self._high = ends.min(axis=0), ends.max(axis=0)
+        self._order = np.zeros(count, dtype=np.int64)
+        self._queued = np.zeros(count, dtype=np.int64)
+        self.state = np.full(count, states.STOWED, dtype=np.int8)
+        self.kind = np.full(count, HOLD, dtype=np.int8)
+        self._base = np.full(count, HOLD, dtype=np.int8)
+        self.standby = np.array(np.broadcast_to(np.asarray(standby, dtype=np.float64), (count, 3)))
+        self.aim = np.full((count, 3), np.nan)
+        self._target = np.full((count, 3), np.nan)
+        self._ready = np.zeros(count, dtype=np.bool_)
+        self._lease = np.zeros(count, dtype=np.int64)
+        self._dark = np.zeros(count, dtype=np.int64)
+        self._knot, self._renew, self._since = np.zeros((3, count), dtype=np.int64)
+        self._start, self._slope = np.zeros((2, count, 2))
+        self._path = np.zeros((count, 1, 3))
+        self._length = np.zeros(count, dtype=np.int64)
+        self._place = np.zeros(count, dtype=np.int64)
+        self._way, self._way_length = self._ways()
+        self._sun = np.zeros((2, 3), dtype=np.int64)
+        self._sun_ms = 0
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    # -- the safe way ----------------------------------------------------------------------
+
+    def _ways(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+        """Return the points from the ground to standby, (N, P, 3), and how many there are."""
+        origin = self._told.armature.origin_1
+        here = np.broadcast_to(self._told.position, origin.shape)
+        half = 0.5 * (self.standby - here)
+        sine, cosine = 0.5, 0.866
+        aside, foot = here.copy(), self.standby.copy()
+        aside[:, 0] += cosine * half[:, 0] - sine * half[:, 1]
+        aside[:, 1] += sine * half[:, 0] + cosine * half[:, 1]
+        foot[:, 2] = here[:, 2]
+        return pieces(np.stack([aside, foot, self.standby], axis=1), origin)
+
+    # -- poses -----------------------------------------------------------------------------
+
+    def _drives(self, rows: Rows) -> Drive:
+        table = self._told.drives.table
+        return Drive(table if table.ndim == 2 else table[rows])
+
+    def _angles_at(self, counts: npt.ArrayLike, rows: Rows | None = None) -> FloatArray:
+        chosen = np.arange(len(self.axes)) if rows is None else rows
+        return np.asarray(self._drives(chosen).angles(np.asarray(counts, dtype=np.float64)))
+
+    def _pose(self, rows: Rows, aims: FloatArray, ahead_ms: int) -> tuple[FloatArray, Bools]:
+        """Return joint angles (M, 2) at which beams reach aims (M, 3), and whether they do."""
+        sun = (self._sun[0] + self._sun[1] * (self._sun_ms + ahead_ms) // 1000) / UNIT
+        found = track(
+            self._told[rows], sun / np.linalg.norm(sun), aims,
+            current=self.axes["count"][rows].astype(np.float64), tolerance=2e-10,
+        )  # fmt: skip
+        return np.asarray(found.chosen(found.angles)), np.asarray(
+            found.chosen(found.status) == Status.OK
+        )
+
+    def _go(self, rows: Rows, angles: FloatArray, how: npt.NDArray[np.int64]) -> None:
+        steps = np.floor(self._drives(rows).counts(angles) + 0.5).astype(np.int64)
+        kernels.go_rows(self.axes, self._order, rows, steps, how)
+
+    def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
+        """Angles turned away by the defocus; the other way where a stop is near."""
+        low, high = self._low[rows], self._high[rows]
+        one, other = angles + self._defocus, angles - self._defocus
+        stop = np.where(angles - low > high - angles, low, high)
+        inside = (low <= other) & (other <= high)
+        back = np.where(inside, other, stop)
+        return np.asarray(np.where((low <= one) & (one <= high), one, back))
+
+    def still(self) -> Bools:
+        """Whether nothing moves, (N,)."""
+        out = np.empty(len(self), dtype=np.bool_)
+        kernels.still_rows(self.axes, self._queued, out)
+        return out
+
+    def at_stow(self) -> Bools:
+        """Whether it stands at stow, (N,)."""
+        there: Bools = (self.axes["count"] == self._stow).all(axis=1)
+        return self.still() & there
+
+    # -- what begins -----------------------------------------------------------------------
+
+    def _hold(self, rows: Rows) -> None:
+        self.kind[rows] = HOLD
+        self.axes["braking"][rows] = 1
+
+    def _begin(self, rows: Rows, kind: int, targets: FloatArray) -> None:
+        self.kind[rows] = kind
+        self._target[rows] = targets
+        self._knot[rows] = self._renew[rows] = 0
+
+    def _turn_away(self, rows: Rows) -> None:
+        rows = rows[~np.isin(self.kind[rows], (DEFOCUS, STOW)) & ~self.at_stow()[rows]]
+        self._base[rows] = self.kind[rows]
+        self.kind[rows] = DEFOCUS
+        self._knot[rows] = self._renew[rows] = 0
+        angles = self._away(rows, self._angles_at(self.axes["count"][rows], rows))
+        self._go(rows, angles, np.full(len(rows), kernels.BOTH))
+
+    def _stow_directly(self, rows: Rows) -> None:
+        self._ready[rows] = False
+        self.kind[rows] = STOW
+        kernels.go_rows(
+            self.axes, self._order, rows, np.ascontiguousarray(self._stow[rows]),
+            np.full(len(rows), kernels.SECONDARY_FIRST),
+        )  # fmt: skip
+
+    def _return(self, rows: Rows) -> None:
+        """Back by the way of the approach, and to stow."""
+        for i in rows:
+            self._set_path(i, self._way_back(i))
+        self.kind[rows] = RETURN
+        self._ready[rows] = False
+        self._place[rows] = -1
+        self.axes["braking"][rows] = 1
+
+    def _way_back(self, i: np.intp) -> FloatArray:
+        if self.kind[i] == APPROACH:
+            return self._path[i, : max(0, self._place[i])][::-1].copy()
+        if not self._ready[i]:
+            return np.zeros((0, 3))
+        way = self._way[i, : self._way_length[i]][::-1]
+        if self.kind[i] == TRACK:
+            corners = np.concatenate([self.aim[i][None], way])[None]
+            long, length = pieces(corners, self._told.armature.origin_1[i][None])
+            return np.asarray(long[0, 1 : length[0]])
+        if self.kind[i] == DEFOCUS:
+            return np.asarray(way[way[:, 2] < self.standby[i, 2]])
+        return np.asarray(way)
+
+    def _set_path(self, i: np.intp, points: FloatArray) -> None:
+        if len(points) > self._path.shape[1]:
+            wider = np.zeros((len(self), len(points), 3))
+            wider[:, : self._path.shape[1]] = self._path
+            self._path = wider
+        self._path[i, : len(points)] = points
+        self._length[i] = len(points)
+
+    def _enter(self, rows: Rows, state: int) -> None:
+        dark = rows[(self.state[rows] != state)] if state == states.DEFOCUSED else rows[:0]
+        self._dark[dark] = STOW_WAIT_MS
+        self.state[rows] = state
+
+    # -- messages --------------------------------------------------------------------------
+
+    def take_sun(
+        self, values: tuple[int, ...], rows: Rows | None = None, delay_ms: int = 0
+    ) -> None:
+        """Take SUN of the wire (`control` sends it each second): it renews the lease.
+
+        Parameters
+        ----------
+        values
+            As in the message: second, direction, rate.
+        rows
+            Who hears it; None: all.
+        delay_ms
+            How long it was under way.
+        """
+        self._sun[0], self._sun[1] = values[1:4], np.multiply(values[4:7], RATE_FACTOR)
+        self._sun_ms = delay_ms
+        self._lease[slice(None) if rows is None else rows] = LEASE_MS - max(0, delay_ms)
+
+    def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
+        """Give a command; return who has taken it, (N,).
+
+        Parameters
+        ----------
+        name
+            DEFOCUS, STOW, APPROACH, IDLE, TRACK, REFOCUS or AIM.
+        rows
+            Whom; None: all.
+        aim
+            Of AIM, (3,) or (M, 3), m.
+
+        Raises
+        ------
+        InputError
+            Another name, or AIM without an aim.
+        """
+        chosen = np.arange(len(self)) if rows is None else np.asarray(rows)
+        state, taken = self.state[chosen], np.zeros(len(self), dtype=np.bool_)
+        if name == "DEFOCUS":
+            self._defocus_now(chosen)
+        elif name == "STOW":
+            goes = chosen[~np.isin(state, (states.STOWED, states.STOWING))]
+            fresh = self._lease[goes] > 0
+            self._enter(goes, states.STOWING)
+            self._return(goes[fresh])
+            self._stow_directly(goes[~fresh])
+        elif name == "APPROACH":
+            chosen = chosen[(state == states.STOWED) & (self._lease[chosen] > 0)]
+            for i in chosen:
+                self._set_path(i, self._way[i, : self._way_length[i]])
+            self.kind[chosen], self._place[chosen] = APPROACH, -1
+            self._ready[chosen] = False
+            self._enter(chosen, states.APPROACHING)
+        elif name in ("TRACK", "REFOCUS", "IDLE"):
+            chosen = self._sun_bound(chosen, name)
+        elif name == "AIM" and aim is not None:
+            chosen = chosen[~np.isin(self.kind[chosen], (APPROACH, RETURN))]
+            self.aim[chosen] = aim
+            self._knot[chosen] = self._renew[chosen] = 0
+            tracks = chosen[self.kind[chosen] == TRACK]
+            self._target[tracks] = self.aim[tracks]
+        else:
+            raise InputError(f"field: {name!r} with aim {aim!r}; see Field.order for what it takes")
+        taken[chosen] = True
+        return taken
+
+    def _sun_bound(self, rows: Rows, name: str) -> Rows:
+        """TRACK, REFOCUS and IDLE; returns who has taken it."""
+        state, fresh = self.state[rows], self._lease[rows] > 0
+        if name == "IDLE":
+            rows = rows[np.isin(state, (states.IDLE, states.TRACKING, states.DEFOCUSED))]
+            self._stand_by(rows)
+            self.state[rows] = states.IDLE
+            return rows
+        begins = (states.DEFOCUSED,) if name == "REFOCUS" else (states.IDLE, states.DEFOCUSED)
+        able = fresh & self._ready[rows] & ~np.isnan(self.aim[rows, 0]) & np.isin(state, begins)
+        rows = rows[able]
+        if len(rows):
+            rows = rows[self._pose(rows, self.aim[rows], 0)[1]]
+        self._begin(rows, TRACK, self.aim[rows])
+        self.state[rows] = states.TRACKING
+        return rows
+
+    def _stand_by(self, rows: Rows) -> None:
+        able = self._ready[rows] & (self._lease[rows] > 0)
+        self._begin(rows[able], STANDBY, self.standby[rows[able]])
+        self._hold(rows[~able])
+
+    def _defocus_now(self, rows: Rows) -> None:
+        """DEFOCUS, LAPSED or UNREACHABLE, by the state table."""
+        state = self.state[rows]
+        goes = rows[np.isin(state, (states.APPROACHING, states.IDLE, states.TRACKING))]
+        self._turn_away(goes)
+        self._enter(goes, states.DEFOCUSED)
+        self._stow_directly(rows[state == states.STOWING])
+
+    # -- time ------------------------------------------------------------------------------
+
+    def advance(self, milliseconds: int) -> None:
+        """Let time pass, in ticks of `TICK_MS`.
+
+        Raises
+        ------
+        InputError
+            No multiple of `TICK_MS`.
+        """
+        if milliseconds % TICK_MS or milliseconds < 0:
+            raise InputError(f"field: {milliseconds} ms are no multiple of {TICK_MS} ms")
+        for _ in range(milliseconds // TICK_MS):
+            self._tick()
+
+    def _tick(self) -> None:
+        self._sun_ms += TICK_MS
+        np.maximum(self._lease - TICK_MS, 0, out=self._lease)
+        fresh = self._lease > 0
+        follows = np.isin(self.kind, (STANDBY, TRACK)) | (
+            (self.kind == DEFOCUS) & np.isin(self._base, (STANDBY, TRACK))
+        )
+        needs = np.isin(self.state, (states.APPROACHING, states.TRACKING))
+        renewed = fresh & (follows | needs)
+        self._dark = np.where(renewed, STOW_WAIT_MS, np.maximum(self._dark - TICK_MS, 0))
+        stands = (self.state == states.IDLE) & (self.kind == STANDBY)
+        comes = (self.state == states.STOWING) & (self.kind == RETURN)
+        lapsed = np.flatnonzero(~fresh & (needs | stands | comes))
+        if len(lapsed):
+            self._defocus_now(lapsed)
+        silent = np.flatnonzero((self.state == states.DEFOCUSED) & (self._dark == 0))
+        if len(silent):
+            self._stow_directly(silent)
+            self.state[silent] = states.STOWING
+        self._move()
+        kernels.advance_rows(self.axes, self._order, self._queued, TICK_MS, SLOT_MS, AHEAD_MS)
+
+    def _move(self) -> None:
+        """`Motion.tick`."""
+        for left in (self._knot, self._renew):
+            np.maximum(left - TICK_MS, 0, out=left)
+        np.minimum(self._since + TICK_MS, KNOT_MS, out=self._since)
+        kind = self.kind.copy()
+        arrived = np.flatnonzero((kind == STOW) & self.at_stow())
+        self.kind[arrived] = HOLD
+        self.state[arrived[self.state[arrived] == states.STOWING]] = states.STOWED
+        on_path = np.flatnonzero(np.isin(kind, (APPROACH, RETURN)) & self.still())
+        if len(on_path):
+            self._on_path(on_path)
+        due = ~np.isin(kind, (STOW, APPROACH, RETURN)) & (self._renew <= 0)
+        self._renew[due] = RENEW_MS
+        away = (kind == DEFOCUS) & np.isin(self._base, (STANDBY, TRACK)) & (self._lease > 0)
+        rows = np.flatnonzero(due & (np.isin(kind, (STANDBY, TRACK)) | away))
+        if len(rows):
+            lost = self._follow(rows)
+            self._base[lost[kind[lost] == DEFOCUS]] = HOLD
+            lost = lost[kind[lost] != DEFOCUS]
+            if len(lost):
+                self._defocus_now(lost)
+
+    def _on_path(self, rows: Rows) -> None:
+        """Go on along the path: `Motion._on_path`."""
+        self._place[rows] += 1
+        goes = rows[self._place[rows] < self._length[rows]]
+        ends = rows[self._place[rows] >= self._length[rows]]
+        if len(goes):
+            angles, good = self._pose(goes, self._path[goes, self._place[goes]], 0)
+            first = (self.kind[goes] == APPROACH) & (self._place[goes] == 0)
+            how = np.where(first, kernels.PRIMARY_FIRST, kernels.BOTH)
+            self._go(goes[good], angles[good], how[good])
+            self._defocus_now(goes[~good])
+        came = ends[self.kind[ends] == APPROACH]
+        self._ready[came] = True
+        self.state[came] = states.IDLE
+        self._stand_by(came)
+        self._stow_directly(ends[self.kind[ends] == RETURN])
+
+    def _follow(self, rows: Rows) -> Rows:
+        """Keep beams on their aims: `Motion._follow`; returns those that no pose reaches."""
+        new = rows[self._knot[rows] <= 0]
+        lost = new[:0]
+        if len(new):
+            here, good = self._pose(new, self._target[new], RENEW_MS // 2)
+            there, reached = self._pose(new, self._target[new], RENEW_MS // 2 + KNOT_MS)
+            change = there - here
+            smooth = reached & (np.abs(change).max(axis=1) <= KNOT_LIMIT)
+            lost = new[~good]
+            self._start[new] = here
+            self._slope[new] = np.where(smooth[:, None], change / KNOT_MS, 0.0)
+            self._knot[new] = np.where(smooth, KNOT_MS, RENEW_MS)
+            self._knot[lost] = self._since[lost]
+            self._since[new] = 0
+            rows = rows[~np.isin(rows, lost)]
+        angles = self._start[rows] + self._slope[rows] * self._since[rows, None]
+        away = self.kind[rows] == DEFOCUS
+        angles[away] = self._away(rows[away], angles[away])
+        self._go(rows, angles, np.full(len(rows), -1))
+        return lost
+
+    # -- what is true ----------------------------------------------------------------------
+
+    def normals(self) -> FloatArray:
+        """Return the true normals of the mirrors, (N, 3)."""
+        return self.mechanism.pose(self.axes["count"]).normal
+
+    def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
+        """Return the share of the field's light that passes a receiver, 0 to 1.
+
+        Parameters
+        ----------
+        sun
+            Direction to the sun, (3,).
+        receiver
+            Its middle, (3,), m.
+        radius
+            Beams whose axis passes it nearer than this (m) are on it. Each counts with the
+            cosine of its incidence, against the same for all beams aimed at the middle.
+        """
+        s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
+        pose = self.mechanism.pose(self.axes["count"])
+        cosine = pose.normal @ s
+        rays = 2.0 * cosine[:, None] * pose.normal - s
+        way = point - pose.vertex
+        along = np.einsum("ij,ij->i", way, rays)
+        off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
+        unit = way / np.linalg.norm(way, axis=1)[:, None]
+        nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
+        on = (along > 0.0) & (off <= radius)
+        return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())
+
+
+def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Return ways with points between where a beam would turn by more than `lcu.motion.PIECE`.
+
+    Parameters
+    ----------
+    corners
+        (N, C, 3), m.
+    origin
+        From where the beams go, (N, 3), m.
+
+    Returns
+    -------
+    Points (N, P, 3), and how many of them each way has, (N,).
+    """
+    rays = corners - origin[:, None]
+    cross = np.linalg.norm(np.cross(rays[:, :-1], rays[:, 1:]), axis=-1)
+    turn = np.arctan2(cross, np.einsum("nci,nci->nc", rays[:, :-1], rays[:, 1:]))
+    parts = 1 + (turn / PIECE).astype(np.int64)
+    length = 1 + parts.sum(axis=1)
+    out = np.zeros((len(corners), int(length.max()), 3))
+    out[:, 0] = corners[:, 0]
+    place = np.ones(len(corners), dtype=np.int64)
+    for c in range(parts.shape[1]):
+        first, way = corners[:, c], corners[:, c + 1] - corners[:, c]
+        for k in range(1, int(parts[:, c].max()) + 1):
+            rows = np.flatnonzero(k <= parts[:, c])
+            n = parts[rows, c, None]
+            inner: Any = first[rows] + way[rows] * k / n
+            out[rows, place[rows]] = np.where(k == n, corners[rows, c + 1], inner)
+            place[rows] += 1
+    return out, length
