@@ -13,7 +13,9 @@ from typing import Any
 from benchmarks._run import BUSY, BenchmarkError, Neighbours, keep, machine
 
 #: The registry: each is a module of this package with ``run(quick: bool) -> Result``.
-NAMES = ("tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames")
+NAMES = (
+    "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
+)  # fmt: skip
 #: Columns of a table that goes to a file or a pipe.
 WIDTH = 180
 

@@ -28,6 +28,10 @@ COLUMNS = {
     "frames": {
         "format", "way", "trials", "refused", "survived", "unhurt", "false", "one_false_in",
     },
+    "clusters": {
+        "clusters", "heliostats", "frames_per_cluster_second", "heard", "cores_for_all",
+        "processor_ms_per_cluster_second",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
@@ -92,6 +96,13 @@ def test_bus_takes_no_less_than_the_wire() -> None:
         paced = row["line"] != "unpaced"
         assert row["wire_ms"] == pytest.approx(row["bytes"] * 1e4 / 115_200 if paced else 0.0)
         assert row["median_ms"] > row["wire_ms"]
+
+
+def test_every_heliostat_of_every_cluster_is_polled() -> None:
+    for row in _quick("clusters")["rows"]:
+        assert row["heard"] == row["heliostats"] == 32 * row["clusters"]
+        # Two questions to each, and three broadcasts.
+        assert row["frames_per_cluster_second"] == pytest.approx(67.0, rel=0.1)
 
 
 def test_no_damaged_frame_is_taken_for_true_and_packets_are() -> None:

@@ -1,0 +1,168 @@
+"""Cluster controllers: what one of 32 heliostats takes of a core in a second, alone or among many.
+
+Virtual time, a bus that answers at once with frames made before, and a link that carries nothing:
+what is measured is the cluster alone, without bus, heliostats, network and plant.
+"""
+
+import asyncio
+import time
+
+import numpy as np
+
+from benchmarks._run import Result, Row
+from heliotrope.control.clock import Clock, VirtualClock, run_virtual
+from heliotrope.control.cluster import Cluster
+from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.link import LinkClosedError, Outcome, Statistics, running
+from heliotrope.control.protocol import Lease, Status, decode, encode
+from heliotrope.control.timekeeping import SystemTime
+from heliotrope.lcu import messages, wire
+from heliotrope.sun import Site
+
+HELIOSTATS = 32
+BUDGET_MS = 1.5
+SITE = Site(37.09, -2.36, 500.0)
+ANSWERS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "QUERY_STATUS": ("STATUS", (5, 0x1F, 0, 12345, 600, 24000, 25, 0xDEADBEEF, 3)),
+    "QUERY_STEPS": ("STEPS", (123456, 234567, 123500, 234600)),
+}
+
+
+class ReadyBus:
+    """A bus whose answers were made before."""
+
+    connected, closed = True, False
+
+    def __init__(self) -> None:
+        self._answers: dict[bytes, bytes] = {}
+        self.frames = 0
+
+    async def run(self) -> None:
+        """Nothing is to be kept open."""
+
+    async def close(self) -> None:
+        """Nothing is open."""
+
+    async def transmit(
+        self, frame: bytes, *, expires: float | None = None, urgent: bool = False
+    ) -> Outcome:
+        """Count a frame."""
+        del frame, expires, urgent
+        self.frames += 1
+        return Outcome.SENT
+
+    async def transact(
+        self, frame: bytes, timeout: float, *, expires: float | None = None,
+        urgent: bool = False, complete: object = None,
+    ) -> bytes:  # fmt: skip
+        """Answer a question."""
+        del timeout, expires, urgent, complete
+        self.frames += 1
+        answer = self._answers.get(frame)
+        if answer is None:
+            (asked,) = wire.Reader().feed(frame)
+            name, values = ANSWERS[asked.name]
+            number = messages.NUMBER_OF[name]
+            payload = wire.pack(name, *values)
+            answer = wire.encode(wire.Frame(0, asked.to, asked.sequence, number, payload))
+            self._answers[frame] = answer
+        return answer
+
+
+class LeasingLink:
+    """A link from which a lease comes every second, and that keeps what was sent last."""
+
+    name, connected, silent_for, problem = "plant", True, 0.0, ""
+
+    def __init__(self) -> None:
+        self.statistics = Statistics(opened=1)
+        self._closing = asyncio.Event()
+        self._lease = encode(Lease(7))
+        self.last = b""
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        return self._closing.is_set()
+
+    async def run(self) -> None:
+        """Wait to be closed."""
+        await self._closing.wait()
+
+    async def close(self) -> None:
+        """End ``run``."""
+        self._closing.set()
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        """Keep a message."""
+        del expires, hold
+        self.last = data
+        return Outcome.SENT
+
+    async def receive(self) -> bytes:
+        """Give a lease after a second."""
+        try:
+            async with asyncio.timeout(1.0):
+                await self._closing.wait()
+        except TimeoutError:
+            return self._lease
+        raise LinkClosedError("closed")
+
+
+def _cluster(
+    number: int, clock: Clock, keeper: SystemTime
+) -> tuple[Cluster, ReadyBus, LeasingLink]:
+    members = tuple(Member(f"H{number}.{n}", n) for n in range(1, HELIOSTATS + 1))
+    bus, link = ReadyBus(), LeasingLink()
+    config = ClusterConfig(f"C{number}", SITE, members)
+    return Cluster(config, bus, link, clock, keeper), bus, link
+
+
+def _measure(count: int, seconds: int) -> Row:
+    async def main(clock: VirtualClock) -> Row:
+        keeper = SystemTime(clock)
+        parts = [_cluster(number, clock, keeper) for number in range(count)]
+        clusters = [part[0] for part in parts]
+        async with running(*(part[2] for part in parts)), running(*clusters):
+            await asyncio.sleep(5.0)
+            frames = sum(bus.frames for _, bus, _ in parts)
+            begin = time.process_time()
+            await asyncio.sleep(float(seconds))
+            took = time.process_time() - begin
+            frames = sum(bus.frames for _, bus, _ in parts) - frames
+            heard = [_heard(link) for _, _, link in parts]
+        return {
+            "clusters": count,
+            "heliostats": count * HELIOSTATS,
+            "seconds": seconds,
+            "frames_per_cluster_second": frames / count / seconds,
+            "heard": sum(heard),
+            "processor_ms_per_cluster_second": 1e3 * took / count / seconds,
+            "cores_for_all": took / seconds,
+        }
+
+    return run_virtual(main, seed=None)
+
+
+def _heard(link: LeasingLink) -> int:
+    """How many heliostats the last status tells of as heard within a second."""
+    status = decode(link.last)
+    assert isinstance(status, Status)
+    return int(np.sum(status.nodes()["heard_ms"] < 1000))
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    sizes = ((1, 20), (4, 5)) if quick else ((1, 240), (32, 20), (313, 10))
+    rows = [_measure(count, seconds) for count, seconds in sizes]
+    last = rows[-1]
+    each = float(last["processor_ms_per_cluster_second"] or 0.0)
+    return Result(
+        rows,
+        f"{each:.2f} ms of a core for a second of one cluster; {last['heliostats']:,} heliostats "
+        f"take {float(last['cores_for_all'] or 0.0):.2f} cores",
+        {"budget_ms": BUDGET_MS},
+        None if quick else each <= BUDGET_MS,
+    )
