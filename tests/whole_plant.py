@@ -5,6 +5,7 @@ import contextlib
 import random
 import struct
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,7 @@ class WholePlant:
                                 np.array([0.0, 1.0, 0.0]), 4.0, 4.0),),
         )  # fmt: skip
         wanted = {name: items_of(perfect[i], MACHINE) for i, name in enumerate(names)}
+        like = outfit.outfits(1)[0]
         self.boards: dict[str, Board] = {}
         self.clusters: list[Cluster] = []
         self.parts: list[Any] = []
@@ -90,9 +92,10 @@ class WholePlant:
             for i in (2 * k, 2 * k + 1):
                 address = 11 + i
                 items = {**wanted[names[i]], "address": struct.pack("<H", address)}
-                fit = outfit.Outfit(
-                    names[i], address, 5000 + i, bytes([address]) * 32, self.truth[i], items
-                )
+                fit = replace(
+                    like, name=names[i], address=address, serial=5000 + i,
+                    key=bytes([address]) * 32, mechanism=self.truth[i], items=items,
+                )  # fmt: skip
                 board = self.boards[names[i]] = Board(fit, seed=seed + i)
                 stations.append(board)
                 members.append(Member(names[i], address, serial=5000 + i, key=fit.key))
