@@ -54,7 +54,13 @@ class Axis:
 
     def _begin(self):
         self.machine.exec("mov(x, invert(null))")
+        self.machine.exec("mov(osr, null)")
         self.machine.active(1)
+
+    def _read(self, register):
+        self.machine.exec(f"mov(isr, {register})")
+        self.machine.exec("push(noblock)")
+        return self.machine.get()
 
     def play(self, direction, count, interval_us):
         while count > 0:
@@ -76,14 +82,15 @@ class Axis:
         machine = self.machine
         machine.active(0)
         queued = machine.tx_fifo()
-        machine.exec("mov(isr, x)")
-        machine.exec("push(noblock)")
-        left = machine.get()
+        left, taken = self._read("x"), self._read("osr")
         undone = sum([steps for steps, _ in self.waiting])
         for steps in self.given[len(self.given) - queued :]:
             undone += steps
         if left != IDLE:
             undone += left + 1 if self.given[-1 - queued] > 0 else -left - 1
+        elif taken:
+            # A word that was taken and not yet unpacked; else all its bits are shifted out.
+            undone += self.given[-1 - queued]
         for _ in range(queued):
             machine.exec("pull(noblock)")
         self.waiting, self.given = [], []
