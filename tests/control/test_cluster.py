@@ -373,8 +373,43 @@ def test_what_no_plant_says_is_an_alarm() -> None:
     async def main(field: Field) -> None:
         await field.plant.link.send(b"nonsense")
         await field.until(lambda: bool(field.plant.alarms("plant_unintelligible")))
+        await asyncio.sleep(0.5)
         await field.plant.link.send(encode(Status("C9", 0, 0.0, "gps", 0.0, 0.0, 0.0)))
         await asyncio.sleep(2.0)
+        first, second = field.plant.alarms("plant_unintelligible")
+        assert "message of 8 bytes does not begin with JSON" in first.text
+        assert second.text == "a status came from the plant; only clusters send it"
         assert field.states() == ["STOWED", "STOWED"]
 
     run(main)
+
+
+def test_an_emergency_that_finds_no_bus_is_carried_out_when_it_is_back() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.bus.plugged = False
+        await field.emergency("stop", "STOW")
+        await asyncio.sleep(2.5)
+        assert field.states() == ["TRACKING", "TRACKING"]
+        named = {alarm.subject for alarm in field.plant.alarms("order_unacknowledged")}
+        assert named == {"A1", "A2"}
+        field.bus.plugged = True
+        await field.until(lambda: field.states() == ["STOWING", "STOWING"], 1.2)
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("stop", "A2"), 1.2)
+
+    run(main, "TRACKING")
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_order_of_callbacks_and_no_damage_keeps_a_mirror_on_the_receiver(seed: int) -> None:
+    async def main(field: Field) -> None:
+        field.bus.faults = BusFaults(loss=0.15, corruption=0.1, late=0.1, duplication=0.05)
+        await asyncio.sleep(3.0)
+        await field.emergency("stop", "DEFOCUS")
+        await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 1.0)
+        for name in ("A1", "A2"):
+            await field.until(
+                lambda name=name: field.plant.stages("stop", name)[-1:] == [Stage.DONE], 25.0
+            )
+
+    run(main, "TRACKING", seed=seed)

@@ -42,6 +42,10 @@ class Reports:
             self._alarms[key] = alarm = Alarm(condition, subject, severity, text)
             self._out.append(alarm)
 
+    def event(self, condition: str, subject: str, severity: str, text: str) -> None:
+        """Note something that happens and is over, each time."""
+        self._out.append(Alarm(condition, subject, severity, text))
+
     def clear(self, condition: str, subject: str, text: str = "") -> None:
         """Note that it is over."""
         known = self._alarms.pop((condition, subject), None)

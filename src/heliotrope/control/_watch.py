@@ -115,6 +115,8 @@ class Watch:
                 f"the plant grants {lease.autonomy:g} s of autonomy; cluster {self._cluster} is "
                 f"configured for {self._longest:g} s, which it keeps to",
             )  # fmt: skip
+        else:
+            self._reports.clear("autonomy_limited", "")
         if autonomy != self._autonomy:
             self._autonomy = autonomy
             self._state = replace(self._state, table=self._table())

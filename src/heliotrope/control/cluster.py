@@ -139,6 +139,7 @@ class Cluster:
         self._opened = -1
         self._was_connected = False
         self._silent: set[int] = set()
+        self._strange: set[int] = set()
         self.cycle = 0.0
         self.overruns = 0
 
@@ -277,6 +278,7 @@ class Cluster:
         sender = self._exchange.sender
         try:
             sender.epoch, sender.count = self._kept.start(at_least), 0
+            self._reports.clear("state_unwritable", "")
         except OSError as error:
             self._reports.alarm("state_unwritable", "", "ALARM", f"epoch cannot be kept: {error}")
         self._epoch_of_time = self._epoch_of_time or at_least > 0
@@ -329,7 +331,11 @@ class Cluster:
         if status[0] >= len(states.STATES):
             text = f"{node.name}: state {status[0]} is not known; its firmware is another"
             self._reports.alarm("node_unintelligible", node.name, "ALARM", text)
+            self._strange.add(node.index)
             return False
+        if node.index in self._strange:
+            self._strange.remove(node.index)
+            self._reports.clear("node_unintelligible", node.name)
         before, node.status = node.status, status
         if before[2] != status[2]:
             self._fault(node)
@@ -382,7 +388,7 @@ class Cluster:
             try:
                 message = decode(data)
             except ProtocolError as error:
-                self._reports.alarm("plant_unintelligible", "", "WARNING", str(error))
+                self._reports.event("plant_unintelligible", "", "WARNING", str(error))
             else:
                 self._take(message)
             if self._reports.waiting:
@@ -414,7 +420,7 @@ class Cluster:
             self._take_acknowledgement(message)
         elif isinstance(message, Status | Progress | Alarm | Answer):
             text = f"a {message.kind} came from the plant; only clusters send it"
-            self._reports.alarm("plant_unintelligible", "", "WARNING", text)
+            self._reports.event("plant_unintelligible", "", "WARNING", text)
         self._wake.set()
 
     def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:
