@@ -32,6 +32,7 @@ COLUMNS = {
         "clusters", "heliostats", "frames_per_cluster_second", "heard", "cores_for_all",
         "processor_ms_per_cluster_second",
     },
+    "plant": {"work", "cpu_s", "budget_s"},
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
@@ -103,6 +104,16 @@ def test_every_heliostat_of_every_cluster_is_polled() -> None:
         assert row["heard"] == row["heliostats"] == 32 * row["clusters"]
         # Two questions to each, and three broadcasts.
         assert row["frames_per_cluster_second"] == pytest.approx(67.0, rel=0.1)
+
+
+def test_a_plant_runs_and_is_defocused() -> None:
+    # That all heliostats were live, and all are done, the benchmark itself makes sure of.
+    result = _quick("plant")
+    assert result["heliostats"] == 32 * result["clusters"] == 640
+    assert [row["work"] for row in result["rows"]] == [
+        "a second of operation", "order to all links", "all answers to it"
+    ]  # fmt: skip
+    assert all(row["cpu_s"] > 0.0 for row in result["rows"])
 
 
 def test_no_damaged_frame_is_taken_for_true_and_packets_are() -> None:

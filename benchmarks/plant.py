@@ -1,0 +1,183 @@
+"""The plant with 10,016 heliostats on 313 clusters: CPU for a second of operation and an emergency.
+
+The links are replaced by ones that take and give messages at once, so what is measured is the
+plant alone: decoding and keeping each cluster's status, leases, the safety table, the order, and
+all answers to it.
+"""
+
+import asyncio
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._run import BenchmarkError, Result, Row
+from heliotrope.control.audit import JsonLines
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.link import LinkClosedError, Outcome, Statistics
+from heliotrope.control.plant import PlantController
+from heliotrope.control.protocol import (
+    NODE,
+    Emergency,
+    Progress,
+    Stage,
+    Status,
+    decode,
+    encode,
+)
+from heliotrope.field.example import azimuth_elevation
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
+from heliotrope.lcu import states
+from heliotrope.sun import Site
+
+MEMBERS = 32
+#: Half a core is for the plant and the twin together.
+BUDGET_S = 0.5
+ORDER_BUDGET_S = 1.0
+
+
+class _Direct:
+    """A link that is always there."""
+
+    silent_for, problem, connected = 0.0, "", True
+
+    def __init__(self, name: str) -> None:
+        self.name, self.closed, self.statistics = name, False, Statistics(opened=1)
+        self.sent: list[bytes] = []
+        self.arrived: asyncio.Queue[bytes] = asyncio.Queue()
+        self._end = asyncio.Event()
+
+    async def run(self) -> None:
+        await self._end.wait()
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        del expires, hold
+        self.sent.append(data)
+        return Outcome.SENT
+
+    async def receive(self) -> bytes:
+        if self.closed:
+            raise LinkClosedError("closed")
+        return await self.arrived.get()
+
+    async def close(self) -> None:
+        self.closed = True
+        self._end.set()
+
+
+def _design(clusters: int) -> Plant:
+    count = clusters * MEMBERS
+    rng = np.random.default_rng(0)
+    places = rng.uniform((-800.0, 100.0, 0.0), (800.0, 1200.0, 0.0), (count, 3))
+    return Plant(
+        "large", Site(37.09, -2.36, 500.0),
+        {"all": Heliostats(
+            tuple(f"H{i:05d}" for i in range(count)), azimuth_elevation(places),
+            np.full(count, 3.0), np.full(count, 2.0),
+            cluster=tuple(f"K{i // MEMBERS:03d}" for i in range(count)),
+        )},
+        receivers=(Receiver("receiver", "planar", np.array([0.0, 0.0, 200.0]),
+                            np.array([0.0, 1.0, 0.0]), 10.0, 10.0),),
+    )  # fmt: skip
+
+
+class _Run:
+    """One plant, and what its parts took, s of CPU."""
+
+    def __init__(self, clock: VirtualClock, clusters: int, seconds: int, folder: Path) -> None:
+        self.clock, self.seconds = clock, seconds
+        design = _design(clusters)
+        self.names = design.names
+        self.links = [_Direct(f"K{k:03d}") for k in range(clusters)]
+        audit = JsonLines(folder / "audit.jsonl", clock.utc())
+        self.plant = PlantController(design, {x.name: x for x in self.links}, clock, audit)
+        self.rows = np.zeros(MEMBERS, NODE)
+        self.rows["state"] = states.TRACKING
+
+    def _members(self, k: int) -> tuple[str, ...]:
+        return self.names[k * MEMBERS : (k + 1) * MEMBERS]
+
+    def _report(self, *, greet: bool = False) -> None:
+        for k, link in enumerate(self.links):
+            names = self._members(k) if greet else ()
+            status = Status(
+                link.name, MEMBERS, 0.0, "gps", 1e-3, 3.0, 0.2, names=names,
+                block=self.rows.tobytes(),
+            )  # fmt: skip
+            link.arrived.put_nowait(encode(status))
+
+    async def steady(self) -> float:
+        """CPU for a second of operation, the clusters' encoding of the status taken out."""
+        await asyncio.sleep(0.1)
+        self._report(greet=True)
+        await asyncio.sleep(2.0)
+        spent = 0.0
+        for _ in range(self.seconds):
+            self._report()
+            begin = time.process_time()
+            await asyncio.sleep(1.0)
+            spent += time.process_time() - begin
+        live = int(self.plant.field.live(self.clock.monotonic()).sum())
+        if live != len(self.names):
+            raise BenchmarkError(f"{live} of {len(self.names)} heliostats are live")
+        return spent / self.seconds
+
+    async def emergency(self) -> tuple[float, float]:
+        """CPU from the order until it is with all links, and for all answers to it."""
+        for link in self.links:
+            link.sent.clear()
+        begin = time.process_time()
+        order = self.plant.raise_emergency("benchmark")
+        while not all(link.sent for link in self.links):
+            await asyncio.sleep(0.0)
+        out = time.process_time() - begin
+        for k, link in enumerate(self.links):
+            orders = [m for m in map(decode, link.sent) if isinstance(m, Emergency)]
+            if len(orders) != 1:
+                raise BenchmarkError(f"cluster {link.name} got {len(orders)} orders")
+            for stage in (Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE):
+                progress = Progress(orders[0].identity, stage, self._members(k))
+                link.arrived.put_nowait(encode(progress))
+        begin = time.process_time()
+        await asyncio.sleep(0.2)
+        answers = time.process_time() - begin
+        left = order.report(self.clock.monotonic()).not_done
+        if left:
+            raise BenchmarkError(f"{len(left)} heliostats are not done")
+        return out, answers
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    found: list[tuple[float, float, float]] = []
+    clusters, seconds = (20, 2) if quick else (313, 20)
+
+    async def main(clock: VirtualClock) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            one = _Run(clock, clusters, seconds, Path(folder))
+            task = asyncio.create_task(one.plant.run())
+            steady = await one.steady()
+            found.append((steady, *await one.emergency()))
+            await one.plant.close()
+            await task
+
+    for _ in range(1 if quick else 3):
+        run_virtual(main)
+    steady, out, answers = (min(column) for column in zip(*found, strict=True))
+    rows: list[Row] = [
+        {"work": "a second of operation", "cpu_s": steady, "budget_s": BUDGET_S},
+        {"work": "order to all links", "cpu_s": out, "budget_s": ORDER_BUDGET_S},
+        {"work": "all answers to it", "cpu_s": answers, "budget_s": None},
+    ]
+    return Result(
+        rows,
+        f"{clusters * MEMBERS:,} heliostats: {steady:.3f} s of CPU a second; an emergency order is "
+        f"with all {clusters} links after {out:.3f} s of CPU",
+        {"heliostats": clusters * MEMBERS, "clusters": clusters},
+        None if quick else steady <= BUDGET_S and out <= ORDER_BUDGET_S,
+    )
