@@ -64,8 +64,8 @@ class Account:
     in_hand, how, forged, quiet, before, good
         Of the frame that it is hearing: what the cluster sent, how it came, what a stranger
         sent, the invariant by which it must change nothing, what was before.
-    answers
-        When the cluster heard it, and the state that it told or -1.
+    answered_at, told
+        When the cluster last heard it; the last states that it told.
     from_stow
         Whether it has left stow and not tracked since.
     """
@@ -82,7 +82,8 @@ class Account:
         self.quiet = 0
         self.before: dict[str, object] = {}
         self.good = 0
-        self.answers: deque[tuple[float, int]] = deque(maxlen=12)
+        self.answered_at = float("-inf")
+        self.told: deque[int] = deque(maxlen=3)
         self.from_stow = False
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items

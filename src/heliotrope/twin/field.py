@@ -362,6 +362,10 @@ class Field:
         self._enter(goes, states.DEFOCUSED)
         self._stow_directly(rows[state == states.STOWING])
 
+    def lease_left(self, row: int) -> int:
+        """Return what is left of the lease of one heliostat, ms."""
+        return int(self._lease[row])
+
     # -- time ------------------------------------------------------------------------------
 
     def advance(self, milliseconds: int) -> None:

@@ -300,8 +300,9 @@ class Observer:
             account = self._by_address.get(frame.sender)
             if account is not None:
                 values = frame.values()
-                state = int(values[0]) if frame.name == "STATUS" and values else -1
-                account.answers.append((now, state))
+                account.answered_at = now
+                if frame.name == "STATUS" and values:
+                    account.told.append(int(values[0]))
 
     # -- the boards (Witness) --------------------------------------------------------------
 
@@ -477,7 +478,7 @@ class Observer:
             if account is None or int(row["heard_ms"]) == NEVER:
                 continue
             claimed = now - int(row["heard_ms"]) / 1000.0
-            last = account.answers[-1][0] if account.answers else float("-inf")
+            last = account.answered_at
             # The age is that of when it was written: it may wait for a connection, and be under
             # way, for as long as it lives.
             slack = STATUS_LIFE + AGE_ROUNDING
@@ -485,10 +486,9 @@ class Observer:
             self.check(11, claimed <= last + slack, now, name, saw)
             if int(row["boots"]) == 0:
                 continue  # every board has booted: this row is of one that has told no state yet
-            told = {state for at, state in account.answers if state >= 0}
             state = int(row["state"])
-            saw = f"told to be {states.STATES[state]}, which it has not answered of late"
-            self.check(11, state in told, now, name, saw)
+            saw = f"told to be {states.STATES[state]}, which is not what it has answered last"
+            self.check(11, state in account.told, now, name, saw)
 
     # -- time ------------------------------------------------------------------------------
 

@@ -1,0 +1,122 @@
+"""A real cluster whose heliostats are rows of a vectorised field."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.cluster import Cluster
+from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.link import LinkClosedError, Outcome, running
+from heliotrope.control.memory import memory_pair
+from heliotrope.control.protocol import Command, Emergency, Lease, Stage, decode, encode
+from heliotrope.errors import InputError
+from heliotrope.lcu import states, wire
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.drives import rotary
+from heliotrope.twin.clocks import SimulatedTime
+from heliotrope.twin.field import Field
+from heliotrope.twin.field_bus import FieldBus
+from heliotrope.twin.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STEPS_PER_TURN, STOW
+from heliotrope.twin.simulation import SITE
+
+TOKEN = 77
+
+
+def a_field() -> Field:
+    gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
+    place = np.array([(-20.0, 80.0, 0.0), (5.0, 90.0, 0.0), (30.0, 100.0, 0.0), (9.0, 70.0, 0.0)])
+    machine = kinds.azimuth_elevation(
+        place, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
+    )
+    return Field(machine, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY)
+
+
+def test_a_cluster_leads_rows_of_a_field() -> None:
+    field = a_field()
+    told: list[tuple[str, range]] = []
+
+    async def main(clock: VirtualClock) -> list[object]:
+        plant, mine, _ = memory_pair(clock)
+        # The first row is another cluster's.
+        bus = FieldBus(field, range(1, 4), lambda name, rows: told.append((name, rows)))
+        members = tuple(Member(f"H{n}", n) for n in (1, 2, 3))
+        cluster = Cluster(ClusterConfig("C", SITE, members), bus, mine, clock, SimulatedTime(clock))
+        heard: list[object] = []
+
+        async def listen() -> None:
+            while True:
+                heard.append(decode(await plant.receive()))
+
+        async def live(seconds: int) -> None:
+            for tick in range(20 * seconds):
+                if tick % 20 == 0:
+                    await plant.send(encode(Lease(TOKEN)), expires=clock.monotonic() + 1.0)
+                await asyncio.sleep(0.05)
+                field.advance(50)
+
+        async with asyncio.TaskGroup() as group:
+            async with running(plant, mine, bus), running(cluster):
+                listener = group.create_task(listen())
+                await live(4)
+                for identity, name, values in (("a", "AIM", RECEIVER), ("b", "APPROACH", ())):
+                    command = Command(identity, name, values, token=TOKEN)
+                    await plant.send(encode(command), expires=clock.monotonic() + 5.0)
+                await live(60)
+                assert field.state.tolist() == [states.STOWED] + 3 * [states.IDLE]
+                track = Command("c", "TRACK", token=TOKEN)
+                await plant.send(encode(track), expires=clock.monotonic() + 5.0)
+                await live(15)
+                assert field.state.tolist() == [states.STOWED] + 3 * [states.TRACKING]
+                await plant.send(encode(Emergency("d", "DEFOCUS")), expires=clock.monotonic() + 5)
+                await live(3)
+                assert field.state.tolist() == [states.STOWED] + 3 * [states.DEFOCUSED]
+                listener.cancel()
+        return heard
+
+    heard = run_virtual(main)
+    done = [m for m in heard if getattr(m, "stage", None) is Stage.DONE]
+    assert {m.identity for m in done} >= {"a", "b", "c", "d"}  # type: ignore[attr-defined]
+    assert ("DEFOCUS", range(1, 4)) in told
+    assert ("AIM", range(2, 3)) in told
+
+
+def test_answers_are_frames_of_the_wire() -> None:
+    field = a_field()
+    bus = FieldBus(field, range(4))
+    sender = wire.Sender(0, 1)
+
+    async def main(clock: VirtualClock) -> list[bytes]:
+        del clock
+        asked = [sender.frame(3, name) for name in ("QUERY_STATUS", "QUERY_STEPS", "DEFOCUS")]
+        asked += [sender.frame(9, "QUERY_STATUS"), b"\x01\0", sender.frame(3, "SEARCH", 7, 8, 1, 1)]
+        answers = [await bus.transact(frame, 0.1) for frame in asked]
+        bus.plugged = False
+        assert await bus.transact(asked[0], 0.1) == b""
+        assert await bus.transmit(asked[0]) is Outcome.DISCONNECTED
+        await bus.close()
+        with pytest.raises(LinkClosedError, match="field bus: it is closed"):
+            await bus.transmit(asked[0])
+        with pytest.raises(LinkClosedError, match="field bus: it is closed"):
+            await bus.transact(asked[0], 0.1)
+        return answers
+
+    status, steps, ack, nobody, broken, refused = run_virtual(main)
+    (frame,) = wire.Reader().feed(status)
+    values = frame.values()
+    assert (frame.name, frame.sender, frame.sequence) == ("STATUS", 3, 1)
+    assert values is not None
+    assert values[0] == states.STOWED
+    (frame,) = wire.Reader().feed(steps)
+    assert frame.values() == (*STOW, *STOW)
+    (frame,) = wire.Reader().feed(ack)
+    assert frame.values() == (3, 0x20, 0)
+    assert nobody == broken == b""
+    (frame,) = wire.Reader().feed(refused)
+    assert frame.values() == (5, 0x45, 1)
+
+
+def test_rows_that_are_not_there() -> None:
+    with pytest.raises(InputError, match=r"field bus: rows range\(2, 9\) are not within 0 to 3"):
+        FieldBus(a_field(), range(2, 9))
