@@ -16,7 +16,19 @@ from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.control.memory import Faults
 from heliotrope.control.parameters import Axis, Machine, Wanted, items_of
 from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import Ask, Command, Lease, Parameters, Stage
+from heliotrope.control.protocol import (
+    NODE,
+    Alarm,
+    Answer,
+    Ask,
+    Command,
+    Lease,
+    Parameters,
+    Progress,
+    Stage,
+    Status,
+    encode,
+)
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype
 from heliotrope.lcu import states
@@ -449,6 +461,40 @@ def test_what_cannot_be_recorded_is_not_accepted_but_defocus_is(
     assert [(r.what, r.result) for r in records if r.what != "AUTHORITY"] == [
         ("STOW", "STOW: 18 done")
     ]
+
+
+def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
+    rows = np.zeros(3, NODE).tobytes()
+    said = [
+        Status("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[:-1]),
+        Status("pod-1", 2, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[: NODE.itemsize]),
+        Status("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, names=("P1A", "P1A", "P6C"), block=rows),
+        Progress("nothing-known", Stage.DONE, ("P1A",)), Lease(7), Command("c", "TRACK"),
+        Answer("statistics-1", {"error": "no"}), Answer("stored-9", {"names": 1}),
+        Answer("stored-1", {"names": ["a"], "sizes": [3]}), Alarm("x", "", "alarm", "text"),
+    ]  # fmt: skip
+
+    async def scene(bench: Bench) -> None:
+        chance = np.random.default_rng(1)
+        cluster = bench.clusters["pod-1"]
+        expires = bench.clock.monotonic() + 30.0
+        for message in said:
+            await cluster.send(message)
+        for size in range(60):
+            await cluster.link.send(chance.bytes(size), expires=expires)
+            whole = encode(said[size % len(said)])
+            cut = int(chance.integers(len(whole)))
+            await cluster.link.send(whole[:cut] + chance.bytes(2) + whole[cut:], expires=expires)
+        cluster.first = True
+        await bench.wait(5.0)
+        plant = bench.plant
+        assert plant.counters.refused > 60
+        assert plant.field.counted(plant.now()) == {"STOWED": 18}
+        assert {a.subject for a in plant.alarms if a.condition == "x"} == {"pod-1"}
+        token = await bench.commanded()
+        assert await plant.command(OPERATOR, token, "APPROACH").end(5.0)
+
+    play(tmp_path, scene)
 
 
 def test_a_plant_that_does_not_hold_together_is_refused(tmp_path: Path) -> None:
