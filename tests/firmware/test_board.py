@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from firmware.chips import DRIVE, Partition, World, board_path
+from board_chips import DRIVE, Partition, World, board_path
 from heliotrope.lcu import controller, messages, states, wire
 from heliotrope.lcu.journal import Journal
 from lcu_machines import ADDRESS, KEY, START_S, STOW, TOKEN, heliostat, items_of_heliostat, sha256

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from firmware.chips import World, board_path
+from board_chips import World, board_path
 from heliotrope.lcu.stepper import BOTH, Axis, Stepper
 
 PINS = ("step1", "way1", "step2", "way2")
