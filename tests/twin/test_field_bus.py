@@ -56,23 +56,24 @@ def test_a_cluster_leads_rows_of_a_field() -> None:
                 await asyncio.sleep(0.05)
                 field.advance(50)
 
-        async with asyncio.TaskGroup() as group:
-            async with running(plant, mine, bus), running(cluster):
-                listener = group.create_task(listen())
-                await live(4)
-                for identity, name, values in (("a", "AIM", RECEIVER), ("b", "APPROACH", ())):
-                    command = Command(identity, name, values, token=TOKEN)
-                    await plant.send(encode(command), expires=clock.monotonic() + 5.0)
-                await live(60)
-                assert field.state.tolist() == [states.STOWED] + 3 * [states.IDLE]
-                track = Command("c", "TRACK", token=TOKEN)
-                await plant.send(encode(track), expires=clock.monotonic() + 5.0)
-                await live(15)
-                assert field.state.tolist() == [states.STOWED] + 3 * [states.TRACKING]
-                await plant.send(encode(Emergency("d", "DEFOCUS")), expires=clock.monotonic() + 5)
-                await live(3)
-                assert field.state.tolist() == [states.STOWED] + 3 * [states.DEFOCUSED]
-                listener.cancel()
+        async with (
+            asyncio.TaskGroup() as group, running(plant, mine, bus), running(cluster),
+        ):  # fmt: skip
+            listener = group.create_task(listen())
+            await live(4)
+            for identity, name, values in (("a", "AIM", RECEIVER), ("b", "APPROACH", ())):
+                command = Command(identity, name, values, token=TOKEN)
+                await plant.send(encode(command), expires=clock.monotonic() + 5.0)
+            await live(60)
+            assert field.state.tolist() == [states.STOWED] + 3 * [states.IDLE]
+            track = Command("c", "TRACK", token=TOKEN)
+            await plant.send(encode(track), expires=clock.monotonic() + 5.0)
+            await live(15)
+            assert field.state.tolist() == [states.STOWED] + 3 * [states.TRACKING]
+            await plant.send(encode(Emergency("d", "DEFOCUS")), expires=clock.monotonic() + 5)
+            await live(3)
+            assert field.state.tolist() == [states.STOWED] + 3 * [states.DEFOCUSED]
+            listener.cancel()
         return heard
 
     heard = run_virtual(main)

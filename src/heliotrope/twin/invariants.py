@@ -74,7 +74,7 @@ JUMP_COUNTS = 60.0
 ORDER_WITHIN = 1.0
 #: A value may be told this much (s) younger than it is: the rounding of its age.
 AGE_ROUNDING = 0.1
-#: A status is not delivered later than this after it was sent, s.
+#: A status is made every second, and not delivered later than this after it was sent, s.
 STATUS_LIFE = 1.0
 
 #: What a controller may do by itself, or by DEFOCUS and STOW: state before, state after.
@@ -479,9 +479,9 @@ class Observer:
                 continue
             claimed = now - int(row["heard_ms"]) / 1000.0
             last = account.answered_at
-            # The age is that of when it was written: it may wait for a connection, and be under
-            # way, for as long as it lives.
-            slack = STATUS_LIFE + AGE_ROUNDING
+            # The age is that of when it was written: it waits for a connection until the next one
+            # is made, and may then be under way for as long as it lives.
+            slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
             saw = f"told to be heard {now - claimed:.2f} s ago, it was {now - last:.2f} s ago"
             self.check(11, claimed <= last + slack, now, name, saw)
             if int(row["boots"]) == 0:

@@ -1,0 +1,239 @@
+"""A whole field under real cluster controllers: what it takes of a core, and how soon it is safe.
+
+Clusters of 32 heliostats, each on a bus whose heliostats are rows of the vectorised twin, which
+goes on in ticks of 50 ms with the integers of the boards. Time is virtual; the bus takes none, so
+that to the time from an order to the last heliostat the three calls on the wire are to be added
+(4 ms at 115,200 baud). The limit of processor time, half a core, is that of the design; what the
+clusters alone take is in ``clusters``.
+"""
+
+import asyncio
+import resource
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks._run import BenchmarkError, Result, Row
+from heliotrope.control._sun_line import sun_values
+from heliotrope.control.clock import VirtualClock, gps_seconds, run_virtual
+from heliotrope.control.cluster import Cluster
+from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.link import LinkClosedError, Outcome, Statistics, running
+from heliotrope.control.protocol import Acknowledge, Command, Emergency, Lease, Message, encode
+from heliotrope.lcu import states
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.drives import rotary
+from heliotrope.sun import Site, vector
+from heliotrope.twin.clocks import SimulatedTime
+from heliotrope.twin.field import Field
+from heliotrope.twin.field_bus import FieldBus
+from heliotrope.twin.outfit import LIMITS, RANGES, STEPS_PER_TURN, STOW
+
+EACH = 32
+SITE = Site(37.4, -6.0, 100.0)
+RECEIVER, STANDBY, RADIUS = (0.0, 0.0, 120.0), (15.0, 0.0, 110.0), 6.0
+TOKEN, LEASE = 9, 3.0
+CORES, ORDER_S, DEFOCUS_S, STOW_S, DARK = 0.5, 1.0, 30.0, 300.0, 0.1
+
+
+class Line:
+    """The plant's end and the cluster's in one: what is put in comes out at once."""
+
+    name, connected, silent_for, problem = "plant", True, 0.0, ""
+
+    def __init__(self) -> None:
+        self.statistics = Statistics(opened=1)
+        self._waiting: asyncio.Queue[bytes | None] = asyncio.Queue()
+        self.closed = False
+
+    async def run(self) -> None:
+        """Nothing is to be kept open."""
+
+    async def close(self) -> None:
+        """End what waits."""
+        self.closed = True
+        self._waiting.put_nowait(None)
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        """Take what the plant is told."""
+        del data, expires, hold
+        return Outcome.SENT
+
+    def put(self, data: bytes) -> None:
+        """Bring a message of the plant."""
+        self._waiting.put_nowait(data)
+
+    async def receive(self) -> bytes:
+        """Wait for a message of the plant."""
+        data = await self._waiting.get()
+        if data is None:
+            raise LinkClosedError("closed")
+        return data
+
+
+@dataclass
+class Bench:
+    """A field and its clusters while they run."""
+
+    clock: VirtualClock
+    field: Field
+    lines: list[Line]
+    times: SimulatedTime
+    leases: bool = True
+    longest: float = 0.0  # wall time of a second, s
+
+    def tell(self, message: Message) -> None:
+        """Tell all clusters."""
+        data = encode(message)
+        for line in self.lines:
+            line.put(data)
+
+    def flux(self) -> float:
+        """Return the share of the light that is on the receiver."""
+        utc = self.clock.utc().timestamp()
+        return self.field.flux(vector(utc, SITE), RECEIVER, RADIUS)
+
+    async def live(self, seconds: float, until: Callable[[], bool] | None = None) -> float:
+        """Let time pass, at most until something holds; return how long that took, s."""
+        begin, wall = self.clock.monotonic(), time.perf_counter()
+        for tick in range(round(20 * seconds)):
+            if tick % 20 == 0:
+                self.longest, wall = (
+                    max(self.longest, time.perf_counter() - wall),
+                    (time.perf_counter()),
+                )
+                if self.leases:
+                    self.tell(Lease(TOKEN))
+            await asyncio.sleep(0.05)
+            self.field.advance(50)
+            if until is not None and tick % 5 == 4 and until():
+                break
+        return self.clock.monotonic() - begin
+
+
+def _field(count: int) -> Field:
+    rng = np.random.default_rng(0)
+    away = np.sqrt(rng.uniform(100.0**2, 700.0**2, count))
+    bearing = rng.uniform(-1.2, 1.2, count)
+    place = np.c_[away * np.sin(bearing), away * np.cos(bearing), np.zeros(count)]
+    gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
+    machine = kinds.azimuth_elevation(
+        place, pivot_height=3.0, pivot_offset=0.3, drives=(rotary(**gear), rotary(**gear))
+    )
+    return Field(machine, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY)
+
+
+def _on_receiver(field: Field, clock: VirtualClock) -> None:
+    """Bring the field to the receiver without clusters: that is not what is measured."""
+    field.order("AIM", aim=RECEIVER)
+    for second in range(130):
+        utc = clock.utc().timestamp() - 130 + second
+        values = sun_values(int(gps_seconds(clock.utc())) - 130 + second, utc, SITE)
+        assert values is not None
+        field.take_sun(values)
+        if second == 0:
+            field.order("APPROACH")
+        if second == 110:
+            field.order("TRACK")
+        field.advance(1000)
+    if not (field.state == states.TRACKING).all():
+        raise BenchmarkError(f"{(field.state != states.TRACKING).sum()} heliostats do not track")
+
+
+def _measure(count: int) -> Row:
+    told: list[str] = []
+
+    async def main(clock: VirtualClock) -> Row:
+        field, keeper = _field(count), SimulatedTime(clock)
+        _on_receiver(field, clock)
+        lines, buses, clusters = [], [], []
+        for first in range(0, count, EACH):
+            rows = range(first, min(count, first + EACH))
+            line = Line()
+            bus = FieldBus(field, rows, lambda name, rows: told.extend([name] * len(rows)))
+            members = tuple(Member(f"H{row}", row - first + 1) for row in rows)
+            config = ClusterConfig(f"C{first}", SITE, members, steps_every=5)
+            clusters.append(Cluster(config, bus, line, clock, keeper))
+            lines.append(line)
+            buses.append(bus)
+        bench = Bench(clock, field, lines, keeper)
+        async with running(*lines, *buses):
+            async with running(*clusters):
+                row = await _through(bench, told, count, len(clusters))
+            bench.leases = False
+            # The clusters are gone; the field is alone.
+            row["stow_after_cluster_loss_s"] = await bench.live(
+                STOW_S, lambda: bool((field.state == states.STOWED).all())
+            )
+        return row
+
+    return run_virtual(main, seed=None)
+
+
+async def _through(bench: Bench, told: list[str], count: int, clusters: int) -> Row:
+    """Track; an order; the loss of the plant; a jump of the clock: each ends in the dark."""
+
+    def dark() -> bool:
+        return bench.flux() < DARK
+
+    await bench.live(5)
+    bench.longest, begin = 0.0, time.process_time()
+    await bench.live(10)
+    cores = (time.process_time() - begin) / 10.0
+    longest, flux = bench.longest, bench.flux()
+    told.clear()
+    wall = time.perf_counter()
+    bench.tell(Emergency("e", "DEFOCUS"))
+    at = bench.clock.monotonic()
+    while told.count("DEFOCUS") < count and bench.clock.monotonic() - at < ORDER_S:
+        await asyncio.sleep(0.001)
+    order, order_wall = bench.clock.monotonic() - at, time.perf_counter() - wall
+    row: Row = {
+        "heliostats": count, "clusters": clusters, "cores": cores,
+        "memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+        "longest_second_s": longest, "flux_before": flux, "order_s": order,
+        "order_processing_s": order_wall, "dark_after_order_s": await bench.live(DEFOCUS_S, dark),
+    }  # fmt: skip
+    await _back(bench)
+    bench.leases = False
+    row["dark_after_plant_loss_s"] = await bench.live(DEFOCUS_S, dark)
+    bench.leases = True
+    await bench.live(6)
+    await _back(bench)
+    bench.times.jump(5.0)
+    row["dark_after_clock_jump_s"] = await bench.live(DEFOCUS_S, dark)
+    return row
+
+
+async def _back(bench: Bench) -> None:
+    """Back to the receiver."""
+    await bench.live(3)
+    bench.tell(Acknowledge("k", "clock_jump", "operator", "operator"))
+    bench.tell(Command("r", "REFOCUS", token=TOKEN))
+    await bench.live(12)
+    if bench.flux() < 0.9:
+        raise BenchmarkError(f"only {bench.flux():.2f} of the light is back on the receiver")
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    rows = [_measure(64)] if quick else [_measure(10_000)]
+    last = rows[-1]
+    limits = {
+        "cores": CORES, "order_s": ORDER_S, "order_processing_s": ORDER_S,
+        "dark_after_order_s": DEFOCUS_S, "dark_after_plant_loss_s": DEFOCUS_S,
+        "dark_after_clock_jump_s": DEFOCUS_S, "stow_after_cluster_loss_s": STOW_S,
+    }  # fmt: skip
+    kept = {name: float(last[name] or 0.0) < limit for name, limit in limits.items()}
+    return Result(
+        rows,
+        f"{last['heliostats']:,} heliostats under {last['clusters']} clusters: "
+        f"{float(last['cores'] or 0.0):.2f} cores, dark "
+        f"{float(last['dark_after_order_s'] or 0.0):.1f} s after an order",
+        {f"limit_{name}": limit for name, limit in limits.items()},
+        None if quick else all(kept.values()),
+    )
