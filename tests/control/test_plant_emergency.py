@@ -217,8 +217,42 @@ def test_who_comes_back_during_an_emergency_is_told(tmp_path: Path) -> None:
         await bench.until(lambda: bench.count(states.STOWED) == 18, 5.0)
         with pytest.raises(InputError, match="HOLD is none"):
             bench.plant.raise_emergency("Olga", Act.HOLD)
+        # Whoever calls it again is on record too.
+        assert bench.plant.raise_emergency("Vera").act is Act.STOW
+        await bench.wait(1.0)
 
-    play(tmp_path, scene)
+    bench = play(tmp_path, scene)
+    records, _ = read(bench.audit.path)
+    assert [(r.who, r.role, r.what) for r in records] == [
+        ("Olga", "anybody", "STOW"), ("Vera", "anybody", "DEFOCUS")
+    ]  # fmt: skip
+
+
+def test_defocus_of_some_is_repeated_until_it_is_acknowledged(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        bench.lines["pod-2"].cut(second_to_first=False)
+        bench.cluster_of("P3A").deaf.add("P3A")
+        ticket = bench.plant.defocus("Olga", ("P1A", "P2A", "P3A"))
+        await bench.wait(1.2)
+        assert bench.count(states.DEFOCUSED) == 1
+        bench.lines["pod-2"].heal()
+        assert not await ticket.end(20.0)
+        assert ticket.refusals == {"P3A": "no answer before it expired"}
+        assert bench.count(states.DEFOCUSED) == 2
+
+        # What came after it ends the repetition.
+        bench.cluster_of("P4A").deaf.add("P4A")
+        ticket = bench.plant.defocus("Olga", ("P4A", "P4B"))
+        await bench.wait(1.5)
+        bench.plant.stow("Olga", ("P4A",))
+        assert ticket.refusals == {"P4A": "STOW came after it"}
+        await bench.wait(3.5)
+
+    bench = play(tmp_path, scene)
+    names = [name for name, _ in orders(bench, "pod-4")]
+    assert names == ["DEFOCUS"] * 2 + ["STOW"] * 4
+    assert orders(bench, "pod-1") == [("DEFOCUS", ("P1A",))]
+    assert 10 <= len(orders(bench, "pod-3")) <= 14
 
 
 def test_when_the_plant_ends_so_do_its_leases(tmp_path: Path) -> None:

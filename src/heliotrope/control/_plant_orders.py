@@ -13,6 +13,12 @@ from heliotrope.control.protocol import Command, Emergency, Parameters, Progress
 from heliotrope.control.safety import Act
 from heliotrope.errors import InputError
 
+#: Commands that are taken from anybody.
+SAFE = ("DEFOCUS", "STOW")
+#: What is told of a message so long after it is of no use any more, s.
+FORGOTTEN = 60.0
+#: DEFOCUS and STOW are sent again so often to those that have not acknowledged, s.
+REPEAT = 1.0
 #: What a cluster may need beyond a command's life to say that it failed, s.
 GRACE = 3.0
 
@@ -24,6 +30,7 @@ class _Under:
     ticket: Ticket
     cluster: str
     heliostats: tuple[str, ...]
+    at: float
 
 
 class PlantOrders:
@@ -66,6 +73,8 @@ class PlantOrders:
         self._open: dict[str, Ticket] = {}
         self._under: dict[str, _Under] = {}
         self._owed: list[Callable[[], None]] = []
+        self._sent_at: dict[str, float] = {}
+        self._purged_at = clock.monotonic()
         self.confirmed_at = clock.monotonic()
         self.problem = ""
 
@@ -143,12 +152,28 @@ class PlantOrders:
             message = Command(identity, name, values, whom, token, self._lifetime)
             end.post(message, self._lifetime, self._told(identity))
 
-    def emergency(self, ticket: Ticket, act: Act, heliostats: Iterable[str]) -> None:
-        """Send DEFOCUS or STOW, before all else that has not gone out."""
+    def emergency(
+        self, ticket: Ticket, act: Act, heliostats: Sequence[str], *, again: bool = False
+    ) -> None:
+        """Send DEFOCUS or STOW, before all else that has not gone out.
+
+        ``again`` gives those that have not acknowledged no more time to do so.
+        """
+        if not again:
+            self._supersede(ticket, frozenset(heliostats))
+        self._sent_at[ticket.identity] = self._clock.monotonic()
         for end, part in self._by_cluster(heliostats):
-            identity = self._begin(ticket, end, part)
+            identity = self._begin(ticket, end, part, again=again)
             whom = () if len(part) == len(end.members) else part
             end.post(Emergency(identity, act.name, whom), None, self._told(identity), urgent=True)
+
+    def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
+        """End what is repeated to the same heliostats: an older DEFOCUS must not follow a STOW."""
+        for identity in self._sent_at:
+            other = self._open.get(identity)
+            if other is not None and other is not ticket:
+                left = [name for name in other.unacknowledged() if name in heliostats]
+                other.advance(left, Stage.FAILED, f"{ticket.name} came after it")
 
     def parameters(
         self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int
@@ -168,18 +193,22 @@ class PlantOrders:
             parts.setdefault(self._home[name], []).append(name)
         return [(self._ends[cluster], tuple(part)) for cluster, part in parts.items()]
 
-    def _begin(self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...]) -> str:
+    def _begin(
+        self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...], *, again: bool = False
+    ) -> str:
+        now = self._clock.monotonic()
         self._messages += 1
         identity = f"{ticket.identity}.{self._messages}"
-        self._under[identity] = _Under(ticket, end.name, part)
-        ticket.expect(part, self._clock.monotonic() + self._lifetime + GRACE)
+        self._under[identity] = _Under(ticket, end.name, part, now)
+        if not again:
+            ticket.expect(part, now + self._lifetime + GRACE)
         return identity
 
     def _told(self, identity: str) -> Callable[[Outcome], None]:
         def told(outcome: Outcome) -> None:
             under = self._under.get(identity)
             # An emergency is sent again until it is acknowledged.
-            if under is None or outcome is Outcome.SENT or under.ticket.name in ("DEFOCUS", "STOW"):
+            if under is None or outcome is Outcome.SENT or under.ticket.name in SAFE:
                 return
             text = f"cluster {under.cluster}: {outcome.value}"
             under.ticket.advance(under.heliostats, Stage.FAILED, text)
@@ -202,17 +231,33 @@ class PlantOrders:
 
     def beat(self, now: float) -> None:
         """End what was not answered in time, and note the results of what has ended."""
-        ended = set()
+        ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
             if ticket.finished:
-                ended.add(identity)
+                ended.append(identity)
                 self._owe_result(identity, ticket.text)
-        if ended:
-            self._open = {key: t for key, t in self._open.items() if key not in ended}
+        for identity in ended:
+            del self._open[identity]
+        self._repeat(now)
+        if now - self._purged_at >= FORGOTTEN:
+            self._purged_at = now
             self._under = {
-                key: u for key, u in self._under.items() if u.ticket.identity not in ended
-            }
+                key: u for key, u in self._under.items()
+                if u.ticket.identity in self._open or now - u.at < FORGOTTEN
+            }  # fmt: skip
+
+    def _repeat(self, now: float) -> None:
+        """Send DEFOCUS and STOW again to those that have not acknowledged them."""
+        for identity, at in list(self._sent_at.items()):
+            ticket = self._open.get(identity)
+            if ticket is None:
+                del self._sent_at[identity]
+            elif now - at >= REPEAT:
+                left = [
+                    n for n in ticket.unacknowledged() if self._ends[self._home[n]].link.connected
+                ]
+                self.emergency(ticket, Act[ticket.name], left, again=True)
 
     def end(self, now: float) -> None:
         """Record how far everything has come, at the end of the plant."""

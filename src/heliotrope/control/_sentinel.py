@@ -126,10 +126,12 @@ class Sentinel:
                 self._joining.drop(text, frozenset(end.members))
                 self.send_safe(("safety table", "plant"), act, end.members, text)
 
-    def order_field(self, act: Act, who: str, reason: str, now: float) -> EmergencyOrder:
+    def order_field(
+        self, act: Act, who: str, reason: str, now: float, role: str = "plant"
+    ) -> EmergencyOrder:
         """Order DEFOCUS or STOW of the whole field."""
         names = self._field.names
-        record = (who, "plant", act.name)
+        record = (who, role, act.name)
         ticket = self._orders.accept(record, (), names, reason, late=True)
         self.order = EmergencyOrder(act, who, reason, now, ticket)
         self.on, self._repeated_at = True, now
@@ -141,7 +143,8 @@ class Sentinel:
         """Order it on behalf of a person; it holds until it is withdrawn."""
         self.called = True
         if not self.on or self.order is None or act > self.order.act:
-            return self.order_field(act, who, reason, self._clock.monotonic())
+            return self.order_field(act, who, reason, self._clock.monotonic(), "anybody")
+        self._orders.note(who, "anybody", act.name, f"{reason}; it holds already")
         return self.order
 
     def send_safe(
@@ -153,15 +156,18 @@ class Sentinel:
         return ticket
 
     def repeat(self, ends: Iterable[ClusterEnd]) -> None:
-        """Send the order again to those that have not acknowledged it."""
+        """Send the order again to those that have not acknowledged it, for as long as it holds.
+
+        While its ticket is open that is done for it as for every other.
+        """
         order = self.order
-        if order is None or not self.on:
+        if order is None or not self.on or not order.ticket.finished:
             return
         self._repeated_at = self._clock.monotonic()
         for end in ends:
             left = order.unacknowledged(end.members)
             if left and end.link.connected:
-                self._orders.emergency(order.ticket, order.act, left)
+                self._orders.emergency(order.ticket, order.act, left, again=True)
 
     def take_progress(
         self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress

@@ -83,6 +83,11 @@ class Ticket:
             )  # fmt: skip
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
+    def unacknowledged(self) -> tuple[str, ...]:
+        """Return the heliostats that have neither acknowledged it nor ended."""
+        rows = np.flatnonzero(self._stage < RANK[Stage.ACKNOWLEDGED])
+        return tuple(self.heliostats[i] for i in rows)
+
     @property
     def finished(self) -> bool:
         """Whether every heliostat has come to an end."""
