@@ -12,7 +12,7 @@ import numpy as np
 from heliotrope.control.audit import JsonLines
 from heliotrope.control.authority import Person, Role
 from heliotrope.control.clock import VirtualClock, sleep_until
-from heliotrope.control.link import Link, messages
+from heliotrope.control.link import Link, LinkClosedError, messages
 from heliotrope.control.memory import Faults, MemoryLine, memory_pair
 from heliotrope.control.plant import PlantController
 from heliotrope.control.plant_settings import PlantSettings
@@ -118,8 +118,9 @@ class ScriptedCluster:
             await sleep_until(self.clock, due)
 
     async def send(self, message: Message) -> None:
-        """Send a message."""
-        await self.link.send(encode(message), expires=self.clock.monotonic() + 1.0)
+        """Send a message, unless the test is over."""
+        with contextlib.suppress(LinkClosedError):
+            await self.link.send(encode(message), expires=self.clock.monotonic() + 1.0)
 
     async def _take(self, message: Message) -> None:
         self.taken.append((self.clock.monotonic(), message))
@@ -186,7 +187,7 @@ class Bench:
         for group in self.design.groups.values():
             for name, cluster in zip(group.names, group.cluster, strict=True):
                 held.setdefault(cluster, []).append(name)
-        links: dict[str, Link] = {}
+        links = self.links = dict[str, Link]()
         self.lines: dict[str, MemoryLine] = {}
         self.clusters: dict[str, ScriptedCluster] = {}
         for i, (name, names) in enumerate(held.items()):
@@ -237,6 +238,7 @@ async def running(bench: Bench) -> AsyncIterator[Bench]:
     failure: Exception | None = None
     async with asyncio.TaskGroup() as group:
         others = [group.create_task(cluster.run()) for cluster in bench.clusters.values()]
+        others += [group.create_task(link.run()) for link in bench.links.values()]
         task = group.create_task(bench.plant.run())
         try:
             await bench.wait(3.0)

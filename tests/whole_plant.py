@@ -101,6 +101,7 @@ class WholePlant:
                 members.append(Member(names[i], address, serial=5000 + i, key=fit.key))
             near, far, _ = memory_pair(clock, names=("plant", f"K{k + 1}"), seed=10 * seed + k)
             links[f"K{k + 1}"] = near
+            self.parts.append(near)
             self._cluster(ClusterConfig(f"K{k + 1}", SITE, tuple(members)), stations, far)
         self.audit = JsonLines(folder / "audit.jsonl", clock.utc())
         chance = random.Random(seed)

@@ -140,6 +140,7 @@ class Installation:
                 )
                 self.token = self.plant.take_authority(ENGINEER).token
                 staying = asyncio.create_task(self._stay())
+                await asyncio.sleep(8.0)  # what was silent at the start has to clear
                 yield self
                 staying.cancel()
         self.audit.close()

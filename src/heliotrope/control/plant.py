@@ -75,7 +75,7 @@ class PlantController:
     design
         Site, heliostats, receivers, targets.
     links
-        To each cluster, by its name.
+        To each cluster, by its name; run by the owner, as by a `TcpServer`.
     clock
         Its monotonic time decides everything.
     audit
@@ -173,7 +173,7 @@ class PlantController:
         async with asyncio.TaskGroup() as group:
             parts: list[Coroutine[Any, Any, None]] = [self._beats()]
             for end in self._ends.values():
-                parts += [end.link.run(), self._hear(end), self._keep(end)]
+                parts += [self._hear(end), self._keep(end)]
                 parts += [end.deliver(urgent=True), end.deliver(urgent=False)]
             tasks = [group.create_task(part) for part in parts]
             await self._closing.wait()
