@@ -214,6 +214,8 @@ class Field:
         self._knot[rows] = self._renew[rows] = 0
 
     def _turn_away(self, rows: Rows) -> None:
+        if not len(rows):
+            return
         rows = rows[~np.isin(self.kind[rows], (DEFOCUS, STOW)) & ~self.at_stow()[rows]]
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
@@ -222,6 +224,8 @@ class Field:
         self._go(rows, angles, np.full(len(rows), kernels.BOTH))
 
     def _stow_directly(self, rows: Rows) -> None:
+        if not len(rows):
+            return
         self._ready[rows] = False
         self.kind[rows] = STOW
         kernels.go_rows(

@@ -1,0 +1,143 @@
+"""Parts of the twin: flash, motors, clocks, the bus and its faults, many runs."""
+
+import random
+from pathlib import Path
+
+import pytest
+
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.link import LinkClosedError, Outcome
+from heliotrope.errors import FormatError, InputError
+from heliotrope.lcu import ticks, wire
+from heliotrope.twin.bus import BusFaults, TwinBus
+from heliotrope.twin.clocks import DriftingClock, SimulatedTime, TickCounter
+from heliotrope.twin.flash import NorFlash, PowerCutError
+from heliotrope.twin.motors import Axis
+from heliotrope.twin.outfit import outfits
+from heliotrope.twin.simulation import Plan
+from heliotrope.twin.soak import soak
+
+
+def test_flash_takes_what_came_before_the_cut() -> None:
+    flash = NorFlash(1)
+    flash.budget = 3
+    with pytest.raises(PowerCutError, match="flash: the supply failed within 8 bytes at 16"):
+        flash.write(16, bytes(8))
+    held = flash.read(16, 8)
+    assert held[:3] == bytes(3)
+    assert held[4:] == b"\xff" * 4
+    with pytest.raises(ValueError, match="flash: 1 bytes at 16 were written before; erase"):
+        flash.write(16, b"\0")
+    flash.erase(0)
+    assert flash.read(16, 8) == b"\xff" * 8
+
+
+def test_motors_play_in_time_with_backlash_and_lose_what_is_queued() -> None:
+    axis = Axis(100, play=10.0)
+    axis.take(1, 50, 1000, now=0.0)
+    axis.play_to(0.0245)
+    assert axis.turned == 125
+    axis.play_to(1.0)
+    assert (axis.turned, axis.joint, axis.emitted) == (150, 150.0, 150)
+    axis.take(-1, 30, 1000, now=1.0)
+    axis.play_to(1.0095)
+    assert (axis.turned, axis.joint) == (140, 150.0)
+    assert axis.stop() == -20
+    assert axis.emitted == axis.turned == 140
+    missing = Axis(0, miss=1.0, chance=random.Random(1))
+    missing.take(1, 5, 1000, now=0.0)
+    missing.play_to(1.0)
+    assert (missing.turned, missing.missed, missing.emitted) == (4, 1, 5)
+
+
+def test_clocks_drift_wrap_and_jump() -> None:
+    counter = TickCounter(ticks.PERIOD - 500, drift=0.01)
+    assert ticks.diff(counter.at(10.0), counter.at(0.0)) == 10_100
+    counter.jump(-2000)
+    assert ticks.diff(counter.at(10.0), counter.at(0.0)) == 10_100
+    clock = VirtualClock()
+    drifting = DriftingClock(clock.monotonic, clock.utc(), drift=1e-3)
+    told = SimulatedTime(drifting)
+    clock.advance(100.0)
+    assert drifting.monotonic() == pytest.approx(100.1)
+    before = told.time().gps_s
+    told.jump(5.0)
+    assert told.time().gps_s - before == pytest.approx(5.0)
+    assert told.time().jumped
+    told.detects = False
+    assert not told.time().jumped
+    told.quality = "none"
+    assert told.time().error == float("inf")
+    with pytest.raises(InputError, match=r"drifting clock: a drift of 0.6; give less than 0.5"):
+        DriftingClock(clock.monotonic, clock.utc(), drift=0.6)
+
+
+class Echo:
+    """A station that keeps what it hears, and answers."""
+
+    def __init__(self) -> None:
+        self.heard: list[bytes] = []
+
+    def hear(self, data: bytes, now: float) -> bytes:
+        del now
+        self.heard.append(data)
+        return b"answer\0"
+
+
+def test_the_bus_does_to_frames_what_its_faults_say() -> None:
+    async def main(clock: VirtualClock) -> None:
+        echo = Echo()
+        bus = TwinBus(clock, [echo], seed=1)
+        begin = clock.monotonic()
+        assert await bus.transact(b"frame\0", 0.1) == b"answer\0"
+        assert clock.monotonic() - begin == pytest.approx(13 * 10 / 115200 + 0.002, abs=1e-5)
+        bus.faults = BusFaults(loss=1.0)
+        assert await bus.transact(b"lost\0", 0.1) == b""
+        bus.faults = BusFaults(duplication=1.0)
+        await bus.transmit(b"twice\0")
+        assert echo.heard[-2:] == [b"twice\0", b"twice\0"]
+        bus.faults = BusFaults(corruption=1.0)
+        await bus.transmit(bytes(20))
+        assert sum(value.bit_count() for value in echo.heard[-1]) == 1
+        bus.faults = BusFaults(late=1.0)
+        await bus.transmit(b"first\0")
+        bus.faults = BusFaults()
+        await bus.transmit(b"second\0")
+        assert echo.heard[-2:] == [b"second\0", b"first\0"]
+        bus.faults = BusFaults(stuck=True)
+        assert await bus.transact(b"stuck\0", 0.1) == b""
+        bus.faults = BusFaults()
+        bus.plugged = False
+        assert await bus.transmit(b"x\0") is Outcome.DISCONNECTED
+        bus.plugged = True
+        assert await bus.transmit(b"x\0", expires=clock.monotonic()) is Outcome.EXPIRED
+        with pytest.raises(InputError, match=r"bus: a timeout of 0.0 s; it must be above 0"):
+            await bus.transact(b"x\0", 0.0)
+        await bus.close()
+        with pytest.raises(LinkClosedError, match="bus: it is closed"):
+            await bus.transmit(wire.encode(wire.Frame(1, 0, 1, 1, b"")))
+
+    run_virtual(main)
+    with pytest.raises(InputError, match=r"bus faults: a chance of loss of 1.5; give 0 to 1"):
+        BusFaults(loss=1.5)
+
+
+def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    plans = [Plan(seed, 5.0, 1) for seed in range(3)]
+    kept = tmp_path / "soak.jsonl"
+    first = soak(plans[:2], progress=kept)
+    told = []
+    both = soak(plans, progress=kept, tell=lambda found: told.append(found.runs))
+    assert (first.runs, both.runs, told) == (2, 3, [3])
+    assert both.checks == soak(plans).checks
+    assert soak(plans, budget=0.0).runs == 0
+    kept.write_text('{"seed": 1}\n')
+    with pytest.raises(FormatError, match=r"soak.jsonl: line 1: no run of a soak; give another"):
+        soak(plans, progress=kept)
+    with pytest.raises(InputError, match="soak with 0 processes; give 1 or more"):
+        soak(plans, processes=0)
+
+
+def test_a_bus_carries_no_more() -> None:
+    with pytest.raises(InputError, match="33 heliostats on a bus; a cluster has 1 to 32"):
+        outfits(33)
