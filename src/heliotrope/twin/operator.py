@@ -35,6 +35,8 @@ from heliotrope.twin.outfit import RECEIVER, STANDBY
 TOKEN = 0x5EED0001
 #: A lease that is under way for longer is not delivered, s.
 LEASE_EXPIRY = 1.0
+#: A cluster counts a command's life from when it comes: so long it may have been under way, s.
+UNDER_WAY = 0.8
 #: What leads on from a state.
 ONWARDS = {
     states.STOWED: ("APPROACH",), states.IDLE: ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
@@ -167,7 +169,9 @@ class Operator:
         now = self._clock.monotonic()
         addresses = frozenset(self._addresses[each] for each in heliostats or self._addresses)
         self._observer.ordered(
-            Order(command.identity, name, addresses, now, now + lifetime + 0.1, token == TOKEN)
+            Order(
+                command.identity, name, addresses, now, now + lifetime + UNDER_WAY, token == TOKEN
+            )
         )
         await self._send(command, lifetime)
 
@@ -224,7 +228,7 @@ class Operator:
         self._observer.ordered(
             Order(
                 message.identity, "PARAMETERS", frozenset((self._addresses[name],)), now,
-                now + message.lifetime + 0.1, authorised=True,
+                now + message.lifetime + UNDER_WAY, authorised=True,
             )
         )  # fmt: skip
         await self._send(message, message.lifetime)
