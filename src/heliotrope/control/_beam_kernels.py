@@ -190,7 +190,8 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, f
     what is not proven clear there counts as an entry.
 
     Writes into found: index of the path's corner plus share of the leg up to which it is
-    clear, distance along the beam, m, origin and direction in the pose just after. Returns the poses that were tried, negative at an entry.
+    clear, distance along the beam, m, origin and direction in the pose just after. Returns the
+    poses that were tried, negative at an entry.
     """
     lever_1, lever_2 = _levers(a)
     tried = 0

@@ -184,7 +184,7 @@ class _MemoryCarrier:
             item = self._in.take()
             if isinstance(item, bytes):
                 return item
-            # At least a microsecond, since what rounding leaves over would not move a virtual clock.
+            # At least a microsecond: what rounding leaves over would not move a virtual clock.
             left = None if item is None else max(1e-6, item - self._in.clock.monotonic())
             try:
                 async with asyncio.timeout(left):

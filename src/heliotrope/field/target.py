@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -76,12 +77,12 @@ class Target:
         """Mean height, m."""
         return float(np.linalg.norm(self._up))
 
-    @property
+    @cached_property
     def normal(self) -> FloatArray:
         """Unit normal out of the front, (3,)."""
         return normalize(np.cross(self._across, self._up))
 
-    @property
+    @cached_property
     def axes(self) -> FloatArray:
         """Unit axes in the plane, to the right as seen from the front, and up, (2, 3)."""
         right = normalize(self._across)

@@ -313,8 +313,7 @@ def smooth(picture: Rectified, values: Image, sigma: float) -> Image:
 
     paint = picture.paint.astype(np.float32)
     top = cv2.GaussianBlur(np.asarray(values, dtype=np.float32) * paint, (0, 0), sigma)
-    bottom = cv2.GaussianBlur(paint, (0, 0), sigma)
-    return np.asarray(top / np.maximum(bottom, 1e-3), dtype=np.float32)
+    return np.asarray(top / picture.share(sigma), dtype=np.float32)
 
 
 def _orders(picture: Rectified) -> tuple[int, int]:

@@ -67,6 +67,19 @@ class Rectified:
         """Where bare paint is seen: neither beyond the targets nor on a mark."""
         return np.asarray(self.surface & ~self.marks)
 
+    @cached_property
+    def _shares(self) -> dict[float, Image]:
+        return {}
+
+    def share(self, sigma: float) -> Image:
+        """Return how much bare paint is about each pixel, (H, W), softened by ``sigma`` pixels."""
+        import cv2
+
+        if sigma not in self._shares:
+            soft = cv2.GaussianBlur(self.paint.astype(np.float32), (0, 0), sigma)
+            self._shares[sigma] = np.maximum(soft, np.float32(1e-3))
+        return self._shares[sigma]
+
     def plane(self, pixels: FloatArray) -> FloatArray:
         """Return plane coordinates, m, of grid pixels (column, row), (..., 2)."""
         return np.asarray(self.first + self.step * np.asarray(pixels) * [1.0, -1.0])
@@ -110,13 +123,14 @@ def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
     reduction = max(1, int(step * per_metre))
     places = _places(view, first, step, (int(rows), int(columns)))
     # Pixel centres of a frame reduced by k: (p + 0.5)/k − 0.5.
-    at = (places + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
-    values = _resample(brightness, reduction, at, frame.full_scale)
+    corner, part = _around(brightness, places, reduction)
+    at = (places - corner + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
+    values = _resample(part, reduction, at, frame.full_scale)
     clipped = np.zeros_like(values)
     # Clipped pixels are many together, or they do no harm: their mean is bright, too.
     if float(values.max()) > 0.7 * CLIPPED:
         limit = float(np.ceil(CLIPPED * frame.full_scale))
-        clipped = _resample(_at_least(brightness, limit), reduction, at, 255.0)
+        clipped = _resample(_at_least(part, limit), reduction, at, 255.0)
     height, width = brightness.shape
     inside = (
         (places[..., 0] >= 0) & (places[..., 1] >= 0)
@@ -192,6 +206,20 @@ def _places(view: View, first: FloatArray, step: float, shape: tuple[int, int]) 
         nodes, scale, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     )
     return np.asarray(spread)
+
+
+def _around(grey: Image, places: Image, reduction: int) -> tuple[Image, Image]:
+    """Return the corner (column, row) and the part of a frame that some places lie in."""
+    margin = 2 * reduction
+    sides = []
+    for k, length in ((0, grey.shape[1]), (1, grey.shape[0])):
+        low, high = float(places[..., k].min()) - margin, float(places[..., k].max()) + margin + 1
+        begin = int(np.clip(low, 0, length - 1)) // reduction * reduction
+        sides.append((begin, int(np.clip(np.ceil(high), begin + 1, length))))
+    (left, right), (top, bottom) = sides
+    if right - left < 2 * reduction or bottom - top < 2 * reduction:
+        return np.zeros(2, dtype=np.float32), grey
+    return np.array([left, top], dtype=np.float32), grey[top:bottom, left:right]
 
 
 def _resample(grey: Image, reduction: int, at: Image, full: float) -> Image:

@@ -105,8 +105,8 @@ def _models() -> list[Any]:
 
     return [
         models.PlantDocument, models.PlantTable, models.SiteTable, models.TargetTable,
-        models.MarkTable, models.ReceiverTable, models.CameraTable, models.GroupTable, models.ChainTable, models.RotaryDrive,
-        models.LinearDrive,
+        models.MarkTable, models.ReceiverTable, models.CameraTable, models.GroupTable,
+        models.ChainTable, models.RotaryDrive, models.LinearDrive,
     ]  # fmt: skip
 
 
