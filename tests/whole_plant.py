@@ -39,6 +39,9 @@ from heliotrope.twin.bus import TwinBus
 ENGINEER = Person("Egon", Role.ENGINEER)
 SITE = Site(37.09, -2.36, 500.0, name="Tabernas")
 _AXES = tuple(Axis(*limits, *outfit.LIMITS) for limits in outfit.RANGES)
+_CORNERS = ((3.0, 0.0, 43.0), (-3.0, 0.0, 43.0), (-3.0, 0.0, 37.0), (3.0, 0.0, 37.0))
+#: Without marks: for cameras that read no pixels.
+TARGET = Target("white", np.array(_CORNERS), np.array([0.0, 0.0, 40.0]))
 MACHINE = Machine((_AXES[0], _AXES[1]), outfit.STOW, outfit.STANDBY, outfit.DEFOCUS)
 
 
@@ -64,7 +67,13 @@ class WholePlant:
     """Clusters of two heliostats each, with everything real but motors, mirrors and bus."""
 
     def __init__(
-        self, clock: VirtualClock, folder: Path, clusters: int = 2, seed: int = 1, **options: Any
+        self,
+        clock: VirtualClock,
+        folder: Path,
+        clusters: int = 2,
+        seed: int = 1,
+        target: Target = TARGET,
+        **options: Any,
     ) -> None:
         self.clock = clock
         count = 2 * clusters
@@ -72,12 +81,11 @@ class WholePlant:
         homes = tuple(f"K{i // 2 + 1}" for i in range(count))
         perfect = nominal(count)
         self.truth = installed(perfect, seed)
-        corners = ((3.0, 0.0, 43.0), (-3.0, 0.0, 43.0), (-3.0, 0.0, 37.0), (3.0, 0.0, 37.0))
         self.design = Plant(
             "whole", SITE,
             {"all": Heliostats(names, perfect, np.full(count, 3.0), np.full(count, 2.0),
                                cluster=homes)},
-            targets=(Target("white", np.array(corners), np.array([0.0, 0.0, 40.0])),),
+            targets=(target,),
             receivers=(Receiver("receiver", "planar", np.array(outfit.RECEIVER),
                                 np.array([0.0, 1.0, 0.0]), 4.0, 4.0),),
         )  # fmt: skip

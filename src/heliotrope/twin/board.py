@@ -236,6 +236,20 @@ class Board:
         """State of `lcu.states`, -1 while the supply is off."""
         return -1 if self.node is None else self.node.controller.state
 
+    def mirror(self, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
+        """Return vertex (3,), m, and unit normal (3,).
+
+        Parameters
+        ----------
+        believed
+            Whether what has slipped is taken out: where the node thinks that it stands.
+        """
+        counts = [axis.joint for axis in self.axes]
+        if believed:
+            counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
+        pose = self.outfit.mechanism.pose(counts)
+        return pose.vertex, pose.normal
+
     def beam(self, sun: FloatArray, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """Return vertex (3,) and direction (3,) of the reflected ray.
 
@@ -244,13 +258,9 @@ class Board:
         sun
             Direction to the sun, (3,).
         believed
-            Whether what has slipped is taken out: where the node thinks that the beam goes.
+            As of `mirror`.
         """
-        counts = [axis.joint for axis in self.axes]
-        if believed:
-            counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
-        pose = self.outfit.mechanism.pose(counts)
-        normal, vertex = pose.normal, pose.vertex
+        vertex, normal = self.mirror(believed=believed)
         return vertex, 2.0 * (normal @ sun) * normal - sun
 
     def miss(
