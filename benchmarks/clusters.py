@@ -6,6 +6,7 @@ what is measured is the cluster alone, without bus, heliostats, network and plan
 
 import asyncio
 import time
+from typing import ClassVar
 
 import numpy as np
 
@@ -29,12 +30,12 @@ ANSWERS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 class ReadyBus:
-    """A bus whose answers were made before."""
+    """A bus whose answers were made before, once for all buses."""
 
     connected, closed = True, False
+    _answers: ClassVar[dict[bytes, bytes]] = {}
 
     def __init__(self) -> None:
-        self._answers: dict[bytes, bytes] = {}
         self.frames = 0
 
     async def run(self) -> None:

@@ -174,11 +174,11 @@ def _always_new(patch: pytest.MonkeyPatch) -> None:
     pack_into = _nodes.Node.pack_into
 
     def fresh(self: Any, block: bytearray, now: float) -> None:
-        heard = self.heard_at
-        if heard > -math.inf:
-            self.heard_at = now
+        told = self.status_at
+        if told > -math.inf:
+            self.status_at = now
         pack_into(self, block, now)
-        self.heard_at = heard
+        self.status_at = told
 
     patch.setattr(_nodes.Node, "pack_into", fresh)
 

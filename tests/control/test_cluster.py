@@ -5,13 +5,24 @@ import dataclasses
 
 import pytest
 
-from clusters import LATER, TOKEN, Board, Field, boards_in, run
+from clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
+from heliotrope.control import _nodes
 from heliotrope.control._kept import Kept
 from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.control.link import LinkError, running
-from heliotrope.control.protocol import Acknowledge, Alarm, Lease, Stage, Status, encode
-from heliotrope.lcu import states
-from heliotrope.twin.bus import BusFaults
+from heliotrope.control.protocol import (
+    NEVER,
+    Acknowledge,
+    Alarm,
+    Answer,
+    Ask,
+    Lease,
+    Stage,
+    Status,
+    encode,
+)
+from heliotrope.lcu import states, wire
+from heliotrope.twin.bus import BusFaults, TwinBus
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 
@@ -253,6 +264,84 @@ def test_a_heliostat_that_falls_silent_is_reported_with_its_beam() -> None:
         await field.until(lambda: not field.plant.alarms("node_silent")[-1].active, 8.0)
 
     run(main, "TRACKING")
+
+
+class Selective(TwinBus):
+    """A bus that loses the answers to some questions, or puts one of before in their place."""
+
+    lost = False
+    kept: bytes = b""
+
+    def carry(self, frame: bytes) -> bytes:
+        answer = super().carry(frame)
+        if wire.Reader().feed(frame)[0].name != "QUERY_STATUS":
+            return answer
+        if self.kept:
+            return self.kept
+        return b"" if self.lost else answer
+
+
+def selective(clock: object, boards: list[Board]) -> Selective:
+    return Selective(clock, [*boards])  # type: ignore[arg-type]
+
+
+def test_an_acknowledgement_makes_no_old_state_young() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        field.bus.lost = True
+        for k in range(8):
+            await field.order(f"aim{k}", "AIM", *AIM)
+            await asyncio.sleep(1.0)
+            assert Stage.ACKNOWLEDGED in field.plant.stages(f"aim{k}", "A1")
+        row = field.plant.status().nodes()[0]
+        assert 6900 < row["heard_ms"] < 9500
+        assert row["state"] == states.TRACKING
+        statistics = field.cluster._asked.statistics()
+        assert statistics["A1"]["heard_s"] < 1.1
+
+    run(main, "TRACKING", bus=selective)
+
+
+def test_who_has_only_acknowledged_is_not_told_to_be_in_any_state() -> None:
+    def dumb(clock: object, boards: list[Board]) -> Selective:
+        bus = selective(clock, boards)
+        bus.lost = True
+        return bus
+
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        await field.emergency("stow", "STOW")
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("stow", "A1"))
+        await asyncio.sleep(2.0)
+        rows = field.plant.status().nodes()
+        assert (rows["answered"] > 0).all()
+        assert (rows["heard_ms"] == NEVER).all()
+        assert "C1: not heard 2; silent 0" in field.cluster.line()
+        await field.plant.send(Ask("sums", "checksums"))
+        await field.until(lambda: bool(field.plant.all(Answer)))
+        assert field.plant.all(Answer)[0].data == {}
+        await field.until(lambda: len(field.plant.alarms("node_silent")) == 2, 15.0)
+        assert field.plant.alarms("node_silent")[0].text == (
+            "A1: no answer for 10 s, its state was never heard"
+        )
+
+    run(main, bus=dumb)
+
+
+def test_an_answer_that_comes_many_seconds_late_is_not_believed() -> None:
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        node = field.cluster.nodes[0]
+        frame = _nodes.STATUS.frame(node.address, node.next_sequence())
+        field.bus.kept = field.boards[0].hear(frame, field.clock.monotonic())
+        assert field.bus.kept
+        late = node.counts.late
+        await asyncio.sleep(60.0)
+        # Whatever the number of rounds since, it is the answer to another question.
+        assert node.counts.late >= late + 10
+        assert field.plant.status().nodes()["heard_ms"][0] > 58_000
+
+    run(main, "TRACKING", bus=selective)
 
 
 def test_damaged_answers_are_counted_and_never_believed() -> None:

@@ -38,7 +38,7 @@ class Asked:
     def take(self, ask: Ask) -> None:
         """Answer a question, or keep it until the bus is free."""
         if ask.what == "checksums":
-            data = {node.name: node.status[7] for node in self._nodes if node.counts.answered}
+            data = {node.name: node.status[7] for node in self._nodes if node.known}
             self._reports.answer(Answer(ask.identity, data))
         elif ask.what == "statistics":
             self._reports.answer(Answer(ask.identity, self.statistics()))

@@ -96,7 +96,7 @@ class Exchange:
         """Ask a node at ``begin``, and return the values of its answer or None; see ``now``."""
         node.counts.asked += 1
         self._asked += 1
-        data = await self._bus.transact(node.frame(question, sequence), self._answer)
+        data = await self._bus.transact(question.frame(node.address, sequence), self._answer)
         values = question.read(data, node.address, sequence)
         if values is None:
             frame = answer_in(data, node.address, sequence, (question.answer,)) if data else None

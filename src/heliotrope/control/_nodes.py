@@ -3,8 +3,9 @@
 Every second each is asked once or twice, so the frames of the questions are made once, and an
 answer of the right size is read with one call of ``struct``. Whatever is not exactly the answer
 that was asked for goes through `wire.Reader`, which decides; the quick way accepts nothing that
-it would not. An answer carries the sequence of its question: questions cycle through a few, so
-that one that comes a second late is not taken for the next.
+it would not. An answer carries the sequence of its question, and each question to a node has
+another: one that comes late, from a serial server in the network by many seconds, is not taken for
+that of a later question.
 """
 
 import math
@@ -20,8 +21,8 @@ from heliotrope.lcu import messages, states, wire
 _ROW = struct.Struct("<BBIIiiiiIHbHIII")
 assert _ROW.size == NODE.itemsize
 
-#: Questions go out under these sequences in turn.
-SEQUENCES = (1, 2, 3, 4)
+#: Questions to a node go out under as many sequences in turn: four minutes of them.
+SEQUENCES = 256
 
 _NO_STATUS = (states.UNCONFIGURED, 0, 0, 0, NEVER, 0, 0, 0, 0)
 _NO_STEPS = (0, 0, 0, 0)
@@ -36,10 +37,17 @@ class Question:
         self.answer = messages.NUMBER_OF[answer]
         self._layout = struct.Struct(wire.HEADER + messages.codes_of(self.answer) + "I")
         self.size = self._layout.size + 2
+        self._frames: dict[int, bytes] = {}
 
     def frame(self, address: int, sequence: int) -> bytes:
         """Return the question to an address."""
-        return wire.encode(wire.Frame(address, wire.CLUSTER_ADDRESS, sequence, self.number, b""))
+        # Kept for all clusters of a process, whose addresses are the same.
+        key = address << 16 | sequence
+        frame = self._frames.get(key)
+        if frame is None:
+            made = wire.Frame(address, wire.CLUSTER_ADDRESS, sequence, self.number, b"")
+            frame = self._frames[key] = wire.encode(made)
+        return frame
 
     def read(self, data: bytes, address: int, sequence: int) -> tuple[Any, ...] | None:
         """Return the answer's values if the bytes are exactly that answer, else None.
@@ -113,10 +121,10 @@ class Node:
         See `Counts`.
     status, steps
         Values of the last STATUS and STEPS.
-    steps_at
-        When STEPS were last told, monotonic s.
+    status_at, steps_at
+        When they came, monotonic s; -inf: never.
     heard_at
-        When it last answered, monotonic s; -inf: never.
+        When it last answered anything, monotonic s; -inf: never.
     missed
         How many questions in a row it has not answered.
     """
@@ -127,18 +135,20 @@ class Node:
         self.counts = Counts()
         self.status: tuple[Any, ...] = _NO_STATUS
         self.steps: tuple[Any, ...] = _NO_STEPS
-        self.steps_at = -math.inf
+        self.status_at = self.steps_at = -math.inf
         self.heard_at = -math.inf
         self.missed = 0
-        self._frames: dict[int, bytes] = {}
+        self._sequence = 0
 
-    def frame(self, question: Question, sequence: int) -> bytes:
-        """Return a question to this node."""
-        key = question.number << 16 | sequence
-        frame = self._frames.get(key)
-        if frame is None:
-            frame = self._frames[key] = question.frame(self.address, sequence)
-        return frame
+    def next_sequence(self) -> int:
+        """Return the sequence of the next questions to it."""
+        self._sequence = self._sequence % SEQUENCES + 1
+        return self._sequence
+
+    @property
+    def known(self) -> bool:
+        """Whether it has told its state since the start; if not, ``state`` means nothing."""
+        return self.status_at > -math.inf
 
     @property
     def state(self) -> int:
@@ -177,7 +187,8 @@ class Node:
     def pack_into(self, block: bytearray, now: float) -> None:
         """Write its row of `protocol.NODE`."""
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
-        age = 1e3 * (now - self.heard_at)
+        # An ACK shows that it is there, not what state it is in.
+        age = 1e3 * (now - self.status_at)
         heard = int(age) if age < NEVER else NEVER
         _ROW.pack_into(
             block, self.index * _ROW.size, state, fault, flags, heard, *self.steps, sun_age,

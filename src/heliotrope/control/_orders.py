@@ -18,7 +18,7 @@ from heliotrope.control._discovery import SPAN, heard
 from heliotrope.control._exchange import Exchange
 from heliotrope.control._goals import GOALS, Goals
 from heliotrope.control._kept import Kept
-from heliotrope.control._nodes import SEQUENCES, STATUS, Node
+from heliotrope.control._nodes import Node
 from heliotrope.control._reports import Reports
 from heliotrope.control.cluster_config import ClusterConfig
 from heliotrope.control.protocol import Command, Parameters, ProtocolError, Stage
@@ -334,10 +334,11 @@ class Orders:
             return self._again(job, f"no answer to QUERY_STORED of {step.item} before it expired")
         same = data == step.data
         if same and step.item == "armature":
-            status = await self._exchange.poll(node, STATUS, SEQUENCES[0], self._clock())
-            if status is None:
+            asked_at = self._clock()
+            await self._look(node)
+            if node.status_at < asked_at:
                 return self._again(job, "no answer to QUERY_STATUS before it expired")
-            same = status[7] == crc32(data)
+            same = node.status[7] == crc32(data)
         if not same:
             return self._fail(
                 job, f"{step.item}: what is stored differs from what was sent; send it again"
@@ -361,7 +362,7 @@ class Orders:
 
     def _why(self, node: Node, result: int) -> str:
         text = messages.RESULTS[result] if result < len(messages.RESULTS) else f"result {result}"
-        if result == messages.REFUSED_STATE:
+        if result == messages.REFUSED_STATE and node.known:
             fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
             text += f" ({states.STATES[node.state]}{fault})"
         return text

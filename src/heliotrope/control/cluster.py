@@ -27,7 +27,7 @@ from heliotrope.control._asked import Asked
 from heliotrope.control._exchange import Exchange
 from heliotrope.control._goals import BEAM_OUT, Goals
 from heliotrope.control._kept import Kept
-from heliotrope.control._nodes import SEQUENCES, STATUS, STEPS, Node, rows
+from heliotrope.control._nodes import STATUS, STEPS, Node, rows
 from heliotrope.control._orders import Orders, Refusal
 from heliotrope.control._reports import Reports
 from heliotrope.control._sun_line import sun_values
@@ -291,7 +291,6 @@ class Cluster:
     async def _round(self, until: float) -> None:
         """Ask every node once, in the order of addresses; orders are done in between."""
         nodes, count = self._by_address, len(self.nodes)
-        sequence = SEQUENCES[self._number % len(SEQUENCES)]
         first, self._next = self._next, 0
         now = self._clock.monotonic()
         for place in range(first, first + count):
@@ -301,19 +300,18 @@ class Cluster:
                 return
             node = nodes[place % count]
             if node.missed < _ABSENT or (self._number + node.index) % _PROBE == 0:
-                now = await self._poll(node, sequence, now)
+                now = await self._poll(node, now)
             if self._busy(patient=False):
                 await self._serve()
                 now = self._clock.monotonic()
 
     async def _look(self, node: Node) -> None:
         """Ask a node for its state, between two rounds."""
-        sequence = SEQUENCES[self._number % len(SEQUENCES)]
-        await self._poll(node, sequence, self._clock.monotonic())
+        await self._poll(node, self._clock.monotonic())
 
-    async def _poll(self, node: Node, sequence: int, now: float) -> float:
+    async def _poll(self, node: Node, now: float) -> float:
         """Ask a node for state and step counts; ``now`` at the beginning, returned at the end."""
-        exchange = self._exchange
+        exchange, sequence = self._exchange, node.next_sequence()
         status = await exchange.poll(node, STATUS, sequence, now)
         if status is None or not self._believes(node, status):
             return exchange.now
@@ -336,7 +334,7 @@ class Cluster:
         if node.index in self._strange:
             self._strange.remove(node.index)
             self._reports.clear("node_unintelligible", node.name)
-        before, node.status = node.status, status
+        before, node.status, node.status_at = node.status, status, node.heard_at
         if before[2] != status[2]:
             self._fault(node)
         if self._watch.verdict.dark and status[0] in BEAM_OUT and not self._urgent.waits(node):
@@ -373,8 +371,9 @@ class Cluster:
 
     def _tell_silence(self, node: Node, limit: float) -> None:
         text = f"{node.name}: no answer for {limit:g} s"
-        if node.heard_at < self._started:
-            self._reports.alarm("node_silent", node.name, "WARNING", f"{text}, never heard")
+        if not node.known:
+            heard = "never heard" if node.heard_at < self._started else "its state was never heard"
+            self._reports.alarm("node_silent", node.name, "WARNING", f"{text}, {heard}")
             return
         state = states.STATES[node.state]
         out = node.state in BEAM_OUT
@@ -486,12 +485,16 @@ class Cluster:
         """Return the state in one line, for a log."""
         counts = [0] * len(states.STATES)
         for node in self.nodes:
-            counts[node.state] += 1
-        shown = " ".join(f"{states.STATES[i]} {n}" for i, n in enumerate(counts) if n)
+            if node.known:
+                counts[node.state] += 1
+        shown = [f"{states.STATES[i]} {n}" for i, n in enumerate(counts) if n]
+        if unknown := len(self.nodes) - sum(counts):
+            shown.append(f"not heard {unknown}")
         present, now = self._time.time(), self._clock.monotonic()
         lease = self._watch.lease_left(now)
         return (
-            f"{self.config.name}: {shown}; silent {len(self._silent)}; cycle {self.cycle:.2f} s; "
+            f"{self.config.name}: {' '.join(shown)}; silent {len(self._silent)}; "
+            f"cycle {self.cycle:.2f} s; "
             f"time {present.quality} ±{min(present.error, 999.0):.2g} s; "
             f"plant {'here' if self._link.connected else 'away'}, "
             f"lease {'over' if lease <= 0.0 else f'{lease:.1f} s'}"

@@ -27,7 +27,8 @@ from heliotrope.errors import HeliotropeError
 VERSION = 1
 
 #: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
-#: age of the row when it was sent (2^32 - 1: never heard); states and flags as in `lcu.names`.
+#: age of its STATUS when the row was written (2^32 - 1: none has come, and the row says nothing);
+#: states and flags as in `lcu.names`.
 NODE = np.dtype(
     [
         ("state", "u1"), ("fault", "u1"), ("flags", "<u4"), ("heard_ms", "<u4"),

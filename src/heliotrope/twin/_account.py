@@ -1,6 +1,7 @@
 """What the observer knows of one heliostat."""
 
 from collections import deque
+from typing import Any
 
 from heliotrope.lcu import messages, motion, states, wire
 from heliotrope.lcu.journal import items_of
@@ -64,8 +65,8 @@ class Account:
     in_hand, how, forged, quiet, before, good
         Of the frame that it is hearing: what the cluster sent, how it came, what a stranger
         sent, the invariant by which it must change nothing, what was before.
-    answered_at, told
-        When the cluster last heard it; the last states that it told.
+    told
+        When the cluster heard its last STATUS answers, s, and their values.
     from_stow
         Whether it has left stow and not tracked since.
     """
@@ -82,8 +83,7 @@ class Account:
         self.quiet = 0
         self.before: dict[str, object] = {}
         self.good = 0
-        self.answered_at = float("-inf")
-        self.told: deque[int] = deque(maxlen=3)
+        self.told: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=64)
         self.from_stow = False
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items
