@@ -183,6 +183,23 @@ def _always_new(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(_nodes.Node, "pack_into", fresh)
 
 
+def _young_by_any_answer(patch: pytest.MonkeyPatch) -> None:
+    """A row is as old as the last answer of any kind, be it an ACK."""
+    pack_into = _nodes.Node.pack_into
+
+    def of_any(self: Any, block: bytearray, now: float) -> None:
+        told, self.status_at = self.status_at, self.heard_at
+        pack_into(self, block, now)
+        self.status_at = told
+
+    patch.setattr(_nodes.Node, "pack_into", of_any)
+
+
+def _questions_alike(patch: pytest.MonkeyPatch) -> None:
+    """All questions go out under one sequence: a late answer passes for the one to a later one."""
+    patch.setattr(_nodes, "SEQUENCES", 1)
+
+
 def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "fresh", lambda self: True)
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
@@ -209,4 +226,6 @@ DEFECTS = (
     Defect((10,), "approach with elevation first", _approach_swapped, ("line_drop",), 60.0),
     Defect((11,), "acceptance never reported", _acceptance_lost, ("line_drop",), 60.0),
     Defect((11,), "every value told as new", _always_new, ("bus_bad", "power_cut"), 10.0),
+    Defect((11,), "an acknowledgement makes a row young", _young_by_any_answer, ("bus_bad",), 5.0),
+    Defect((11,), "a late answer passes for another", _questions_alike, ("bus_bad",), 5.0),
 )  # fmt: skip
