@@ -155,6 +155,37 @@ def test_where_the_answer_was_lost_the_state_decides() -> None:
     run(main, "IDLE", bus=interrupted)
 
 
+@pytest.mark.parametrize("lost", [1, 2, 3, 4, 5, 6])
+def test_a_search_is_done_only_if_it_was_begun(lost: int) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("SEARCH", lost)
+        await field.order("search", "SEARCH", 2e-3, 3e-2, heliostats=("A1",))
+        assert await final(field, "search") is Stage.DONE
+        assert field.boards[0].state == "SEARCHING"
+        # The other refuses it, and stays in IDLE, which is where a search ends.
+        field.boards[1].node.controller._may_track = lambda: messages.REFUSED_STATE
+        field.bus.lose("SEARCH", lost)
+        await field.order("other", "SEARCH", 2e-3, 3e-2, heliostats=("A2",))
+        assert await final(field, "other", "A2") is Stage.FAILED
+        assert field.boards[1].state == "IDLE"
+        assert field.plant.text("other") == (
+            "SEARCH: its answer was lost, and nothing shows that it was taken; it is IDLE"
+        )
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_a_diagnosis_whose_answers_were_lost_is_done_if_it_was_seen() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("DIAGNOSE", 4)
+        await field.order("d", "DIAGNOSE", heliostats=("A1",))
+        assert await final(field, "d", limit=200.0) is Stage.DONE
+
+    run(main, "IDLE", bus=interrupted)
+
+
 def test_a_command_that_nobody_answers_expires() -> None:
     async def main(field: Field) -> None:
         await field.until(field.sun_is_fresh)
@@ -232,6 +263,28 @@ def test_parameters_are_written_item_by_item_and_read_back() -> None:
         assert sums.data["A1"] == crc32(items["armature"]) != sums.data["A2"]
         place = sum(all_.data["sizes"][: all_.data["names"].index("biases")])
         assert all_.block[place : place + 8] == items["biases"]
+
+    run(main, bus=interrupted)
+
+
+@pytest.mark.parametrize(("lost", "answered"), [(2, True), (8, True), (9, False)])
+def test_what_is_stored_is_asked_for_in_three_seconds(lost: int, answered: bool) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.bus.lose("QUERY_STORED", lost)
+        begin = field.clock.monotonic()
+        await field.plant.send(Ask("all", "stored", "A1"))
+        await field.until(lambda: bool(field.plant.all(Answer)), 6.0)
+        (answer,) = field.plant.all(Answer)
+        if answered:
+            held = field.boards[0].node.journal.items
+            assert {"armature", "location", "edition"} <= set(answer.data["names"])
+            sizes = dict(zip(answer.data["names"], answer.data["sizes"], strict=True))
+            assert sizes["armature"] == len(held["armature"])
+            assert len(answer.block) == sum(answer.data["sizes"])
+        else:
+            assert answer.data == {"error": "A1 does not answer"}
+            assert field.clock.monotonic() - begin > 1.0
 
     run(main, bus=interrupted)
 

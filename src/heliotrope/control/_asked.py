@@ -16,6 +16,23 @@ from heliotrope.lcu.journal import ITEMS
 
 _SECRET = "key_id"  # noqa: S105 (the name of an item that is never told)
 _PATIENCE = 5.0
+#: A node that does not answer is asked again in the next second, so often in all.
+_TRIES = 3
+_STORED = tuple(name for name, _ in ITEMS if name != _SECRET)
+
+
+class _Recall:
+    """The question what a node has stored, item by item."""
+
+    def __init__(self, ask: Ask, node: Node) -> None:
+        self.ask, self.node = ask, node
+        self.found: dict[str, bytes] = {}
+        self.tries = 0
+
+    @property
+    def item(self) -> str:
+        """The next item."""
+        return _STORED[len(self.found)]
 
 
 class Asked:
@@ -27,7 +44,8 @@ class Asked:
     ) -> None:  # fmt: skip
         self._config, self._nodes, self._exchange = config, nodes, exchange
         self._reports, self._clock = reports, clock
-        self._waiting: deque[Ask] = deque(maxlen=64)
+        self._waiting: deque[Ask | _Recall] = deque(maxlen=64)
+        self._later: list[_Recall] = []
         self._discovery: Discovery | None = None
 
     @property
@@ -42,7 +60,9 @@ class Asked:
             self._reports.answer(Answer(ask.identity, data))
         elif ask.what == "statistics":
             self._reports.answer(Answer(ask.identity, self.statistics()))
-        elif ask.what in ("stored", "discover"):
+        elif ask.what == "stored":
+            self._take_stored(ask)
+        elif ask.what == "discover":
             self._waiting.append(ask)
         else:
             known = "checksums, stored, statistics, discover"
@@ -57,12 +77,19 @@ class Asked:
             for node in self._nodes
         }
 
+    def second(self) -> None:
+        """Give what is to be tried again its turn."""
+        self._waiting.extend(self._later)
+        self._later.clear()
+
     async def serve(self) -> None:
-        """Go on with the first question that waits."""
-        if self._waiting[0].what == "discover":
-            await self._discover(self._waiting[0])
+        """Do one step of the first question that waits."""
+        first = self._waiting[0]
+        if isinstance(first, _Recall):
+            self._waiting.popleft()
+            await self._recall(first)
         else:
-            await self._recall(self._waiting.popleft())
+            await self._discover(first)
 
     async def _discover(self, ask: Ask) -> None:
         if self._discovery is None:
@@ -73,19 +100,28 @@ class Asked:
             self._reports.answer(Answer(ask.identity, self._discovery.result()))
             self._discovery = None
 
-    async def _recall(self, ask: Ask) -> None:
+    def _take_stored(self, ask: Ask) -> None:
         node = next((each for each in self._nodes if each.name == ask.heliostat), None)
         if node is None:
             self._error(ask, f"cluster {self._config.name} has no heliostat {ask.heliostat!r}")
+        else:
+            self._waiting.append(_Recall(ask, node))
+
+    async def _recall(self, recall: _Recall) -> None:
+        """Ask for one item; those that came are not asked for again."""
+        ask, node, found = recall.ask, recall.node, recall.found
+        data = await stored(self._exchange, node, recall.item, self._clock() + _PATIENCE)
+        if data is None:
+            recall.tries += 1
+            if recall.tries < _TRIES:
+                self._later.append(recall)
+            else:
+                self._error(ask, f"{node.name} does not answer")
             return
-        found: dict[str, bytes] = {}
-        for name, _ in ITEMS:
-            if name != _SECRET:
-                data = await stored(self._exchange, node, name, self._clock() + _PATIENCE)
-                if data is None:
-                    self._error(ask, f"{node.name} does not answer")
-                    return
-                found[name] = data
+        found[recall.item] = data
+        if len(found) < len(_STORED):
+            self._waiting.appendleft(recall)
+            return
         data_of = {"names": list(found), "sizes": [len(data) for data in found.values()]}
         self._reports.answer(Answer(ask.identity, data_of, b"".join(found.values())))
 

@@ -53,6 +53,10 @@ class Goal:
     near
         The step counts must be near their goal: a mirror that is defocused goes on with the sun,
         beside the receiver, so that it never stands still.
+    told
+        For a goal that looks like what was before: where the answer was lost, one of these states
+        or flags must have been seen, or nobody knows whether the command was taken; None: the goal
+        itself shows it.
     limit
         For getting there, s.
     """
@@ -62,6 +66,7 @@ class Goal:
     clear: int = 0
     needed: int = 0
     near: bool = False
+    told: tuple[frozenset[int], int] | None = None
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
@@ -74,19 +79,25 @@ class Goal:
             return True if clear and flags & self.needed == self.needed else None
         return None if state in self.on_way else False
 
+    def shown(self, state: int, flags: int) -> bool:
+        """Whether state and flags are none that would be there without the command."""
+        return self.told is None or state in self.told[0] or bool(flags & self.told[1])
 
+
+#: Nothing that is told shows whether it was taken.
+_NOTHING: tuple[frozenset[int], int] = (frozenset(), 0)
 GOALS = {
     "APPROACH": Goal(frozenset({IDLE}), frozenset({APPROACHING})),
     "IDLE": Goal(frozenset({IDLE})),
     "TRACK": Goal(frozenset({TRACKING})),
     "REFOCUS": Goal(frozenset({TRACKING})),
-    "SEARCH": Goal(frozenset({SEARCHING, IDLE})),
+    "SEARCH": Goal(frozenset({SEARCHING, IDLE}), told=(frozenset({SEARCHING}), 0)),
     "LOCK": Goal(frozenset({LOCKED})),
     "UNLOCK": Goal(_ALL - {LOCKED}),
     "CLEAR_FAULT": Goal(_ALL - {FAULT}),
     "JOG": Goal(frozenset({IDLE}), clear=_MOVING),
-    "GOTO": Goal(frozenset({IDLE}), clear=_MOVING),
-    "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING),
+    "GOTO": Goal(frozenset({IDLE}), clear=_MOVING, told=_NOTHING),
+    "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING, told=(frozenset(), _DIAGNOSING)),
     "DEFOCUS": Goal(_ALL - BEAM_OUT, near=True, limit=DEFOCUS_BUDGET),
     "STOW": Goal(
         _ALL - BEAM_OUT - {states.DEFOCUSED}, clear=_MOVING, needed=_AT_STOW, limit=STOW_BUDGET
@@ -96,11 +107,12 @@ assert STOWED in GOALS["STOW"].there
 assert STOWING in GOALS["STOW"].there
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Watch:
     identity: str
     name: str
     since: float
+    sure: bool  # that it was taken
 
 
 class Goals:
@@ -110,15 +122,18 @@ class Goals:
         self._reports = reports
         self._watches: dict[int, list[_Watch]] = {}
 
-    def begin(self, identity: str, name: str, node: Node, now: float) -> None:
-        """Note that a node has acknowledged a command; goals of other commands are void."""
+    def begin(self, identity: str, name: str, node: Node, now: float, *, sure: bool = True) -> None:
+        """Note that a node has acknowledged a command; goals of other commands are void.
+
+        Not ``sure``: it may have, its answer was lost.
+        """
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
             return
         same = [watch for watch in self._watches.get(node.index, []) if watch.name == name]
         if not same:
             self.end(node, f"{name} came after it")
-        self._watches[node.index] = [*same, _Watch(identity, name, now)]
+        self._watches[node.index] = [*same, _Watch(identity, name, now, sure)]
 
     def waits(self, node: Node) -> bool:
         """Whether a node is to reach something."""
@@ -161,6 +176,7 @@ class Goals:
         if asked_at < watch.since + _SETTLE:
             return None
         goal = GOALS[watch.name]
+        watch.sure = watch.sure or goal.shown(node.state, node.flags)
         if goal.near and node.steps_at < watch.since + _SETTLE:
             return None
         primary, secondary, primary_goal, secondary_goal = node.steps
@@ -168,8 +184,11 @@ class Goals:
         reached = goal.reached(node.state, node.flags, off)
         if reached is None:
             return None
+        state = states.STATES[node.state]
+        if reached and not watch.sure:
+            return f"its answer was lost, and nothing shows that it was taken; it is {state}"
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
-        return "" if reached else f"went to {states.STATES[node.state]}{fault}"
+        return "" if reached else f"went to {state}{fault}"
 
 
 def _late(node: Node, now: float, watch: _Watch) -> str | None:

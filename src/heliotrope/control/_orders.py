@@ -31,6 +31,9 @@ TRIES = 3
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
 #: May mean that an earlier frame was taken whose answer was lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
+#: The goal looks like what was before: "duplicate" leaves open what the first answer was, a new
+#: frame tells, and does no harm if the first was taken.
+_ANEW = ("GOTO", "SEARCH", "DIAGNOSE")
 #: Would act twice.
 _RELATIVE = ("JOG",)
 #: For all heliostats together; the bus does about a hundred in a second.
@@ -351,9 +354,12 @@ class Orders:
         if result == messages.DONE:
             self.out_of_step = 0
             return self._advance(job)
-        if lost and result in _MAYBE and name in GOALS:
-            return self._advance(job)
         text = f"{name}: {self._why(job.node, result)}"
+        if lost and result == messages.DUPLICATE and name in _ANEW:
+            job.unanswered = True
+            return self._again(job, text)
+        if lost and result in _MAYBE and name in GOALS:
+            return self._advance(job, sure=False)
         if result in _AGAIN:
             self.out_of_step += result == messages.DUPLICATE and not lost
             return self._again(job, text)
@@ -367,7 +373,8 @@ class Orders:
             text += f" ({states.STATES[node.state]}{fault})"
         return text
 
-    def _advance(self, job: Job) -> None:
+    def _advance(self, job: Job, *, sure: bool = True) -> None:
+        """Go on after a step that was done; not ``sure``: its goal shows whether it was."""
         if job.void:
             return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
@@ -381,7 +388,7 @@ class Orders:
         elif done.item:
             self._reports.add(order.identity, Stage.DONE, node.name)
         else:
-            self._goals.begin(order.identity, done.name, node, self._clock())
+            self._goals.begin(order.identity, done.name, node, self._clock(), sure=sure)
         return None
 
     def _again(self, job: Job, why: str) -> None:

@@ -71,6 +71,8 @@ _OUT_OF_STEP = 3
 #: A message to the plant is worth so long, s.
 _NEWS_LIFE = 5.0
 _STATUS_LIFE = 1.0
+#: The names of the rows are repeated after so many status: the message of before may be lost.
+_NAMES_EVERY = 10
 _UNBOUNDED = 1e9
 
 
@@ -110,6 +112,7 @@ class Cluster:
         self._link, self._clock, self._time = link, clock, time
         self._kept = kept or Kept(None)
         self.nodes = [Node(member, index) for index, member in enumerate(config.heliostats)]
+        self._names = tuple(node.name for node in self.nodes)
         self._by_address = sorted(self.nodes, key=lambda node: node.address)
         now, present = clock.monotonic(), time.time()
         # Without a file the time alone makes sure that the epoch is above that of any run before.
@@ -138,6 +141,7 @@ class Cluster:
         self._running = False
         self._opened = -1
         self._was_connected = False
+        self._told_names = 0  # in which second
         self._silent: set[int] = set()
         self._strange: set[int] = set()
         self.cycle = 0.0
@@ -232,6 +236,7 @@ class Cluster:
         if verdict.new is not None:
             self._act(Act.STOW if verdict.new is Act.STOW else Act.DEFOCUS)
         self._orders.token = self._authority()
+        self._asked.second()
         if self._orders.out_of_step >= _OUT_OF_STEP:
             self._new_epoch(0)
         self._urgent.second()
@@ -452,7 +457,7 @@ class Cluster:
         greet = connected and (opened != self._opened or not self._was_connected)
         self._was_connected = connected
         if greet:
-            self._opened = opened
+            self._opened, self._told_names = opened, self._number
             self._reports.greet()
         present, now = self._time.time(), self._clock.monotonic()
         self._reports.status(
@@ -461,7 +466,7 @@ class Cluster:
                 time_quality=present.quality, time_error_s=min(present.error, _UNBOUNDED),
                 lease_left=self._watch.lease_left(now), cycle_s=now - begin,
                 acts=self._watch.verdict.acts,
-                names=tuple(node.name for node in self.nodes) if greet else (),
+                names=self._names if (self._number - self._told_names) % _NAMES_EVERY == 0 else (),
                 block=rows(self.nodes, now),
             )
         )  # fmt: skip

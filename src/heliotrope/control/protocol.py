@@ -60,7 +60,8 @@ class Stage(Enum):
 class Lease:
     """The plant is there, and commands through this token (0: nobody may command).
 
-    The cluster goes on for ``lifetime`` s from when it was sent, and for ``autonomy`` s more.
+    The cluster goes on for ``lifetime`` s from when it arrives, and for ``autonomy`` s more. How
+    long it may be under way is limited by the expiry that it is sent with.
     """
 
     kind: ClassVar[str] = "lease"
@@ -73,7 +74,8 @@ class Lease:
 class Command:
     """A command of the wire, by its name and values, to heliostats by name ((): all).
 
-    ``identity`` returns in every `Progress`. ``lifetime`` in s, from when it was sent.
+    ``identity`` returns in every `Progress`. ``lifetime`` in s, from when it arrives at the
+    cluster; it arrives within the expiry that it is sent with, or not at all.
     """
 
     kind: ClassVar[str] = "command"
@@ -99,7 +101,7 @@ class Emergency:
 class Parameters:
     """Items of the journal of one heliostat (`lcu.journal.ITEMS`), to be stored there.
 
-    ``sizes`` tells how ``block`` falls into the items' bytes.
+    ``sizes`` tells how ``block`` falls into the items' bytes; ``lifetime`` as of `Command`.
     """
 
     kind: ClassVar[str] = "parameters"
@@ -143,7 +145,10 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Ask:
-    """A question: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``."""
+    """A question: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``.
+
+    The answer to ``statistics`` names all heliostats in the order of the rows of `Status`.
+    """
 
     kind: ClassVar[str] = "ask"
     identity: str
@@ -169,7 +174,8 @@ class Acknowledge:
 class Status:
     """Once a second: the cluster and all its heliostats.
 
-    ``names`` is given in the first message of a connection and whenever it changed, else ().
+    ``names``, in the order of the rows, is given in the first message of a connection and in
+    every tenth after it, as each may be lost; else it is ().
     ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` how far it may be off.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     """

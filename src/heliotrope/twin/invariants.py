@@ -103,11 +103,10 @@ BY_COMMAND = {
 AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
 #: What DEFOCUS and STOW never leave a mirror in.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
-#: States that a command asks for: what DONE must mean. SEARCH begins and ends in IDLE, so that
-#: states cannot tell whether it has been.
+#: States that a command asks for: what DONE must mean.
 ASKED = {
     "APPROACH": (states.IDLE,), "IDLE": (states.IDLE,), "TRACK": (states.TRACKING,),
-    "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,),
+    "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,), "SEARCH": (states.SEARCHING,),
 }  # fmt: skip
 
 
@@ -431,12 +430,16 @@ class Observer:
         """Note an order of the plant."""
         self.orders.note(order)
 
-    def emergency(self, name: str, now: float, *, carried: bool) -> None:
-        """Note DEFOCUS or STOW for everybody; ``carried``: line and cluster are there."""
+    def emergency(
+        self, name: str, now: float, *, carried: bool, heliostats: Iterable[str] = ()
+    ) -> None:
+        """Note DEFOCUS or STOW for some (none: all); ``carried``: line and cluster are there."""
         if carried:
             self._emergencies.append((name, now))
+        whom = set(heliostats)
         for account in self.accounts:
-            account.must(name, now)
+            if not whom or account.name in whom:
+                account.must(name, now)
 
     def jumped(self, now: float, place: int | None = None) -> None:
         """Note that a clock jumps, or the counter of the board at a place."""
