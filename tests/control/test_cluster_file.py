@@ -1,8 +1,10 @@
 """The cluster's file and its keys, and the parts of a cluster that stand alone."""
 
+import ctypes
 import json
 import math
 import shutil
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +13,19 @@ import pytest
 from clusters import SITE, config_of
 from heliotrope import sun
 from heliotrope.cli.cluster import _line, _link, _time
+from heliotrope.control import timekeeping
 from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
 from heliotrope.control._sun_line import HORIZON, sun_at, sun_values
-from heliotrope.control.clock import SystemClock
+from heliotrope.control.clock import SystemClock, VirtualClock
 from heliotrope.control.cluster_config import ClusterConfig, Member
 from heliotrope.control.cluster_file import TABLES, read_cluster
 from heliotrope.control.gps import GpsTime
+from heliotrope.control.timekeeping import Time
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
 from heliotrope.sun import Site
+from nmea_talk import rmc
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "cluster"
@@ -74,6 +79,11 @@ def test_the_example_is_read(folder: Path) -> None:
         ("tcp://10.0.0.2:4840", "tcp://host:99999", "is no URL"),
         ('url = "/dev/ttyACM0"\n', "", "time: source is gps, and no url is given"),
         ("latitude_deg = -33.9281", "latitude_deg = 133", "site.latitude_deg: 133"),
+        ("[time]", "[time]\nntp = true", "time.ntp: ntp belongs to source system"),
+        ("[time]", "[time]\nlatency_s = 2", "time.latency_s: 2: input should be less than"),
+        ("[time]", "[time]\nsystem_tolerance_s = -1", "time.system_tolerance_s: -1: input"),
+        ("[time]", "[time]\ndrift_ppm = 0", "time.drift_ppm: 0: input should be greater than 0"),
+        ("baud_rate = 9600", "baud_rate = 4000000", "time.baud_rate: 4000000: input should be"),
         ("[site] ", "[site", "no TOML"),
         ('"C1.keys.toml" ', '"none.toml" ', "none.toml: there is no such file"),
         ("version = 1\n", "version = 1\nkeys2 = 3\n", "'keys2' is not known; did you mean 'keys'"),
@@ -270,7 +280,8 @@ def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
     nodes = [Node(Member("A", 9), 0), Node(Member("B", 10), 1)]
     nodes[0].status, nodes[0].steps = STATUS_VALUES, (1, -2, 3, -4)
     nodes[0].counts.asked = 7
-    nodes[0].answered(99.0, 0.01)
+    nodes[0].status_at = 99.0
+    nodes[0].answered(100.2, 0.01)  # an ACK, which says nothing of its state
     table = np.frombuffer(rows(nodes, 100.5), dtype=NODE)
     assert table["heard_ms"][0] == 1500
     assert table["heard_ms"][1] == 2**32 - 1
@@ -302,6 +313,75 @@ def test_links_and_times_are_made_as_the_file_says(folder: Path) -> None:
     changed(folder, "mqtt://", "mqtts://")
     with pytest.raises(InputError, match=r"no\.pem"):
         _link(read_cluster(folder / "C1.toml"), clock)
+
+
+def spoken(keeper: GpsTime, clock: VirtualClock, seconds: int = 5) -> Time:
+    """What a receiver without latency makes a keeper believe."""
+    true = datetime(2026, 6, 21, 10, tzinfo=UTC)
+    for second in range(seconds):
+        keeper._disciplined.hear(rmc(true + timedelta(seconds=second)))
+        clock.advance(1.0)
+    return keeper.time()
+
+
+@pytest.mark.parametrize(
+    ("lines", "off", "quality", "error"),
+    [
+        ("", 0.0, "gps", 0.255),
+        ("latency_s = 0.1", 0.0, "gps", 0.055),
+        ("", 5.0, "none", math.inf),
+        ("system_tolerance_s = 6", 5.0, "gps", 0.255),
+        ("system_tolerance_s = 0", 5.0, "gps", 0.255),
+    ],
+)
+def test_a_receiver_is_believed_as_the_file_says(
+    folder: Path, lines: str, off: float, quality: str, error: float
+) -> None:
+    changed(folder, "[time]", f"[time]\n{lines}")
+    clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
+    clock.jump(off)
+    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    assert isinstance(keeper, GpsTime)
+    found = spoken(keeper, clock)
+    assert found.quality == quality
+    assert found.error == pytest.approx(error, abs=0.002)
+
+
+def test_an_oscillator_drifts_as_the_file_says(folder: Path) -> None:
+    changed(folder, "[time]", "[time]\ndrift_ppm = 200")
+    clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
+    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    assert isinstance(keeper, GpsTime)
+    before = spoken(keeper, clock).error
+    clock.advance(1000.0)
+    assert (keeper.time().quality, keeper.time().error) == (
+        "holdover", pytest.approx(before + 0.2, abs=1e-6),
+    )  # fmt: skip
+
+
+def test_with_ntp_the_kernel_is_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = [True]
+    monkeypatch.setattr(timekeeping, "kernel_synchronised", lambda: kept[0])
+    changed(
+        folder, 'source = "gps"', 'source = "system"\nntp = true\ndrift_ppm = 400\nerror_s = 0.1'
+    )
+    clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
+    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.1)
+    kept[0] = False
+    clock.advance(1000.0)
+    assert (keeper.time().quality, keeper.time().error) == ("holdover", pytest.approx(0.5))
+    clock.advance(2000.0)
+    assert keeper.time().quality == "none"
+
+
+def test_where_the_kernel_cannot_be_asked_that_is_said_at_the_start(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changed(folder, 'source = "gps"', 'source = "system"\nntp = true')
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
+    with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
+        _time(read_cluster(folder / "C1.toml"), SystemClock())
 
 
 def test_an_emergency_line_that_cannot_be_read_is_open(tmp_path: Path) -> None:

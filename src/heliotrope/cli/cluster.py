@@ -115,9 +115,17 @@ def _link(installation: "Installation", clock: "Clock") -> "Link":
 def _time(installation: "Installation", clock: "Clock") -> "TimeKeeper":
     time = installation.time
     if time.source == "system":
-        from heliotrope.control.timekeeping import SystemTime
+        from heliotrope.control.timekeeping import SystemTime, kernel_synchronised
 
-        return SystemTime(clock, time.error_s)
+        if time.ntp:
+            kernel_synchronised()  # where the kernel cannot be asked, that is said at the start
+        asked = kernel_synchronised if time.ntp else None
+        return SystemTime(clock, time.error_s, synchronised=asked, drift_ppm=time.drift_ppm)
+    from heliotrope.control.discipline import DisciplineSettings
     from heliotrope.control.gps import GpsSettings, GpsTime
 
-    return GpsTime(time.url, clock, GpsSettings(baud_rate=time.baud_rate))
+    discipline = DisciplineSettings(
+        latency=time.latency_s, drift_ppm=time.drift_ppm,
+        system_tolerance=time.system_tolerance_s or None,
+    )  # fmt: skip
+    return GpsTime(time.url, clock, GpsSettings(time.baud_rate, discipline=discipline))

@@ -78,9 +78,27 @@ class TimeTable(Table):
 
     source: Literal["system", "gps"] = Field("system", description="This computer, or a receiver.")
     url: str = Field("", description="Of the receiver's port (NMEA 0183).")
-    baud_rate: int = Field(9600, ge=1200, le=4_000_000, description="Of the receiver's port.")
+    baud_rate: int = Field(9600, ge=1200, le=921_600, description="Of the receiver's port.")
+    latency_s: float = Field(
+        0.5,
+        ge=0.01,
+        le=1.9,
+        description="From a second to the quickest of its sentences; half of it is the error.",
+    )
+    system_tolerance_s: float = Field(
+        2.0,
+        ge=0.0,
+        le=3600.0,
+        description="How far this computer's clock may be from the receiver; 0: it has no say.",
+    )
     error_s: float = Field(
         0.5, gt=0.0, le=0.5, description="What the operator vouches for with `system`."
+    )
+    ntp: bool = Field(
+        False, description="With `system`: ask the kernel whether NTP keeps its clock."
+    )
+    drift_ppm: float = Field(
+        100.0, gt=0.0, le=1000.0, description="Of this computer's oscillator, left alone, at most."
     )
 
 
@@ -233,6 +251,11 @@ def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Inst
     )  # fmt: skip
     if document.time.source == "gps" and not document.time.url:
         raise FormatError(path, "source is gps, and no url is given; add it", "time")
+    if document.time.source == "gps" and document.time.ntp:
+        raise FormatError(
+            path, "ntp belongs to source system; with gps the computer's clock is asked through "
+            "system_tolerance_s", "time.ntp",
+        )  # fmt: skip
     line = document.safety.emergency_line
     scheme, host, port, prefix = _place(path, document.plant.url)
     return Installation(
