@@ -1,5 +1,7 @@
 """The vectorised field beside firmware-true boards: the same steps, from stow to stow."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from heliotrope.control._sun_line import sun_values
 from heliotrope.control.clock import gps_seconds
 from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
+from heliotrope.lcu.controller import STUCK_PRIMARY
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
@@ -26,22 +29,24 @@ from heliotrope.twin.outfit import (
     sha256,
 )
 from heliotrope.twin.simulation import SITE, START
+from heliotrope.twin.wind import Wind
 
 TOKEN, COUNT = 0xF1E1D, 3
 
 
-def field_of(mechanism: Mechanism) -> Field:
+def field_of(mechanism: Mechanism, **options: Any) -> Field:
     return Field(
-        mechanism, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY, defocus=DEFOCUS
-    )
+        mechanism, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY, defocus=DEFOCUS,
+        **options,
+    )  # fmt: skip
 
 
 class Both:
     """Boards and a field that are told the same at the same time."""
 
-    def __init__(self) -> None:
+    def __init__(self, play: float = 0.0, wind: Wind | None = None) -> None:
         made = outfits(COUNT, seed=4)
-        self.boards = [Board(outfit, seed=i) for i, outfit in enumerate(made)]
+        self.boards = [Board(outfit, seed=i, play=play, wind=wind) for i, outfit in enumerate(made)]
         gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
         perfect = kinds.azimuth_elevation(
             np.array([outfit.mechanism.position for outfit in made]), pivot_height=2.0,
@@ -50,11 +55,13 @@ class Both:
         self.field = field_of(
             perfect.with_parameters(
                 {name: np.array([outfit.causes[name] for outfit in made]) for name in CAUSES}
-            )
-        )
+            ),
+            play=play, wind=wind,
+        )  # fmt: skip
         for board, row in zip(self.boards, self.field.mechanism.armature.table, strict=True):
             assert np.allclose(board.outfit.mechanism.armature.table, row, atol=1e-12)
-        self.ticks = 0
+        self.ticks = self.compared = 0
+        self.play = 0.0
         self.sender = wire.Sender(0, int(gps_seconds(START)), sha256)
         for board in self.boards:
             board.power_on(0.0)
@@ -74,6 +81,28 @@ class Both:
             head = () if name in ("DEFOCUS", "STOW") else (TOKEN, expires)
             self.hear(self.sender.frame(11 + i, name, *head, *values))
         self.field.order(name, np.array(rows), values or None)
+
+    def fail(self, i: int) -> None:
+        node = self.boards[i].node
+        assert node is not None
+        node.on_fault(STUCK_PRIMARY, self.boards[i].ticks.at(self.now), False)
+        self.field.fail(np.array([i]), STUCK_PRIMARY)
+
+    def mend(self, i: int) -> None:
+        node = self.boards[i].node
+        assert node is not None
+        node.fault_gone(STUCK_PRIMARY)
+        self.field.mend(np.array([i]))
+
+    def cut(self, *rows: int, warned: bool = False) -> None:
+        for i in rows:
+            self.boards[i].power_off(self.now, warned=warned)
+        self.field.cut(np.array(rows), warned=warned)
+
+    def restore(self, *rows: int) -> None:
+        for i in rows:
+            self.boards[i].power_on(self.now)
+        self.field.restore(np.array(rows))
 
     def run(self, seconds: float, *, sun: bool = True) -> None:
         """Let time pass; steps and states are the same at every tick."""
@@ -97,17 +126,24 @@ class Both:
         self.field.take_sun(values)
 
     def same(self) -> None:
-        counts = [[b.controller.motion.place(k) for k in (0, 1)] for b in self.boards]  # type: ignore[union-attr]
+        drives = self.field.drives
+        self.play = max(self.play, float((drives.joint - drives.turned).max()))
         at = f"at {self.now:.2f} s"
-        assert self.field.axes["count"].tolist() == counts, at
         assert self.field.state.tolist() == [board.state for board in self.boards], at
+        for i, board in enumerate(self.boards):
+            own = board.controller
+            if own is not None:
+                counts = [own.motion.place(k) for k in (0, 1)]
+                assert self.field.axes["count"][i].tolist() == counts, at
+            # Joints can be compared when the timers have played what was emitted.
+            if all(axis.idle for axis in board.axes):
+                assert drives.turned[i].tolist() == [a.turned for a in board.axes], at
+                assert drives.joint[i].tolist() == [a.joint for a in board.axes], at
+                self.compared += 1
 
     def angles_apart(self) -> float:
-        """Largest angle between the normals of boards and field, rad."""
-        normals = [
-            board.outfit.mechanism.pose([axis.emitted for axis in board.axes]).normal
-            for board in self.boards
-        ]
+        """Largest angle between the true normals of boards and field, rad."""
+        normals = [board.mirror()[1] for board in self.boards]
         return float(np.linalg.norm(self.field.normals() - normals, axis=1).max())
 
     def states(self) -> set[str]:
@@ -141,6 +177,65 @@ def test_field_and_boards_make_the_same_steps() -> None:
     both.run(50, sun=False)
     assert both.states() == {"STOWED"}
     assert both.angles_apart() < 1e-9
+
+
+def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
+    wind = Wind(speed=7.0, towards=1.0, seed=3)
+    both = Both(play=35.0, wind=wind)
+    both.run(2)
+    both.order("AIM", *RECEIVER)
+    both.order("APPROACH", rows=(0, 1))
+    both.run(8)
+    both.fail(1)  # on the way
+    both.order("LOCK", rows=(2,))
+    both.run(60)
+    assert both.states() == {"IDLE", "FAULT", "LOCKED"}
+    both.order("TRACK")
+    both.order("UNLOCK", rows=(2,))
+    both.order("CLEAR_FAULT", rows=(1,))  # its cause is still there
+    both.run(15)
+    assert [states.STATES[s] for s in both.field.state] == ["TRACKING", "FAULT", "STOWED"]
+    assert both.angles_apart() < 1e-9
+    both.mend(1)
+    both.order("APPROACH", rows=(2,))
+    both.order("CLEAR_FAULT", rows=(1,))
+    both.run(2)
+    assert both.field.state[1] in (states.IDLE, states.STOWED)
+    both.order("LOCK", rows=(0,))
+    both.run(3)
+    both.order("DEFOCUS", rows=(0,))
+    both.run(8)
+    both.cut(0, 1)
+    both.run(3)
+    both.order("STOW", rows=(0, 1))  # nobody hears it
+    both.run(1)
+    both.restore(0, 1)
+    both.run(20)
+    assert both.field.state[0] == states.LOCKED
+    assert both.angles_apart() < 1e-9
+    both.run(50)
+    both.order("TRACK", rows=(2,))
+    both.run(12)
+    assert both.field.state[2] == states.TRACKING
+    both.order("IDLE", rows=(2,))
+    both.run(10)
+    both.cut(2, warned=True)
+    both.run(2)
+    both.restore(2)
+    both.order("STOW", rows=(0,))
+    both.run(40)
+    assert [states.STATES[s] for s in both.field.state][::2] == ["LOCKED", "FAULT"]
+    # A fault that is left to itself goes to stow, and is one there.
+    both.run(30)
+    assert both.field.at_stow()[[0, 2]].all()
+    both.order("CLEAR_FAULT", rows=(2,))
+    both.order("UNLOCK", rows=(0,))
+    both.run(1)
+    assert both.states() == {"STOWED"}
+    assert both.angles_apart() < 1e-9
+    # The play has shown: going down, joints have stood above their motors.
+    assert both.play == 35.0
+    assert both.compared > 0.5 * COUNT * both.ticks
 
 
 def test_flux_follows_the_beams() -> None:
@@ -186,6 +281,77 @@ def test_flux_follows_the_beams() -> None:
     assert field.at_stow().all()
 
 
+def test_lost_steps_are_in_the_mirrors_and_not_in_the_counts() -> None:
+    made = Both().field.mechanism
+    perfect, lossy = field_of(made), field_of(made, miss=0.2, seed=8)
+    second = round(gps_seconds(START))
+    values = sun_values(second, START.timestamp(), SITE)
+    assert values is not None
+    moved = np.zeros((COUNT, 2))
+    for field in (perfect, lossy):
+        field.take_sun(values)
+        assert field.order("APPROACH").all()
+    for _ in range(100):
+        before = lossy.axes["count"].copy()
+        for field in (perfect, lossy):
+            field.take_sun(values)
+            field.advance(50)
+        moved += before != lossy.axes["count"]
+    assert np.array_equal(perfect.axes["count"], lossy.axes["count"])
+    missed = lossy.drives.missed
+    spread = np.sqrt(0.2 * 0.8 * moved.sum())
+    assert abs(missed.sum() - 0.2 * moved.sum()) < 4.0 * spread
+    # All of it went one way so far: each lost step is missing.
+    assert np.array_equal(np.abs(lossy.drives.turned - lossy.axes["count"]), missed)
+    # They are 15.7 µrad each.
+    apart = np.linalg.norm(lossy.normals() - perfect.normals(), axis=1)
+    assert (apart < 15.8e-6 * missed.sum(axis=1)).all()
+    # A mirror that still looks up is hardly moved by its azimuth.
+    assert apart.min() > 1e-6
+    assert apart.max() > 50e-6
+
+
+def test_the_wind_turns_the_mirrors_of_a_field() -> None:
+    wind = Wind(speed=9.0, towards=0.7, seed=2)
+    made = Both().field.mechanism
+    calm, windy = field_of(made), field_of(made, wind=wind)
+    # At stow a mirror is nearly edge on: its normal is off the zenith by its imperfections alone.
+    assert np.abs(calm.normals() - windy.normals()).max() < 0.1e-3
+    values = sun_values(round(gps_seconds(START)), START.timestamp(), SITE)
+    assert values is not None
+    for field in (calm, windy):
+        field.take_sun(values)
+        field.order("APPROACH")
+    turns = []
+    for _ in range(30):
+        for field in (calm, windy):
+            field.take_sun(values)
+            field.advance(1000)
+        turns.append(np.linalg.norm(calm.normals() - windy.normals(), axis=1))
+    assert np.array_equal(calm.axes, windy.axes)
+    last = np.array(turns[-10:])
+    assert 0.05e-3 < last.min() < last.max() < 3e-3
+    assert (last.std(axis=0) > 0.02 * last.mean(axis=0)).all()
+    place = np.broadcast_to(made.position, (COUNT, 3))
+    assert np.allclose(windy.normals(), wind.turned(calm.normals(), place, 30.0), atol=1e-12)
+
+
+def test_without_a_supply_nothing_is_heard() -> None:
+    field = Both().field
+    values = sun_values(round(gps_seconds(START)), START.timestamp(), SITE)
+    assert values is not None
+    field.cut(np.array([1]))
+    field.take_sun(values)
+    assert [field.lease_left(i) > 0 for i in range(COUNT)] == [True, False, True]
+    assert field.order("APPROACH").tolist() == [True, False, True]
+    assert field.order("DEFOCUS").tolist() == [True, False, True]
+    field.fail(np.array([0, 1]), STUCK_PRIMARY)
+    assert field.fault.tolist() == [STUCK_PRIMARY, 0, 0]
+    field.cut(np.array([1]))
+    field.restore(np.array([0, 1]))
+    assert field.state.tolist() == [states.FAULT, states.STOWED, states.DEFOCUSED]
+
+
 def test_what_a_field_refuses() -> None:
     made = outfits(1)[0]
     with pytest.raises(InputError, match=r"field: mechanisms of shape \(\) with 2 drives; give"):
@@ -195,3 +361,9 @@ def test_what_a_field_refuses() -> None:
         field.advance(70)
     with pytest.raises(InputError, match="field: 'JUMP' with aim None; see Field"):
         field.order("JUMP")
+    with pytest.raises(InputError, match="field: fault 11; give 1 to 10"):
+        field.fail(np.array([0]), 11)
+    with pytest.raises(InputError, match=r"drives: a play of -1.0 steps and a chance of 0.0"):
+        field_of(field.mechanism, play=-1.0)
+    with pytest.raises(InputError, match=r"a chance of 1.5 to lose one; give 0 or more"):
+        field_of(field.mechanism, miss=1.5)

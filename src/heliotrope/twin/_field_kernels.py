@@ -115,8 +115,26 @@ def still_rows(axes, queued, out):
 
 
 @njit(**OPTIONS)
-def advance_rows(axes, order, queued, elapsed_ms, slot_ms, ahead_ms):
-    """Emit what the time has made room for: `Stepper.advance`."""
+def _carry(drives, i, k, steps):
+    """Turn a motor by what was emitted; its joint is carried along by the flank that pushes."""
+    turned, joint, play, lost, missed = drives
+    if steps == 0:
+        return
+    if lost[i, k]:
+        lost[i, k] = False
+        missed[i, k] += 1
+        steps -= 1 if steps > 0 else -1
+    turned[i, k] += steps
+    joint[i, k] = min(max(joint[i, k], turned[i, k]), turned[i, k] + play[i, k])
+
+
+@njit(**OPTIONS)
+def advance_rows(axes, order, queued, drives, elapsed_ms, slot_ms, ahead_ms):
+    """Emit what the time has made room for: `Stepper.advance`.
+
+    ``drives`` holds, each (N, 2): where motors and joints stand, the play, whether a step is
+    lost next, and how many were.
+    """
     for i in range(len(axes)):
         queued[i] -= elapsed_ms
         if queued[i] < 0:
@@ -129,5 +147,7 @@ def advance_rows(axes, order, queued, elapsed_ms, slot_ms, ahead_ms):
                 break
             for k in range(2):
                 waits = order[i] == (SECONDARY_FIRST if k == 0 else PRIMARY_FIRST)
+                before = axes[i, k]["count"]
                 _slot(axes, i, k, waits and not _still(axes, i, 1 - k))
+                _carry(drives, i, k, axes[i, k]["count"] - before)
             queued[i] += slot_ms

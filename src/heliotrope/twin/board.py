@@ -21,6 +21,7 @@ from heliotrope.twin.clocks import TickCounter
 from heliotrope.twin.flash import NorFlash, PowerCutError
 from heliotrope.twin.motors import Axis
 from heliotrope.twin.outfit import STOW, Outfit, sha256
+from heliotrope.twin.wind import Wind
 
 #: Longest pauses between two looks of the main loop: while steps are made; while the sun is
 #: followed; at rest. A board looks far more often. This is the worst that the core allows for
@@ -73,6 +74,8 @@ class Board:
         Its counter of milliseconds.
     play, miss
         Of the motors; see `twin.motors.Axis`.
+    wind
+        That turns the mirror; None: there is none.
 
     Attributes
     ----------
@@ -96,9 +99,10 @@ class Board:
         ticks: TickCounter | None = None,
         play: float = 0.0,
         miss: float = 0.0,
+        wind: Wind | None = None,
     ) -> None:
         chance = random.Random(seed)
-        self.outfit = outfit
+        self.outfit, self.wind = outfit, wind
         self.ticks = ticks or TickCounter()
         self.flash = NorFlash(chance.getrandbits(32))
         self.axes = [Axis(count, play, miss, random.Random(chance.random())) for count in STOW]
@@ -237,18 +241,21 @@ class Board:
         return -1 if self.node is None else self.node.controller.state
 
     def mirror(self, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Return vertex (3,), m, and unit normal (3,).
+        """Return vertex (3,), m, and unit normal (3,), at the time of what happened last.
 
         Parameters
         ----------
         believed
-            Whether what has slipped is taken out: where the node thinks that it stands.
+            Whether what has slipped and the wind are taken out: where the node thinks that it
+            stands.
         """
         counts = [axis.joint for axis in self.axes]
         if believed:
             counts = [axis.turned - slip for axis, slip in zip(self.axes, self.slip, strict=True)]
         pose = self.outfit.mechanism.pose(counts)
-        return pose.vertex, pose.normal
+        if self.wind is None or believed:
+            return pose.vertex, pose.normal
+        return pose.vertex, self.wind.turned(pose.normal, self.outfit.mechanism.position, self.now)
 
     def beam(self, sun: FloatArray, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
         """Return vertex (3,) and direction (3,) of the reflected ray.

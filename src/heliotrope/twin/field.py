@@ -5,12 +5,11 @@ heliostats of a field at once, in the same integers: poses come from the vectori
 `mechanism`, steps from the kernels of `twin._field_kernels`. Where both overlap, step counts are
 those of the firmware-true board.
 
-It knows STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED and STOWING, the lease, and the
-way by itself to defocus and to stow. Locks, faults, settings, searching and moving by hand are
-the board's (`twin.board`).
+It knows STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and FAULT, the
+lease, and the way by itself to defocus and to stow. Supplies may be cut and come back; gears have
+play, motors lose steps, and the wind turns mirrors. Settings, searching and moving by hand are the
+board's (`twin.board`).
 """
-
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +17,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.lcu.controller import LATCHED, NO_FAULT
 from heliotrope.lcu.lease import RATE_FACTOR, UNIT
 from heliotrope.lcu.motion import (
     APPROACH,
@@ -25,7 +25,6 @@ from heliotrope.lcu.motion import (
     HOLD,
     KNOT_LIMIT,
     KNOT_MS,
-    PIECE,
     RENEW_MS,
     RETURN,
     STANDBY,
@@ -36,6 +35,9 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, track
 from heliotrope.twin import _field_kernels as kernels
+from heliotrope.twin._field_drives import Drives
+from heliotrope.twin._field_ways import pieces
+from heliotrope.twin.wind import Wind
 
 Rows = npt.NDArray[np.intp]
 Bools = npt.NDArray[np.bool_]
@@ -70,13 +72,23 @@ class Field:
         Points, (3,) or (N, 3), m.
     defocus
         Angles of both axes, rad.
+    play, miss, seed
+        Of the drives; see `twin._field_drives.Drives`.
+    wind
+        That turns the mirrors; None: there is none.
 
     Attributes
     ----------
     state, kind
-        Of `lcu.states` and `lcu.motion`, (N,).
+        Of `lcu.states` (-1 without supply) and `lcu.motion`, (N,).
+    fault
+        Of `lcu.controller`, 0 for none, (N,).
     axes
-        Of dtype `AXIS`, (N, 2).
+        Of dtype `AXIS`, (N, 2): what the controllers count.
+    drives
+        Where motors and joints stand in truth.
+    now_ms
+        Since the beginning.
     aim, standby
         (N, 3), m.
 
@@ -96,6 +108,10 @@ class Field:
         standby: npt.ArrayLike,
         defocus: tuple[float, float] = (0.1, 0.05),
         believed: Mechanism | None = None,
+        play: npt.ArrayLike = 0.0,
+        miss: float = 0.0,
+        wind: Wind | None = None,
+        seed: int = 0,
     ) -> None:
         if len(mechanism.shape) != 1 or len(mechanism.driven) != 2:
             raise InputError(
@@ -120,9 +136,14 @@ class Field:
             self.axes[name] = self._stow
         ends = np.stack([self._angles_at(self.axes[name]) for name in ("low", "high")])
         self._low, self._high = ends.min(axis=0), ends.max(axis=0)
+        self.drives = Drives(self.axes["count"], play, miss, seed)
+        self.wind, self.now_ms = wind, 0
         self._order = np.zeros(count, dtype=np.int64)
         self._queued = np.zeros(count, dtype=np.int64)
         self.state = np.full(count, states.STOWED, dtype=np.int8)
+        self.fault = np.full(count, NO_FAULT, dtype=np.int8)
+        self._present = np.zeros(count, dtype=np.bool_)
+        self._kept = self.state.copy()
         self.kind = np.full(count, HOLD, dtype=np.int8)
         self._base = np.full(count, HOLD, dtype=np.int8)
         self.standby = np.array(np.broadcast_to(np.asarray(standby, dtype=np.float64), (count, 3)))
@@ -265,8 +286,8 @@ class Field:
         self._length[i] = len(points)
 
     def _enter(self, rows: Rows, state: int) -> None:
-        dark = rows[(self.state[rows] != state)] if state == states.DEFOCUSED else rows[:0]
-        self._dark[dark] = STOW_WAIT_MS
+        if state in (states.DEFOCUSED, states.FAULT):
+            self._dark[rows[self.state[rows] != state]] = STOW_WAIT_MS
         self.state[rows] = state
 
     # -- messages --------------------------------------------------------------------------
@@ -287,7 +308,8 @@ class Field:
         """
         self._sun[0], self._sun[1] = values[1:4], np.multiply(values[4:7], RATE_FACTOR)
         self._sun_ms = delay_ms
-        self._lease[slice(None) if rows is None else rows] = LEASE_MS - max(0, delay_ms)
+        heard = np.arange(len(self)) if rows is None else rows
+        self._lease[heard[self.state[heard] >= 0]] = LEASE_MS - max(0, delay_ms)
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
         """Give a command; return who has taken it, (N,).
@@ -295,7 +317,7 @@ class Field:
         Parameters
         ----------
         name
-            DEFOCUS, STOW, APPROACH, IDLE, TRACK, REFOCUS or AIM.
+            DEFOCUS, STOW, APPROACH, IDLE, TRACK, REFOCUS, AIM, LOCK, UNLOCK or CLEAR_FAULT.
         rows
             Whom; None: all.
         aim
@@ -307,15 +329,14 @@ class Field:
             Another name, or AIM without an aim.
         """
         chosen = np.arange(len(self)) if rows is None else np.asarray(rows)
+        chosen = chosen[self.state[chosen] >= 0]
         state, taken = self.state[chosen], np.zeros(len(self), dtype=np.bool_)
         if name == "DEFOCUS":
             self._defocus_now(chosen)
         elif name == "STOW":
-            goes = chosen[~np.isin(state, (states.STOWED, states.STOWING))]
-            fresh = self._lease[goes] > 0
-            self._enter(goes, states.STOWING)
-            self._return(goes[fresh])
-            self._stow_directly(goes[~fresh])
+            self._stow_now(chosen)
+        elif name in ("LOCK", "UNLOCK", "CLEAR_FAULT"):
+            chosen = self._lock(chosen, name)
         elif name == "APPROACH":
             chosen = chosen[(state == states.STOWED) & (self._lease[chosen] > 0)]
             for i in chosen:
@@ -335,6 +356,34 @@ class Field:
             raise InputError(f"field: {name!r} with aim {aim!r}; see Field.order for what it takes")
         taken[chosen] = True
         return taken
+
+    def _stow_now(self, rows: Rows) -> None:
+        """STOW, by the state table."""
+        state = self.state[rows]
+        kept = np.isin(state, (states.LOCKED, states.FAULT))
+        self._stow_directly(rows[kept])
+        goes = rows[~kept & ~np.isin(state, (states.STOWED, states.STOWING))]
+        fresh = self._lease[goes] > 0
+        self._enter(goes, states.STOWING)
+        self._return(goes[fresh])
+        self._stow_directly(goes[~fresh])
+
+    def _lock(self, rows: Rows, name: str) -> Rows:
+        """LOCK, UNLOCK and CLEAR_FAULT; returns who has taken it."""
+        state = self.state[rows]
+        if name == "UNLOCK":
+            rows = rows[state == states.LOCKED]
+        elif name == "CLEAR_FAULT":
+            rows = rows[(state == states.FAULT) & ~self._present[rows]]
+            self.fault[rows] = NO_FAULT
+        home = np.where(self.at_stow()[rows], states.STOWED, states.IDLE)
+        after = np.where(self.fault[rows] == NO_FAULT, home, states.FAULT)
+        for to in (
+            (states.LOCKED,) if name == "LOCK" else (states.STOWED, states.IDLE, states.FAULT)
+        ):
+            self._enter(rows if name == "LOCK" else rows[after == to], to)
+        self._hold(rows)
+        return rows
 
     def _sun_bound(self, rows: Rows, name: str) -> Rows:
         """TRACK, REFOCUS and IDLE; returns who has taken it."""
@@ -364,11 +413,69 @@ class Field:
         goes = rows[np.isin(state, (states.APPROACHING, states.IDLE, states.TRACKING))]
         self._turn_away(goes)
         self._enter(goes, states.DEFOCUSED)
+        self._turn_away(rows[np.isin(state, (states.LOCKED, states.FAULT))])
         self._stow_directly(rows[state == states.STOWING])
 
     def lease_left(self, row: int) -> int:
         """Return what is left of the lease of one heliostat, ms."""
         return int(self._lease[row])
+
+    # -- faults and supplies ---------------------------------------------------------------
+
+    def fail(self, rows: Rows, number: int) -> None:
+        """Let controllers find a fault of `lcu.controller`; it lasts until `mend`.
+
+        Raises
+        ------
+        InputError
+            A number that no fault has.
+        """
+        if not NO_FAULT < number <= LATCHED:
+            raise InputError(f"field: fault {number}; give 1 to {LATCHED}, as lcu.names has them")
+        rows = rows[self.state[rows] >= 0]
+        self._present[rows] = True
+        self.fault[rows] = np.where(self.fault[rows] == NO_FAULT, number, self.fault[rows])
+        state = self.state[rows]
+        self._hold(rows[np.isin(state, (states.STOWED, states.LOCKED))])
+        self._stow_directly(rows[state == states.STOWING])
+        away = (states.APPROACHING, states.IDLE, states.TRACKING, states.DEFOCUSED)
+        self._turn_away(rows[np.isin(state, away)])
+        self._enter(rows[state != states.LOCKED], states.FAULT)
+
+    def mend(self, rows: Rows) -> None:
+        """Let the causes of faults be gone: the faults stay until CLEAR_FAULT."""
+        self._present[rows] = False
+
+    def cut(self, rows: Rows, *, warned: bool = False) -> None:
+        """Cut supplies: motors stand, nothing is heard. What was emitted is made yet.
+
+        ``warned``: the brown-out detectors see it come, which is a fault that stays.
+        """
+        rows = rows[self.state[rows] >= 0]
+        if warned:
+            self._enter(rows[self.state[rows] != states.LOCKED], states.FAULT)
+        self._kept[rows], self.state[rows] = self.state[rows], -1
+        self.kind[rows] = self._base[rows] = HOLD
+        self._lease[rows] = self._queued[rows] = self._order[rows] = 0
+        self._ready[rows] = self._present[rows] = False
+        for name in ("speed", "phase", "led", "braking"):
+            self.axes[name][rows] = 0
+        self.axes["direction"][rows] = 1
+        for name in ("goal", "leg"):
+            self.axes[name][rows] = self.axes["count"][rows]
+
+    def restore(self, rows: Rows) -> None:
+        """Let supplies come back: locked and faulty ones are so still, others turn away."""
+        rows = rows[self.state[rows] < 0]
+        before = self._kept[rows]
+        locked, faulty = before == states.LOCKED, before == states.FAULT
+        self.fault[rows] = np.where(faulty, LATCHED, NO_FAULT)
+        home = self.at_stow()[rows] & ~locked & ~faulty
+        self._enter(rows[locked], states.LOCKED)
+        self._enter(rows[home], states.STOWED)
+        self._turn_away(rows[~home & ~locked])
+        self._enter(rows[faulty], states.FAULT)
+        self._enter(rows[~home & ~locked & ~faulty], states.DEFOCUSED)
 
     # -- time ------------------------------------------------------------------------------
 
@@ -386,6 +493,7 @@ class Field:
             self._tick()
 
     def _tick(self) -> None:
+        self.now_ms += TICK_MS
         self._sun_ms += TICK_MS
         np.maximum(self._lease - TICK_MS, 0, out=self._lease)
         fresh = self._lease > 0
@@ -393,7 +501,7 @@ class Field:
             (self.kind == DEFOCUS) & np.isin(self._base, (STANDBY, TRACK))
         )
         needs = np.isin(self.state, (states.APPROACHING, states.TRACKING))
-        renewed = fresh & (follows | needs)
+        renewed = fresh & ((follows & (self.state != states.FAULT)) | needs)
         self._dark = np.where(renewed, STOW_WAIT_MS, np.maximum(self._dark - TICK_MS, 0))
         stands = (self.state == states.IDLE) & (self.kind == STANDBY)
         comes = (self.state == states.STOWING) & (self.kind == RETURN)
@@ -404,8 +512,15 @@ class Field:
         if len(silent):
             self._stow_directly(silent)
             self.state[silent] = states.STOWING
+        faulty = np.flatnonzero(
+            (self.state == states.FAULT) & (self._dark == 0) & (self.kind != STOW)
+        )
+        if len(faulty):
+            self._stow_directly(faulty[~self.at_stow()[faulty]])
         self._move()
-        kernels.advance_rows(self.axes, self._order, self._queued, TICK_MS, SLOT_MS, AHEAD_MS)
+        kernels.advance_rows(
+            self.axes, self._order, self._queued, self.drives.next(), TICK_MS, SLOT_MS, AHEAD_MS
+        )
 
     def _move(self) -> None:
         """`Motion.tick`."""
@@ -472,8 +587,16 @@ class Field:
     # -- what is true ----------------------------------------------------------------------
 
     def normals(self) -> FloatArray:
-        """Return the true normals of the mirrors, (N, 3)."""
-        return self.mechanism.pose(self.axes["count"]).normal
+        """Return the true normals of the mirrors now, (N, 3)."""
+        return self._stand()[0]
+
+    def _stand(self) -> tuple[FloatArray, FloatArray]:
+        """Return true normals and vertices, (N, 3)."""
+        pose = self.mechanism.pose(self.drives.joint)
+        if self.wind is None:
+            return pose.normal, pose.vertex
+        place = np.broadcast_to(self.mechanism.position, pose.normal.shape)
+        return self.wind.turned(pose.normal, place, 1e-3 * self.now_ms), pose.vertex
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
         """Return the share of the field's light that passes a receiver, 0 to 1.
@@ -489,46 +612,13 @@ class Field:
             cosine of its incidence, against the same for all beams aimed at the middle.
         """
         s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
-        pose = self.mechanism.pose(self.axes["count"])
-        cosine = pose.normal @ s
-        rays = 2.0 * cosine[:, None] * pose.normal - s
-        way = point - pose.vertex
+        normal, vertex = self._stand()
+        cosine = normal @ s
+        rays = 2.0 * cosine[:, None] * normal - s
+        way = point - vertex
         along = np.einsum("ij,ij->i", way, rays)
         off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
         unit = way / np.linalg.norm(way, axis=1)[:, None]
         nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
         on = (along > 0.0) & (off <= radius)
         return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())
-
-
-def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return ways with points between where a beam would turn by more than `lcu.motion.PIECE`.
-
-    Parameters
-    ----------
-    corners
-        (N, C, 3), m.
-    origin
-        From where the beams go, (N, 3), m.
-
-    Returns
-    -------
-    Points (N, P, 3), and how many of them each way has, (N,).
-    """
-    rays = corners - origin[:, None]
-    cross = np.linalg.norm(np.cross(rays[:, :-1], rays[:, 1:]), axis=-1)
-    turn = np.arctan2(cross, np.einsum("nci,nci->nc", rays[:, :-1], rays[:, 1:]))
-    parts = 1 + (turn / PIECE).astype(np.int64)
-    length = 1 + parts.sum(axis=1)
-    out = np.zeros((len(corners), int(length.max()), 3))
-    out[:, 0] = corners[:, 0]
-    place = np.ones(len(corners), dtype=np.int64)
-    for c in range(parts.shape[1]):
-        first, way = corners[:, c], corners[:, c + 1] - corners[:, c]
-        for k in range(1, int(parts[:, c].max()) + 1):
-            rows = np.flatnonzero(k <= parts[:, c])
-            n = parts[rows, c, None]
-            inner: Any = first[rows] + way[rows] * k / n
-            out[rows, place[rows]] = np.where(k == n, corners[rows, c + 1], inner)
-            place[rows] += 1
-    return out, length

@@ -1,0 +1,64 @@
+"""Motors and gears of a whole field: what becomes of the steps that are emitted.
+
+The same as `twin.motors` does for one axis, but for the time within a tick: steps are made when
+they are emitted, which on a board is up to a tenth of a second before its timer plays them.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+
+Integers = npt.NDArray[np.int64]
+Bools = npt.NDArray[np.bool_]
+
+
+class Drives:
+    """Motors and joints of N heliostats with two axes each.
+
+    Parameters
+    ----------
+    counts
+        Where they stand, steps, (N, 2).
+    play
+        Play of the gears, steps, a number or (N, 2); see `twin.motors.Axis`.
+    miss
+        Chance of an axis that moves to lose a step, in each tick.
+    seed
+        Of the steps that are lost.
+
+    Attributes
+    ----------
+    turned, joint
+        Where motors and joints stand, steps, (N, 2).
+    missed
+        Steps lost so far, (N, 2).
+
+    Raises
+    ------
+    InputError
+        A play below 0, or a chance that none is.
+    """
+
+    def __init__(
+        self, counts: Integers, play: npt.ArrayLike = 0.0, miss: float = 0.0, seed: int = 0
+    ) -> None:
+        self._play = np.array(np.broadcast_to(np.asarray(play, dtype=np.float64), counts.shape))
+        if not (self._play >= 0.0).all() or not 0.0 <= miss <= 1.0:
+            raise InputError(
+                f"drives: a play of {self._play.min()} steps and a chance of {miss} to lose one; "
+                "give 0 or more, and 0 to 1"
+            )
+        self._miss = miss
+        self.turned: Integers = counts.copy()
+        self.joint: FloatArray = counts.astype(np.float64)
+        self.missed: Integers = np.zeros_like(counts)
+        self._lost: Bools = np.zeros(counts.shape, dtype=np.bool_)
+        self._chance = np.random.default_rng(seed)
+
+    def next(self) -> tuple[Integers, FloatArray, FloatArray, Bools, Integers]:
+        """Return what the kernel turns in the next tick; draws who will lose a step."""
+        if self._miss > 0.0:
+            self._lost = self._chance.random(self.turned.shape) < self._miss
+        return self.turned, self.joint, self._play, self._lost, self.missed
