@@ -99,14 +99,16 @@ class Joiner:
         As assigned, ENU, m, (N, 3); NaN where none was.
     sun
         Gives the unit vector to the sun now, (3,).
+    life
+        Of a command whose turn has come, s.
     """
 
     def __init__(
         self, queue: JoinQueue, orders: PlantOrders, beams: BeamCheck, field: FieldState,
-        aims: FloatArray, sun: Callable[[], FloatArray],
+        aims: FloatArray, sun: Callable[[], FloatArray], life: float,
     ) -> None:  # fmt: skip
         self._queue, self._orders, self._beams, self._field = queue, orders, beams, field
-        self._aims, self._sun = aims, sun
+        self._aims, self._sun, self._life = aims, sun, life
 
     def beat(self, now: float, token: int) -> None:
         """Send those whose turn it is."""
@@ -115,7 +117,7 @@ class Joiner:
             for name, text in wrong.items():
                 job.ticket.advance((name,), Stage.FAILED, text)
             clear = [name for name in part if name not in wrong]
-            self._orders.command(job.ticket, job.name, job.values, clear, token)
+            self._orders.command(job.ticket, job.name, job.values, clear, token, self._life)
 
     def _problems(self, job: Job, part: tuple[str, ...]) -> dict[str, str]:
         """Return whose beams may not go to their aims now, and why."""

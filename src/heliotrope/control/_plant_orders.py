@@ -143,14 +143,15 @@ class PlantOrders:
 
     def command(
         self, ticket: Ticket, name: str, values: tuple[float, ...], heliostats: Iterable[str],
-        token: int,
+        token: int, lifetime: float | None = None,
     ) -> None:  # fmt: skip
-        """Send a command to some of a ticket's heliostats."""
+        """Send a command to some of a ticket's heliostats; ``lifetime`` other than usual, in s."""
+        life = self._lifetime if lifetime is None else lifetime
         for end, part in self._by_cluster(heliostats):
             identity = self._begin(ticket, end, part)
             whom = () if len(part) == len(end.members) else part
-            message = Command(identity, name, values, whom, token, self._lifetime)
-            end.post(message, self._lifetime, self._told(identity))
+            message = Command(identity, name, values, whom, token, life)
+            end.post(message, life, self._told(identity))
 
     def emergency(
         self, ticket: Ticket, act: Act, heliostats: Sequence[str], *, again: bool = False

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 
 from heliotrope.control._plant_orders import PlantOrders
 from heliotrope.control._tickets import Ticket
+from heliotrope.control.audit import AuditError
 from heliotrope.control.field_state import FieldState
 from heliotrope.control.parameters import CALIBRATION_ITEMS, Wanted, checksums
 from heliotrope.control.protocol import Answer, ProtocolError
@@ -113,8 +114,11 @@ class Pusher:
             return
         self._tried[name] = now
         items: Mapping[str, bytes] = {item: self._wanted.items[name][item] for item in able}
-        ticket = self._orders.accept(
-            ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able), late=True
-        )
+        try:
+            ticket = self._orders.accept(
+                ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able)
+            )
+        except AuditError:
+            return  # nothing is sent without its record; the safety table tells of the disk
         self._orders.parameters(ticket, name, items, token)
         self.follow(name, ticket)

@@ -146,6 +146,25 @@ class MemoryLine:
             lane.clear()
             lane.news.set()
 
+    def end(
+        self, place: int, name: str, clock: Clock, *,
+        settings: LinkSettings | None = None, seed: int = 0,
+    ) -> CarriedLink:  # fmt: skip
+        """Return a new link at one end, as for a program that starts there anew.
+
+        Parameters
+        ----------
+        place
+            0 or 1. What was at that end before must have ended.
+        name
+            Whom it leads to.
+        clock
+            Of this end.
+        settings, seed
+            As of `memory_pair`.
+        """
+        return CarriedLink(name, _MemoryCarrier(self, place), clock, settings, seed=seed)
+
 
 class _MemoryCarrier:
     """One end of a line."""
@@ -226,7 +245,7 @@ def memory_pair(
     line = MemoryLine(clock, faults, seed)
     first, second = clocks or (clock, clock)
     return (
-        CarriedLink(names[1], _MemoryCarrier(line, 0), first, settings, seed=2 * seed + 1),
-        CarriedLink(names[0], _MemoryCarrier(line, 1), second, settings, seed=2 * seed + 2),
+        line.end(0, names[1], first, settings=settings, seed=2 * seed + 1),
+        line.end(1, names[0], second, settings=settings, seed=2 * seed + 2),
         line,
     )

@@ -154,8 +154,9 @@ class PlantController:
         count = len(self.field)
         self.aims, self.standbys = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
         self._joiner = Joiner(
-            self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector
-        )
+            self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector,
+            self.settings.join_life,
+        )  # fmt: skip
         self._sentinel = Sentinel(
             clock, design.site, self.field, self._ends, self._orders, self._joining,
             self.authority, self._watch, self.beams.drives, self.settings.repeat,

@@ -24,6 +24,9 @@ class PlantSettings:
         Mirrors that may join the receiver in a second, and at once after a rest.
     join_wait
         How long a mirror may wait to join, s.
+    join_life
+        Life of a command to join once its turn has come, s. What is held up on the way for longer
+        must not arrive together with those whose turn came later.
     lifetime, patience
         Of a command until it is acknowledged, then until it is done, s.
     stale
@@ -43,6 +46,7 @@ class PlantSettings:
     join_rate: float = 10.0
     join_burst: int = 10
     join_wait: float = 1800.0
+    join_life: float = 3.0
     lifetime: float = 10.0
     patience: float = 600.0
     stale: float = STALE
