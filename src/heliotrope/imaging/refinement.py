@@ -33,8 +33,8 @@ _SOFT = 0.8
 #: Samples are softened by this, so that they and the drawing can be told between samples.
 _SMOOTH = 0.7
 #: Gauss-Newton steps; from a tenth of a stroke two or three are enough. A place that moves by
-#: less than this part of a sample, a thirtieth of what it is known to, is found.
-_STEPS, _STILL = 6, 0.03
+#: less than this part of a sample is found.
+_STEPS, _STILL = 6, 0.01
 #: Around a drawing, in its own sizes.
 _MARGIN = 0.3
 #: An even light that explains less than this is worth a second look without the light.
@@ -396,8 +396,7 @@ def _adjust(
         _, numbers = _solve(basis[:, :10], weight * inside, samples)
         residual = samples - basis[:, :10] @ numbers.astype(np.float32)
         off = np.abs(residual)
-        # Every third tells the spread as well.
-        spread = max(1.4826 * _quantile(off[::3], 0.5), 0.1)
+        spread = max(1.4826 * _quantile(off, 0.5), 0.1)
         weight = (1.0 / np.maximum(off / (2.0 * spread), 1.0)).astype(np.float32)
         # A drawing moved by δ is the drawing less δ times its slope.
         depth = numbers[3] if abs(numbers[3]) > 1e-9 else 1e-9
