@@ -19,7 +19,7 @@ from benchmarks._run import BenchmarkError, Result, Row
 from heliotrope.control._sun_line import sun_values
 from heliotrope.control.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
 from heliotrope.control.link import LinkClosedError, Outcome, Statistics, running
 from heliotrope.control.protocol import Acknowledge, Command, Emergency, Lease, Message, encode
 from heliotrope.lcu import states
@@ -156,7 +156,8 @@ def _measure(count: int) -> Row:
             line = Line()
             bus = FieldBus(field, rows, lambda name, rows: told.extend([name] * len(rows)))
             members = tuple(Member(f"H{row}", row - first + 1) for row in rows)
-            config = ClusterConfig(f"C{first}", SITE, members, steps_every=5)
+            phase = spread_phase(first // EACH, -(-count // EACH))
+            config = ClusterConfig(f"C{first}", SITE, members, steps_every=5, phase=phase)
             clusters.append(Cluster(config, bus, line, clock, keeper))
             lines.append(line)
             buses.append(bus)

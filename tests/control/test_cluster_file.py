@@ -18,7 +18,7 @@ from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
 from heliotrope.control._sun_line import HORIZON, sun_at, sun_values
 from heliotrope.control.clock import SystemClock, VirtualClock
-from heliotrope.control.cluster_config import ClusterConfig, Member
+from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
 from heliotrope.control.cluster_file import TABLES, read_cluster
 from heliotrope.control.gps import GpsTime
 from heliotrope.control.timekeeping import Time
@@ -382,6 +382,17 @@ def test_where_the_kernel_cannot_be_asked_that_is_said_at_the_start(
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
     with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
         _time(read_cluster(folder / "C1.toml"), SystemClock())
+
+
+def test_many_clusters_begin_their_seconds_apart() -> None:
+    phases = [spread_phase(index, 313) for index in range(313)]
+    assert phases[0] == 0.0
+    assert np.diff(phases) == pytest.approx(1 / 313)
+    assert config_of(2, phase=phases[-1]).phase < 1.0
+    assert spread_phase(0, 1) == 0.0
+    for index, count in ((313, 313), (-1, 2), (0, 0)):
+        with pytest.raises(InputError, match=f"cluster {index} is none of {count}"):
+            spread_phase(index, count)
 
 
 def test_an_emergency_line_that_cannot_be_read_is_open(tmp_path: Path) -> None:

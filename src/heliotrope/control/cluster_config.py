@@ -75,7 +75,8 @@ class ClusterConfig:
         Most that the plant may grant, in s. Above 0 only where a hard-wired emergency line
         reaches this cluster.
     phase
-        Each second begins so long after that of GPS, in s, 0 to below 1.
+        Each second begins so long after that of GPS, in s, 0 to below 1. Where one process runs
+        many clusters, see `spread_phase`.
 
     Raises
     ------
@@ -130,3 +131,28 @@ class ClusterConfig:
             if each.name == name:
                 return each
         raise UnknownNameError("heliostat", name, [each.name for each in self.heliostats])
+
+
+def spread_phase(index: int, count: int) -> float:
+    """Return the phase of one of many clusters in a process, so that their seconds don't collide.
+
+    Parameters
+    ----------
+    index
+        Which cluster, 0 to ``count`` - 1.
+    count
+        How many there are.
+
+    Returns
+    -------
+    float
+        In s, 0 to below 1; neighbours are as far apart as may be.
+
+    Raises
+    ------
+    InputError
+        An index that is none of so many.
+    """
+    if not 0 <= index < count:
+        raise InputError(f"phase: cluster {index} is none of {count}; give 0 to {count - 1}")
+    return index / count
