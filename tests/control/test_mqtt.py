@@ -1,21 +1,19 @@
 """Links through a real Mosquitto on this machine: also frozen, killed and restarted."""
 
 import asyncio
-import getpass
 import os
 import re
 import shutil
-import signal
 import socket
 import subprocess
 import threading
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import aiomqtt
 import pytest
 
+from broker import MOSQUITTO, Mosquitto, mosquitto_for
 from heliotrope.control.clock import SystemClock, sleep_until
 from heliotrope.control.link import Link, LinkSettings, Outcome, running
 from heliotrope.control.mqtt import Broker, mqtt_link
@@ -30,62 +28,10 @@ QUICK = LinkSettings(period=0.1, deadline=1.0, open_limit=1.0, first_pause=0.05,
 CALM = LinkSettings(period=0.1, deadline=10.0, open_limit=5.0)
 CLOCK = SystemClock()
 
-MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin:/usr/local/sbin")
-
-
-_CONFIG = "listener 8883\nallow_anonymous true\nset_tcp_nodelay true\npersistence false"
-
-
-class Mosquitto:
-    """A broker with its own configuration, on a port of this machine alone."""
-
-    def __init__(self, folder: Path, config: str = _CONFIG) -> None:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.port = free.getsockname()[1]
-        self.log = folder / "mosquitto.log"
-        self._config = folder / "mosquitto.conf"
-        self._config.write_text(
-            f"{config.replace('listener 8883', f'listener {self.port} 127.0.0.1')}\n"
-            f"user {getpass.getuser()}\nlog_type all\nlog_dest file {self.log}\n"
-        )
-        self.start()
-
-    def start(self) -> None:
-        assert MOSQUITTO is not None
-        self._process = subprocess.Popen(
-            [MOSQUITTO, "-c", self._config], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        deadline = time.monotonic() + PATIENCE
-        while True:
-            try:
-                socket.create_connection(("127.0.0.1", self.port)).close()
-            except ConnectionRefusedError:
-                assert self._process.poll() is None, "mosquitto ended at once"
-                assert time.monotonic() < deadline, "mosquitto does not listen"
-                time.sleep(0.01)
-            else:
-                return
-
-    def freeze(self) -> None:
-        os.kill(self._process.pid, signal.SIGSTOP)
-
-    def thaw(self) -> None:
-        os.kill(self._process.pid, signal.SIGCONT)
-
-    def kill(self) -> None:
-        self._process.kill()
-        self._process.wait()
-
 
 @pytest.fixture
 def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
-    if MOSQUITTO is None:
-        if os.environ.get("CI"):
-            pytest.fail("mosquitto is not installed, and CI tests everything: apt install it")
-        pytest.skip("mosquitto is not installed: links through a broker are not tested")
-    broker = Mosquitto(tmp_path)
-    yield broker
-    broker.kill()
+    yield from mosquitto_for(tmp_path)
 
 
 def real(main: Callable[[], Awaitable[None]]) -> None:
