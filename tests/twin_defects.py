@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+import plant_defects
 from heliotrope.control import _nodes, _reports, _watch
 from heliotrope.control.protocol import Stage
 from heliotrope.lcu import (
@@ -31,7 +32,11 @@ Plant = Callable[[pytest.MonkeyPatch], None]
 
 @dataclass(frozen=True)
 class Defect:
-    """A defect, the invariants by which it may be found, and where to look for it."""
+    """A defect, the invariants by which it may be found, and where to look for it.
+
+    ``first`` is the seed that is tried first, since it found it; ``slow``: it takes longer, and
+    the normal tests have another one for its invariant.
+    """
 
     numbers: tuple[int, ...]
     name: str
@@ -40,6 +45,8 @@ class Defect:
     pause: float = 12.0
     seconds: float = 240.0
     faults: tuple[Fault, ...] | None = None
+    first: int = 0
+    slow: bool = False
 
     def plan(self, seed: int) -> Plan:
         """Where it is looked for."""
@@ -208,24 +215,31 @@ def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
 DEFECTS = (
     Defect((1, 4, 5), "lease renewed by any frame", _lease_by_any_frame,
            ("cluster_crash", "replay", "stranger_safe", "forgery"), 1.5),
-    Defect((1,), "lease that never ends", _lease_too_long, ("cluster_crash",), 20.0),
-    Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0),
+    Defect((1,), "lease that never ends", _lease_too_long, ("cluster_crash",), 20.0,
+           first=1),
+    Defect((2,), "defocus only holds", _defocus_holds, faults=STILL, seconds=180.0,
+           first=4, slow=True),
     Defect((2,), "cluster goes on without the plant", _plant_forgotten, ("plant_silent",), 20.0),
-    Defect((3,), "tracking follows approach by itself", _tracks_by_itself, ("line_drop",), 60.0),
+    Defect((3,), "tracking follows approach by itself", _tracks_by_itself, ("line_drop",), 60.0,
+           first=1),
     Defect((4,), "DEFOCUS refused to strangers", _defocus_from_cluster_only,
            ("stranger_safe",), 5.0),
     Defect((4,), "authority unchecked", _authority_unchecked, ("forgery",), 1.0),
     Defect((5,), "duplicate accepted", _duplicates_accepted, ("replay",), 0.4),
     Defect((6,), "damaged frame accepted", _damage_accepted, ("bus_bad",), 5.0),
-    Defect((7,), "journal written in place", _journal_in_place, ("flash_cut",), 3.0),
+    Defect((7,), "journal written in place", _journal_in_place, ("flash_cut",), 3.0,
+           first=1, slow=True),
     Defect((7,), "step counts kept at rest only", _counts_late, ("power_cut",), 8.0),
     Defect((7,), "idle after a boot", _idle_after_boot, ("power_cut",), 8.0),
     Defect((8,), "counts slip from what is emitted", _counts_slip, ("line_drop",), 60.0),
     Defect((9,), "a jump back extends the lease", _jump_extends_lease,
-           ("tick_jump", "cluster_crash"), 3.0),
+           ("tick_jump", "cluster_crash"), 3.0, first=4),
     Defect((10,), "approach with elevation first", _approach_swapped, ("line_drop",), 60.0),
     Defect((11,), "acceptance never reported", _acceptance_lost, ("line_drop",), 60.0),
     Defect((11,), "every value told as new", _always_new, ("bus_bad", "power_cut"), 10.0),
     Defect((11,), "an acknowledgement makes a row young", _young_by_any_answer, ("bus_bad",), 5.0),
-    Defect((11,), "a late answer passes for another", _questions_alike, ("bus_bad",), 5.0),
+    Defect((11,), "a late answer passes for another", _questions_alike, ("bus_bad",), 5.0,
+           first=3, slow=True),
+    *(Defect(numbers, name, defect, only, pause, first=first)
+      for numbers, name, defect, only, pause, first in plant_defects.ROWS),
 )  # fmt: skip

@@ -18,6 +18,9 @@ KINDS = {
     "line_drop": (2, "the connection breaks and both notice"),
     "line_bad": (3, "messages are lost, doubled, overtaken, damaged, delayed"),
     "plant_silent": (2, "the plant stands still"),
+    "plant_crash": (3, "the plant ends at once and starts again later"),
+    "audit_full": (2, "the disk of the plant's records is full"),
+    "nobody_there": (1, "nobody keeps the command authority up"),
     "cluster_crash": (3, "the cluster ends at once and starts again later"),
     "bus_bad": (6, "frames are lost, damaged, doubled, late"),
     "bus_stuck": (2, "a transmitter holds the line"),
@@ -36,6 +39,7 @@ KINDS = {
 #: Longest duration of a fault, s.
 _LONGEST = {
     "line_cut": 60.0, "line_one_way": 60.0, "line_bad": 60.0, "plant_silent": 60.0,
+    "plant_crash": 40.0, "audit_full": 40.0, "nobody_there": 60.0,
     "cluster_crash": 40.0, "bus_bad": 60.0, "bus_stuck": 40.0, "bus_unplugged": 30.0,
     "power_cut": 20.0, "brown_out": 20.0, "flash_cut": 5.0, "time_lost": 60.0,
 }  # fmt: skip

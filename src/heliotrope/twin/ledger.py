@@ -52,6 +52,8 @@ class Order:
         When it was given and when it expires, in s.
     authorised
         Whether it carried the token of the authority.
+    token
+        That it carried.
     accepted
         How often it was reported as accepted, by heliostat.
     """
@@ -62,6 +64,7 @@ class Order:
     at: float
     until: float
     authorised: bool
+    token: int = 0
     accepted: Counter[str] = field(default_factory=Counter)
 
 
@@ -126,6 +129,12 @@ class OrderLedger:
     def note(self, order: Order) -> None:
         """Keep an order; the second one of an identity is the same order, sent again."""
         self.by_identity.setdefault(order.identity, order)
+
+    def void(self, token: int, until: float) -> None:
+        """Let orders of a token end: the authority that gave them is over."""
+        for order in self.by_identity.values():
+            if order.token == token:
+                order.until = min(order.until, until)
 
     def drop(self, now: float) -> None:
         """Forget what has expired long ago."""

@@ -1,186 +1,202 @@
-"""A scripted operator at the plant's end of a link: leases, commands and mistakes, by a seed.
+"""Scripted persons at a real plant: duty, commands and mistakes, by a seed.
 
-He leads the heliostats onwards from state to state, changes aims, orders emergencies, pushes
-parameters; he also sends the same command twice, with a wrong token, or too late. He is told only
-what the cluster tells him. What he does is noted with the observer as he does it.
+An operator and an engineer lead the heliostats onwards from state to state, change aims, order
+emergencies and end them, push parameters, and break each other's authority. They also command
+with an authority that they have lost, and a viewer tries what he may not. What the plant accepts
+of them they tell its observer. A rogue has a plant's end of a line, and tokens of before.
 """
 
 import asyncio
+import contextlib
 import random
 import struct
 from collections import Counter
+from collections.abc import Callable, Sequence
 
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.authority import Person, RefusedError, Role
 from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.link import Link, LinkClosedError, Outcome
-from heliotrope.control.protocol import (
-    NEVER,
-    Acknowledge,
-    Alarm,
-    Command,
-    Emergency,
-    Lease,
-    Message,
-    Parameters,
-    Progress,
-    ProtocolError,
-    Status,
-    decode,
-    encode,
-)
-from heliotrope.lcu import states
-from heliotrope.twin.invariants import Observer
-from heliotrope.twin.ledger import Order
+from heliotrope.control.link import LinkClosedError
+from heliotrope.control.plant import PlantController
+from heliotrope.control.protocol import Command, encode
+from heliotrope.control.safety import Act
 from heliotrope.twin.outfit import RECEIVER, STANDBY
+from heliotrope.twin.plant_observer import VOID_WITHIN, PlantObserver
+from heliotrope.twin.pod import PlantEar, Pod
 
-TOKEN = 0x5EED0001
-#: A lease that is under way for longer is not delivered, s.
-LEASE_EXPIRY = 1.0
-#: A cluster counts a command's life from when it comes: so long it may have been under way, s.
-UNDER_WAY = 0.8
+OPERATOR = Person("operator", Role.OPERATOR)
+ENGINEER = Person("engineer", Role.ENGINEER)
+VIEWER = Person("viewer", Role.VIEWER)
+#: Between two things that they do, on average, s.
+PAUSE = 2.0
 #: What leads on from a state.
 ONWARDS = {
-    states.STOWED: ("APPROACH",), states.IDLE: ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
-    states.TRACKING: ("AIM", "AIM", "IDLE", "ROUGH"), states.DEFOCUSED: ("REFOCUS", "IDLE"),
-    states.SEARCHING: ("TRACK", "IDLE"), states.LOCKED: ("UNLOCK",),
-    states.FAULT: ("CLEAR_FAULT",),
+    "": ("APPROACH",), "STOWED": ("APPROACH",),
+    "IDLE": ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
+    "TRACKING": ("AIM", "AIM", "IDLE", "ROUGH"), "DEFOCUSED": ("REFOCUS", "IDLE"),
+    "SEARCHING": ("TRACK", "IDLE"), "LOCKED": ("UNLOCK",), "FAULT": ("CLEAR_FAULT",),
 }  # fmt: skip
+#: Rows of the safety table that latch; the others release by themselves.
+LATCHING = frozenset(
+    {"operator_emergency", "nodes_unacknowledged", "flux_after_emergency", "clock_jump"}
+)
 
 
 class Operator:
-    """The plant's end.
+    """The persons.
 
     Parameters
     ----------
     clock
         True time.
     seed
-        Of what he does.
+        Of what they do.
     observer
-        Is told of everything.
-    addresses
-        Of the heliostats, by name.
+        Is told of what is accepted.
+    names
+        Of the heliostats.
+    pods
+        Whose lines the rogue uses.
+    flux
+        Measures the share of the beams that are on the receiver.
 
     Attributes
     ----------
-    link
-        Set by who owns it; another one after the cluster has started again.
-    silent
-        Whether he stands still.
-    carried
-        Whether line and cluster are there: an order of now must be carried out.
+    plant
+        Set by who owns it; None while it does not run.
+    away
+        Whether nobody is there.
     counts
-        Of what he did and was told.
+        Of what they did.
     """
 
     def __init__(
-        self, clock: Clock, seed: int, observer: Observer, addresses: dict[str, int]
-    ) -> None:
-        self.link: Link | None = None
-        self.silent = False
-        self.carried = True
+        self, clock: Clock, seed: int, observer: PlantObserver, names: Sequence[str],
+        pods: Sequence[Pod], flux: Callable[[], float],
+    ) -> None:  # fmt: skip
+        self.plant: PlantController | None = None
+        self.away = False
         self.counts: Counter[str] = Counter()
-        self._clock = clock
+        self._clock, self._observer, self._flux = clock, observer, flux
         self._chance = random.Random(f"operator {seed}")
-        self._observer = observer
-        self._addresses = addresses
-        self._number = 0
-        self._names: tuple[str, ...] = ()
-        self._told: dict[str, int] = {}
+        self._names, self._pods = sorted(names), pods
+        self._duty = ENGINEER
+        self._tokens: dict[str, int] = {}
         self._rest_until = 0.0
-        self._alarms: set[str] = set()
+        self._called = False
+        self._number = 0
 
-    # -- what he is told -------------------------------------------------------------------
+    def begins(self, plant: PlantController | None) -> None:
+        """Note that the plant has started, or (None) ended: who called an emergency is free."""
+        self.plant = plant
+        self._called = False
 
-    async def listen(self, link: Link) -> None:
-        """Take what comes over a link until it is closed."""
+    # -- the authority ---------------------------------------------------------------------
+
+    async def keep(self) -> None:
+        """Keep the authority up and measure the flux, each second."""
         while True:
-            try:
-                data = await link.receive()
-            except LinkClosedError:
-                return
-            try:
-                self._take(decode(data))
-            except ProtocolError:
-                self.counts["refused messages"] += 1
+            due = self._clock.monotonic() + 1.0
+            plant = self.plant
+            if plant is not None and not self.away:
+                plant.put_flux(self._flux())
+                if plant.authority.grant is None:
+                    self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
+                token = self._tokens.get(self._duty.name, 0)
+                with contextlib.suppress(RefusedError):
+                    plant.authority.keep(self._duty, token)
+                    self._observer.kept(self._clock.monotonic())
+            await sleep_until(self._clock, due)
 
-    def _take(self, message: Message) -> None:
+    def _take(self, plant: PlantController, person: Person) -> None:
+        try:
+            token = plant.take_authority(person).token
+        except RefusedError:
+            return self._seize(plant, person)
         now = self._clock.monotonic()
-        if isinstance(message, Status):
-            self.counts["status"] += 1
-            self._names = message.names or self._names
-            if len(self._names) == len(message.nodes()):
-                self._observer.status(message, self._names, now)
-                for name, row in zip(self._names, message.nodes(), strict=True):
-                    if int(row["heard_ms"]) != NEVER:
-                        self._told[name] = int(row["state"])
-        elif isinstance(message, Progress):
-            self.counts[f"progress {message.stage.value}"] += 1
-            self._observer.progress(message, now)
-        elif isinstance(message, Alarm):
-            self.counts["alarms"] += 1
-            if message.active:
-                self._alarms.add(message.condition)
-            else:
-                self._alarms.discard(message.condition)
+        if token == self._tokens.get(person.name):
+            self._observer.kept(now)
+        else:
+            self._granted(person, token, seized=False)
+        return None
 
-    # -- what he does ----------------------------------------------------------------------
+    def _seize(self, plant: PlantController, person: Person) -> None:
+        try:
+            token = plant.seize_authority(person, "on duty now").token
+        except RefusedError:
+            self.counts["authority refused"] += 1
+        else:
+            self._granted(person, token, seized=True)
 
-    async def _send(self, message: Message, lifetime: float) -> bool:
-        if self.link is None:
-            return False
-        expires = self._clock.monotonic() + lifetime
-        return await self.link.send(encode(message), expires=expires) is Outcome.SENT
+    def _granted(self, person: Person, token: int, *, seized: bool) -> None:
+        self.counts["authority broken" if seized else "authority taken"] += 1
+        self._tokens[person.name] = token
+        if person is not VIEWER:
+            self._duty = person
+        self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
-    async def lease(self) -> None:
-        """Send the lease every second, unless he stands still."""
-        while True:
-            begin = self._clock.monotonic()
-            if not self.silent and await self._send(Lease(TOKEN), LEASE_EXPIRY):
-                self._observer.leased(begin)
-            await sleep_until(self._clock, begin + 1.0)
+    def _change(self, plant: PlantController) -> None:
+        """Somebody else comes on duty: by breaking it, or after it was given back."""
+        other = OPERATOR if self._duty is ENGINEER else ENGINEER
+        if self._chance.random() < 0.5:
+            with contextlib.suppress(RefusedError):
+                plant.release_authority(self._duty, self._tokens.get(self._duty.name, 0))
+                self._observer.released(self._duty, self._clock.monotonic())
+        self._seize(plant, self._chance.choice([other, other, VIEWER]))
+
+    # -- what they do ----------------------------------------------------------------------
 
     async def work(self) -> None:
         """Command, for ever."""
         while True:
-            await asyncio.sleep(self._chance.expovariate(1 / 3.0))
-            if self.silent or self._clock.monotonic() < self._rest_until:
+            await asyncio.sleep(self._chance.expovariate(1 / PAUSE))
+            plant = self.plant
+            if plant is None or self.away or self._clock.monotonic() < self._rest_until:
                 continue
-            for condition in sorted(self._alarms):
-                await self._acknowledge(condition)
+            self._end_emergency(plant)
+            self._acknowledge(plant)
             does = self._chance.choices(
-                [self._onward, self._everybody, self._parameters, self._emergency, self._lock,
-                 self._wrong],
-                [60, 12, 8, 4, 3, 5],
+                [self._onward, self._everybody, self._parameters, self._emergency, self._one_safe,
+                 self._lock, self._wrong, self._change],
+                [60, 14, 8, 4, 2, 3, 5, 4],
             )[0]  # fmt: skip
-            await does()
+            does(plant)
+            if self._chance.random() < 0.06:
+                await self._rogue()
 
-    async def _acknowledge(self, condition: str) -> None:
-        self._number += 1
-        self.counts["acknowledgements"] += 1
-        await self._send(
-            Acknowledge(f"a{self._number}", condition, "operator", "operator"), lifetime=5.0
-        )
-
-    async def _command(self, name: str, heliostats: tuple[str, ...], *, token: int = TOKEN) -> None:
-        self._number += 1
+    def _give(
+        self, plant: PlantController, what: str, heliostats: Sequence[str] = (),
+        person: Person | None = None, token: int | None = None,
+    ) -> None:  # fmt: skip
+        """Give a command, and tell the observer if it was accepted."""
+        who = person or self._duty
+        mine = self._tokens.get(who.name, 0) if token is None else token
+        names = heliostats or self._names
         self.counts["commands"] += 1
-        lifetime = self._chance.choice([1.5, 5.0, 10.0])
-        command = Command(f"c{self._number}", name, self._values(name), heliostats, token, lifetime)
-        now = self._clock.monotonic()
-        addresses = frozenset(self._addresses[each] for each in heliostats or self._addresses)
-        self._observer.ordered(
-            Order(
-                command.identity, name, addresses, now, now + lifetime + UNDER_WAY, token == TOKEN
-            )
-        )
-        await self._send(command, lifetime)
+        try:
+            if what == "AIM":
+                ticket = plant.aim(who, mine, self._points(names, RECEIVER, 1.0))
+            elif what == "STANDBY":
+                ticket = plant.standby(who, mine, self._points(names, STANDBY, 0.5))
+            else:
+                ticket = plant.command(who, mine, what, heliostats, self._values(what))
+        except RefusedError:
+            self.counts["refused"] += 1
+            return
+        self._accepted(who, mine, ticket, what)
+
+    def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
+        self.counts["accepted"] += 1
+        self._observer.accepted(who, token, ticket, what, self._clock.monotonic())
+
+    def _points(
+        self, names: Sequence[str], about: tuple[float, float, float], size: float
+    ) -> dict[str, tuple[float, ...]]:
+        point = tuple(x + self._chance.uniform(-size, size) for x in about)
+        return dict.fromkeys(names, point)
 
     def _values(self, name: str) -> tuple[float, ...]:
         chance = self._chance
-        if name == "AIM":
-            return tuple(x + chance.uniform(-1.0, 1.0) for x in RECEIVER)
-        if name == "STANDBY":
-            return tuple(x + chance.uniform(-0.5, 0.5) for x in STANDBY)
         if name == "SEARCH":
             return 2e-3, chance.choice([4e-3, 8e-3])
         if name == "JOG":
@@ -189,56 +205,107 @@ class Operator:
             return (float(chance.randrange(2)),)
         return ()
 
-    async def _onward(self) -> None:
-        name = self._chance.choice(sorted(self._addresses))
-        state = self._told.get(name, states.STOWED)
+    def _onward(self, plant: PlantController) -> None:
+        name = self._chance.choice(self._names)
+        state = plant.field.of(name, plant.now()).state
         what = self._chance.choice(ONWARDS.get(state, ("APPROACH",)))
         if what == "APPROACH":
-            await self._command("AIM", (name,))
-        await self._command(what, (name,))
+            self._give(plant, "AIM", (name,))
+        self._give(plant, what, (name,))
 
-    async def _everybody(self) -> None:
+    def _everybody(self, plant: PlantController) -> None:
         for what in self._chance.choice(
-            [("AIM",), ("APPROACH",), ("TRACK",), ("IDLE",), ("REFOCUS",), ("STANDBY",),
-             ("AIM", "APPROACH"), ("DIAGNOSE",)]
+            [("AIM",), ("APPROACH",), ("TRACK",), ("TRACK",), ("IDLE",), ("REFOCUS",),
+             ("STANDBY",), ("AIM", "APPROACH"), ("DIAGNOSE",)]
         ):  # fmt: skip
-            await self._command(what, ())
+            self._give(plant, what)
 
-    async def _lock(self) -> None:
-        await self._command("LOCK", (self._chance.choice(sorted(self._addresses)),))
+    def _lock(self, plant: PlantController) -> None:
+        self._give(plant, "LOCK", (self._chance.choice(self._names),))
 
-    async def _wrong(self) -> None:
-        """With the token of somebody who has no authority any more."""
-        what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS"])
-        name = self._chance.choice(sorted(self._addresses))
-        await self._command(what, (name,), token=self._chance.choice([0, TOKEN + 1]))
+    def _wrong(self, plant: PlantController) -> None:
+        """Without the authority: with that of before, with another's, or as a viewer."""
+        what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
+        name = self._chance.choice(self._names)
+        other = OPERATOR if self._duty is ENGINEER else ENGINEER
+        who = self._chance.choice([other, other, VIEWER])
+        token = self._chance.choice(
+            [self._tokens.get(other.name, 0), self._tokens.get(self._duty.name, 0), 0, 1]
+        )
+        self._give(plant, what, (name,), who, token)
 
-    async def _parameters(self) -> None:
+    def _parameters(self, plant: PlantController) -> None:
         """Push two items of the calibration to one heliostat."""
-        self._number += 1
         self.counts["parameters"] += 1
-        chance = self._chance
-        name = chance.choice(sorted(self._addresses))
+        chance, who = self._chance, self._duty
         items = {
             "biases": struct.pack("<ff", chance.gauss(0.0, 1e-4), chance.gauss(0.0, 1e-4)),
             "defocus": struct.pack("<ff", chance.uniform(0.08, 0.12), chance.uniform(0.05, 0.06)),
         }
-        message = Parameters.of(f"p{self._number}", name, items, TOKEN)
-        now = self._clock.monotonic()
-        self._observer.ordered(
-            Order(
-                message.identity, "PARAMETERS", frozenset((self._addresses[name],)), now,
-                now + message.lifetime + UNDER_WAY, authorised=True,
-            )
-        )  # fmt: skip
-        await self._send(message, message.lifetime)
+        token = self._tokens.get(who.name, 0)
+        try:
+            ticket = plant.parameters(who, token, chance.choice(self._names), items)
+        except RefusedError:
+            self.counts["refused"] += 1
+            return
+        self._accepted(who, token, ticket, "PARAMETERS")
 
-    async def _emergency(self) -> None:
-        self._number += 1
+    # -- safety ----------------------------------------------------------------------------
+
+    def _emergency(self, plant: PlantController) -> None:
         self.counts["emergencies"] += 1
-        what = self._chance.choice(["DEFOCUS", "STOW"])
+        act = self._chance.choice([Act.DEFOCUS, Act.STOW])
         now = self._clock.monotonic()
-        self._observer.emergency(what, now, carried=self.carried)
         # Nothing else until what was ordered is done, or is overdue.
         self._rest_until = now + self._chance.choice([2.0, 33.0, 33.0, 310.0])
-        await self._send(Emergency(f"e{self._number}", what), 5.0)
+        who = self._chance.choice([VIEWER, self._duty])
+        plant.raise_emergency(who.name, act)
+        self._observer.obeyed(who.name, act.name, now)
+        self._called = True
+
+    def _one_safe(self, plant: PlantController) -> None:
+        """Take one heliostat off, which anybody may."""
+        what = self._chance.choice([plant.defocus, plant.stow])
+        what(VIEWER.name, (self._chance.choice(self._names),))
+        self._observer.obeyed(VIEWER.name, what.__name__.upper(), self._clock.monotonic())
+
+    def _end_emergency(self, plant: PlantController) -> None:
+        if self._called:
+            plant.withdraw_emergency(self._duty)
+            self._observer.obeyed(self._duty.name, "WITHDRAW", self._clock.monotonic())
+            self._called = False
+
+    def _acknowledge(self, plant: PlantController) -> None:
+        """Acknowledge what waits for it; the engineer stands in for the supervisor."""
+        waiting: dict[tuple[str, str], bool] = {}
+        for alarm in plant.alarms:
+            if alarm.condition in LATCHING:
+                waiting[alarm.condition, alarm.subject] = alarm.active
+        for (condition, subject), active in waiting.items():
+            if active:
+                with contextlib.suppress(RefusedError):
+                    plant.acknowledge(ENGINEER, condition, subject)
+                    now = self._clock.monotonic()
+                    self._observer.obeyed(ENGINEER.name, "ACKNOWLEDGE", now)
+                    self.counts["acknowledgements"] += 1
+
+    # -- the rogue -------------------------------------------------------------------------
+
+    async def _rogue(self) -> None:
+        """Command past the plant, with a token that is void, or guessed."""
+        now = self._clock.monotonic()
+        void = [token for token, at in self._observer.old.items() if now - at > VOID_WITHIN]
+        token = self._chance.choice([0, self._chance.getrandbits(32), *void[-2:], *void[-2:]])
+        pod = self._chance.choice(self._pods)
+        tap = pod.tap
+        if tap is None or (self._observer.known(token) and token not in void):
+            return
+        self._number += 1
+        self.counts["rogue"] += 1
+        whom = (self._chance.choice(pod.boards).outfit.name,)
+        what = self._chance.choice(["TRACK", "APPROACH", "REFOCUS", "IDLE"])
+        command = Command(f"rogue-{self._number}", what, (), whom, token, 5.0)
+        ear = PlantEar(pod, self._observer)
+        pod.observer.ordered(ear.order(command, now, known=False))
+        with contextlib.suppress(LinkClosedError):
+            await tap.inner.send(encode(command), expires=now + 5.0)

@@ -4,7 +4,11 @@ import hashlib
 import math
 import random
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.lcu.drives import ROTARY
@@ -74,15 +78,12 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
     if not 1 <= count <= MOST:
         raise InputError(f"{count} heliostats on a bus; a cluster has 1 to {MOST}")
     chance = random.Random(seed)
-    gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
     found = []
     for i in range(count):
         bearing = math.radians(-35.0 + 70.0 * (i + chance.uniform(0.2, 0.8)) / count)
         away = chance.uniform(60.0, 130.0)
         place = (away * math.sin(bearing), away * math.cos(bearing), 0.0)
-        perfect = kinds.azimuth_elevation(
-            place, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
-        )
+        perfect = _perfect(place)
         causes = {name: chance.gauss(0.0, 3e-3) for name in CAUSES}
         mechanism = perfect.with_parameters(causes)
         address = 11 + i
@@ -99,6 +100,22 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
             )
         )
     return found
+
+
+def _perfect(places: npt.ArrayLike) -> Mechanism:
+    """Return mechanisms without imperfections at places (..., 3)."""
+    gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
+    return kinds.azimuth_elevation(
+        places, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
+    )
+
+
+def mechanisms(fits: Sequence[Outfit]) -> Mechanism:
+    """Return the true mechanisms of heliostats as one, (N,)."""
+    perfect = _perfect(np.stack([each.mechanism.position for each in fits]))
+    return perfect.with_parameters(
+        {name: np.array([each.causes[name] for each in fits]) for name in CAUSES}
+    )
 
 
 def items_of(mechanism: Mechanism, address: int) -> dict[str, bytes]:

@@ -1,54 +1,83 @@
-"""Deterministic simulation: a real cluster and real nodes in virtual time, and all that goes wrong.
+"""Deterministic simulation: a real plant, clusters and nodes in virtual time, and all that fails.
 
-One run is a seed and a length. The seed gives the heliostats, what the operator does, the list of
-faults, the clocks' drifts, and the order in which the event loop takes ready callbacks. The same
-seed gives the same run, so what broke an invariant is replayed by one command
-(`Outcome.command`). The observer of `twin.invariants` judges every step.
+One run is a seed and a length. The seed gives the heliostats and clusters, what persons do, the
+list of faults, the clocks' drifts, and the order in which the event loop takes ready callbacks. The
+same seed gives the same run, so what broke an invariant is replayed by one command
+(`Outcome.command`). The observers (`twin.invariants`, `twin.plant_observer`) judge every step.
 """
 
 import asyncio
-import math
 import random
 import traceback
-from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from heliotrope.control._kept import Kept
-from heliotrope.control.carried import CarriedLink
 from heliotrope.control.clock import VirtualClock, VirtualLoop
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
-from heliotrope.control.memory import Faults, MemoryLine, memory_pair
-from heliotrope.control.timekeeping import SystemTime
+from heliotrope.control.parameters import Wanted
+from heliotrope.control.plant import PlantController
+from heliotrope.control.plant_settings import PlantSettings
+from heliotrope.control.safety import conditions
 from heliotrope.errors import InputError
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.sun import Site, vector
 from heliotrope.twin import faults as kinds
 from heliotrope.twin.board import Board
-from heliotrope.twin.bus import BusFaults, TwinBus
-from heliotrope.twin.clocks import DriftingClock, SimulatedTime, TickCounter
+from heliotrope.twin.clocks import TickCounter
+from heliotrope.twin.damage import Damage
 from heliotrope.twin.faults import Fault
-from heliotrope.twin.intruder import Intruder
-from heliotrope.twin.invariants import InvariantError, Observer, Violation
+from heliotrope.twin.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.operator import Operator
-from heliotrope.twin.outfit import Outfit, outfits
+from heliotrope.twin.outfit import RECEIVER, Outfit, mechanisms, outfits
+from heliotrope.twin.plant_observer import PlantObserver
+from heliotrope.twin.pod import PlantEar, Pod
+from heliotrope.twin.records import RecordsDisk, SimulatedAudit
+from heliotrope.twin.tapped import TappedLink
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
 START = datetime(2026, 6, 21, 9, tzinfo=UTC)
-#: The world looks at the boards at least so often, and the observer at everything, s.
+#: The world looks at the boards at least so often, and the observers at everything, s.
 LOOK, JUDGE = 0.2, 0.5
 #: The true sun is computed so far apart (s), and between it goes straight: 1e-6 rad off.
 _SUN_EVERY = 30.0
-#: Line, bus and cluster count as whole after so long without a fault, s.
-_SETTLED = 4.0
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
+#: Few mirrors: they join one after the other.
+SETTINGS = PlantSettings(join_rate=0.5, join_burst=1)
+#: Without the rows on the share of failed nodes: one of three or four is more than they allow.
+TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
+
+
+def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: Site) -> Plant:
+    """Return the plant of some heliostats, calibrated to the truth.
+
+    Parameters
+    ----------
+    fits
+        Its heliostats.
+    homes
+        Their names by the name of their cluster.
+    site
+        Where it is.
+    """
+    home = {name: cluster for cluster, names in homes.items() for name in names}
+    names = tuple(each.name for each in fits)
+    size = np.full(len(fits), 2.0)
+    group = Heliostats(
+        names, mechanisms(fits), size, size, cluster=tuple(home[name] for name in names)
+    )
+    receiver = Receiver(
+        "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
+    )
+    return Plant("simulation", site, {"all": group}, receivers=(receiver,))
 
 
 @dataclass(frozen=True)
@@ -62,7 +91,7 @@ class Plan:
     seconds
         Length in simulated time.
     heliostats
-        On the one bus, 1 to 32.
+        Of the plant, 1 to 32; by the seed on one bus or on two.
     pause
         Mean time between two faults, s.
     only
@@ -95,6 +124,11 @@ class Plan:
             kinds.drawn(0, 1.0, 1, pause=self.pause, only=self.only)
 
     @property
+    def clusters(self) -> int:
+        """How many clusters there are: two with every third seed."""
+        return 2 if self.seed % 3 == 2 and self.heliostats > 1 else 1
+
+    @property
     def drawn(self) -> tuple[Fault, ...]:
         """The faults of the run."""
         if self.faults is not None:
@@ -121,7 +155,7 @@ class Outcome:
     faults
         How often each kind of fault came.
     counts
-        Of what the operator did and was told.
+        Of what persons did and the plant was told.
     states
         How often each state was entered.
     seconds
@@ -169,32 +203,47 @@ class Simulation:
         What to run.
     loop
         Its virtual time is the true one.
+
+    Attributes
+    ----------
+    begin
+        Time at which it began, s.
+    boards, pods
+        All heliostats, and the clusters that they hang on.
+    plant
+        The plant's program; None while it does not run.
+    disk
+        With the plant's records.
+    operator
+        The persons at the plant.
+    faults
+        How often each kind came.
     """
 
     def __init__(self, plan: Plan, loop: VirtualLoop) -> None:
         self.plan = plan
         self.faults: Counter[str] = Counter()
-        chance = random.Random(f"simulation {plan.seed}")
-        self._chance = chance
+        self._chance = random.Random(f"simulation {plan.seed}")
         self._clock = VirtualClock(loop.time, START)
-        self._begin = loop.time()
+        self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
-        self.outfits: list[Outfit] = outfits(plan.heliostats, plan.seed)
-        self.boards = [self._board(each) for each in self.outfits]
-        self.observer = Observer(self.boards, self._begin, self.sun)
+        fits = outfits(plan.heliostats, plan.seed)
+        self.boards = [self._board(each) for each in fits]
+        self.pods = self._new_pods()
+        homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
+        self._design, self._homes = design_of(fits, homes, SITE), homes
+        self._wanted = Wanted()  # what is wanted of the boards outlasts the plant's program
+        self.disk = RecordsDisk()
+        observers = [pod.observer for pod in self.pods]
+        self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
+        names = [each.name for each in fits]
         self.operator = Operator(
-            self._clock, plan.seed, self.observer, {o.name: o.address for o in self.outfits}
+            self._clock, plan.seed, self.observer, names, self.pods, self._flux
         )
-        self.intruder = Intruder(self.observer.frames, [o.address for o in self.outfits])
-        drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
-        self.cluster_clock = DriftingClock(loop.time, START, drift)
-        self.time = SimulatedTime(self.cluster_clock) if chance.random() < 0.5 else None
-        self._kept = Kept(None)  # what a cluster has on its disk outlasts its crashes
-        self.bus = self._new_bus()
-        self.line: MemoryLine | None = None
-        self._links: tuple[CarriedLink, CarriedLink] | None = None
-        self._running: list[asyncio.Task[None]] = []
-        self._whole_since = self._begin
+        self.plant: PlantController | None = None
+        self._program: list[asyncio.Task[None]] = []
+        for pod in self.pods:
+            pod.plant = self.observer
 
     def _board(self, outfit: Outfit) -> Board:
         chance = self._chance
@@ -202,17 +251,22 @@ class Simulation:
         counter = TickCounter(start, chance.choice([0.0, 1e-4, -1e-4, 5e-4]))
         play = chance.choice([0.0, 30.0])
         board = Board(outfit, seed=chance.getrandbits(32), ticks=counter, play=play)
-        board.power_on(self._begin)
+        board.power_on(self.begin)
         return board
 
-    def _new_bus(self) -> TwinBus:
-        return TwinBus(
-            self._clock, list(self.boards), seed=self._chance.getrandbits(32), tap=self.observer
-        )
+    def _new_pods(self) -> list[Pod]:
+        count = self.plan.clusters
+        cut = -(-len(self.boards) // count)
+        pods = []
+        for i in range(count):
+            part = self.boards[i * cut : (i + 1) * cut]
+            observer = Observer(part, self.begin, self.sun)
+            pods.append(Pod(f"C{i + 1}", part, observer, self._clock, START, SITE, self._chance))
+        return pods
 
     def sun(self, now: float) -> FloatArray:
         """Return the true direction to the sun, (3,), at a time of the loop."""
-        place, part = divmod(now - self._begin, _SUN_EVERY)
+        place, part = divmod(now - self.begin, _SUN_EVERY)
         first, second = self._sun_at(int(place)), self._sun_at(int(place) + 1)
         mixed = first + (second - first) * (part / _SUN_EVERY)
         return np.asarray(mixed / np.linalg.norm(mixed))
@@ -224,41 +278,53 @@ class Simulation:
             self._suns[place] = found
         return found
 
-    # -- the cluster -----------------------------------------------------------------------
+    def _flux(self) -> float:
+        """Return the share of the beams that are on the receiver."""
+        sun = self.sun(self._clock.monotonic())
+        return float(np.mean([board.miss(sun, RECEIVER) <= OFF for board in self.boards]))
 
-    @property
-    def cluster_runs(self) -> bool:
-        """Whether the cluster's program runs."""
-        return bool(self._running)
+    def pod_of(self, fault: Fault) -> Pod:
+        """Return the cluster that a fault happens to."""
+        board = self.boards[fault.target]
+        return next(pod for pod in self.pods if board in pod.boards)
 
-    def start_cluster(self, group: asyncio.TaskGroup) -> None:
-        """Start the cluster anew, with a link and a bus of its own: nothing of before is left."""
-        number = self._chance.getrandbits(31)
-        plant, mine, self.line = memory_pair(
-            self._clock, seed=number, clocks=(self._clock, self.cluster_clock)
-        )
-        self._links = plant, mine
-        self.bus = self._new_bus()
-        keeper = self.time or SystemTime(self.cluster_clock)
-        members = tuple(Member(o.name, o.address, o.serial, o.key) for o in self.outfits)
-        cluster = Cluster(
-            ClusterConfig("C1", SITE, members), self.bus, mine, self.cluster_clock, keeper,
-            self._kept,
+    # -- the plant -------------------------------------------------------------------------
+
+    def start_plant(self, group: asyncio.TaskGroup) -> None:
+        """Start the plant's program anew: of before only disk and wanted parameters are left."""
+        links = {}
+        for pod in self.pods:
+            seed = self._chance.getrandbits(31)
+            link = pod.line.end(0, pod.name, self._clock, seed=seed)
+            pod.tap = TappedLink(link, self._clock, PlantEar(pod, self.observer))
+            links[pod.name] = pod.tap
+        audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
+        plant = self.plant = PlantController(
+            self._design, links, self._clock, audit, clusters=self._homes, settings=SETTINGS,
+            wanted=self._wanted, table=TABLE, entropy=self._chance.randbytes,
         )  # fmt: skip
-        self.operator.link = plant
-        start = group.create_task
-        self._running = [
-            start(plant.run()), start(mine.run()), start(cluster.run()),
-            start(self.operator.listen(plant)),
-        ]  # fmt: skip
+        self.operator.begins(plant)
+        self._program = [group.create_task(link.run()) for link in links.values()]
+        self._program.append(group.create_task(plant.run()))
 
-    def crash_cluster(self) -> None:
-        """End the cluster's program at once, wherever it is."""
-        for task in self._running:
+    def crash_plant(self, now: float) -> None:
+        """End the plant's program at once, wherever it is; the network tells the clusters."""
+        for task in self._program:
             task.cancel()
-        self._running = []
-        self._links = self.line = None
-        self.operator.link = None
+        self._program, self.plant = [], None
+        self.operator.begins(None)
+        self.observer.ended(now)
+        for pod in self.pods:
+            pod.tap = None
+            pod.line.drop()
+            pod.observer.disturbed(now, crashed=True)
+
+    def hang_plant(self, now: float, *, on: bool) -> None:
+        """Let the plant's program stand still, or go on."""
+        self.observer.hangs(now, on=on and self.plant is not None)
+        for pod in self.pods:
+            if pod.tap is not None:
+                pod.tap.hang(on=on)
 
     # -- the world -------------------------------------------------------------------------
 
@@ -272,191 +338,36 @@ class Simulation:
         """
         damage = Damage(self, self.plan.drawn)
         async with asyncio.TaskGroup() as group:
-            self.start_cluster(group)
-            others = [group.create_task(self.operator.lease()),
+            for pod in self.pods:
+                pod.start(group)
+            self.start_plant(group)
+            others = [group.create_task(self.operator.keep()),
                       group.create_task(self.operator.work())]  # fmt: skip
             await self._turn(damage, group)
-            self.crash_cluster()
+            self.crash_plant(self._clock.monotonic())
+            for pod in self.pods:
+                pod.crash()
             for task in others:
                 task.cancel()
 
-    async def _turn(self, damage: "Damage", group: asyncio.TaskGroup) -> None:
-        """Let boards, faults and observer go on until the end."""
-        end, judged = self._begin + self.plan.seconds, self._begin
+    async def _turn(self, damage: Damage, group: asyncio.TaskGroup) -> None:
+        """Let boards, faults and observers go on until the end."""
+        end, judged = self.begin + self.plan.seconds, self.begin
         while (now := self._clock.monotonic()) < end:
             damage.look(now, group)
             for board in self.boards:
                 if board.due(now) <= now:
                     board.step(now)
-            self._look_at_line(now, damage)
+            for pod in self.pods:
+                pod.look(now, hindered=damage.hinders(pod))
             if now >= judged:
-                self.observer.look(now)
+                for pod in self.pods:
+                    pod.observer.look(now)
+                self.observer.look(self.plant, now)
                 judged = now + JUDGE
             times = [board.due(now) for board in self.boards]
             due = min(*times, damage.next, now + LOOK, end)
             await asyncio.sleep(max(1e-3, due - now))
-
-    def _look_at_line(self, now: float, damage: "Damage") -> None:
-        """Whether an order of now would surely be carried out."""
-        links = self._links
-        whole = links is not None and links[0].connected and links[1].connected
-        if damage.hinders or not whole:
-            self._whole_since = now
-            self.observer.disturbed(now)
-        self.operator.carried = now - self._whole_since > _SETTLED
-
-
-class Damage:
-    """Makes the faults of a run happen, and ends them.
-
-    Parameters
-    ----------
-    simulation
-        What they happen to.
-    faults
-        In the order of their times.
-
-    Attributes
-    ----------
-    next
-        When it has to look again, s.
-    """
-
-    def __init__(self, simulation: Simulation, faults: Sequence[Fault]) -> None:
-        self._of = simulation
-        self._begin = simulation.observer.start
-        self._left = deque(sorted(faults, key=lambda fault: fault.at))
-        self._active: list[tuple[float, Fault]] = []
-        self._off: dict[int, float] = {}  # boards without supply, and when it comes back
-        self._pause = 1.0  # until a board that died within a write starts again
-        self.next = -math.inf
-
-    @property
-    def hinders(self) -> bool:
-        """Whether line, bus or cluster are not whole."""
-        return not self._of.cluster_runs or any(
-            fault.kind.startswith(("line", "bus", "plant")) for _, fault in self._active
-        )
-
-    def look(self, now: float, group: asyncio.TaskGroup) -> None:
-        """Begin and end what is due."""
-        changed = False
-        while self._left and self._begin + self._left[0].at <= now:
-            fault = self._left.popleft()
-            self._of.faults[fault.kind] += 1
-            self._begins(fault, now)
-            changed = True
-        over = [fault for until, fault in self._active if until <= now]
-        if over:
-            self._active = [(until, fault) for until, fault in self._active if until > now]
-            changed = True
-        if changed:
-            self._apply(group)
-        self._supply(now)
-        times = [until for until, _ in self._active] + list(self._off.values())
-        if self._left:
-            times.append(self._begin + self._left[0].at)
-        self.next = min(times, default=math.inf)
-
-    def _begins(self, fault: Fault, now: float) -> None:
-        of, board = self._of, self._of.boards[fault.target]
-        if fault.lasts > 0.0:
-            self._active.append((now + fault.lasts, fault))
-        if fault.kind in ("power_cut", "brown_out"):
-            board.power_off(now, warned=fault.kind == "brown_out")
-            self._off[fault.target] = now + fault.lasts
-        elif fault.kind == "flash_cut":
-            chance = random.Random(f"flash {fault.size}")
-            board.flash.budget = chance.choice([chance.randrange(40), chance.randrange(5000)])
-            board.flash.ragged = chance.random() < 0.5
-            self._pause = 0.1 + fault.lasts
-        elif fault.kind == "tick_jump":
-            of.observer.jumped(now, fault.target)
-            board.ticks.jump(kinds.tick_jump(fault.size))
-        elif fault.kind == "time_jump":
-            self._time_jump(fault, now)
-        elif fault.kind == "line_drop" and of.line is not None:
-            of.line.drop()
-            of.observer.disturbed(now)
-        elif fault.kind == "cluster_crash":
-            of.crash_cluster()
-            of.observer.disturbed(now, crashed=True)
-        else:
-            self._strangers(fault)
-
-    def _time_jump(self, fault: Fault, now: float) -> None:
-        of, seconds = self._of, kinds.time_jump(fault.size)
-        of.observer.jumped(now)
-        if of.time is None:
-            of.cluster_clock.jump(seconds)
-        else:
-            of.time.detects = fault.target % 2 == 0
-            of.time.jump(seconds)
-
-    def _strangers(self, fault: Fault) -> None:
-        intruder, bus = self._of.intruder, self._of.bus
-        if fault.kind == "replay" and (old := intruder.recorded(fault.size)):
-            bus.inject(old, how="replayed")
-        elif fault.kind == "forgery":
-            bus.inject(intruder.forged(fault.target, fault.size), how="forged")
-        elif fault.kind == "stranger_safe":
-            bus.inject(intruder.safe(fault.target, fault.size), how="forged")
-        elif fault.kind == "noise":
-            bus.inject(intruder.noise(fault.size), how="damaged")
-
-    def _apply(self, group: asyncio.TaskGroup) -> None:
-        """Set everything that lasts as the active faults say."""
-        of = self._of
-        active = {fault.kind: fault for _, fault in self._active}
-        of.operator.silent = "plant_silent" in active
-        if of.time is not None:
-            of.time.quality = "none" if "time_lost" in active else "gps"
-        if "cluster_crash" not in active and not of.cluster_runs:
-            of.start_cluster(group)
-        bad = active.get("bus_bad")
-        of.bus.faults = replace(
-            BusFaults() if bad is None else _bus_faults(bad.size), stuck="bus_stuck" in active
-        )
-        of.bus.plugged = "bus_unplugged" not in active
-        if of.line is not None:
-            one_way = active.get("line_one_way")
-            of.line.cut(
-                first_to_second="line_cut" in active
-                or (one_way is not None and one_way.size < 0.5),
-                second_to_first="line_cut" in active
-                or (one_way is not None and one_way.size >= 0.5),
-            )
-            poor = active.get("line_bad")
-            of.line.faults = Faults() if poor is None else _line_faults(poor.size)
-
-    def _supply(self, now: float) -> None:
-        """Give boards their supply back, those too that died within a write of flash."""
-        for place, board in enumerate(self._of.boards):
-            if board.node is not None:
-                continue
-            back = self._off.setdefault(place, now + self._pause)
-            if now >= back:
-                del self._off[place]
-                board.power_on(now)
-
-
-def _bus_faults(size: float) -> BusFaults:
-    chance = random.Random(f"bus {size}")
-    names = ("loss", "corruption", "burst", "duplication", "late")
-    some = chance.sample(names, chance.randint(1, 3))
-    chances = {name: chance.choice([0.02, 0.1, 0.4]) for name in some}
-    loss, corruption, burst, duplication, late = (chances.get(name, 0.0) for name in names)
-    return BusFaults(loss, corruption, burst, duplication, late)
-
-
-def _line_faults(size: float) -> Faults:
-    chance = random.Random(f"line {size}")
-    names = ("loss", "duplication", "reordering", "corruption")
-    some = chance.sample(names, chance.randint(1, 3))
-    return Faults(
-        **{name: chance.choice([0.02, 0.1, 0.3]) for name in some},
-        delay=chance.choice([(0.0, 0.0), (0.01, 0.1), (0.0, 0.6)]),
-    )
 
 
 # -- running -----------------------------------------------------------------------------------
@@ -475,10 +386,12 @@ def run(plan: Plan) -> Outcome:
         except (Exception, BaseExceptionGroup) as error:  # noqa: BLE001 - it is the finding
             _blame(error, outcome)
             outcome.seconds = loop.time() - begin
-    outcome.checks = simulation.observer.checks
+    outcome.checks = sum(
+        (pod.observer.checks for pod in simulation.pods), Counter(simulation.observer.checks)
+    )
     outcome.faults = simulation.faults
-    outcome.counts = simulation.operator.counts
-    outcome.states = simulation.observer.entered
+    outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)
+    outcome.states = sum((pod.observer.entered for pod in simulation.pods), Counter())
     return outcome
 
 

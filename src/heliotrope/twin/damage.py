@@ -1,0 +1,187 @@
+"""Makes the faults of a run happen to a simulated plant, and ends them."""
+
+import asyncio
+import math
+import random
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from heliotrope.control.memory import Faults
+from heliotrope.twin import faults as kinds
+from heliotrope.twin.bus import BusFaults
+from heliotrope.twin.faults import Fault
+from heliotrope.twin.pod import Pod
+
+if TYPE_CHECKING:
+    from heliotrope.twin.simulation import Simulation
+
+#: While one of these lasts, an order need not be carried out.
+_HINDERS = ("line", "bus", "plant")
+
+
+class Damage:
+    """See the head of this module.
+
+    Parameters
+    ----------
+    simulation
+        What they happen to.
+    faults
+        In the order of their times.
+
+    Attributes
+    ----------
+    next
+        When it has to look again, s.
+    """
+
+    def __init__(self, simulation: "Simulation", faults: Sequence[Fault]) -> None:
+        self._of = simulation
+        self._begin = simulation.begin
+        self._left = deque(sorted(faults, key=lambda fault: fault.at))
+        self._active: list[tuple[float, Fault]] = []
+        self._off: dict[int, float] = {}  # boards without supply, and when it comes back
+        self._pause = 1.0  # until a board that died within a write starts again
+        self.next = -math.inf
+
+    def hinders(self, pod: Pod) -> bool:
+        """Whether plant, line, bus or cluster are not whole."""
+        return not pod.runs or any(
+            fault.kind.startswith("plant")
+            or (fault.kind.startswith(_HINDERS) and self._of.pod_of(fault) is pod)
+            for _, fault in self._active
+        )
+
+    def look(self, now: float, group: asyncio.TaskGroup) -> None:
+        """Begin and end what is due."""
+        changed = False
+        while self._left and self._begin + self._left[0].at <= now:
+            fault = self._left.popleft()
+            self._of.faults[fault.kind] += 1
+            self._begins(fault, now)
+            changed = True
+        over = [fault for until, fault in self._active if until <= now]
+        if over:
+            self._active = [(until, fault) for until, fault in self._active if until > now]
+            changed = True
+        if changed:
+            self._apply(group, now)
+        self._supply(now)
+        times = [until for until, _ in self._active] + list(self._off.values())
+        if self._left:
+            times.append(self._begin + self._left[0].at)
+        self.next = min(times, default=math.inf)
+
+    def _begins(self, fault: Fault, now: float) -> None:
+        of, board, pod = self._of, self._of.boards[fault.target], self._of.pod_of(fault)
+        if fault.lasts > 0.0:
+            self._active.append((now + fault.lasts, fault))
+        if fault.kind in ("power_cut", "brown_out"):
+            board.power_off(now, warned=fault.kind == "brown_out")
+            self._off[fault.target] = now + fault.lasts
+        elif fault.kind == "flash_cut":
+            chance = random.Random(f"flash {fault.size}")
+            board.flash.budget = chance.choice([chance.randrange(40), chance.randrange(5000)])
+            board.flash.ragged = chance.random() < 0.5
+            self._pause = 0.1 + fault.lasts
+        elif fault.kind == "tick_jump":
+            pod.observer.jumped(now, pod.boards.index(board))
+            board.ticks.jump(kinds.tick_jump(fault.size))
+        elif fault.kind == "time_jump":
+            _time_jump(pod, fault, now)
+        elif fault.kind == "line_drop":
+            pod.line.drop()
+            pod.observer.disturbed(now)
+        elif fault.kind == "cluster_crash":
+            pod.crash()
+            pod.observer.disturbed(now, crashed=True)
+        elif fault.kind == "plant_crash":
+            of.crash_plant(now)
+        else:
+            _strangers(pod, pod.boards.index(board), fault)
+
+    def _apply(self, group: asyncio.TaskGroup, now: float) -> None:
+        """Set everything that lasts as the active faults say."""
+        of = self._of
+        everywhere = {fault.kind for _, fault in self._active}
+        of.operator.away = "nobody_there" in everywhere
+        of.disk.set_full(now, full="audit_full" in everywhere)
+        for pod in of.pods:
+            active = {fault.kind: fault for _, fault in self._active if of.pod_of(fault) is pod}
+            if "cluster_crash" not in active and not pod.runs:
+                pod.start(group)
+            _apply_to(pod, active)
+        # Without room for its records the plant does not start.
+        if "plant_crash" not in everywhere and not of.disk.full and of.plant is None:
+            of.start_plant(group)
+        of.hang_plant(now, on="plant_silent" in everywhere)
+
+    def _supply(self, now: float) -> None:
+        """Give boards their supply back, those too that died within a write of flash."""
+        for place, board in enumerate(self._of.boards):
+            if board.node is not None:
+                continue
+            back = self._off.setdefault(place, now + self._pause)
+            if now >= back:
+                del self._off[place]
+                board.power_on(now)
+
+
+def _apply_to(pod: Pod, active: dict[str, Fault]) -> None:
+    if pod.time is not None:
+        pod.time.quality = "none" if "time_lost" in active else "gps"
+    bad = active.get("bus_bad")
+    pod.bus.faults = replace(
+        BusFaults() if bad is None else _bus_faults(bad.size), stuck="bus_stuck" in active
+    )
+    pod.bus.plugged = "bus_unplugged" not in active
+    one_way = active.get("line_one_way")
+    pod.line.cut(
+        first_to_second="line_cut" in active or (one_way is not None and one_way.size < 0.5),
+        second_to_first="line_cut" in active or (one_way is not None and one_way.size >= 0.5),
+    )
+    poor = active.get("line_bad")
+    pod.line.faults = Faults() if poor is None else _line_faults(poor.size)
+
+
+def _time_jump(pod: Pod, fault: Fault, now: float) -> None:
+    seconds = kinds.time_jump(fault.size)
+    pod.observer.jumped(now)
+    if pod.time is None:
+        pod.clock.jump(seconds)
+    else:
+        pod.time.detects = fault.target % 2 == 0
+        pod.time.jump(seconds)
+
+
+def _strangers(pod: Pod, target: int, fault: Fault) -> None:
+    intruder, bus = pod.intruder, pod.bus
+    if fault.kind == "replay" and (old := intruder.recorded(fault.size)):
+        bus.inject(old, how="replayed")
+    elif fault.kind == "forgery":
+        bus.inject(intruder.forged(target, fault.size), how="forged")
+    elif fault.kind == "stranger_safe":
+        bus.inject(intruder.safe(target, fault.size), how="forged")
+    elif fault.kind == "noise":
+        bus.inject(intruder.noise(fault.size), how="damaged")
+
+
+def _bus_faults(size: float) -> BusFaults:
+    chance = random.Random(f"bus {size}")
+    names = ("loss", "corruption", "burst", "duplication", "late")
+    some = chance.sample(names, chance.randint(1, 3))
+    chances = {name: chance.choice([0.02, 0.1, 0.4]) for name in some}
+    loss, corruption, burst, duplication, late = (chances.get(name, 0.0) for name in names)
+    return BusFaults(loss, corruption, burst, duplication, late)
+
+
+def _line_faults(size: float) -> Faults:
+    chance = random.Random(f"line {size}")
+    names = ("loss", "duplication", "reordering", "corruption")
+    some = chance.sample(names, chance.randint(1, 3))
+    return Faults(
+        **{name: chance.choice([0.02, 0.1, 0.3]) for name in some},
+        delay=chance.choice([(0.0, 0.0), (0.01, 0.1), (0.0, 0.6)]),
+    )

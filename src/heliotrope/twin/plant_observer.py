@@ -1,0 +1,323 @@
+"""The observer of the plant: what it accepts, records, shows and lets join, in true time.
+
+He stands beside `twin.invariants.Observer`, one of which watches each cluster, and like them takes
+nobody's word: who holds the authority he knows from those who took it, what has a record from the
+disk, how old a value is from when the bus carried it, and who joins from what is sent and from the
+boards. He checks the plant's part of three invariants: 4 (authority), 10 (joining) and 11 (records,
+values and proofs).
+"""
+
+from collections import Counter, deque
+from collections.abc import Sequence
+from itertools import islice
+
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.authority import OPERATOR_COMMANDS, Person, Role
+from heliotrope.control.plant import JOINING, PlantController
+from heliotrope.control.plant_settings import PlantSettings
+from heliotrope.control.protocol import Command, Emergency, Message, Parameters
+from heliotrope.lcu import states
+from heliotrope.twin.invariants import InvariantError, Observer, Violation
+from heliotrope.twin.records import RecordsDisk
+
+#: A status waits for up to a second, may be under way for one more, and ages are rounded: a value
+#: may be taken for so much younger than it is, s.
+YOUNGER = 2.2
+#: A record that may follow is there within this, s.
+RECORD_WITHIN = 2.0
+#: How long a cluster may go by a token that is void: until the last lease with it came, and is
+#: over, s.
+VOID_WITHIN = 4.2
+#: From when a command to join is posted to when it is carried out at the latest, beyond its life:
+#: under way, and late on the bus; and how far apart the boards are looked at, s.
+LATE, LOOKS = 1.8, 0.5
+#: What a proof calls done.
+_OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.FAULT,
+        states.UNCONFIGURED)  # fmt: skip
+_OWN = ("plant", "safety table")
+
+
+class PlantObserver:
+    """See the head of this module.
+
+    Parameters
+    ----------
+    start
+        Time that counts as 0 s in what it says.
+    disk
+        Where records are kept.
+    settings
+        Of the plant.
+    clusters
+        The observers of its clusters.
+
+    Attributes
+    ----------
+    checks
+        How often each invariant was checked.
+    old
+        Tokens that are void, and since when, s.
+    """
+
+    def __init__(
+        self, start: float, disk: RecordsDisk, settings: PlantSettings,
+        clusters: Sequence[Observer],
+    ) -> None:  # fmt: skip
+        self.checks: Counter[int] = Counter()
+        self.old: dict[int, float] = {}
+        self._start, self._disk, self._settings = start, disk, settings
+        self._clusters = clusters
+        self._accounts = {a.name: a for each in clusters for a in each.accounts}
+        self._holder: tuple[Person, int, float] | None = None
+        self._accepted: Counter[tuple[str, str]] = Counter()
+        self._recorded: Counter[tuple[str, str]] = Counter()
+        self._looked = 0  # records that were counted
+        self._noted_at: dict[tuple[str, str], float] = {}
+        self._following: dict[str, float] = {}  # tickets whose record may follow
+        self._own: dict[str, float] = {}  # the plant's own records without a message yet
+        self._sent: set[str] = set()
+        self._posted: deque[tuple[float, int]] = deque(maxlen=400)
+        self._joined: deque[tuple[float, int]] = deque(maxlen=400)
+        self._on: set[str] = set()
+        self._heard: dict[str, deque[tuple[float, int]]] = {
+            name: deque(maxlen=64) for name in self._accounts
+        }
+        self._proved: set[tuple[str, str]] = set()
+        self._hangs, self._hung_at = False, float("-inf")
+
+    def check(self, number: int, good: bool, now: float, saw: str) -> None:
+        """Count a check, and raise if it fails.
+
+        Raises
+        ------
+        InvariantError
+            If ``good`` is False.
+        """
+        self.checks[number] += 1
+        if not good:
+            raise InvariantError(Violation(number, now - self._start, "plant", saw))
+
+    # -- the authority ---------------------------------------------------------------------
+
+    def _live(self, now: float) -> tuple[Person, int, float] | None:
+        """Return who holds the authority; what nobody has kept up is over."""
+        holder = self._holder
+        if holder is not None and now - holder[2] >= self._settings.authority:
+            self._end(holder[2] + self._settings.authority)
+        return self._holder
+
+    def _end(self, now: float) -> None:
+        if self._holder is not None:
+            token = self._holder[1]
+            self.old[token] = now
+            for each in self._clusters:
+                each.orders.void(token, now + VOID_WITHIN)
+        self._holder = None
+
+    def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
+        """Judge who was given the authority."""
+        before = self._live(now)
+        saw = f"{person.name} ({person.role.name.lower()}) was given the authority"
+        good = person.role >= Role.OPERATOR
+        if before is not None:
+            saw += f", which {before[0].name} had"
+            good &= person.role >= before[0].role if seized else person == before[0]
+        if before is None or seized:
+            good &= token != 0 and token not in self.old and (before is None or token != before[1])
+            self._noted(person.name, "AUTHORITY", now)
+            self._end(now)
+        self.check(4, good, now, saw)
+        self._holder = (person, token, now)
+
+    def kept(self, now: float) -> None:
+        """Note that the holder has kept it up."""
+        if self._holder is not None:
+            self._holder = (*self._holder[:2], now)
+
+    def released(self, person: Person, now: float) -> None:
+        """Note that it was given back."""
+        self._noted(person.name, "AUTHORITY", now)
+        self._end(now)
+
+    def until(self, token: int, until: float) -> float:
+        """Return when an order with a token is void."""
+        void = self.old.get(token)
+        return until if void is None else min(until, void + VOID_WITHIN)
+
+    def known(self, token: int) -> bool:
+        """Whether somebody was ever given a token."""
+        return token in self.old or (self._holder is not None and self._holder[1] == token)
+
+    # -- what the plant accepts ------------------------------------------------------------
+
+    def accepted(self, person: Person, token: int, ticket: Ticket, what: str, now: float) -> None:
+        """Judge a command that the plant has accepted."""
+        holder = self._live(now)
+        held = holder is not None and holder[:2] == (person, token)
+        saw = f"{what} of {person.name} was accepted, who has not the authority"
+        self.check(4, held, now, saw)
+        enough = person.role >= (Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER)
+        saw = f"{what} was accepted of {person.name}, who is {person.role.name.lower()}"
+        self.check(4, enough, now, saw)
+        self.kept(now)
+        record = self._disk.records.get(ticket.identity)
+        right = record is not None and (record.who, record.what) == (person.name, what)
+        self.check(11, right, now, f"{what} of {person.name} was accepted without its record")
+        self._accepted[person.name, what] += 1
+        self._count(now)
+
+    def obeyed(self, who: str, what: str, now: float) -> None:
+        """Note what the plant must take of anybody, and may record later."""
+        self._noted(who, what, now)
+
+    def _noted(self, who: str, what: str, now: float) -> None:
+        self._accepted[who, what] += 1
+        self._noted_at[who, what] = now
+
+    def ended(self, now: float) -> None:
+        """Note that the plant's program has ended: what it owed to the disk is lost."""
+        self._end(now)
+        self._count(now)
+        self._accepted = Counter(self._recorded)
+        self._following.clear()
+        self._own.clear()
+        self._hangs = False
+
+    def hangs(self, now: float, *, on: bool) -> None:
+        """Note that what the plant posts waits, and may go out together; or goes again."""
+        if on or self._hangs:
+            self._hung_at = now
+        self._hangs = on
+
+    # -- what it sends ---------------------------------------------------------------------
+
+    def posted(self, members: int, message: Message, now: float) -> None:
+        """Judge a message before it goes to a cluster with so many heliostats."""
+        if not isinstance(message, Command | Parameters | Emergency):
+            return
+        identity = message.identity.rpartition(".")[0]
+        self._sent.add(identity)
+        self._own.pop(identity, None)
+        if isinstance(message, Emergency):
+            if identity not in self._disk.records:
+                self._following.setdefault(identity, now)
+            return
+        what = message.name if isinstance(message, Command) else "PARAMETERS"
+        record = self._disk.records.get(identity)
+        good = record is not None and record.what == what
+        self.check(11, good, now, f"{what} {message.identity} is sent before its record is kept")
+        if isinstance(message, Command) and what in JOINING:
+            self._posted.append((now, len(message.heliostats) or members))
+            self._bounded(self._posted, 0.0, now, f"are sent {what}")
+
+    def _bounded(
+        self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
+    ) -> None:
+        """In any span that ends now, no more mirrors join than the settings allow."""
+        rate, burst = self._settings.join_rate, self._settings.join_burst
+        if now - self._hung_at < 2.0 * self._settings.join_life:
+            slack += self._settings.join_life
+        count = 0
+        for at, some in reversed(joined):
+            count += some
+            span = now - at
+            most = burst + rate * (span + slack) + 1e-6
+            saw = f"{count} mirrors {how} within {span:.2f} s, at most {most:.1f} may join"
+            self.check(10, count <= most, now, saw)
+            if span > 60.0:
+                break
+
+    # -- what it shows ---------------------------------------------------------------------
+
+    def heard(self, name: str, state: int, now: float) -> None:
+        """Note what a heliostat has told its cluster."""
+        self._heard[name].append((now, state))
+
+    def look(self, plant: PlantController | None, now: float) -> None:
+        """Judge what must have come true by now; None: the plant does not run."""
+        self.hangs(now, on=self._hangs)
+        self._live(now)
+        self._count(now)
+        self._boards(now)
+        if plant is None:
+            return
+        if now - self._disk.well_since > RECORD_WITHIN and not self._disk.full:
+            self._complete(now)
+        self._shown(plant, now)
+        self._proofs(plant, now)
+
+    def _count(self, now: float) -> None:
+        """Each record belongs to one command, and no command has two."""
+        records = self._disk.records
+        for record in islice(records.values(), self._looked, None):
+            if record.who in _OWN:
+                if record.identity not in self._sent:
+                    self._own[record.identity] = now
+                continue
+            key = (record.who, record.what)
+            self._recorded[key] += 1
+        for key in self._recorded if self._looked < len(records) else ():
+            count, most = self._recorded[key], self._accepted[key]
+            saw = f"{count} records of {key[1]} by {key[0]}, who gave it {most} times"
+            self.check(11, count <= most, now, saw)
+        self._looked = len(records)
+
+    def _complete(self, now: float) -> None:
+        """What may be recorded later has been by now."""
+        for key, at in list(self._noted_at.items()):
+            if now - at > RECORD_WITHIN:
+                del self._noted_at[key]
+                count, most = self._recorded[key], self._accepted[key]
+                saw = f"{count} records of {key[1]} by {key[0]}, who gave it {most} times"
+                self.check(11, count == most, now, saw)
+        for identity, at in list(self._following.items()):
+            if now - at > RECORD_WITHIN:
+                del self._following[identity]
+                good = identity in self._disk.records
+                self.check(11, good, now, f"order {identity} has no record {now - at:.1f} s later")
+        for identity, at in list(self._own.items()):
+            if now - max(at, self._hung_at) > RECORD_WITHIN:
+                del self._own[identity]
+                self.check(11, False, now, f"record {identity} belongs to nothing that was sent")
+
+    def _boards(self, now: float) -> None:
+        """Who joins, by the boards themselves."""
+        on = {
+            name for name, account in self._accounts.items()
+            if account.state in (states.TRACKING, states.SEARCHING)
+        }  # fmt: skip
+        new, self._on = len(on - self._on), on
+        if new:
+            self._joined.append((now, new))
+            slack = self._settings.join_life + LATE + LOOKS
+            self._bounded(self._joined, slack, now, "have joined")
+
+    def _shown(self, plant: PlantController, now: float) -> None:
+        """A value that is shown as live is young, and is what was told."""
+        live = plant.field.live(now)
+        limit = self._settings.stale + YOUNGER
+        for name, heard in self._heard.items():
+            shown = plant.field.of(name, now)
+            row = plant.field.index[name]
+            saw = f"{name} is {'live' if shown.live else 'stale'} in one place, not in the other"
+            self.check(11, shown.live == live[row], now, saw)
+            if not shown.live:
+                continue
+            age = now - heard[-1][0] if heard else float("inf")
+            saw = f"{name} is shown as live, last heard {age:.2f} s ago, limit {limit:.2f} s"
+            self.check(11, age <= limit, now, saw)
+            told = {states.STATES[state] for at, state in heard if now - at <= limit}
+            saw = f"{name} is shown as {shown.state}; it told {', '.join(sorted(told))}"
+            self.check(11, shown.state in told, now, saw)
+
+    def _proofs(self, plant: PlantController, now: float) -> None:
+        """What a proof calls done was done."""
+        order = plant.emergency
+        if order is None:
+            return
+        for name, account in self._accounts.items():
+            key = (order.ticket.identity, name)
+            if key not in self._proved and order.is_done(name):
+                self._proved.add(key)
+                saw = f"{order.act.name} is proven for {name}, which has not left its beam"
+                self.check(11, account.was_in(_OFF, order.at - YOUNGER), now, saw)

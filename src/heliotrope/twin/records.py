@@ -1,0 +1,109 @@
+"""Records of commands on a simulated disk, which may be full and outlasts the plant."""
+
+from dataclasses import replace
+
+from heliotrope.control.audit import STOPPED, AuditError, Record
+from heliotrope.errors import InputError
+
+
+class RecordsDisk:
+    """What is written, and whether more can be.
+
+    Attributes
+    ----------
+    records
+        By identity, in the order of their beginning.
+    full
+        Whether nothing can be written.
+    well_since
+        Since when it has not been full, s.
+    """
+
+    def __init__(self) -> None:
+        self.records: dict[str, Record] = {}
+        self.full = False
+        self.well_since = float("-inf")
+
+    def set_full(self, now: float, *, full: bool) -> None:
+        """Fill the disk, or make room."""
+        if self.full and not full:
+            self.well_since = now
+        self.full = full
+
+    def check(self) -> None:
+        """See that something can be written.
+
+        Raises
+        ------
+        AuditError
+            If the disk is full.
+        """
+        if self.full:
+            raise AuditError("audit: no space left on the simulated disk; make room")
+
+
+class SimulatedAudit:
+    """A `control.audit.Audit` of one run of the plant.
+
+    Parameters
+    ----------
+    disk
+        Where records lie.
+    started
+        UTC, ISO 8601, for the records that are ended now since the plant stopped before.
+
+    Raises
+    ------
+    AuditError
+        If the disk is full.
+    """
+
+    def __init__(self, disk: RecordsDisk, started: str) -> None:
+        self._disk = disk
+        for identity, record in list(disk.records.items()):
+            if not record.result:
+                self.finish(identity, STOPPED, started)
+
+    def begin(self, record: Record) -> None:
+        """Keep a record without result.
+
+        Raises
+        ------
+        AuditError
+            If the disk is full.
+        InputError
+            An identity that was used before.
+        """
+        self._disk.check()
+        if record.identity in self._disk.records:
+            raise InputError(f"audit: a record {record.identity} exists; identities are unique")
+        self._disk.records[record.identity] = record
+
+    def finish(self, identity: str, result: str, at: str) -> None:
+        """Add the result to a record.
+
+        Raises
+        ------
+        AuditError
+            If the disk is full.
+        InputError
+            A record that was not begun, or has its result.
+        """
+        self._disk.check()
+        known = self._disk.records.get(identity)
+        if known is None or known.result:
+            raise InputError(f"audit: no record {identity} waits for a result")
+        self._disk.records[identity] = replace(known, result=result, finished=at)
+
+    def confirm(self) -> None:
+        """See that a record could be written now.
+
+        Raises
+        ------
+        AuditError
+            If the disk is full.
+        """
+        self._disk.check()
+
+    def close(self) -> None:
+        """End it: everything is on the disk."""

@@ -1,0 +1,83 @@
+"""Defects to plant in the code of the plant, which the simulation runs: for `twin_defects`."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.control import _emergency, authority, field_state
+from heliotrope.control._plant_orders import PlantOrders
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.audit import AuditError
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def join_limiter_off(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(
+        _emergency.JoinLimiter, "admit", lambda self, wanted, now: (replace(self, at=now), wanted)
+    )
+
+
+def record_doubled(patch: pytest.MonkeyPatch) -> None:
+    accept = PlantOrders.accept
+
+    def twice(self: Any, *given: Any, **more: Any) -> Ticket:
+        accept(self, *given, **more)
+        return accept(self, *given, **more)
+
+    patch.setattr(PlantOrders, "accept", twice)
+
+
+def record_missing(patch: pytest.MonkeyPatch) -> None:
+    """If the disk is full it is done without a record."""
+    accept = PlantOrders.accept
+
+    def careless(self: Any, record: Any, *given: Any, **more: Any) -> Ticket:
+        try:
+            return accept(self, record, *given, **more)
+        except AuditError:
+            return accept(self, record, *given, **{**more, "late": True})
+
+    patch.setattr(PlantOrders, "accept", careless)
+
+
+def safe_not_recorded(patch: pytest.MonkeyPatch) -> None:
+    """What may be recorded later is forgotten."""
+    patch.setattr(PlantOrders, "pay", lambda self: setattr(self, "_owed", []))
+
+
+def stale_as_live(patch: pytest.MonkeyPatch) -> None:
+    def young(self: Any, now: float) -> Any:
+        return np.where(np.isfinite(self.heard), 0.0, np.inf)
+
+    patch.setattr(field_state.FieldState, "age", young)
+
+
+def authority_of_anybody(patch: pytest.MonkeyPatch) -> None:
+    """Whoever has a role is believed to have the authority too."""
+
+    def trusting(self: Any, person: Any, token: int, command: str) -> None:
+        if person.role < authority.Role.OPERATOR:
+            raise authority.RefusedError(f"{command}: {person.name} is viewer")
+
+    patch.setattr(authority.Authority, "check", trusting)
+
+
+def broken_by_anybody(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(authority.Authority, "seize", lambda self, person, reason: self._give(person))
+
+
+#: Invariants by which it may be found, name, defect, faults to draw from, pause between them, and
+#: the seed that found it.
+ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...] = (
+    ((10,), "nobody bounds who joins", join_limiter_off, ("line_drop",), 60.0, 0),
+    ((11,), "audit record doubled", record_doubled, ("line_drop",), 60.0, 0),
+    ((11,), "audit record missing on a full disk", record_missing, ("audit_full",), 10.0, 0),
+    ((11,), "orders to everybody are not recorded", safe_not_recorded, ("line_drop",), 60.0, 0),
+    ((11,), "stale row shown as live", stale_as_live, ("power_cut", "cluster_crash"), 10.0, 0),
+    ((4,), "command accepted without authority", authority_of_anybody, ("line_drop",), 60.0, 1),
+    ((4,), "authority broken by anybody", broken_by_anybody, ("line_drop",), 60.0, 1),
+)
