@@ -77,7 +77,7 @@ ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...
     ((11,), "audit record doubled", record_doubled, ("line_drop",), 60.0, 0),
     ((11,), "audit record missing on a full disk", record_missing, ("audit_full",), 10.0, 0),
     ((11,), "orders to everybody are not recorded", safe_not_recorded, ("line_drop",), 60.0, 0),
-    ((11,), "stale row shown as live", stale_as_live, ("power_cut", "cluster_crash"), 10.0, 0),
+    ((11,), "stale row shown as live", stale_as_live, ("power_cut", "cluster_crash"), 10.0, 1),
     ((4,), "command accepted without authority", authority_of_anybody, ("line_drop",), 60.0, 1),
-    ((4,), "authority broken by anybody", broken_by_anybody, ("line_drop",), 60.0, 1),
+    ((4,), "authority broken by anybody", broken_by_anybody, ("line_drop",), 60.0, 2),
 )
