@@ -17,7 +17,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
 from heliotrope.twin.clocks import SimulatedTime
 from heliotrope.twin.field import Field
-from heliotrope.twin.field_bus import FieldBus
+from heliotrope.twin.field_bus import FieldBus, _stuffed, _unstuffed
 from heliotrope.twin.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STEPS_PER_TURN, STOW
 from heliotrope.twin.simulation import SITE
 
@@ -116,6 +116,55 @@ def test_answers_are_frames_of_the_wire() -> None:
     assert nobody == broken == b""
     (frame,) = wire.Reader().feed(refused)
     assert frame.values() == (5, 0x45, 1)
+
+
+def test_frames_are_stuffed_as_the_wire_does() -> None:
+    rng = np.random.default_rng(6)
+    for _ in range(500):
+        # Many zeros, as frames have them, and none.
+        data = (rng.integers(0, 256, rng.integers(1, 240)) * rng.integers(0, 2)).astype(np.uint8)
+        data = np.where(rng.random(len(data)) < rng.choice([0.0, 0.5]), 0, data)
+        raw = data.astype(np.uint8).tobytes()
+        assert _stuffed(raw) == wire.stuff(raw)
+        assert _unstuffed(_stuffed(raw) + b"\0") == raw
+    for bad in (b"", b"\0", b"\x01\x02", b"\x05\x01\0", b"\x03\0\x01\0", b"\xff\x01\0"):
+        assert _unstuffed(bad) == b""
+
+
+def test_status_tells_faults_at_once_and_without_supply_nothing() -> None:
+    field = a_field()
+    bus = FieldBus(field, range(4))
+    sender = wire.Sender(0, 1)
+    every = np.arange(4)
+
+    async def main(clock: VirtualClock) -> None:
+        del clock
+
+        async def ask(address: int) -> tuple[object, ...]:
+            answer = await bus.transact(sender.frame(address, "QUERY_STATUS"), 0.1)
+            frames = wire.Reader().feed(answer)
+            assert len(frames) == (answer != b"")
+            return (frames[0].values() or ()) if frames else ()
+
+        first = await ask(2)
+        assert (first[0], first[2], first[4]) == (states.STOWED, 0, 0xFFFFFFFF)
+        # Nothing is kept too long: sun, orders, faults, cuts and time are seen at once.
+        field.take_sun((1, 0, 0, 1 << 30, 0, 0, 0))
+        assert (await ask(2))[4] == 0
+        field.advance(50)
+        assert (await ask(2))[4] == 50
+        field.order("LOCK", every[1:2])
+        assert (await ask(2))[0] == states.LOCKED
+        field.fail(every[1:2], 3)
+        assert (await ask(2))[2] == 3
+        field.cut(every[1:2])
+        assert await ask(2) == ()
+        assert await bus.transact(sender.frame(2, "DEFOCUS"), 0.1) == b""
+        field.restore(every[1:2])
+        assert (await ask(2))[0] == states.LOCKED
+        assert (await ask(3))[0] == states.STOWED
+
+    run_virtual(main)
 
 
 def test_rows_that_are_not_there() -> None:

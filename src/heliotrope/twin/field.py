@@ -35,6 +35,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, track
 from heliotrope.twin import _field_kernels as kernels
+from heliotrope.twin._among import among
 from heliotrope.twin._field_drives import Drives
 from heliotrope.twin._field_ways import pieces
 from heliotrope.twin.wind import Wind
@@ -89,6 +90,8 @@ class Field:
         Where motors and joints stand in truth.
     now_ms
         Since the beginning.
+    edition
+        Rises with all that changes: what was read at the same edition is still so.
     aim, standby
         (N, 3), m.
 
@@ -137,7 +140,7 @@ class Field:
         ends = np.stack([self._angles_at(self.axes[name]) for name in ("low", "high")])
         self._low, self._high = ends.min(axis=0), ends.max(axis=0)
         self.drives = Drives(self.axes["count"], play, miss, seed)
-        self.wind, self.now_ms = wind, 0
+        self.wind, self.now_ms, self.edition = wind, 0, 0
         self._order = np.zeros(count, dtype=np.int64)
         self._queued = np.zeros(count, dtype=np.int64)
         self.state = np.full(count, states.STOWED, dtype=np.int8)
@@ -212,16 +215,22 @@ class Field:
         back = np.where(inside, other, stop)
         return np.asarray(np.where((low <= one) & (one <= high), one, back))
 
-    def still(self) -> Bools:
-        """Whether nothing moves, (N,)."""
-        out = np.empty(len(self), dtype=np.bool_)
-        kernels.still_rows(self.axes, self._queued, out)
+    def still(self, rows: Rows | None = None) -> Bools:
+        """Whether nothing moves, (N,), or (M,) of some rows."""
+        axes, queued = self.axes, self._queued
+        if rows is not None:
+            axes, queued = axes[rows], queued[rows]
+        out = np.empty(len(axes), dtype=np.bool_)
+        kernels.still_rows(axes, queued, out)
         return out
 
-    def at_stow(self) -> Bools:
-        """Whether it stands at stow, (N,)."""
-        there: Bools = (self.axes["count"] == self._stow).all(axis=1)
-        return self.still() & there
+    def at_stow(self, rows: Rows | None = None) -> Bools:
+        """Whether it stands at stow, (N,), or (M,) of some rows."""
+        count, stow = self.axes["count"], self._stow
+        if rows is not None:
+            count, stow = count[rows], stow[rows]
+        there: Bools = (count == stow).all(axis=1)
+        return self.still(rows) & there
 
     # -- what begins -----------------------------------------------------------------------
 
@@ -237,7 +246,7 @@ class Field:
     def _turn_away(self, rows: Rows) -> None:
         if not len(rows):
             return
-        rows = rows[~np.isin(self.kind[rows], (DEFOCUS, STOW)) & ~self.at_stow()[rows]]
+        rows = rows[~among(self.kind[rows], DEFOCUS, STOW) & ~self.at_stow(rows)]
         self._base[rows] = self.kind[rows]
         self.kind[rows] = DEFOCUS
         self._knot[rows] = self._renew[rows] = 0
@@ -306,6 +315,7 @@ class Field:
         delay_ms
             How long it was under way.
         """
+        self.edition += 1
         self._sun[0], self._sun[1] = values[1:4], np.multiply(values[4:7], RATE_FACTOR)
         self._sun_ms = delay_ms
         heard = np.arange(len(self)) if rows is None else rows
@@ -330,6 +340,7 @@ class Field:
         """
         chosen = np.arange(len(self)) if rows is None else np.asarray(rows)
         chosen = chosen[self.state[chosen] >= 0]
+        self.edition += 1
         state, taken = self.state[chosen], np.zeros(len(self), dtype=np.bool_)
         if name == "DEFOCUS":
             self._defocus_now(chosen)
@@ -347,7 +358,7 @@ class Field:
         elif name in ("TRACK", "REFOCUS", "IDLE"):
             chosen = self._sun_bound(chosen, name)
         elif name == "AIM" and aim is not None:
-            chosen = chosen[~np.isin(self.kind[chosen], (APPROACH, RETURN))]
+            chosen = chosen[~among(self.kind[chosen], APPROACH, RETURN)]
             self.aim[chosen] = aim
             self._knot[chosen] = self._renew[chosen] = 0
             tracks = chosen[self.kind[chosen] == TRACK]
@@ -360,9 +371,9 @@ class Field:
     def _stow_now(self, rows: Rows) -> None:
         """STOW, by the state table."""
         state = self.state[rows]
-        kept = np.isin(state, (states.LOCKED, states.FAULT))
+        kept = among(state, states.LOCKED, states.FAULT)
         self._stow_directly(rows[kept])
-        goes = rows[~kept & ~np.isin(state, (states.STOWED, states.STOWING))]
+        goes = rows[~kept & ~among(state, states.STOWED, states.STOWING)]
         fresh = self._lease[goes] > 0
         self._enter(goes, states.STOWING)
         self._return(goes[fresh])
@@ -376,7 +387,7 @@ class Field:
         elif name == "CLEAR_FAULT":
             rows = rows[(state == states.FAULT) & ~self._present[rows]]
             self.fault[rows] = NO_FAULT
-        home = np.where(self.at_stow()[rows], states.STOWED, states.IDLE)
+        home = np.where(self.at_stow(rows), states.STOWED, states.IDLE)
         after = np.where(self.fault[rows] == NO_FAULT, home, states.FAULT)
         for to in (
             (states.LOCKED,) if name == "LOCK" else (states.STOWED, states.IDLE, states.FAULT)
@@ -389,12 +400,12 @@ class Field:
         """TRACK, REFOCUS and IDLE; returns who has taken it."""
         state, fresh = self.state[rows], self._lease[rows] > 0
         if name == "IDLE":
-            rows = rows[np.isin(state, (states.IDLE, states.TRACKING, states.DEFOCUSED))]
+            rows = rows[among(state, states.IDLE, states.TRACKING, states.DEFOCUSED)]
             self._stand_by(rows)
             self.state[rows] = states.IDLE
             return rows
         begins = (states.DEFOCUSED,) if name == "REFOCUS" else (states.IDLE, states.DEFOCUSED)
-        able = fresh & self._ready[rows] & ~np.isnan(self.aim[rows, 0]) & np.isin(state, begins)
+        able = fresh & self._ready[rows] & ~np.isnan(self.aim[rows, 0]) & among(state, *begins)
         rows = rows[able]
         if len(rows):
             rows = rows[self._pose(rows, self.aim[rows], 0)[1]]
@@ -410,15 +421,20 @@ class Field:
     def _defocus_now(self, rows: Rows) -> None:
         """DEFOCUS, LAPSED or UNREACHABLE, by the state table."""
         state = self.state[rows]
-        goes = rows[np.isin(state, (states.APPROACHING, states.IDLE, states.TRACKING))]
-        self._turn_away(goes)
-        self._enter(goes, states.DEFOCUSED)
-        self._turn_away(rows[np.isin(state, (states.LOCKED, states.FAULT))])
+        goes = rows[among(state, states.APPROACHING, states.IDLE, states.TRACKING)]
+        if len(goes):
+            self._turn_away(goes)
+            self._enter(goes, states.DEFOCUSED)
+        self._turn_away(rows[among(state, states.LOCKED, states.FAULT)])
         self._stow_directly(rows[state == states.STOWING])
 
     def lease_left(self, row: int) -> int:
         """Return what is left of the lease of one heliostat, ms."""
         return int(self._lease[row])
+
+    def leases(self, rows: Rows) -> npt.NDArray[np.int64]:
+        """Return what is left of the leases of some heliostats, ms, (M,)."""
+        return self._lease[rows]
 
     # -- faults and supplies ---------------------------------------------------------------
 
@@ -433,13 +449,14 @@ class Field:
         if not NO_FAULT < number <= LATCHED:
             raise InputError(f"field: fault {number}; give 1 to {LATCHED}, as lcu.names has them")
         rows = rows[self.state[rows] >= 0]
+        self.edition += 1
         self._present[rows] = True
         self.fault[rows] = np.where(self.fault[rows] == NO_FAULT, number, self.fault[rows])
         state = self.state[rows]
-        self._hold(rows[np.isin(state, (states.STOWED, states.LOCKED))])
+        self._hold(rows[among(state, states.STOWED, states.LOCKED)])
         self._stow_directly(rows[state == states.STOWING])
         away = (states.APPROACHING, states.IDLE, states.TRACKING, states.DEFOCUSED)
-        self._turn_away(rows[np.isin(state, away)])
+        self._turn_away(rows[among(state, *away)])
         self._enter(rows[state != states.LOCKED], states.FAULT)
 
     def mend(self, rows: Rows) -> None:
@@ -452,6 +469,7 @@ class Field:
         ``warned``: the brown-out detectors see it come, which is a fault that stays.
         """
         rows = rows[self.state[rows] >= 0]
+        self.edition += 1
         if warned:
             self._enter(rows[self.state[rows] != states.LOCKED], states.FAULT)
         self._kept[rows], self.state[rows] = self.state[rows], -1
@@ -467,10 +485,11 @@ class Field:
     def restore(self, rows: Rows) -> None:
         """Let supplies come back: locked and faulty ones are so still, others turn away."""
         rows = rows[self.state[rows] < 0]
+        self.edition += 1
         before = self._kept[rows]
         locked, faulty = before == states.LOCKED, before == states.FAULT
         self.fault[rows] = np.where(faulty, LATCHED, NO_FAULT)
-        home = self.at_stow()[rows] & ~locked & ~faulty
+        home = self.at_stow(rows) & ~locked & ~faulty
         self._enter(rows[locked], states.LOCKED)
         self._enter(rows[home], states.STOWED)
         self._turn_away(rows[~home & ~locked])
@@ -493,14 +512,15 @@ class Field:
             self._tick()
 
     def _tick(self) -> None:
+        self.edition += 1
         self.now_ms += TICK_MS
         self._sun_ms += TICK_MS
         np.maximum(self._lease - TICK_MS, 0, out=self._lease)
         fresh = self._lease > 0
-        follows = np.isin(self.kind, (STANDBY, TRACK)) | (
-            (self.kind == DEFOCUS) & np.isin(self._base, (STANDBY, TRACK))
+        follows = among(self.kind, STANDBY, TRACK) | (
+            (self.kind == DEFOCUS) & among(self._base, STANDBY, TRACK)
         )
-        needs = np.isin(self.state, (states.APPROACHING, states.TRACKING))
+        needs = among(self.state, states.APPROACHING, states.TRACKING)
         renewed = fresh & ((follows & (self.state != states.FAULT)) | needs)
         self._dark = np.where(renewed, STOW_WAIT_MS, np.maximum(self._dark - TICK_MS, 0))
         stands = (self.state == states.IDLE) & (self.kind == STANDBY)
@@ -516,7 +536,7 @@ class Field:
             (self.state == states.FAULT) & (self._dark == 0) & (self.kind != STOW)
         )
         if len(faulty):
-            self._stow_directly(faulty[~self.at_stow()[faulty]])
+            self._stow_directly(faulty[~self.at_stow(faulty)])
         self._move()
         kernels.advance_rows(
             self.axes, self._order, self._queued, self.drives.next(), TICK_MS, SLOT_MS, AHEAD_MS
@@ -531,13 +551,13 @@ class Field:
         arrived = np.flatnonzero((kind == STOW) & self.at_stow())
         self.kind[arrived] = HOLD
         self.state[arrived[self.state[arrived] == states.STOWING]] = states.STOWED
-        on_path = np.flatnonzero(np.isin(kind, (APPROACH, RETURN)) & self.still())
+        on_path = np.flatnonzero(among(kind, APPROACH, RETURN) & self.still())
         if len(on_path):
             self._on_path(on_path)
-        due = ~np.isin(kind, (STOW, APPROACH, RETURN)) & (self._renew <= 0)
+        due = ~among(kind, STOW, APPROACH, RETURN) & (self._renew <= 0)
         self._renew[due] = RENEW_MS
-        away = (kind == DEFOCUS) & np.isin(self._base, (STANDBY, TRACK)) & (self._lease > 0)
-        rows = np.flatnonzero(due & (np.isin(kind, (STANDBY, TRACK)) | away))
+        away = (kind == DEFOCUS) & among(self._base, STANDBY, TRACK) & (self._lease > 0)
+        rows = np.flatnonzero(due & (among(kind, STANDBY, TRACK) | away))
         if len(rows):
             lost = self._follow(rows)
             self._base[lost[kind[lost] == DEFOCUS]] = HOLD

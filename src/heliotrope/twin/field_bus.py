@@ -9,6 +9,7 @@ import asyncio
 import struct
 from binascii import crc32
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 
@@ -17,14 +18,26 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import messages, states, wire
 from heliotrope.twin.field import LEASE_MS, Field
 
-_STATUS = struct.Struct(wire.HEADER + messages.codes_of(messages.NUMBER_OF["STATUS"]))
-_STEPS = struct.Struct(wire.HEADER + messages.codes_of(messages.NUMBER_OF["STEPS"]))
-_STATUS_NUMBER, _STEPS_NUMBER = messages.NUMBER_OF["STATUS"], messages.NUMBER_OF["STEPS"]
+_HEADER = struct.Struct(wire.HEADER)
+_SUN, _AIM = struct.Struct("<Iiiihhh"), struct.Struct("<fff")
+_ACK = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["ACK"]))
+_STEPS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["STEPS"]))
+_NUMBERS = messages.NUMBER_OF
+#: `messages.name_of` looks through a text, as suits a microcontroller.
+_NAMES = {number: name for name, number in messages.NUMBER_OF.items()}
+#: A STATUS for each heliostat: state, flags, fault, uptime, age of the sun, supply, temperature,
+#: checksum of the armature, boots.
+_STATUS = np.dtype(
+    [(f"f{i}", f"<{code}") for i, code in enumerate(messages.codes_of(_NUMBERS["STATUS"]))]
+)
 #: Bits of `lcu.names.FLAGS`: sun fresh, clock set, configured; at stow.
 _SUN_FRESH, _SOUND, _AT_STOW = 1 << 1, 0b1100, 1 << 5
 _NEVER = 0xFFFFFFFF
 #: Commands that the field knows.
-KNOWN = frozenset({"DEFOCUS", "STOW", "APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM"})
+KNOWN = frozenset(
+    {"DEFOCUS", "STOW", "APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "LOCK", "UNLOCK",
+     "CLEAR_FAULT"}
+)  # fmt: skip
 
 
 class FieldBus:
@@ -64,6 +77,9 @@ class FieldBus:
         self._all = np.array(rows)
         self._took = took
         self._closing = asyncio.Event()
+        #: Payloads of all STATUS, and the edition of the field that they are of.
+        self._told: list[bytes] = []
+        self._edition = -1
 
     @property
     def connected(self) -> bool:
@@ -111,33 +127,29 @@ class FieldBus:
         return self._hear(frame) if self.plugged else b""
 
     def _hear(self, data: bytes) -> bytes:
-        raw = wire.unstuff(data[:-1])
-        if raw is None or len(raw) < wire.HEADER_SIZE + wire.CRC_SIZE:
+        raw = _unstuffed(data)
+        if len(raw) < wire.HEADER_SIZE + wire.CRC_SIZE:
             return b""
-        _, to, _, sequence, number = struct.unpack_from(wire.HEADER, raw)
-        name = messages.name_of(number)
-        place = to - 1
+        _, to, _, sequence, number = _HEADER.unpack_from(raw)
+        name = _NAMES.get(number, "")
         if to == wire.BROADCAST:
             self._broadcast(name, raw[wire.HEADER_SIZE : -wire.CRC_SIZE])
             return b""
+        place = to - 1
         if not 0 <= place < len(self._rows):
             return b""
         row = self._rows[place]
         if name == "QUERY_STATUS":
-            return self._status(row, to, sequence)
+            return self._answer(place, sequence, "STATUS", self._statuses()[place])
         if name == "QUERY_STEPS":
-            axes = self._field.axes
-            one, two = axes["count"][row].tolist()
-            goals = axes["goal"][row].tolist()
-            body = _STEPS.pack(
-                wire.VERSION, wire.CLUSTER_ADDRESS, to, sequence, _STEPS_NUMBER, one, two, *goals
-            )
-            return _framed(body)
-        return self._command(name, raw[wire.HEADER_SIZE : -wire.CRC_SIZE], row, to, sequence)
+            axes = self._field.axes[row]
+            counts = _STEPS.pack(*axes["count"].tolist(), *axes["goal"].tolist())
+            return self._answer(place, sequence, "STEPS", counts)
+        return self._command(name, number, raw[wire.HEADER_SIZE : -wire.CRC_SIZE], place, sequence)
 
     def _broadcast(self, name: str, payload: bytes) -> None:
         if name == "SUN":
-            self._field.take_sun(struct.unpack("<Iiiihhh", payload), self._all)
+            self._field.take_sun(_SUN.unpack(payload), self._all)
         elif name in ("DEFOCUS", "STOW"):
             self._field.order(name, self._all)
             self._tell(name, self._rows)
@@ -146,31 +158,81 @@ class FieldBus:
         if self._took is not None:
             self._took(name, rows)
 
-    def _status(self, row: int, to: int, sequence: int) -> bytes:
+    def _statuses(self) -> list[bytes]:
+        """Return the payloads of STATUS of the whole bus.
+
+        A cluster asks for one after the other, and nothing changes between.
+        """
         field = self._field
-        left = field.lease_left(row)
-        state = int(field.state[row])
-        flags = _SOUND | (_SUN_FRESH if left > 0 else 0)
-        flags |= _AT_STOW if state == states.STOWED else 0
-        age = LEASE_MS - left if left > 0 else _NEVER
-        body = _STATUS.pack(
-            wire.VERSION, wire.CLUSTER_ADDRESS, to, sequence, _STATUS_NUMBER,
-            state, flags, 0, 0, age, 24_000, 25, 0, 1,
-        )  # fmt: skip
-        return _framed(body)
+        if self._edition != field.edition:
+            left, state = field.leases(self._all), field.state[self._all]
+            made = np.zeros(len(self._rows), dtype=_STATUS)
+            fresh = left > 0
+            made["f0"] = np.maximum(state, 0)
+            made["f1"] = _SOUND + _SUN_FRESH * fresh + _AT_STOW * (state == states.STOWED)
+            made["f2"] = field.fault[self._all]
+            made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)
+            made["f5"], made["f6"], made["f8"] = 24_000, 25, 1
+            data, size = made.tobytes(), made.itemsize
+            self._told = [data[i : i + size] for i in range(0, len(data), size)]
+            self._edition = field.edition
+        return self._told
 
-    def _command(self, name: str, payload: bytes, row: int, to: int, sequence: int) -> bytes:
-        result = messages.REFUSED_STATE
+    def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
+        """Return a heliostat's frame; nothing if its supply is cut."""
+        if self._field.state[self._rows[place]] < 0:
+            return b""
+        head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
+        check = crc32(payload, crc32(head)).to_bytes(4, "little")
+        if name != "STATUS":
+            return _stuffed(head + payload + check) + b"\0"
+        first, middle, last = _parts(payload)
+        return _stuffed(head + first) + middle + _stuffed(last + check) + b"\0"
+
+    def _command(self, name: str, number: int, payload: bytes, place: int, sequence: int) -> bytes:
+        result, row = messages.REFUSED_STATE, self._rows[place]
         if name in KNOWN:
-            aim = struct.unpack_from("<fff", payload, 8) if name == "AIM" else None
-            taken = self._field.order(name, np.array([row]), aim)
-            result = messages.DONE if taken[row] else messages.REFUSED_STATE
+            aim = _AIM.unpack_from(payload, 8) if name == "AIM" else None
+            # Most have heard the broadcast before: then nothing happens.
+            if name == "DEFOCUS" and self._field.state[row] == states.DEFOCUSED:
+                result = messages.DONE
+            elif self._field.order(name, self._all[place : place + 1], aim)[row]:
+                result = messages.DONE
             self._tell(name, range(row, row + 1))
-        payload = wire.pack("ACK", sequence, messages.NUMBER_OF[name], result)
-        ack = wire.Frame(wire.CLUSTER_ADDRESS, to, sequence, messages.NUMBER_OF["ACK"], payload)
-        return wire.encode(ack)
+        return self._answer(place, sequence, "ACK", _ACK.pack(sequence, number, result))
 
 
-def _framed(body: bytes) -> bytes:
-    """Return a frame's bytes from what the checksum covers."""
-    return wire.stuff(body + struct.pack("<I", crc32(body))) + b"\0"
+def _unstuffed(data: bytes) -> bytes:
+    """Undo `_stuffed` and the zero after it; nothing if that is not possible."""
+    if data.find(0) != len(data) - 1:
+        return b""
+    out, place, end = bytearray(data), 0, len(data) - 1
+    while place < end:
+        code = out[place]
+        out[place] = 0
+        place += code
+    return bytes(out[1:-1]) if place == end else b""
+
+
+def _stuffed(data: bytes) -> bytes:
+    """As `wire.stuff`, block by block instead of byte by byte.
+
+    No frame is long enough (`wire.FRAME_LIMIT`) for a block of 254 bytes. What a zero separates
+    may be stuffed apart and joined.
+    """
+    return b"".join([_LENGTHS[len(block)] + block for block in data.split(b"\0")])
+
+
+@lru_cache(maxsize=4096)
+def _parts(payload: bytes) -> tuple[bytes, bytes, bytes]:
+    """Return a payload up to its first zero, what is between stuffed, and what follows its last.
+
+    A field's heliostats do the same for hours: few payloads differ. It has two zeros at least: a
+    STATUS of a field tells no uptime.
+    """
+    first, _, rest = payload.partition(b"\0")
+    middle, _, last = rest.rpartition(b"\0")
+    return first, _stuffed(middle), last
+
+
+_LENGTHS = [bytes([length + 1]) for length in range(wire.FRAME_LIMIT)]
