@@ -199,9 +199,11 @@ class Cluster:
                 await self._serve()
                 continue
             self._wake.clear()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(left, 1e-6)):
-                    await self._wake.wait()
+            alarm = asyncio.get_running_loop().call_later(max(left, 1e-6), self._wake.set)
+            try:
+                await self._wake.wait()
+            finally:
+                alarm.cancel()
 
     def _busy(self, *, patient: bool = True) -> bool:
         """Whether something is to be done; questions wait until polling is over."""

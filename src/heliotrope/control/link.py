@@ -324,9 +324,13 @@ class Heartbeat:
             self._now.clear()
             due = self._clock.monotonic() + self._period
             await beat()
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(max(0.0, due - self._clock.monotonic())):
-                    await self._now.wait()
+            # Not a timeout, which cancels the task twice a second: a field has hundreds of links.
+            left = max(1e-6, due - self._clock.monotonic())
+            alarm = asyncio.get_running_loop().call_later(left, self._now.set)
+            try:
+                await self._now.wait()
+            finally:
+                alarm.cancel()
 
 
 class Inbox:

@@ -14,7 +14,7 @@ expiry of the link; `Emergency` needs neither, and is taken from anyone.
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, ClassVar
@@ -275,14 +275,10 @@ _KINDS: dict[str, type[Any]] = {
 def encode(message: Message) -> bytes:
     """Return the bytes of a message."""
     fields: dict[str, Any] = {"kind": message.kind, "version": VERSION}
-    block = b""
-    for each in dataclasses.fields(message):
-        value = getattr(message, each.name)
-        if each.name == "block":
-            block = value
-        else:
-            fields[each.name] = value.value if isinstance(value, Stage) else value
-    return json.dumps(fields, separators=(",", ":"), allow_nan=False).encode() + b"\n" + block
+    for name, _, _ in _FIELDS[message.kind]:
+        value = getattr(message, name)
+        fields[name] = value.value if isinstance(value, Stage) else value
+    return _ENCODER.encode(fields).encode() + b"\n" + getattr(message, "block", b"")
 
 
 def decode(data: bytes) -> Message:
@@ -295,7 +291,7 @@ def decode(data: bytes) -> Message:
     """
     line, _, block = data.partition(b"\n")
     try:
-        fields = json.loads(line, parse_constant=_no_number)
+        fields = _DECODER.decode(line.decode())
     except (ValueError, RecursionError):
         raise ProtocolError(f"message of {len(data)} bytes does not begin with JSON") from None
     if not isinstance(fields, dict) or fields.get("version") != VERSION:
@@ -304,12 +300,13 @@ def decode(data: bytes) -> Message:
     kind = _KINDS.get(str(fields.get("kind")))
     if kind is None:
         raise ProtocolError(f"message of unknown kind {fields.get('kind')!r}")
-    values: dict[str, Any] = {}
-    for each in dataclasses.fields(kind):
-        if each.name == "block":
-            values["block"] = block
-        elif each.name in fields:
-            values[each.name] = _checked(kind.kind, each, fields[each.name])
+    values: dict[str, Any] = {"block": block} if hasattr(kind, "block") else {}
+    for name, wanted, read in _FIELDS[kind.kind]:
+        if name in fields:
+            value = values[name] = read(fields[name])
+            if value is None:
+                given = fields[name]
+                raise ProtocolError(f"{kind.kind}: {name} is {given!r:.60}, not {wanted}")
     try:
         message: Message = kind(**values)
     except TypeError as error:
@@ -321,25 +318,13 @@ def _no_number(text: str) -> float:
     raise ValueError(text)
 
 
-def _checked(kind: str, each: "dataclasses.Field[Any]", value: Any) -> Any:
-    """Return the value of a field if it is of the field's type."""
-    wanted: Any = each.type
-    good: Any = None
-    if wanted is Stage:
-        good = next((stage for stage in Stage if stage.value == value), None)
-    elif wanted is str or wanted is bool:
-        good = value if isinstance(value, wanted) else None
-    elif wanted is int:
-        good = value if isinstance(value, int) and not isinstance(value, bool) else None
-    elif wanted is float:
-        good = float(value) if _is_number(value) else None
-    elif wanted in _LISTS:
-        good = tuple(value) if isinstance(value, list) and all(map(_LISTS[wanted], value)) else None
-    elif isinstance(value, dict):
-        good = value
-    if good is None:
-        raise ProtocolError(f"{kind}: {each.name} is {value!r:.60}, not {wanted}")
-    return good
+# What follows is made once: each cluster sends and takes several messages in a second.
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
+_DECODER = json.JSONDecoder(parse_constant=_no_number)
+
+
+def _is_whole(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _is_number(value: object) -> bool:
@@ -350,8 +335,32 @@ def _is_number(value: object) -> bool:
         return False
 
 
-_LISTS = {
-    tuple[str, ...]: lambda value: isinstance(value, str),
-    tuple[int, ...]: lambda value: isinstance(value, int) and not isinstance(value, bool),
-    tuple[float, ...]: _is_number,
+def _list_of(good: Callable[[object], bool]) -> Callable[[Any], Any]:
+    return lambda value: tuple(value) if isinstance(value, list) and all(map(good, value)) else None
+
+
+def _is_text(value: object) -> bool:
+    return isinstance(value, str)
+
+
+#: By type of a field: returns its value from that of JSON, None if it is not of that type.
+_READERS: dict[Any, Callable[[Any], Any]] = {
+    Stage: lambda value: next((stage for stage in Stage if stage.value == value), None),
+    str: lambda value: value if isinstance(value, str) else None,
+    bool: lambda value: value if isinstance(value, bool) else None,
+    int: lambda value: value if _is_whole(value) else None,
+    float: lambda value: float(value) if _is_number(value) else None,
+    tuple[str, ...]: _list_of(_is_text),
+    tuple[int, ...]: _list_of(_is_whole),
+    tuple[float, ...]: _list_of(_is_number),
+    Mapping[str, Any]: lambda value: value if isinstance(value, dict) else None,
+}
+#: Of each kind: names, types and readers of the fields of its line.
+_FIELDS: dict[str, tuple[tuple[str, Any, Callable[[Any], Any]], ...]] = {
+    kind: tuple(
+        (each.name, each.type, _READERS[each.type])
+        for each in dataclasses.fields(of)
+        if each.name != "block"
+    )
+    for kind, of in _KINDS.items()
 }
