@@ -29,6 +29,7 @@ from heliotrope.control._pushing import Pusher, stored_items
 from heliotrope.control._sentinel import Sentinel
 from heliotrope.control._tickets import Ticket
 from heliotrope.control.aims import BeamCheck, default_aims
+from heliotrope.control.assigned import Assigned, Points, grouped, points_of
 from heliotrope.control.audit import Audit, AuditError
 from heliotrope.control.authority import Authority, Grant, Person, RefusedError, Role
 from heliotrope.control.beam_paths import Volume
@@ -46,16 +47,16 @@ from heliotrope.control.protocol import (
     Lease,
     Progress,
     ProtocolError,
+    Stage,
     Status,
     decode,
 )
 from heliotrope.control.safety import Act, Condition, conditions
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
-from heliotrope.lcu.config import FAR
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
@@ -88,6 +89,8 @@ class PlantController:
         Where no beam may be.
     wanted
         What local controllers should hold.
+    assigned
+        Where aims and standby points are kept over a restart; None: nowhere.
     table
         Safety rows; None: the defaults at the autonomy of the settings.
     entropy
@@ -123,6 +126,7 @@ class PlantController:
         settings: PlantSettings | None = None,
         volumes: Sequence[Volume] = (),
         wanted: Wanted | None = None,
+        assigned: Assigned | None = None,
         table: Iterable[Condition] | None = None,
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
@@ -151,8 +155,8 @@ class PlantController:
         self._watch = PlantWatch(rows, tuple(held), self.settings.sensors, clock.monotonic())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self.beams = BeamCheck(design, self.field.names, volumes)
-        count = len(self.field)
-        self.aims, self.standbys = np.full((count, 3), np.nan), np.full((count, 3), np.nan)
+        self._points = Points(self.field.names, assigned)
+        self.aims, self.standbys = self._points.aims, self._points.standbys
         self._joiner = Joiner(
             self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector,
             self.settings.join_life,
@@ -590,13 +594,7 @@ class PlantController:
     ) -> Ticket:
         whom = tuple(points)
         rows = np.array([self.field.place(n) for n in whom], dtype=np.intp)
-        if not whom:
-            raise InputError(f"{name}: no points; give one for each heliostat")
-        wanted = as_vectors(
-            np.stack([as_vectors(points[n], f"{n}: point") for n in whom]), "points"
-        )
-        if np.abs(wanted).max() > FAR:
-            raise InputError(f"{name}: a point {np.abs(wanted).max():g} m away; at most {FAR:g} m")
+        wanted = points_of(name, points)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         start = np.where(tracking[:, None], self.aims[rows], self.standbys[rows])
         stopped = name == "AIM"
@@ -605,12 +603,12 @@ class PlantController:
             first, text = next(iter(wrong.items()))
             more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
             raise RefusedError(f"{name} {first}{more}: {text}")
-        groups: dict[tuple[float, ...], list[str]] = {}
-        for heliostat, point in zip(whom, wanted, strict=True):
-            groups.setdefault(tuple(float(x) for x in point), []).append(heliostat)
+        groups = grouped(whom, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         ticket = self._accept(person, token, name, values, whom, f"{len(groups)} points")
-        (self.aims if stopped else self.standbys)[rows] = wanted
+        if problem := self._points.assign(name, rows, wanted):
+            ticket.advance(whom, Stage.FAILED, f"not sent, since it is not kept: {problem}")
+            return ticket
         self._joining.drop(f"another {name} came after it", frozenset(whom), name)
         moving = {whom[i] for i in np.flatnonzero(tracking)} if stopped else set()
         for point, members in groups.items():

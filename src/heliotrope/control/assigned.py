@@ -1,0 +1,180 @@
+"""Where each heliostat aims and rests: assigned by persons, kept over a restart of the plant.
+
+A plant that has forgotten where its beams are cannot prove their ways. So points are on the disk
+before the commands that give them are sent. `Assigned` is what the plant needs of a store;
+`AssignedFile` is one small file, written beside and then renamed: the old one or the new one is
+there, whatever happens.
+"""
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError, HeliotropeError, InputError
+from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.lcu.config import FAR
+
+#: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
+Places = dict[str, tuple[float, ...]]
+KINDS = ("AIM", "STANDBY")
+VERSION = 1
+
+
+class AssignedError(HeliotropeError):
+    """Points that could not be kept."""
+
+
+class Assigned(Protocol):
+    """Where assigned points are kept."""
+
+    def read(self) -> dict[str, Places]:
+        """Return what is kept, by kind; empty if nothing is."""
+        ...
+
+    def keep(self, points: Mapping[str, Places]) -> None:
+        """Keep all points in place of those before; they are safe when this returns."""
+        ...
+
+
+class AssignedFile:
+    """Points in one file.
+
+    Parameters
+    ----------
+    path
+        Made at the first assignment.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+
+    def read(self) -> dict[str, Places]:
+        """Return what is kept.
+
+        Raises
+        ------
+        FormatError
+            A file that holds something else.
+        """
+        try:
+            document = json.loads(self.path.read_bytes())
+        except FileNotFoundError:
+            return {}
+        except ValueError:
+            raise FormatError(self.path, "no assigned points; remove it, then aim anew") from None
+        if not isinstance(document, dict) or document.get("version") != VERSION:
+            raise FormatError(self.path, f"no assigned points of version {VERSION}; remove it")
+        return {kind: self._places(kind, document.get(kind)) for kind in KINDS}
+
+    def _places(self, kind: str, rows: object) -> Places:
+        if not isinstance(rows, dict):
+            raise FormatError(self.path, f"{kind}: no points by name; remove it, then aim anew")
+        for name, point in rows.items():
+            good = isinstance(point, list) and len(point) == 3
+            if not good or not all(isinstance(x, float) and math.isfinite(x) for x in point):
+                raise FormatError(self.path, f"{kind} of {name}: {point!r} is no point in ENU, m")
+        return {name: tuple(point) for name, point in rows.items()}
+
+    def keep(self, points: Mapping[str, Places]) -> None:
+        """Keep all points in place of those before.
+
+        Raises
+        ------
+        AssignedError
+            If they could not be written and synced; those of before are kept.
+        """
+        data = json.dumps({"version": VERSION, **points}, allow_nan=False).encode()
+        beside = self.path.with_name(self.path.name + ".new")
+        try:
+            with beside.open("wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            beside.replace(self.path)
+            folder = os.open(self.path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+        except OSError as error:
+            raise AssignedError(
+                f"assigned points {self.path}: {error.strerror}; see to its disk"
+            ) from None
+
+
+class Points:
+    """Assigned points of N heliostats, and where they are kept.
+
+    Parameters
+    ----------
+    names
+        Of the heliostats.
+    store
+        None: they are kept nowhere.
+
+    Attributes
+    ----------
+    aims, standbys
+        ENU, m, (N, 3); NaN before.
+    """
+
+    def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
+        self.aims, self.standbys = (np.full((len(names), 3), np.nan) for _ in KINDS)
+        self._names, self._store = names, store
+        self._arrays = {"AIM": self.aims, "STANDBY": self.standbys}
+        index = {name: row for row, name in enumerate(names)}
+        for kind, places in ({} if store is None else store.read()).items():
+            for name, point in places.items():
+                if name in index:
+                    self._arrays[kind][index[name]] = point
+
+    def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> str:
+        """Assign points (K, 3) to heliostats (K,); return why they cannot be kept, "" if they are.
+
+        What cannot be kept is not assigned.
+        """
+        array = self._arrays[kind]
+        before = array[rows]
+        array[rows] = points
+        if self._store is not None:
+            try:
+                self._store.keep({k: self._places(a) for k, a in self._arrays.items()})
+            except AssignedError as error:
+                array[rows] = before
+                return str(error)
+        return ""
+
+    def _places(self, array: FloatArray) -> Places:
+        known = np.flatnonzero(np.isfinite(array).all(axis=-1))
+        return {self._names[int(i)]: tuple(array[i].tolist()) for i in known}
+
+
+def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
+    """Return points by name as an array, ENU, m, (K, 3), in their order.
+
+    Raises
+    ------
+    InputError
+        None; one that is no finite point; one beyond what the wire takes.
+    """
+    if not points:
+        raise InputError(f"{kind}: no points; give one for each heliostat")
+    each = [as_vectors(point, f"{name}: point") for name, point in points.items()]
+    found = as_vectors(np.stack(each), "points")
+    if np.abs(found).max() > FAR:
+        raise InputError(f"{kind}: a point {np.abs(found).max():g} m away; at most {FAR:g} m")
+    return found
+
+
+def grouped(names: Sequence[str], points: FloatArray) -> dict[tuple[float, ...], list[str]]:
+    """Return the heliostats of each point (K, 3): what has one point goes into one command."""
+    found: dict[tuple[float, ...], list[str]] = {}
+    for name, point in zip(names, points, strict=True):
+        found.setdefault(tuple(float(x) for x in point), []).append(name)
+    return found

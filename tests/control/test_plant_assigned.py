@@ -1,0 +1,104 @@
+"""Assigned aims and standby points: kept before they are sent, known after a restart."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.control.assigned import AssignedError, AssignedFile, grouped, points_of
+from heliotrope.control.audit import read
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.errors import FormatError, InputError
+from plant_bench import OPERATOR, Bench, running
+
+AIM, STANDBY = (0.1, 0.2, 16.5), (4.0, 0.0, 14.0)
+
+
+def test_what_was_assigned_is_known_after_a_restart(tmp_path: Path) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+
+    async def before(clock: VirtualClock) -> None:
+        async with running(Bench(clock, tmp_path, assigned=store)) as bench:
+            token = await bench.commanded()
+            bench.plant.aim(OPERATOR, token, {"P1A": AIM, "P2B": (0.0, 0.0, 16.0)})
+            bench.plant.aim(OPERATOR, token, {"P2B": AIM})
+            ticket = bench.plant.standby(OPERATOR, token, {"P1A": STANDBY})
+            assert await ticket.end(20.0)
+
+    async def after(clock: VirtualClock) -> None:
+        plant = Bench(clock, tmp_path, seed=2, assigned=store).plant
+        row, other = plant.field.place("P1A"), plant.field.place("P2B")
+        assert plant.aims[[row, other]].tolist() == [list(AIM), list(AIM)]
+        assert plant.standbys[row].tolist() == list(STANDBY)
+        assert np.isfinite(plant.aims).all(axis=-1).sum() == 2
+        assert np.isfinite(plant.standbys).all(axis=-1).sum() == 1
+
+    run_virtual(before)
+    run_virtual(after)
+
+
+def test_what_cannot_be_kept_is_not_sent(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        store = AssignedFile(tmp_path / "nowhere" / "assigned.json")
+        async with running(Bench(clock, tmp_path, assigned=store)) as bench:
+            token = await bench.commanded()
+            ticket = bench.plant.aim(OPERATOR, token, {"P1A": AIM})
+            assert not await ticket.end(5.0)
+            assert "not sent, since it is not kept: assigned points" in ticket.text
+            assert "No such file or directory; see to its disk" in ticket.text
+            assert np.isnan(bench.plant.aims).all()
+            assert not bench.cluster_of("P1A").commands("AIM")
+
+    run_virtual(main)
+    (record,) = [r for r in read(tmp_path / "audit.jsonl")[0] if r.what == "AIM"]
+    assert "1 failed" in record.result
+
+
+def test_the_old_file_stays_until_the_new_one_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+    assert store.read() == {}
+    old = {"AIM": {"A": (1.0, 2.0, 3.0)}, "STANDBY": {}}
+    store.keep(old)
+
+    def full(self: Path, target: Path) -> Path:
+        assert self.read_bytes()
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "replace", full)
+        with pytest.raises(AssignedError, match=r"assigned\.json: No space left on device; see to"):
+            store.keep({"AIM": {"A": (9.0, 9.0, 9.0)}, "STANDBY": {}})
+    assert store.read() == old
+    store.keep({"AIM": {}, "STANDBY": {}})
+    assert store.read() == {"AIM": {}, "STANDBY": {}}
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "no assigned points; remove it, then aim anew"),
+        ('{"version": 7}', "no assigned points of version 1; remove it"),
+        ('{"version": 1, "AIM": 3}', "AIM: no points by name; remove it"),
+        (
+            '{"version": 1, "AIM": {"A": [1.0, NaN, 0.0]}}',
+            r"AIM of A: \[1.0, nan, 0.0\] is no point",
+        ),
+        ('{"version": 1, "AIM": {"A": [1.0]}}', r"AIM of A: \[1.0\] is no point in ENU, m"),
+    ],
+)
+def test_another_file_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    path = tmp_path / "assigned.json"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=says):
+        AssignedFile(path).read()
+
+
+def test_points_are_checked_and_grouped() -> None:
+    with pytest.raises(InputError, match="AIM: no points; give one for each heliostat"):
+        points_of("AIM", {})
+    with pytest.raises(InputError, match="STANDBY: a point 1e\\+09 m away; at most"):
+        points_of("STANDBY", {"A": (0.0, 1e9, 0.0)})
+    points = points_of("AIM", {"A": AIM, "B": STANDBY, "C": AIM})
+    assert grouped("ABC", points) == {AIM: ["A", "C"], STANDBY: ["B"]}
