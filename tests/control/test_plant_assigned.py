@@ -5,10 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from heliotrope.control.aims import BeamCheck
 from heliotrope.control.assigned import AssignedError, AssignedFile, grouped, points_of
 from heliotrope.control.audit import read
+from heliotrope.control.authority import RefusedError
 from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.example import prototype
 from plant_bench import OPERATOR, Bench, running
 
 AIM, STANDBY = (0.1, 0.2, 16.5), (4.0, 0.0, 14.0)
@@ -102,3 +105,37 @@ def test_points_are_checked_and_grouped() -> None:
         points_of("STANDBY", {"A": (0.0, 1e9, 0.0)})
     points = points_of("AIM", {"A": AIM, "B": STANDBY, "C": AIM})
     assert grouped("ABC", points) == {AIM: ["A", "C"], STANDBY: ["B"]}
+
+
+def test_standby_points_where_beams_burn_an_eye_are_refused(tmp_path: Path) -> None:
+    balcony, away = (4.0, -6.0, 12.0), (-6.0, 0.0, 15.0)
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path, eyes=(balcony, (500.0, 0.0, 0.0)))
+        async with running(bench):
+            plant, token = bench.plant, await bench.commanded()
+            names = plant.field.names
+            with pytest.raises(RefusedError) as refused:
+                plant.standby(OPERATOR, token, dict.fromkeys(names, balcony))
+            text = str(refused.value)
+            assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the pl")
+            assert "times what burns an eye; choose another standby point" in text
+            assert np.isnan(plant.standbys).all()
+            # One flat mirror is no more than a look at the sun; what rests there already counts.
+            resting: list[str] = []
+
+            def one_after_the_other() -> None:
+                for name in names:
+                    plant.standby(OPERATOR, token, {name: balcony})
+                    resting.append(name)
+
+            with pytest.raises(RefusedError, match=r"STANDBY P\w\w: at rest its beam shines"):
+                one_after_the_other()
+            assert 1 <= len(resting) < len(names) - 1
+            # Who does not shine there may rest where he likes; aims end at what stops them.
+            plant.standby(OPERATOR, token, {names[-1]: away})
+            plant.aim(OPERATOR, token, dict.fromkeys(names, balcony))
+
+    run_virtual(main)
+    with pytest.raises(InputError, match=r"eyes\[0, 2\]: nan is not a finite number"):
+        BeamCheck(prototype(), ("P1A",), (), ((0.0, 0.0, float("nan")),))

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.control._beams import crossing
 from heliotrope.control.beam_paths import Mirrors, Volume, beams, enter, move
+from heliotrope.control.eye import Hazard, glare_at
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, Tracking, track
@@ -89,12 +91,23 @@ class BeamCheck:
         Of the N heliostats, in the order of all arrays here.
     volumes
         Where no beam may be.
+    eyes
+        Places from where somebody may look into beams at rest, ENU, m, (P, 3).
+
+    Raises
+    ------
+    InputError
+        Eyes that are no finite points.
     """
 
-    def __init__(self, design: Plant, names: Sequence[str], volumes: Sequence[Volume]) -> None:
+    def __init__(
+        self, design: Plant, names: Sequence[str], volumes: Sequence[Volume],
+        eyes: npt.ArrayLike = (),
+    ) -> None:  # fmt: skip
         place = {name: i for i, name in enumerate(design.names)}
         rows = np.array([place[name] for name in names], dtype=np.intp)
         self.names, self.volumes = tuple(names), tuple(volumes)
+        self.eyes = as_vectors(np.reshape(as_float(eyes), (-1, 3)), "eyes")
         self.armature = Armature(design.armature.table[rows])
         self.drives = Drive(design.drives.table[rows])
         groups = design.groups.values()
@@ -162,6 +175,45 @@ class BeamCheck:
         swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == Status.OK))
         if swept.size and sun[2] > 0.0:
             self._sweep(found, rows[swept], start[swept], aims[swept], sun)
+        return found
+
+    def glare(
+        self, rows: npt.NDArray[np.intp], points: FloatArray, standbys: FloatArray, sun: FloatArray
+    ) -> dict[str, str]:
+        """Return whose beams at rest would burn an eye, by name; empty if nobody's.
+
+        All beams that rest count together; who is named shines into an eye that they burn.
+
+        Parameters
+        ----------
+        rows, points
+            Heliostats (K,) that are given standby points, ENU, m, (K, 3).
+        standbys
+            Those of all, as they were, (N, 3); NaN where none was given.
+        sun
+            Unit vector, (3,).
+        """
+        if not len(self.eyes) or not len(rows):
+            return {}
+        after = standbys.copy()
+        after[rows] = points
+        known = np.flatnonzero(np.isfinite(after).all(axis=-1))
+        solved = self.poses(known, after[known], sun)
+        part = _rows_of(self.mirrors, known)
+        rest = beams(
+            solved.chosen(solved.vertex), after[known], part, reach=np.full(len(known), FAR)
+        )
+        seen = glare_at(rest, self.eyes)
+        found: dict[str, str] = {}
+        for eye in np.flatnonzero(seen.hazard == Hazard.DAMAGE):
+            lit = crossing(rest, self.eyes[eye : eye + 1]).concentration[0] > 0.0
+            for row in np.intersect1d(known[lit], rows):
+                found.setdefault(
+                    self.names[row],
+                    f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where a "
+                    f"look into the beams is {seen.burn[eye]:.2g} times what burns an eye; choose "
+                    "another standby point",
+                )
         return found
 
     def on_the_way(

@@ -85,8 +85,8 @@ class PlantController:
         Names of the heliostats of each cluster; None: as the design says.
     settings
         Times and limits.
-    volumes
-        Where no beam may be.
+    volumes, eyes
+        Where no beam may be; from where people may look into beams at rest, ENU, m, (P, 3).
     wanted
         What local controllers should hold.
     assigned
@@ -125,6 +125,7 @@ class PlantController:
         clusters: Mapping[str, Sequence[str]] | None = None,
         settings: PlantSettings | None = None,
         volumes: Sequence[Volume] = (),
+        eyes: npt.ArrayLike = (),
         wanted: Wanted | None = None,
         assigned: Assigned | None = None,
         table: Iterable[Condition] | None = None,
@@ -154,7 +155,7 @@ class PlantController:
         rows = conditions(self.settings.autonomy) if table is None else table
         self._watch = PlantWatch(rows, tuple(held), self.settings.sensors, clock.monotonic())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
-        self.beams = BeamCheck(design, self.field.names, volumes)
+        self.beams = BeamCheck(design, self.field.names, volumes, eyes)
         self._points = Points(self.field.names, assigned)
         self.aims, self.standbys = self._points.aims, self._points.standbys
         self._joiner = Joiner(
@@ -598,7 +599,10 @@ class PlantController:
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         start = np.where(tracking[:, None], self.aims[rows], self.standbys[rows])
         stopped = name == "AIM"
-        wrong = self.beams.problems(rows, wanted, self.sun_vector(), start=start, stopped=stopped)
+        light = self.sun_vector()
+        wrong = self.beams.problems(rows, wanted, light, start=start, stopped=stopped)
+        if not stopped:
+            wrong |= self.beams.glare(rows, wanted, self.standbys, light)
         if wrong:
             first, text = next(iter(wrong.items()))
             more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
