@@ -194,9 +194,8 @@ class FieldBus:
         if name in KNOWN:
             aim = _AIM.unpack_from(payload, 8) if name == "AIM" else None
             # Most have heard the broadcast before: then nothing happens.
-            if name == "DEFOCUS" and self._field.state[row] == states.DEFOCUSED:
-                result = messages.DONE
-            elif self._field.order(name, self._all[place : place + 1], aim)[row]:
+            idle = name == "DEFOCUS" and self._field.state[row] == states.DEFOCUSED
+            if idle or self._field.order(name, self._all[place : place + 1], aim)[row]:
                 result = messages.DONE
             self._tell(name, range(row, row + 1))
         return self._answer(place, sequence, "ACK", _ACK.pack(sequence, number, result))
