@@ -31,7 +31,7 @@ def simulate(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Run a real cluster and real local controllers in virtual time, with faults by a seed.
+    """Run the real plant, clusters and local controllers in virtual time, with faults by a seed.
 
     The eleven safety invariants are checked at every step. The exit code is 1 if one is broken.
     """
