@@ -300,4 +300,7 @@ def test_done_is_judged_by_state_and_by_axes() -> None:
     assert not judged(Act.DEFOCUS, states.STOWING, 1.0, settled=False)
     assert not judged(Act.STOW, states.STOWING, 0.0)
     assert judged(Act.STOW, states.LOCKED, 0.0, flags=stowed)
+    # Unlocked at stow it has not obeyed, and may go on to track.
+    for act in (Act.STOW, Act.DEFOCUS):
+        assert not judged(act, states.IDLE, 0.0, flags=stowed)
     assert judged(Act.STOW, states.STOWED, 0.0)

@@ -123,13 +123,14 @@ def done(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask
     settled
         Whether a mirror on its way to stow has had the time to leave the receiver, (K,).
     """
-    stowed = (rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0)
+    # A mirror that stands at stow and is IDLE has not obeyed: it may go on to track.
+    off = ~np.isin(rows["state"], ON_BEAM)
+    stowed = off & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
     if act is Act.STOW:
         return np.asarray(stowed)
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
     goals = np.stack([rows["primary_goal"], rows["secondary_goal"]], axis=-1).astype(np.float64)
     left = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
-    off = ~np.isin(rows["state"], ON_BEAM)
     # On the way to stow the goal is far away, but the beam has left all the same.
     leaving = rows["state"] == states.STOWING
     return np.asarray(stowed | (off & np.where(leaving, settled, left < NEAR)))
