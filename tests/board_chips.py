@@ -570,7 +570,7 @@ def modules(board: str, world: World) -> dict[str, ModuleType]:
 @contextlib.contextmanager
 def board_path(board: str, world: World) -> Iterator[Callable[[str], ModuleType]]:
     """Import the firmware's modules as on a board; what was imported before comes back."""
-    names = ["board", "steps", "nor", "rs485", "loop", "settings"]
+    names = ["board", "steps", "nor", "rs485", "inputs", "loop", "settings"]
     clock = SimpleNamespace(
         ticks_ms=world.ticks_ms,
         ticks_diff=lambda one, two: ((one - two + 2**29) & 0x3FFFFFFF) - 2**29,

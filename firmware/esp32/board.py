@@ -1,17 +1,14 @@
 """Boards with an ESP32, ESP32-S3 or another of the family that has the RMT peripheral."""
 
-import hashlib
 from binascii import crc32
 
 import esp32
 import machine
+from inputs import DIVIDER, Inputs
 from machine import ADC, SPI, UART, Pin
 from nor import Blocks, SpiNor
 from rs485 import Port
 from steps import Timer
-
-#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
-DIVIDER = 11
 
 
 def storage(pins):
@@ -24,7 +21,7 @@ def storage(pins):
     return SpiNor(spi, Pin(select, Pin.OUT, value=1))
 
 
-class Board:
+class Board(Inputs):
     def __init__(self, settings):
         pins = settings.PINS
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
@@ -39,25 +36,6 @@ class Board:
         self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
         self.supply = ADC(Pin(pins["supply"]), atten=ADC.ATTN_11DB)
         self.dog = machine.WDT(timeout=2000)
-
-    def sha256(self, data):
-        return hashlib.sha256(data).digest()
-
-    def feed(self):
-        self.dog.feed()
-
-    def tilt(self):
-        return None
-
-    def switches(self):
-        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
-
-    def supply_good(self):
-        return self.good() == 1
-
-    def limit_hit(self):
-        # Switches open when they are hit, so that a broken wire stops the axis too.
-        return any([pin() for pin in self.limits])
 
     def supply_mv(self):
         return self.supply.read_uv() * DIVIDER // 1000

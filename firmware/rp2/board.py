@@ -1,19 +1,16 @@
 """Raspberry Pi Pico, Pico 2 and other boards with an RP2040 or RP2350."""
 
-import hashlib
 from binascii import crc32
 
 import machine
+from inputs import DIVIDER, Inputs
 from machine import ADC, SPI, UART, Pin
 from nor import SpiNor
 from rs485 import Port
 from steps import Timer
 
-#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
-DIVIDER = 11
 
-
-class Board:
+class Board(Inputs):
     def __init__(self, settings):
         pins = settings.PINS
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
@@ -30,25 +27,6 @@ class Board:
         self.address = [Pin(number, Pin.IN, Pin.PULL_UP) for number in pins["switches"]]
         self.supply, self.warmth = ADC(pins["supply"]), ADC(ADC.CORE_TEMP)
         self.dog = machine.WDT(timeout=2000)
-
-    def sha256(self, data):
-        return hashlib.sha256(data).digest()
-
-    def feed(self):
-        self.dog.feed()
-
-    def tilt(self):
-        return None
-
-    def switches(self):
-        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
-
-    def supply_good(self):
-        return self.good() == 1
-
-    def limit_hit(self):
-        # Switches open when they are hit, so that a broken wire stops the axis too.
-        return any([pin() for pin in self.limits])
 
     def supply_mv(self):
         return self.supply.read_u16() * 3300 * DIVIDER // 65535

@@ -1,21 +1,18 @@
 """Boards with an STM32F4, F7 or H7 that have TIM1 and TIM8 (pyboard, many Nucleo-64 and -144)."""
 
-import hashlib
 from binascii import crc32
 
 import machine
 import pyb
+from inputs import DIVIDER, Inputs
 from machine import SPI, UART
 from nor import SpiNor
 from pyb import Pin
 from rs485 import Port
 from steps import Timer
 
-#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
-DIVIDER = 11
 
-
-class Board:
+class Board(Inputs):
     def __init__(self, settings):
         pins = settings.PINS
         self.firmware, self.key = settings.FIRMWARE, settings.KEY
@@ -31,25 +28,6 @@ class Board:
         self.supply = pyb.ADC(Pin(pins["supply"]))
         self.chip = pyb.ADCAll(12, 0x70000)
         self.dog = machine.WDT(timeout=2000)
-
-    def sha256(self, data):
-        return hashlib.sha256(data).digest()
-
-    def feed(self):
-        self.dog.feed()
-
-    def tilt(self):
-        return None
-
-    def switches(self):
-        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
-
-    def supply_good(self):
-        return self.good() == 1
-
-    def limit_hit(self):
-        # Switches open when they are hit, so that a broken wire stops the axis too.
-        return any([pin() for pin in self.limits])
 
     def supply_mv(self):
         return self.supply.read() * 3300 * DIVIDER // 4095

@@ -8,7 +8,6 @@ plant. Only motors and mirrors are simulated.
 import asyncio
 import contextlib
 import json
-import os
 import re
 import secrets
 import signal
@@ -258,9 +257,6 @@ def _end(process: "subprocess.Popen[Any]") -> None:
 def test_from_power_on_to_tracking_to_calibration_to_stow(
     tmp_path: Path, clusters: int, members: int, per_process: int
 ) -> None:
-    if not hasattr(os, "openpty"):
-        pytest.skip("there are no pseudo-terminals here")
-
     async def main() -> dict[str, Any]:
         async with Installation(tmp_path, clusters, members, per_process).alive() as here:
             return await scene(here)

@@ -26,7 +26,7 @@ class Plant:
             self.world.pins[self.pins["supply_good"]] = 1
             for pin in self.pins["switches"]:
                 self.world.pins[pin] = 1
-            load("nor"), load("rs485"), load("steps")
+            load("nor"), load("rs485"), load("inputs"), load("steps")
             made = load("board").Board(self.settings)
             if items:
                 book = Journal(made.storage)
@@ -233,7 +233,7 @@ def test_a_chip_that_does_not_answer_is_named(board: str) -> None:
 
         machine.SPI.dead = True
         settings: Any = load("settings")
-        load("nor"), load("rs485"), load("steps")
+        load("nor"), load("rs485"), load("inputs"), load("steps")
         with pytest.raises(OSError, match="no flash chip answers"):
             load("board").Board(settings)
 

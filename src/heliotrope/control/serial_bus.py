@@ -14,16 +14,15 @@ Ports: a device ("/dev/ttyUSB0"), or a serial server in the network ("socket://1
 
 import asyncio
 import contextlib
-import heapq
-import itertools
 import random
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import serialx
 
 from heliotrope.control.clock import Clock, sleep_until
 from heliotrope.control.link import Backoff, LinkClosedError, LinkError, Outcome
+from heliotrope.control.turns import Turns
 from heliotrope.errors import InputError
 
 #: Start, eight data bits, stop.
@@ -172,40 +171,6 @@ class _Port(asyncio.Protocol):
         self.news.clear()
 
 
-class _Turns:
-    """Whose turn it is: first come, first served, but the urgent before all others."""
-
-    def __init__(self) -> None:
-        self._busy = False
-        self._waiting: list[tuple[bool, int, asyncio.Future[None]]] = []
-        self._number = itertools.count()
-
-    @contextlib.asynccontextmanager
-    async def turn(self, *, urgent: bool) -> AsyncIterator[None]:
-        if self._busy:
-            mine = asyncio.get_running_loop().create_future()
-            heapq.heappush(self._waiting, (not urgent, next(self._number), mine))
-            try:
-                await mine
-            except asyncio.CancelledError:
-                if mine.done() and not mine.cancelled():
-                    self._next()
-                raise
-        self._busy = True
-        try:
-            yield
-        finally:
-            self._next()
-
-    def _next(self) -> None:
-        while self._waiting:
-            _, _, other = heapq.heappop(self._waiting)
-            if not other.done():
-                other.set_result(None)
-                return
-        self._busy = False
-
-
 class SerialBus:
     """A `Bus` over a serial port.
 
@@ -230,7 +195,7 @@ class SerialBus:
         self._url = url
         self._clock = clock
         self._settings = settings or BusSettings()
-        self._turns = _Turns()
+        self._turns = Turns()
         self._port: _Port | None = None
         self._transport: serialx.BaseSerialTransport | None = None
         self._free_at = 0.0

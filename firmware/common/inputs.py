@@ -1,0 +1,32 @@
+"""What all boards read alike: switches, limits, supply, watchdog."""
+
+import hashlib
+
+#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
+DIVIDER = 11
+
+
+class Inputs:
+    """What is read the same way on all boards.
+
+    ``good``, ``limits`` and ``address`` are pins of the board, ``dog`` its watchdog.
+    """
+
+    def sha256(self, data):
+        return hashlib.sha256(data).digest()
+
+    def feed(self):
+        self.dog.feed()
+
+    def tilt(self):
+        return None
+
+    def switches(self):
+        return sum([(not pin()) << place for place, pin in enumerate(self.address)])
+
+    def supply_good(self):
+        return self.good() == 1
+
+    def limit_hit(self):
+        # Switches open when they are hit, so that a broken wire stops the axis too.
+        return any([pin() for pin in self.limits])
