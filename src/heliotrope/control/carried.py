@@ -20,6 +20,7 @@ from heliotrope.control.link import (
     LinkSettings,
     Outcome,
     Statistics,
+    until_closed,
 )
 from heliotrope.errors import InputError
 
@@ -251,10 +252,7 @@ class CarriedLink:
             raise LinkError(f"link to {self._name}: it runs already")
         self._running = True
         try:
-            async with asyncio.TaskGroup() as group:
-                keeping = group.create_task(self._keep())
-                await self._closing.wait()
-                keeping.cancel()
+            await until_closed(self._closing, self._keep())
         finally:
             self._running = False
 

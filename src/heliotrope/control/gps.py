@@ -16,7 +16,7 @@ from heliotrope.control.discipline import (
     DisciplineSettings,
     DisciplineStatistics,
 )
-from heliotrope.control.link import Backoff, LinkError
+from heliotrope.control.link import Backoff, LinkError, until_closed
 from heliotrope.control.timekeeping import Time
 from heliotrope.errors import InputError
 
@@ -160,11 +160,7 @@ class GpsTime:
             raise LinkError(f"GPS receiver {self._url}: it runs already")
         self._running = True
         try:
-            async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(self._keep()), group.create_task(self._look())]
-                await self._closing.wait()
-                for task in tasks:
-                    task.cancel()
+            await until_closed(self._closing, self._keep(), self._look())
         finally:
             self._running = False
 

@@ -27,9 +27,9 @@ import enum
 import math
 import random
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from heliotrope.control.clock import Clock
 from heliotrope.errors import HeliotropeError, InputError
@@ -385,6 +385,15 @@ async def messages(link: Link) -> AsyncIterator[bytes]:
     with contextlib.suppress(LinkClosedError):
         while True:
             yield await link.receive()
+
+
+async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
+    """Run parts side by side until an event is set, then cancel them; if one fails all end."""
+    async with asyncio.TaskGroup() as group:
+        tasks = [group.create_task(part) for part in parts]
+        await closing.wait()
+        for task in tasks:
+            task.cancel()
 
 
 class Runs(Protocol):

@@ -267,6 +267,10 @@ async def _discard(client: aiomqtt.Client) -> None:
     if task is not None:
         task.cancel()
         await asyncio.wait([task])
+    # Why it ended was told where it was noticed; nobody asks these futures any more.
+    for future in (client._connected, client._disconnected):  # noqa: SLF001
+        if future.done() and not future.cancelled():
+            future.exception()
 
 
 def mqtt_link(

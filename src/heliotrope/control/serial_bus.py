@@ -21,7 +21,13 @@ from dataclasses import dataclass
 import serialx
 
 from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.link import Backoff, LinkClosedError, LinkError, Outcome
+from heliotrope.control.link import (
+    Backoff,
+    LinkClosedError,
+    LinkError,
+    Outcome,
+    until_closed,
+)
 from heliotrope.control.turns import Turns
 from heliotrope.errors import InputError
 
@@ -242,10 +248,7 @@ class SerialBus:
             raise LinkError(f"bus {self._url}: it runs already")
         self._running = True
         try:
-            async with asyncio.TaskGroup() as group:
-                keeping = group.create_task(self._keep())
-                await self._closing.wait()
-                keeping.cancel()
+            await until_closed(self._closing, self._keep())
         finally:
             self._running = False
 
