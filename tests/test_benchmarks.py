@@ -35,7 +35,7 @@ COLUMNS = {
     "plant": {"work", "cpu_s", "budget_s"},
     "control": {
         "heliostats", "clusters", "cores", "memory_mib", "longest_second_s", "flux_before",
-        "order_s", "order_processing_s", "order_cpu_s", "dark_after_order_s",
+        "order_s", "order_processing_s", "order_acknowledged_cpu_s", "dark_after_order_s",
         "dark_after_plant_loss_s", "dark_after_clock_jump_s", "stow_after_cluster_loss_s",
     },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},

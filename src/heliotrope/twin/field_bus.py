@@ -102,8 +102,9 @@ class FieldBus:
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> Outcome:
-        """Send a frame that nobody answers."""
+        """Send a frame that nobody answers; other buses of the process have their turn besides."""
         del expires, urgent
+        await asyncio.sleep(0)
         if self.closed:
             raise LinkClosedError("field bus: it is closed")
         if not self.plugged:
