@@ -18,6 +18,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.mechanism.drives import Drive, rotary
+from heliotrope.twin.wind import Wind
 from plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
@@ -166,6 +167,28 @@ def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:
         table = adjusted(table, row, clear_for=60.0)
     bench = play(tmp_path, scene, settings=WINDY, table=table)
     assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
+
+
+def test_a_gust_of_a_simulated_wind_defocuses_the_field(tmp_path: Path) -> None:
+    """What an anemometer in the twin's wind tells each second is fed to the plant."""
+    wind = Wind(speed=9.0, gust=8.0, seed=4)
+    gusts = [wind.readings((0.0, 0.0, 10.0), float(t))["wind_gust"] for t in range(3600)]
+    strong = [all(g > 15.0 for g in gusts[t : t + 5]) for t in range(3595)]
+    first = strong.index(True)
+    calm = max(t for t in range(first) if gusts[t] <= 15.0)
+
+    async def scene(bench: Bench) -> None:
+        for t in range(first - 30, calm + 3):
+            await feed(bench, 1, receiver_flux=0.7, **wind.readings((0.0, 0.0, 10.0), float(t)))
+            assert bench.count(states.TRACKING) == 18, t
+        for t in range(calm + 3, calm + 8):
+            await feed(bench, 1, receiver_flux=0.7, **wind.readings((0.0, 0.0, 10.0), float(t)))
+        assert bench.count(states.TRACKING) == 0
+        assert bench.plant.emergency is not None
+        assert "gust of wind" in bench.plant.emergency.reason
+
+    sensors = frozenset({"wind_gust", "wind_mean", "receiver_flux"})
+    play(tmp_path, scene, settings=PlantSettings(sensors=sensors))
 
 
 def test_a_sensor_that_falls_silent_counts_as_the_worst(tmp_path: Path) -> None:

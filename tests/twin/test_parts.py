@@ -104,6 +104,14 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
         bus.faults = BusFaults()
         await bus.transmit(b"second\0")
         assert echo.heard[-2:] == [b"second\0", b"first\0"]
+        bus.faults = BusFaults(delay=1.0)
+        took = []
+        for _ in range(20):
+            begin = clock.monotonic()
+            assert await bus.transact(b"slow\0", 0.1) == b"answer\0"
+            took.append(clock.monotonic() - begin)
+        assert min(took) > 0.003
+        assert 0.05 < max(took) <= 0.101
         bus.faults = BusFaults(stuck=True)
         assert await bus.transact(b"stuck\0", 0.1) == b""
         bus.faults = BusFaults()

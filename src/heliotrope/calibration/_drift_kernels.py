@@ -59,45 +59,57 @@ def gram(
 
 
 @njit(**OPTIONS)
+def _decaying_gram(
+    jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
+):  # fmt: skip
+    """As `gram` of the same rows, half of it mirrored; fills ``decay`` (n, n, G) below the diagonal.
+
+    Processes of one group have one time, so that one exponential serves them all. What shares
+    nothing, because a time is not known, decays to 0.
+    """
+    n, size = jacobian.shape[0], jacobian.shape[2]
+    out = np.empty((2 * n, 2 * n))
+    weight = np.empty(size)
+    for i in range(n):
+        for j in range(i + 1):
+            apart = abs(time[i] - time[j])
+            if i == j:
+                apart = 0.0
+            for g in range(tau.shape[0]):
+                decay[i, j, g] = math.exp(-apart / tau[g]) if math.isfinite(apart) else 0.0
+            for p in range(size):
+                weight[p] = static[p]
+            if label[i] == label[j] and label[i] != 0:
+                for p in range(size):
+                    weight[p] += regime[p]
+            shared = min(epoch[i], epoch[j])
+            if shared > 0:
+                for p in range(size):
+                    weight[p] += shared * step[p]
+            for c in range(part.shape[0]):
+                weight[part[c]] += amplitude[c] * amplitude[c] * decay[i, j, group[c]]
+            for a in range(2):
+                for b in range(2):
+                    total = 0.0
+                    for p in range(size):
+                        total += weight[p] * jacobian[i, a, p] * jacobian[j, b, p]
+                    out[2 * i + a, 2 * j + b] = total
+                    out[2 * j + b, 2 * i + a] = total
+    return out
+
+
+@njit(**OPTIONS)
 def cost_and_gradient(
-    jacobian,
-    time,
-    label,
-    epoch,
-    residual,
-    static,
-    regime,
-    step,
-    part,
-    group,
-    amplitude,
-    tau,
-    noise,
-):
+    jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau, noise
+):  # fmt: skip
     """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
 
     ``group`` (C,) says which of the G times a process has; ``tau`` is (G,).
     """
     n, parts, times = len(residual), part.shape[0], tau.shape[0]
-    each = np.empty(parts)
-    for c in range(parts):
-        each[c] = tau[group[c]]
-    matrix = gram(
-        jacobian,
-        time,
-        label,
-        epoch,
-        jacobian,
-        time,
-        label,
-        epoch,
-        True,
-        static,
-        regime,
-        step,
-        part,
-        amplitude,
-        each,
+    decay = np.empty((n, n, times))
+    matrix = _decaying_gram(
+        jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
     )
     for k in range(2 * n):
         matrix[k, k] += noise * noise
@@ -112,9 +124,7 @@ def cost_and_gradient(
     gradient[0] = trace * noise * noise
     for i in range(n):
         for j in range(i + 1):
-            apart = abs(time[i] - time[j])
-            if i == j:
-                apart = 0.0
+            apart = abs(time[i] - time[j]) if i != j else 0.0
             if not math.isfinite(apart):
                 continue
             twice = 1.0 if i == j else 2.0
@@ -125,10 +135,9 @@ def cost_and_gradient(
                     for b in range(2):
                         w = inverse[2 * i + a, 2 * j + b] - alpha[2 * i + a] * alpha[2 * j + b]
                         total += w * jacobian[i, a, p] * jacobian[j, b, p]
-                share = amplitude[c] * amplitude[c] * math.exp(-apart / each[c])
-                total *= 0.5 * twice * share
+                total *= 0.5 * twice * amplitude[c] * amplitude[c] * decay[i, j, group[c]]
                 gradient[1 + c] += 2.0 * total
-                gradient[1 + parts + group[c]] += total * apart / each[c]
+                gradient[1 + parts + group[c]] += total * apart / tau[group[c]]
     return cost, gradient
 
 

@@ -308,7 +308,8 @@ def _regress(
     for longer in trials:
         moved = drive if longer == 0.0 else drive.replace(stroke_offset=stroke + longer)
         gaps = wrap_signed(wanted - moved.angles(counts))
-        centre = gaps[int(np.argmin(np.abs(wrap_signed(gaps[:, None] - gaps)).sum(axis=1)))]
+        # Differences are cut open opposite to their mean direction: then a median is one.
+        centre = np.arctan2(np.sin(gaps).sum(), np.cos(gaps).sum())
         rest = wrap_signed(gaps - centre)
         shift = float(wrap_signed(centre + np.median(rest)))
         spread = float(np.median(np.abs(rest - np.median(rest))))

@@ -50,9 +50,10 @@ class BusFaults:
 
     Parameters
     ----------
-    loss, corruption, burst, duplication, late
+    loss, corruption, burst, duplication, late, delay
         Chances, 0 to 1: nothing comes; one bit is inverted; a run of bytes is noise; it comes
-        twice; it comes only when the next frame is sent (out of order, or between others).
+        twice; it comes only when the next frame is sent (out of order, or between others); an
+        answer takes longer, up to the time that is waited for it.
     stuck
         A transmitter holds the line: nobody hears anything.
 
@@ -67,10 +68,11 @@ class BusFaults:
     burst: float = 0.0
     duplication: float = 0.0
     late: float = 0.0
+    delay: float = 0.0
     stuck: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("loss", "corruption", "burst", "duplication", "late"):
+        for name in ("loss", "corruption", "burst", "duplication", "late", "delay"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
                 raise InputError(f"bus faults: a chance of {name} of {value}; give 0 to 1")
@@ -79,7 +81,7 @@ class BusFaults:
     def any(self) -> bool:
         """Whether it does anything."""
         return self.stuck or any(
-            (self.loss, self.corruption, self.burst, self.duplication, self.late)
+            (self.loss, self.corruption, self.burst, self.duplication, self.late, self.delay)
         )
 
 
@@ -205,6 +207,8 @@ class TwinBus:
             await self._pause(len(frame))
             answer = self.carry(frame)
             took = self._turn_around + self._per_byte * len(answer)
+            if self._happens(self.faults.delay):
+                took = max(took, self._chance.uniform(took, timeout))
             whole = complete(answer) if complete and answer else answer.endswith(b"\0")
             if not answer or took > timeout or not whole:
                 # Nobody ends the wait early: an answer that is damaged or cut has no end.

@@ -174,7 +174,8 @@ def _bus_faults(size: float) -> BusFaults:
     some = chance.sample(names, chance.randint(1, 3))
     chances = {name: chance.choice([0.02, 0.1, 0.4]) for name in some}
     loss, corruption, burst, duplication, late = (chances.get(name, 0.0) for name in names)
-    return BusFaults(loss, corruption, burst, duplication, late)
+    delay = chance.choice([0.0, 0.1, 0.4])
+    return BusFaults(loss, corruption, burst, duplication, late, delay)
 
 
 def _line_faults(size: float) -> Faults:

@@ -22,7 +22,7 @@ KINDS = {
     "audit_full": (2, "the disk of the plant's records is full"),
     "nobody_there": (1, "nobody keeps the command authority up"),
     "cluster_crash": (3, "the cluster ends at once and starts again later"),
-    "bus_bad": (6, "frames are lost, damaged, doubled, late"),
+    "bus_bad": (6, "frames are lost, damaged, doubled, delayed, late"),
     "bus_stuck": (2, "a transmitter holds the line"),
     "bus_unplugged": (1, "the cluster's adapter is gone"),
     "power_cut": (6, "a board loses its supply at any instant"),
