@@ -1,0 +1,152 @@
+"""``heliotrope store``: look at, back up, restore, export and migrate what a plant remembers."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from heliotrope.cli._common import parse_time, print_json, print_table
+
+app = typer.Typer(help="What a plant remembers: look, back up, export.", no_args_is_help=True)
+
+Place = Annotated[
+    str, typer.Argument(help="Data folder of a plant, or postgresql://user@host/name.")
+]
+TelemetryOption = Annotated[
+    Path | None, typer.Option(help="Folder of the telemetry; by default that in the data folder.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+@app.callback()
+def _root() -> None:
+    """What a plant remembers: look, back up, export."""
+
+
+@app.command()
+def info(place: Place, as_json: JsonOption = False) -> None:
+    """Print what is in a store."""
+    from heliotrope.calibration._cells import format_time
+    from heliotrope.store.backup import summary
+    from heliotrope.store.database import Database
+
+    with Database(place) as database:
+        found = summary(database)
+    for name in ("first_sighting", "last_sighting"):
+        found[name] = format_time(found[name]) if found.get(name) is not None else ""
+    if as_json:
+        print_json(found)
+        return
+    rows = found.pop("rows")
+    for name, value in found.items():
+        print(f"{name.replace('_', ' ')}: {value}")
+    if rows:
+        print_table(["table", "rows"], [[name, str(count)] for name, count in rows.items()])
+    else:
+        print("its tables are of another revision: `heliotrope store migrate` brings it up to date")
+
+
+@app.command()
+def backup(
+    place: Place,
+    to: Annotated[Path, typer.Option("--to", help="Folder that is made.")],
+    telemetry: TelemetryOption = None,
+    without_telemetry: Annotated[
+        bool, typer.Option("--without-telemetry", help="Leave the telemetry out.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a backup; the plant may run meanwhile."""
+    from heliotrope.store import backup as backups
+    from heliotrope.store.database import Database
+
+    with Database(place) as database:
+        archive = None if without_telemetry else telemetry or _telemetry(database)
+        made = backups.backup(database, to, parse_time("now"), archive)
+    _tell(made, "made", as_json)
+
+
+@app.command()
+def restore(
+    backup: Annotated[Path, typer.Argument(help="Folder of a backup.")],
+    place: Place,
+    telemetry: TelemetryOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a backup and put it into an empty place."""
+    from heliotrope.store import backup as backups
+    from heliotrope.store.database import Database
+
+    file = Database(place).file
+    archive = telemetry or (file.with_name(backups.TELEMETRY) if file is not None else None)
+    _tell(backups.restore(backup, place, archive), "restored", as_json)
+
+
+@app.command()
+def export(
+    place: Place,
+    to: Annotated[Path, typer.Option("--to", help="Folder that is made.")],
+    heliostat: Annotated[
+        list[str] | None, typer.Option(help="Only these; may be given several times.")
+    ] = None,
+) -> None:
+    """Write every step of the calibrations as CSV, one folder for each heliostat."""
+    from heliotrope.store import export as exports
+    from heliotrope.store.database import Database
+
+    with Database(place) as database:
+        written = exports.export(database, to, heliostat)
+    print(f"{to}: {len(written)} heliostats")
+
+
+@app.command()
+def migrate(place: Place) -> None:
+    """Bring the tables of a store up to date; the plant must be stopped."""
+    from heliotrope.store import backup as backups
+    from heliotrope.store.database import HEAD
+
+    before, copy = backups.migrate(place)
+    if before == HEAD:
+        print(f"{place}: up to date (revision {HEAD})")
+        return
+    kept = "" if copy is None else f"; what was before is in {copy}"
+    print(f"{place}: brought from revision {before} to {HEAD}{kept}")
+
+
+@app.command()
+def query(
+    place: Annotated[Path, typer.Argument(help="Data folder of a plant, or its telemetry.")],
+    sql: Annotated[str, typer.Argument(help="One SELECT from telemetry.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Ask the telemetry archive in SQL (DuckDB)."""
+    from heliotrope.store import telemetry_query
+    from heliotrope.store.backup import TELEMETRY
+
+    inside = place / TELEMETRY
+    answer = telemetry_query.query(inside if inside.is_dir() else place, sql)
+    rows = answer.to_pylist()
+    if as_json:
+        print_json(rows)
+        return
+    print_table(answer.column_names, [[str(v) for v in row.values()] for row in rows])
+
+
+def _telemetry(database: Any) -> Path | None:
+    """Return the folder of the telemetry that lies beside a store, if there is one."""
+    from heliotrope.store.backup import TELEMETRY
+
+    if database.file is None:
+        return None
+    folder: Path = database.file.with_name(TELEMETRY)
+    return folder if folder.is_dir() else None
+
+
+def _tell(found: Any, done: str, as_json: bool) -> None:
+    if as_json:
+        print_json({**vars(found), "folder": str(found.folder)})
+    else:
+        print(
+            f"backup {found.folder} of {found.made} {done}: {found.size / 1e6:.1f} MB, revision "
+            f"{found.revision}"
+        )

@@ -1,0 +1,115 @@
+"""The audit's table: one record for each accepted command, begun and then ended."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from typing import Any
+
+from sqlalchemy import Connection, delete, func, select, update
+
+from heliotrope.errors import InputError
+from heliotrope.store import _rows as rows
+from heliotrope.store import tables
+from heliotrope.store.records import AuditEntry
+
+_AUDIT = tables.audit
+#: Points by name of the heliostat, ENU, m.
+Places = Mapping[str, tuple[float, ...]]
+
+
+def begin(connection: Connection, entry: AuditEntry) -> None:
+    """Keep a record without result; to do so twice is to do it once.
+
+    Raises
+    ------
+    InputError
+        An identity that another record has.
+    """
+    known = _find(connection, entry.identity)
+    if known is not None:
+        if (known.who, known.what, known.at) != (entry.who, entry.what, entry.at):
+            raise InputError(f"audit: a record {entry.identity} exists; identities are unique")
+        return
+    number = (connection.scalar(select(func.max(_AUDIT.c.number))) or 0) + 1
+    values = [float(v) for v in entry.values]
+    row = {**asdict(entry), "values": values, "heliostats": list(entry.heliostats)}
+    rows.insert(connection, _AUDIT, [{**row, "number": number, "result": "", "finished": ""}])
+
+
+def finish(connection: Connection, identity: str, result: str, at: str) -> None:
+    """Add the result to a record; to do so twice is to do it once.
+
+    Raises
+    ------
+    InputError
+        A record that was not begun, or has another result.
+    """
+    open_ = (_AUDIT.c.identity == identity) & (_AUDIT.c.result == "")
+    values = {"result": result, "finished": at}
+    if connection.execute(update(_AUDIT).where(open_).values(values)).rowcount:
+        return
+    known = _find(connection, identity)
+    if known is None or known.result != result:
+        raise InputError(f"audit: no record {identity} waits for a result")
+
+
+def finish_open(connection: Connection, result: str, at: str) -> int:
+    """Give one result to all records that have none; return how many they were."""
+    open_ = update(_AUDIT).where(_AUDIT.c.result == "")
+    return connection.execute(open_.values(result=result, finished=at)).rowcount
+
+
+def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
+    """Return records, the last begun first; those before a place in their order if given."""
+    query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
+    if before:
+        query = query.where(_AUDIT.c.number < before)
+    return [_entry(row) for row in connection.execute(query).mappings()]
+
+
+def _find(connection: Connection, identity: str) -> AuditEntry | None:
+    query = select(_AUDIT).where(_AUDIT.c.identity == identity)
+    row = connection.execute(query).mappings().first()
+    return None if row is None else _entry(row)
+
+
+def _entry(row: Any) -> AuditEntry:
+    fields = {name: value for name, value in row.items() if name != "number"}
+    sets = {"values": tuple(row["values"]), "heliostats": tuple(row["heliostats"])}
+    return AuditEntry(**{**fields, **sets})
+
+
+def probe(connection: Connection) -> None:
+    """Write something of no meaning: only a write shows that the disk takes one."""
+    about = tables.about
+    known = connection.scalar(select(about.c.value).where(about.c.name == "probe"))
+    row = {"name": "probe", "value": str(int(known or 0) + 1)}
+    rows.replace(connection, about, [row])
+
+
+# -- assigned points ---------------------------------------------------------------------
+
+
+def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
+    """Return the assigned points by kind and heliostat."""
+    found: dict[str, dict[str, tuple[float, ...]]] = {}
+    for row in connection.execute(select(tables.assigned_point)).mappings():
+        place = (row["east"], row["north"], row["up"])
+        found.setdefault(row["kind"], {})[row["heliostat"]] = place
+    return found
+
+
+def change_points(
+    connection: Connection, new: Mapping[str, Places], gone: Mapping[str, Iterable[str]]
+) -> None:
+    """Keep new points in place of those of before, and let go of others, by kind."""
+    table = tables.assigned_point
+    for kind, names in gone.items():
+        for name in names:
+            which = (table.c.kind == kind) & (table.c.heliostat == name)
+            connection.execute(delete(table).where(which))
+    for kind, places in new.items():
+        rows.replace(
+            connection, table,
+            [{"kind": kind, "heliostat": name, "east": p[0], "north": p[1], "up": p[2]}
+             for name, p in places.items()],
+        )  # fmt: skip

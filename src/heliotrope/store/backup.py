@@ -1,0 +1,316 @@
+"""Backup and restore: one state of everything, taken while the plant runs.
+
+A backup is a folder: ``store.sqlite`` (also of a store in PostgreSQL, so that each may be restored
+into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file. It
+is there whole or not at all. A restore goes into an empty place only: nothing is ever overwritten.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, func, select
+from sqlalchemy.exc import SQLAlchemyError
+
+from heliotrope import __version__
+from heliotrope.errors import FormatError
+from heliotrope.store import tables
+from heliotrope.store.database import FILE, HEAD, MODE, Database, cause
+from heliotrope.store.records import StoreError
+
+MANIFEST = "manifest.json"
+TELEMETRY = "telemetry"
+_ROWS = 5000
+
+
+@dataclass(frozen=True)
+class Backup:
+    """A backup: its folder, revision of the tables, when it was made, and its size in bytes."""
+
+    folder: Path
+    revision: str
+    made: str
+    size: int
+
+
+def backup(
+    database: Database, folder: str | Path, now: datetime, telemetry: str | Path | None = None
+) -> Backup:
+    """Make a backup.
+
+    Parameters
+    ----------
+    database
+        May be written meanwhile.
+    folder
+        Is made; it must not exist.
+    now
+        Goes into the manifest.
+    telemetry
+        Folder of the archive that is to be in it.
+
+    Raises
+    ------
+    StoreError
+        If there is no store, or the backup cannot be made.
+    """
+    final = Path(folder)
+    database.require()
+    if final.exists():
+        raise StoreError(f"backup {final}: it exists; give a folder that does not")
+    beside = final.with_name(f".{final.name}.{os.getpid()}.part")
+    try:
+        beside.mkdir(parents=True)
+        if database.file is not None:
+            _copy_file(database.file, beside / FILE)
+        else:
+            _copy_tables(database, Database(beside / FILE))
+            _close_log(beside / FILE)
+        if telemetry is not None:
+            _copy_telemetry(Path(telemetry), beside / TELEMETRY)
+        files = {str(p.relative_to(beside)): checksum(p) for p in _files(beside)}
+        size = sum(p.stat().st_size for p in _files(beside))
+        manifest = {
+            "heliotrope": __version__, "revision": HEAD, "made": now.isoformat(), "files": files,
+        }  # fmt: skip
+        (beside / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
+        for path in _files(beside):
+            _sync(path)
+        beside.rename(final)
+        _sync(final.parent)
+    except (OSError, sqlite3.Error) as error:
+        why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+        raise StoreError(f"backup {final}: it cannot be made ({why})") from None
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+    return Backup(final, HEAD, now.isoformat(), size)
+
+
+def check(folder: str | Path) -> Backup:
+    """Return what a backup is, every file of it compared with its checksum.
+
+    Raises
+    ------
+    FormatError
+        If it is none, or a file is missing or not as it was.
+    """
+    place = Path(folder)
+    path = place / MANIFEST
+    try:
+        manifest: Any = json.loads(path.read_text(encoding="utf-8"))
+        files, revision, made = manifest["files"], manifest["revision"], manifest["made"]
+        wanted = dict(files.items())
+    except OSError as error:
+        raise FormatError(path, f"{error.strerror}; give the folder of a backup") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise FormatError(path, "this is no manifest of a backup") from None
+    if FILE not in wanted:
+        raise FormatError(path, f"{FILE} is not in it; this is no manifest of a backup")
+    size = 0
+    for name, sum_ in wanted.items():
+        file = place / name
+        if ".." in Path(name).parts or Path(name).is_absolute():
+            raise FormatError(path, f"the file {name!r} lies outside the backup")
+        if not file.is_file():
+            raise FormatError(file, "the file is missing; take another backup")
+        if checksum(file) != sum_:
+            raise FormatError(file, "its checksum is another; take another backup")
+        size += file.stat().st_size
+    return Backup(place, revision, made, size)
+
+
+def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None = None) -> Backup:
+    """Put a backup into an empty place.
+
+    Parameters
+    ----------
+    folder
+        Of the backup.
+    place
+        As in `Database`: there must be no store yet.
+    telemetry
+        Where its telemetry goes to, if it has any; None: left out.
+
+    Raises
+    ------
+    FormatError
+        If the backup is damaged.
+    StoreError
+        If there is a store already, another process has it, or it cannot be written.
+    """
+    found = check(folder)
+    database = Database(place)
+    try:
+        if database.file is not None:
+            database.file.parent.mkdir(parents=True, exist_ok=True)
+        database.lock()
+        if database.revision():
+            raise StoreError(
+                f"store {database.name}: there is one already; give an empty place, or move it away"
+            )
+        if telemetry is not None and (found.folder / TELEMETRY).is_dir():
+            if Path(telemetry).exists() and any(Path(telemetry).iterdir()):
+                raise StoreError(f"telemetry {telemetry}: it is not empty; move it away")
+            shutil.copytree(found.folder / TELEMETRY, telemetry, dirs_exist_ok=True)
+        if database.file is not None:
+            beside = database.file.with_name(f".{database.file.name}.{os.getpid()}.part")
+            try:
+                shutil.copyfile(found.folder / FILE, beside)
+                beside.chmod(MODE)
+                _sync(beside)
+                beside.rename(database.file)
+                _sync(database.file.parent)
+            finally:
+                beside.unlink(missing_ok=True)
+        else:
+            _copy_tables(Database(found.folder / FILE), database)
+    except OSError as error:
+        raise StoreError(f"store {database.name}: {error.strerror}") from None
+    finally:
+        database.close()
+    return found
+
+
+def summary(database: Database) -> dict[str, Any]:
+    """Return what is in a store: revision, rows of each table, times of the first and last.
+
+    Raises
+    ------
+    StoreError
+        If there is none, or it cannot be read.
+    """
+    revision = database.revision()
+    if not revision:
+        database.require()
+    found: dict[str, Any] = {"store": database.name, "revision": revision, "rows": {}}
+    if revision != HEAD:
+        return found
+    with database.reading() as connection:
+        for table in tables.metadata.sorted_tables:
+            count = connection.scalar(select(func.count()).select_from(table))
+            found["rows"][table.name] = int(count or 0)
+        time = tables.sighting.c.time
+        first, last = connection.execute(select(func.min(time), func.max(time))).one()
+        open_ = select(func.count()).where(tables.audit.c.result == "")
+        found["audit_without_result"] = int(connection.scalar(open_) or 0)
+    found["first_sighting"], found["last_sighting"] = first, last
+    if database.file is not None:
+        found["bytes"] = database.file.stat().st_size
+    return found
+
+
+def migrate(place: str | Path) -> tuple[str, Path | None]:
+    """Bring a store up to date; return its revision before, and the copy that was made of it.
+
+    A file is copied first, to ``store.before-REVISION.sqlite`` beside it; PostgreSQL changes its
+    tables in one transaction.
+
+    Raises
+    ------
+    StoreError
+        If there is no store, another process has it, it is newer than the program, or that fails.
+    """
+    with Database(place) as database:
+        found = database.revision()
+        if not found or found > HEAD:
+            database.require()
+        if found == HEAD:
+            return found, None
+        copy = None
+        database.lock()
+        try:
+            if database.file is not None:
+                copy = database.file.with_name(f"{database.file.stem}.before-{found}.sqlite")
+                if not copy.exists():
+                    _copy_file(database.file, copy)
+                    _sync(copy)
+            database.migrate()
+        except (OSError, sqlite3.Error) as error:
+            raise StoreError(f"store {database.name}: cannot be copied ({error})") from None
+        return found, copy
+
+
+def checksum(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    return (p for p in sorted(folder.rglob("*")) if p.is_file())
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _copy_file(source: Path, target: Path) -> None:
+    """Copy an SQLite database in one step: one state of it, whoever writes meanwhile."""
+    with (
+        closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True, timeout=10.0)) as old,
+        closing(sqlite3.connect(target)) as new,
+    ):
+        old.backup(new)
+    target.chmod(MODE)
+    _close_log(target)
+    with closing(sqlite3.connect(target)) as new:
+        (state,) = new.execute("PRAGMA quick_check(1)").fetchone()
+    if state != "ok":
+        raise StoreError(f"store {source}: it is damaged ({state}); restore a backup")
+
+
+def _close_log(file: Path) -> None:
+    """Make one file of a database and its log."""
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("PRAGMA journal_mode=DELETE")
+
+
+def _copy_tables(source: Database, target: Database) -> None:
+    """Copy all rows from one store to a new one, in one transaction."""
+    source.require()
+    try:
+        target.migrate()
+        with source.reading() as old, target.connect() as new, new.begin():
+            for table in tables.metadata.sorted_tables:
+                for rows in _parts(old, table):
+                    new.execute(table.insert(), rows)
+    except SQLAlchemyError as error:
+        raise StoreError(f"store {target.name}: cannot be written ({cause(error)})") from None
+    finally:
+        if source.file is not None:
+            source.close()
+        else:
+            target.close()
+
+
+def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]:
+    found = connection.execute(select(table).execution_options(yield_per=_ROWS)).mappings()
+    for part in found.partitions():
+        yield [dict(row) for row in part]
+
+
+def _copy_telemetry(source: Path, target: Path) -> None:
+    """Copy an archive; parts may become Parquet files meanwhile."""
+    target.mkdir()
+    for _ in range(2):
+        for path in sorted(source.glob("????-??-??/*.*")):
+            copy = target / path.parent.name / path.name
+            if path.suffix in (".parquet", ".part") and not copy.exists():
+                copy.parent.mkdir(exist_ok=True)
+                try:
+                    shutil.copyfile(path, copy)
+                except FileNotFoundError:
+                    # It is a Parquet file now: the second round takes it.
+                    copy.unlink(missing_ok=True)

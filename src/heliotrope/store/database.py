@@ -1,0 +1,302 @@
+"""A database: SQLite in a folder, or PostgreSQL by URL; opened, locked, brought up to date.
+
+One process at a time writes (the plant); others may read meanwhile. SQLite runs in WAL mode, and
+what is committed is synced to the disk. Its one writing connection is also the only one that
+moves the log into the file.
+"""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import Connection, Engine, NullPool, create_engine, event, inspect, text
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, DBAPIError, SQLAlchemyError
+
+from heliotrope.store.records import StoreError
+
+#: Revision of the tables that this program knows.
+HEAD = "0001"
+FILE = "store.sqlite"
+#: Who may read and write its files.
+MODE = 0o640
+#: For PostgreSQL's advisory lock; the second number is that of the schema.
+_LOCK = 0x48454C49
+#: How long it is waited for, s.
+_PATIENCE = 2
+_LOCK_TIMEOUT = "55P03"
+
+
+class Database:
+    """Where rows are kept.
+
+    Parameters
+    ----------
+    place
+        A folder (the database is ``store.sqlite`` in it), a file ``.sqlite``, or a URL
+        ``postgresql://user@host/name``.
+
+    Attributes
+    ----------
+    url
+        Of the database.
+    file
+        Of SQLite, None for PostgreSQL.
+
+    Raises
+    ------
+    StoreError
+        A URL that cannot be used.
+    """
+
+    def __init__(self, place: str | Path) -> None:
+        self.url, self.file = _place(place)
+        options: dict[str, Any] = {}
+        if self.file is None:
+            # A server that does not answer is told within seconds; the loop never waits for it.
+            options["connect_args"] = {"connect_timeout": 3, "tcp_user_timeout": 5000}
+        self._reader = create_engine(
+            self.url, pool_pre_ping=self.file is None, isolation_level=self._isolation(), **options
+        )
+        self._writer = create_engine(self.url, poolclass=NullPool, **options)
+        if self.file is not None:
+            _prepare(self._reader, "BEGIN", _READER)
+            _prepare(self._writer, "BEGIN IMMEDIATE", _WRITER)
+        self._lock: int | None = None
+        self._spare: Connection | None = None
+        self.locked = False
+
+    def _isolation(self) -> Any:
+        # What is read in one transaction belongs together; SQLite's always does.
+        return "REPEATABLE READ" if self.file is None else "SERIALIZABLE"
+
+    @property
+    def name(self) -> str:
+        """For messages: the file, or the URL without its password."""
+        return str(self.file) if self.file is not None else self.url.render_as_string()
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """Give a connection that sees one state of everything, and cannot write.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be read.
+        """
+        try:
+            with self._reader.connect() as connection, connection.begin():
+                if self.file is None:
+                    connection.execute(text("SET TRANSACTION READ ONLY"))
+                yield connection
+        except SQLAlchemyError as error:
+            raise StoreError(f"store {self.name}: cannot be read ({cause(error)})") from None
+
+    def connect(self) -> Connection:
+        """Return a connection to write with; on PostgreSQL it has the lock if the store has.
+
+        Raises
+        ------
+        StoreError
+            If another process has the lock meanwhile.
+        """
+        spare, self._spare = self._spare, None
+        if spare is not None:
+            return spare
+        connection = self._writer.connect()
+        if self.file is None and self.locked:
+            self._lock_server(connection)
+        return connection
+
+    def lock(self) -> None:
+        """Become the one process that writes.
+
+        Raises
+        ------
+        StoreError
+            If another one is, or the folder cannot be written to.
+        """
+        if self.file is None:
+            self.locked = True
+            try:
+                # The server's lock lasts as long as the connection that took it.
+                self._spare = self.connect()
+            except SQLAlchemyError as error:
+                self.locked = False
+                raise StoreError(f"store {self.name}: {cause(error)}") from None
+            except StoreError:
+                self.locked = False
+                raise
+            return
+        path = self.file.with_name(self.file.name + ".lock")
+        try:
+            self._lock = os.open(path, os.O_RDWR | os.O_CREAT, MODE)
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.close()
+            raise StoreError(
+                f"store {self.file}: another process writes to it; only one plant may run, and "
+                "restore and migrate need it stopped"
+            ) from None
+        except OSError as error:
+            raise StoreError(
+                f"store {self.file}: {error.strerror}; give a folder that may be written to"
+            ) from None
+        self.locked = True
+
+    def _lock_server(self, connection: Connection) -> None:
+        """Take the server's lock, which it may not have taken back yet from a connection before."""
+        key = {"key": _LOCK}
+        try:
+            with connection.begin():
+                connection.execute(text(f"SET LOCAL lock_timeout = {1000 * _PATIENCE}"))
+                lock = "SELECT pg_advisory_lock(:key, hashtext(current_schema()))"
+                connection.execute(text(lock), key)
+        except DBAPIError as error:
+            connection.close()
+            if getattr(error.orig, "sqlstate", "") != _LOCK_TIMEOUT:
+                raise
+            raise StoreError(
+                f"store {self.name}: another process writes to it; only one plant may run"
+            ) from None
+
+    def revision(self) -> str:
+        """Return the revision of the tables, "" if there are none.
+
+        Raises
+        ------
+        StoreError
+            If the database cannot be read.
+        """
+        if self.file is not None and not self.file.exists():
+            return ""
+        with self.reading() as connection:
+            if not inspect(connection).has_table("alembic_version"):
+                return ""
+            return str(connection.scalar(text("SELECT version_num FROM alembic_version")) or "")
+
+    def require(self) -> None:
+        """See that the tables are there, and are those that this program knows.
+
+        Raises
+        ------
+        StoreError
+            If not.
+        """
+        found = self.revision()
+        if not found:
+            raise StoreError(f"store {self.name}: there is none; `heliotrope run` makes one")
+        if found != HEAD:
+            raise StoreError(
+                f"store {self.name}: its tables are of revision {found}, this program's of {HEAD}; "
+                + ("run `heliotrope store migrate`" if found < HEAD else "update the program")
+            )
+
+    def prepare(self) -> None:
+        """Make the tables of a new store; refuse one of another revision.
+
+        Raises
+        ------
+        StoreError
+            If it is of another revision, or cannot be made.
+        """
+        if not self.revision():
+            self.migrate()
+        self.require()
+
+    def migrate(self) -> None:
+        """Bring the tables up to date, all or nothing.
+
+        Raises
+        ------
+        StoreError
+            If that fails; everything is as before.
+        """
+        from alembic import command
+        from alembic.config import Config
+        from alembic.util import CommandError
+
+        config = Config()
+        folder = str(Path(__file__).with_name("migrations"))
+        config.set_main_option("script_location", folder.replace("%", "%%"))
+        try:
+            if self.file is not None:
+                # Hashes of passwords are in it: it is not for everybody's eyes. Its log follows it.
+                os.close(os.open(self.file, os.O_RDWR | os.O_CREAT, MODE))
+            with self._writer.connect() as connection:
+                config.attributes["connection"] = connection
+                with connection.begin():
+                    command.upgrade(config, "head")
+        except OSError as error:
+            raise StoreError(f"store {self.name}: {error.strerror}") from None
+        except (SQLAlchemyError, CommandError) as error:
+            raise StoreError(f"store {self.name}: cannot be set up ({cause(error)})") from None
+
+    def __enter__(self) -> "Database":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give everything back."""
+        if self._spare is not None:
+            self._spare.close()
+            self._spare = None
+        self._reader.dispose()
+        self._writer.dispose()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+        self.locked = False
+
+
+_READER = ("PRAGMA busy_timeout=5000", "PRAGMA wal_autocheckpoint=0", "PRAGMA query_only=ON")
+_WRITER = (
+    "PRAGMA busy_timeout=5000", "PRAGMA journal_mode=WAL", "PRAGMA synchronous=FULL",
+    "PRAGMA foreign_keys=ON",
+)  # fmt: skip
+
+
+def _prepare(engine: Engine, begin: str, pragmas: tuple[str, ...]) -> None:
+    """Let SQLAlchemy's transactions be SQLite's own, and set up each connection."""
+
+    @event.listens_for(engine, "connect")
+    def connected(connection: Any, _: object) -> None:
+        connection.isolation_level = None  # the driver begins no transactions by itself
+        for pragma in pragmas:
+            connection.execute(pragma)
+
+    @event.listens_for(engine, "begin")
+    def began(connection: Connection) -> None:
+        connection.exec_driver_sql(begin)
+
+
+def _place(place: str | Path) -> tuple[URL, Path | None]:
+    if isinstance(place, str) and "://" in place:
+        try:
+            url = make_url(place)
+        except ArgumentError:
+            raise StoreError(
+                "store: the URL cannot be read; write postgresql://user@host/name"
+            ) from None
+        if url.get_backend_name() != "postgresql":
+            raise StoreError(
+                f"store: a URL of {url.get_backend_name()}; give a folder for SQLite, or a URL "
+                "postgresql://user@host/name"
+            )
+        return url.set(drivername="postgresql+psycopg"), None
+    file = Path(place)
+    if file.suffix != ".sqlite":
+        file = file / FILE
+    return URL.create("sqlite", database=str(file)), file
+
+
+def cause(error: Exception) -> str:
+    """Return one line on why a database refused."""
+    inner = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+    lines = str(inner).strip().splitlines()
+    return lines[0] if lines else type(inner).__name__

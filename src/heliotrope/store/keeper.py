@@ -1,0 +1,443 @@
+"""The keeper: `Records` on a database, with the one writer behind it.
+
+The keeper numbers what it takes, so the caller knows the numbers of sightings before they are
+written, and a row that is written twice is there once. Only one process has a store at a time.
+"""
+
+import asyncio
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from sqlalchemy import Connection, Table, and_, delete, func, select, update
+
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.store import _rows as rows
+from heliotrope.store import tables
+from heliotrope.store.database import Database
+from heliotrope.store.people import People
+from heliotrope.store.records import (
+    SEVERITIES,
+    AlarmEntry,
+    CampaignEntry,
+    Event,
+    Hold,
+    Identities,
+    KeptSightings,
+    ParameterVersion,
+    PlannedVisit,
+    StoreError,
+    VisitEntry,
+)
+from heliotrope.store.writer import Work, Writer
+
+_NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
+#: More names than this are not put into a query; what is read is sifted instead.
+_MANY = 500
+
+
+class Keeper:
+    """Keeps what the plant must remember; see `Records` for what each method promises.
+
+    Parameters
+    ----------
+    place
+        A folder (made if need be), a file ``.sqlite``, or a URL ``postgresql://...``.
+    inline
+        Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
+    limit
+        Records that may wait.
+
+    Attributes
+    ----------
+    database, writer, people
+        Its parts.
+
+    Raises
+    ------
+    StoreError
+        If the store cannot be opened, is another program's, or another process has it.
+    """
+
+    def __init__(self, place: str | Path, *, inline: bool = False, limit: int = 50_000) -> None:
+        self.database = Database(place)
+        if self.database.file is not None:
+            _make_folder(self.database.file.parent)
+        self.database.lock()
+        try:
+            self.database.prepare()
+            with self.database.reading() as connection:
+                self._numbers = {t.name: _last_number(connection, t) for t in _NUMBERED}
+                self._versions = _last_versions(connection)
+                self._holds = _standing_holds(connection)
+        except BaseException:
+            self.database.close()
+            raise
+        self._mine = threading.Lock()
+        self.writer = Writer(self.database, limit=limit, inline=inline)
+        self.people = People(self.database, self.writer)
+
+    @property
+    def problem(self) -> str:
+        """Why records cannot be written now, "" if they can."""
+        return self.writer.problem
+
+    @property
+    def refused(self) -> str:
+        """Which record the database refused for what it is, the last; "" if none was."""
+        return self.writer.refused
+
+    @property
+    def backlog(self) -> int:
+        """How many records wait to be written."""
+        return self.writer.backlog
+
+    def close(self) -> None:
+        """Write what waits, and end.
+
+        Raises
+        ------
+        StoreError
+            If something could not be written.
+        """
+        try:
+            self.writer.close()
+        finally:
+            self.database.close()
+
+    async def confirm(self) -> None:
+        """Wait until all that was recorded before is safe.
+
+        Raises
+        ------
+        StoreError
+            If an attempt to write it failed; it is kept waiting and tried again by itself.
+        """
+        done = self.writer.confirmed()
+        if self.writer.inline:
+            done.result()
+        else:
+            await asyncio.wrap_future(done)
+
+    def _take_numbers(self, table: Table, count: int = 1) -> int:
+        """Return the first of some new numbers."""
+        with self._mine:
+            first = self._numbers[table.name] + 1
+            self._numbers[table.name] += count
+        return first
+
+    def _select(self, statement: Any) -> Any:
+        with self.database.reading() as connection:
+            return connection.execute(statement).mappings().all()
+
+    # -- sightings and parameters --------------------------------------------------------
+
+    def record_sightings(
+        self,
+        names: Sequence[str],
+        sightings: Sightings,
+        *,
+        kind: str = "camera_target",
+        target: str = "",
+        campaign: str = "",
+    ) -> Identities:
+        """Keep sightings, whose rows point to ``names``; return their numbers, (M,).
+
+        Raises
+        ------
+        InputError
+            If a row points beyond the names.
+        StoreError
+            If too much waits already.
+        """
+        if len(sightings) and int(sightings.heliostat.max()) >= len(names):
+            raise InputError(
+                f"sightings: heliostat row {int(sightings.heliostat.max())} of {len(names)} names"
+            )
+        first = self._take_numbers(tables.sighting, len(sightings))
+        numbers = np.arange(first, first + len(sightings), dtype=np.int64)
+        made = rows.sighting_rows(numbers, names, sightings, kind, target, campaign)
+        self.writer.put(lambda c: rows.insert(c, tables.sighting, made))
+        return numbers
+
+    def record_parameters(self, version: ParameterVersion) -> int:
+        """Keep a version of parameters; return its number among those of the heliostat."""
+        with self._mine:
+            count = self._versions.get(version.heliostat, 0) + 1
+            row = {**rows.version_row(version), "version": count}
+            used = [{**u, "version": count} for u in rows.used_rows(version)]
+
+            def work(connection: Connection) -> None:
+                rows.insert(connection, tables.parameter_version, [row])
+                rows.insert(connection, tables.parameter_sighting, used)
+
+            self.writer.put(work)
+            self._versions[version.heliostat] = count
+        return count
+
+    def sightings(
+        self,
+        heliostats: Sequence[str] | None = None,
+        *,
+        since: float = float("-inf"),
+        until: float = float("inf"),
+        campaign: str = "",
+    ) -> KeptSightings:
+        """Return sightings of some heliostats (None: of all), those of one campaign if named."""
+        s = tables.sighting.c
+        query = select(tables.sighting).order_by(s.time, s.number)
+        if heliostats is not None and len(heliostats) <= _MANY:
+            query = query.where(s.heliostat.in_(list(heliostats)))
+        if since > float("-inf"):
+            query = query.where(s.time >= since)
+        if until < float("inf"):
+            query = query.where(s.time <= until)
+        if campaign:
+            query = query.where(s.campaign == campaign)
+        with self.database.reading() as connection:
+            found = connection.execute(query).all()
+        if heliostats is not None and len(heliostats) > _MANY:
+            wanted = set(heliostats)
+            found = [row for row in found if row.heliostat in wanted]
+        return rows.kept_sightings(found)
+
+    def latest_parameters(
+        self, heliostats: Sequence[str] | None = None
+    ) -> dict[str, ParameterVersion]:
+        """Return the last version of each, by heliostat, without sightings and residuals."""
+        table = tables.parameter_version
+        last = (
+            select(table.c.heliostat, func.max(table.c.version).label("version"))
+            .group_by(table.c.heliostat).subquery()
+        )  # fmt: skip
+        same = and_(table.c.heliostat == last.c.heliostat, table.c.version == last.c.version)
+        query = select(table).join(last, same).order_by(table.c.heliostat)
+        if heliostats is not None and len(heliostats) <= _MANY:
+            query = query.where(table.c.heliostat.in_(list(heliostats)))
+        wanted = None if heliostats is None else set(heliostats)
+        return {
+            row["heliostat"]: rows.parameter_version(row)
+            for row in self._select(query)
+            if wanted is None or row["heliostat"] in wanted
+        }
+
+    def parameter_history(self, heliostat: str) -> list[ParameterVersion]:
+        """Return all versions of one heliostat, the oldest first, with their residuals."""
+        with self.database.reading() as connection:
+            return parameter_history(connection, heliostat)
+
+    # -- measurements and their plan -----------------------------------------------------
+
+    def record_visit(self, visit: VisitEntry) -> None:
+        """Keep what became of a measurement."""
+        row = rows.visit_row(visit, self._take_numbers(tables.visit))
+        self.writer.put(lambda c: rows.insert(c, tables.visit, [row]))
+
+    def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
+        """Keep what the schedule plans, in place of the plan before."""
+        made = rows.plan_rows(plan)
+
+        def work(connection: Connection) -> None:
+            connection.execute(delete(tables.plan))
+            rows.insert(connection, tables.plan, made)
+
+        self.writer.put(work)
+
+    def record_campaign(self, campaign: CampaignEntry) -> None:
+        """Keep a campaign, in place of what was kept of the same name."""
+        row = rows.campaign_row(campaign)
+        self.writer.put(lambda c: rows.replace(c, tables.campaign, [row]))
+
+    def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
+        """Return measurements, the last first."""
+        query = select(tables.visit).order_by(tables.visit.c.number.desc()).limit(limit)
+        if heliostat:
+            query = query.where(tables.visit.c.heliostat == heliostat)
+        return [rows.visit(row) for row in self._select(query)]
+
+    def plan(self) -> list[PlannedVisit]:
+        """Return the plan that was kept last, the first due first."""
+        found = self._select(select(tables.plan).order_by(tables.plan.c.place))
+        return [rows.planned(row) for row in found]
+
+    def campaigns(self) -> list[CampaignEntry]:
+        """Return the campaigns, the last first."""
+        found = self._select(select(tables.campaign).order_by(tables.campaign.c.begun.desc()))
+        return [rows.campaign(row) for row in found]
+
+    # -- events and alarms ---------------------------------------------------------------
+
+    def record_event(self, event: Event) -> None:
+        """Keep an event.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such severity.
+        """
+        _check_severity(event.severity)
+        row = rows.event_row(event, self._take_numbers(tables.event))
+        self.writer.put(lambda c: rows.insert(c, tables.event, [row]))
+
+    def record_alarm(
+        self, condition: str, subject: str, severity: str, text: str, at: float, *, active: bool
+    ) -> None:
+        """Keep that an alarm stands, or (not active) that it is over."""
+        _check_severity(severity)
+        row = {
+            "number": self._take_numbers(tables.alarm), "condition": condition,
+            "subject": subject, "severity": severity, "text": text, "raised": at,
+            "acknowledged_by": "",
+        }  # fmt: skip
+        a = tables.alarm.c
+        stands = and_(a.condition == condition, a.subject == subject, a.cleared.is_(None))
+        change = {"severity": severity, "text": text} if active else {"cleared": at}
+
+        def work(connection: Connection) -> None:
+            changed = connection.execute(update(tables.alarm).where(stands).values(change))
+            if active and not changed.rowcount:
+                rows.insert(connection, tables.alarm, [row])
+
+        self.writer.put(work)
+
+    def record_acknowledgement(self, condition: str, subject: str, person: str, at: float) -> None:
+        """Keep that a person acknowledged an alarm."""
+        a = tables.alarm.c
+        which = and_(a.condition == condition, a.subject == subject, a.acknowledged.is_(None))
+        change = {"acknowledged": at, "acknowledged_by": person}
+        self.writer.put(lambda c: c.execute(update(tables.alarm).where(which).values(change)))
+
+    def events(
+        self, limit: int = 100, *, heliostat: str = "", severity: str = "info", before: int = 0
+    ) -> list[Event]:
+        """Return events of a severity and above, the last first; those before a number if given."""
+        _check_severity(severity)
+        e = tables.event.c
+        query = select(tables.event).where(e.severity >= SEVERITIES.index(severity))
+        if heliostat:
+            query = query.where(e.heliostat == heliostat)
+        if before:
+            query = query.where(e.number < before)
+        return [rows.event(r) for r in self._select(query.order_by(e.number.desc()).limit(limit))]
+
+    def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
+        """Return alarms, the last first; only those neither over nor acknowledged if standing."""
+        a = tables.alarm.c
+        query = select(tables.alarm).order_by(a.number.desc()).limit(limit)
+        if standing:
+            query = query.where(a.cleared.is_(None) | a.acknowledged.is_(None))
+        return [rows.alarm(row) for row in self._select(query)]
+
+    def forget_events(self, before: float) -> None:
+        """Let go of events before a time, and of alarms that were over and acknowledged by then."""
+        a = tables.alarm.c
+        over = and_(a.cleared < before, a.acknowledged < before)
+
+        def work(connection: Connection) -> None:
+            connection.execute(delete(tables.event).where(tables.event.c.at < before))
+            connection.execute(delete(tables.alarm).where(over))
+
+        self.writer.put(work)
+
+    # -- holds ---------------------------------------------------------------------------
+
+    def hold(
+        self,
+        heliostats: Sequence[str],
+        reason: str,
+        person: str,
+        at: float,
+        until: float | None = None,
+    ) -> None:
+        """Keep the schedule off some heliostats; one that is held already is held anew."""
+        names = list(dict.fromkeys(heliostats))
+        first = self._take_numbers(tables.hold, len(names))
+        made = [
+            {"number": first + i, "heliostat": name, "reason": reason, "person": person,
+             "since": at, "until": until, "ended": None, "ended_by": ""}
+            for i, name in enumerate(names)
+        ]  # fmt: skip
+
+        def work(connection: Connection) -> None:
+            _end_holds(connection, names, person, at)
+            rows.insert(connection, tables.hold, made)
+
+        with self._mine:
+            self.writer.put(work)
+            # A new dictionary: whoever reads the old one sees one state of all.
+            new = {name: Hold(name, reason, person, at, until) for name in names}
+            self._holds = {**self._holds, **new}
+
+    def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
+        """Give heliostats back to the schedule."""
+        names = list(dict.fromkeys(heliostats))
+        with self._mine:
+            self.writer.put(lambda c: _end_holds(c, names, person, at))
+            gone = set(names)
+            self._holds = {n: held for n, held in self._holds.items() if n not in gone}
+
+    def holds(self, at: float) -> dict[str, Hold]:
+        """Return what is held at a time, by heliostat."""
+        return {n: h for n, h in self._holds.items() if h.until is None or at < h.until}
+
+    def do(self, work: Work[Any], timeout: float = 5.0) -> Any:
+        """Let work be written, and return what it gives; see `Writer.do`."""
+        return self.writer.do(work, timeout)
+
+
+def parameter_history(connection: Connection, heliostat: str) -> list[ParameterVersion]:
+    """Return all versions of one heliostat, the oldest first, with their residuals."""
+    versions, used = tables.parameter_version, tables.parameter_sighting
+    query = select(used).where(used.c.heliostat == heliostat).order_by(used.c.place)
+    by_version: dict[int, list[Any]] = {}
+    for row in connection.execute(query).mappings():
+        by_version.setdefault(row["version"], []).append(row)
+    query = select(versions).where(versions.c.heliostat == heliostat).order_by(versions.c.version)
+    return [
+        rows.parameter_version(row, by_version.get(row["version"], ()))
+        for row in connection.execute(query).mappings().all()
+    ]
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(
+            f"store {folder}: {error.strerror}; give a folder that may be written to"
+        ) from None
+
+
+def _last_number(connection: Connection, table: Table) -> int:
+    return int(connection.scalar(select(func.max(table.c.number))) or 0)
+
+
+def _last_versions(connection: Connection) -> dict[str, int]:
+    table = tables.parameter_version.c
+    query = select(table.heliostat, func.max(table.version)).group_by(table.heliostat)
+    return {name: int(version) for name, version in connection.execute(query)}
+
+
+def _standing_holds(connection: Connection) -> dict[str, Hold]:
+    query = select(tables.hold).where(tables.hold.c.ended.is_(None))
+    return {
+        row["heliostat"]: Hold(
+            *(row[n] for n in ("heliostat", "reason", "person", "since", "until"))
+        )
+        for row in connection.execute(query).mappings()
+    }
+
+
+def _end_holds(connection: Connection, names: Sequence[str], person: str, at: float) -> None:
+    h = tables.hold.c
+    for k in range(0, len(names), _MANY):
+        part = and_(h.heliostat.in_(names[k : k + _MANY]), h.ended.is_(None))
+        connection.execute(update(tables.hold).where(part).values(ended=at, ended_by=person))
+
+
+def _check_severity(severity: str) -> None:
+    if severity not in SEVERITIES:
+        raise UnknownNameError("severity", severity, SEVERITIES)

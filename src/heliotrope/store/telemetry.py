@@ -1,0 +1,362 @@
+"""Telemetry: what every heliostat did, day by day, in Parquet.
+
+A folder holds one folder for each day (UTC), and that holds segments: ``0001.parquet``,
+``0002.parquet``, … and, while it is written, ``0003.part``, a stream of Arrow batches. A part
+is readable up to its last whole batch whatever happened to its writer; when it is long enough,
+when its day is over, and at the next start, it becomes a Parquet file: written beside, synced,
+renamed. A row is written when it differs from the last one of its heliostat, and all rows are at
+every keyframe, so that any instant can be told from what lies within one keyframe before it.
+
+Rows hold: ``time``, ``heliostat``, ``state``, ``fault``, ``flags``, ``primary`` and ``secondary``
+(counts), ``age`` (s, of the values at that time).
+"""
+
+import os
+import queue
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.store.records import StoreError
+
+#: Code and name of the state of a heliostat whose values are too old.
+STALE = 255
+#: Pieces of work that may wait for the disk.
+_WAITING = 64
+SCHEMA = pa.schema([
+    ("time", pa.timestamp("ms", "UTC")),
+    ("heliostat", pa.dictionary(pa.int32(), pa.string())),
+    ("state", pa.dictionary(pa.int16(), pa.string())),
+    ("fault", pa.uint8()), ("flags", pa.uint16()),
+    ("primary", pa.int32()), ("secondary", pa.int32()), ("age", pa.float32()),
+])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TelemetrySettings:
+    """Of the archive.
+
+    Attributes
+    ----------
+    period
+        Between two looks at the field, s.
+    keyframe
+        Between two looks of which every row is written, s.
+    deadband
+        Steps by which a drive may have moved without a row.
+    days
+        Days that are kept beside the present one.
+    rows
+        Of one segment, after which the next begins.
+    """
+
+    period: float = 60.0
+    keyframe: float = 3600.0
+    deadband: int = 0
+    days: int = 90
+    rows: int = 1_000_000
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.period <= self.keyframe:
+            raise InputError(
+                f"telemetry: a period of {self.period} s and a keyframe each {self.keyframe} s; "
+                "give a period above 0 and not above the keyframe's"
+            )
+        if self.deadband < 0 or self.days < 0 or self.rows < 1:
+            raise InputError(
+                f"telemetry: deadband {self.deadband}, {self.days} days, {self.rows} rows; give "
+                "0 or more, 0 or more, 1 or more"
+            )
+
+
+@dataclass(frozen=True)
+class Look:
+    """The field at one instant: N rows.
+
+    Attributes
+    ----------
+    state
+        Codes; `STALE` where the values are too old, (N,).
+    fault, flags
+        Codes, (N,).
+    counts
+        Of both drives, (N, 2).
+    age
+        Of these values, s, (N,).
+    """
+
+    state: npt.NDArray[np.uint8]
+    fault: npt.NDArray[np.uint8]
+    flags: npt.NDArray[np.uint16]
+    counts: npt.NDArray[np.int32]
+    age: FloatArray
+
+
+class Telemetry:
+    """Writes the archive; the caller never waits for the disk.
+
+    Parameters
+    ----------
+    folder
+        Of the archive; made if need be.
+    names
+        Of the N heliostats.
+    states
+        Names of the states, by their codes.
+    settings
+        See `TelemetrySettings`.
+    inline
+        Write in the caller's thread: for virtual time, in which no thread can be awaited.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be made.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        names: Sequence[str],
+        states: Sequence[str],
+        settings: TelemetrySettings | None = None,
+        *,
+        inline: bool = False,
+    ) -> None:
+        self.folder = Path(folder)
+        self.settings = settings or TelemetrySettings()
+        self._names = pa.array(names, pa.string())
+        words = [*states, *([""] * (STALE - len(states))), "STALE"]
+        self._states = pa.array(words, pa.string())
+        self._last: Look | None = None
+        self._looked_at = self._keyed_at = -np.inf
+        #: Why it cannot be written now, "" if it can.
+        self.problem = ""
+        self._lost = False
+        self._segment: _Segment | None = None
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(f"telemetry {self.folder}: {error.strerror}") from None
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(_WAITING)
+        self._thread: threading.Thread | None = None
+        if not inline:
+            self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
+            self._thread.start()
+        self._later(lambda: finish_parts(self.folder))
+
+    def take(self, at: float, look: Look) -> int:
+        """Take a look at the field, if one is due; return how many rows it gave.
+
+        Parameters
+        ----------
+        at
+            POSIX s.
+        look
+            Of N rows; it must not be changed afterwards.
+        """
+        gone = at - self._looked_at
+        if 0.0 <= gone < self.settings.period:
+            return 0
+        last = self._last
+        key = last is None or self._lost or not 0.0 <= at - self._keyed_at < self.settings.keyframe
+        if last is None or key:
+            rows = np.arange(len(look.state))
+            self._keyed_at, self._lost = at, False
+        else:
+            rows = np.flatnonzero(changed(last, look, self.settings.deadband))
+        self._last = look if last is None or key else _merged(last, look, rows)
+        self._looked_at = at
+        if len(rows):
+            self._later(lambda: self._write(at, look, rows))
+        return len(rows)
+
+    def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
+        """Return the answer to one SELECT; see `telemetry_query.query`. Call it in a thread."""
+        from heliotrope.store import telemetry_query
+
+        return telemetry_query.query(self.folder, sql, parameters)
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Write what waits, and end; the part that is open is left to the next start."""
+        if self._thread is not None:
+            self._queue.put(None)
+            self._thread.join(timeout)
+        self._drop_segment()
+
+    def _later(self, work: Callable[[], None]) -> None:
+        if self._thread is None:
+            self._try(work)
+            return
+        try:
+            self._queue.put_nowait(work)
+        except queue.Full:
+            self._lost = True
+            self.problem = self.problem or f"telemetry {self.folder}: its disk is too slow"
+
+    def _run(self) -> None:
+        while (work := self._queue.get()) is not None:
+            self._try(work)
+
+    def _try(self, work: Callable[[], None]) -> None:
+        try:
+            work()
+            self.problem = ""
+        except (OSError, pa.ArrowException) as error:
+            why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+            self.problem = f"telemetry {self.folder}: cannot be written ({why}); see to its disk"
+            # Behind a batch that is torn nothing can be read, and rows are missing now.
+            self._lost = True
+            self._drop_segment()
+
+    def _drop_segment(self) -> None:
+        segment, self._segment = self._segment, None
+        if segment is not None:
+            segment.close()
+
+    def _write(self, at: float, look: Look, rows: npt.NDArray[np.intp]) -> None:
+        day = datetime.fromtimestamp(at, UTC).date()
+        segment = self._segment
+        if segment is not None and (segment.day != day or segment.rows >= self.settings.rows):
+            self._drop_segment()
+            finish_parts(self.folder)
+            if segment.day != day:
+                retain(self.folder, self.settings.days, day)
+            segment = None
+        if segment is None:
+            segment = self._segment = _Segment(self.folder, day)
+        segment.write(self._batch(at, look, rows))
+
+    def _batch(self, at: float, look: Look, rows: npt.NDArray[np.intp]) -> pa.RecordBatch:
+        columns = [
+            pa.array(np.full(len(rows), round(1e3 * at)), SCHEMA.field("time").type),
+            pa.DictionaryArray.from_arrays(pa.array(rows, pa.int32()), self._names),
+            pa.DictionaryArray.from_arrays(pa.array(look.state[rows], pa.int16()), self._states),
+            pa.array(look.fault[rows], pa.uint8()), pa.array(look.flags[rows], pa.uint16()),
+            pa.array(look.counts[rows, 0], pa.int32()), pa.array(look.counts[rows, 1], pa.int32()),
+            # More digits of an age tell nothing and take room.
+            pa.array(np.round(look.age[rows], 1), pa.float32()),
+        ]  # fmt: skip
+        return pa.RecordBatch.from_arrays(columns, schema=SCHEMA)
+
+
+class _Segment:
+    """A part that is being written."""
+
+    def __init__(self, folder: Path, day: date) -> None:
+        self.day, self.rows = day, 0
+        place = folder / day.isoformat()
+        place.mkdir(exist_ok=True)
+        number = 1 + max((int(p.stem) for p in place.iterdir() if p.stem.isdigit()), default=0)
+        self._file = (place / f"{number:04d}.part").open("xb")
+        options = pa.ipc.IpcWriteOptions(compression="zstd")
+        self._stream = pa.ipc.new_stream(self._file, SCHEMA, options=options)
+
+    def write(self, batch: pa.RecordBatch) -> None:
+        """Write a batch; it is on the disk when this returns."""
+        self._stream.write_batch(batch)
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self.rows += batch.num_rows
+
+    def close(self) -> None:
+        """Leave the part as it is."""
+        try:
+            self._file.close()
+        except OSError:
+            return  # what could not be written was told already
+
+
+def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
+    """Return which rows differ, (N,): in state, fault or flags, or counts beyond a deadband.
+
+    Of a row that is and was stale nothing is known, so nothing differs.
+    """
+    moved = np.abs(look.counts.astype(np.int64) - last.counts).max(axis=-1) > deadband
+    other = (look.fault != last.fault) | (look.flags != last.flags) | moved
+    known = (look.state != STALE) | (last.state != STALE)
+    return np.asarray(known & (other | (look.state != last.state)))
+
+
+def _merged(last: Look, look: Look, rows: npt.NDArray[np.intp]) -> Look:
+    """Return what was written last of each heliostat."""
+    arrays = []
+    for name in ("state", "fault", "flags", "counts", "age"):
+        array = getattr(last, name).copy()
+        array[rows] = getattr(look, name)[rows]
+        arrays.append(array)
+    return Look(*arrays)
+
+
+def read_part(path: Path) -> list[pa.RecordBatch]:
+    """Return the whole batches of a part, up to where it is torn."""
+    batches = []
+    with path.open("rb") as file:
+        try:
+            stream = pa.ipc.open_stream(file)
+            while True:
+                batches.append(stream.read_next_batch())
+        except (StopIteration, pa.ArrowException, OSError):
+            return batches
+
+
+def finish_parts(folder: Path) -> None:
+    """Turn all parts of an archive into Parquet; none of them may be written any more."""
+    for part in sorted(folder.glob("????-??-??/*.part")):
+        final = part.with_suffix(".parquet")
+        # A crash between the two steps below leaves both: the Parquet file is whole.
+        if not final.exists():
+            table = pa.Table.from_batches(read_part(part), SCHEMA)
+            if table.num_rows:
+                _write_parquet(table, final)
+        part.unlink()
+
+
+def _write_parquet(table: pa.Table, final: Path) -> None:
+    table = table.unify_dictionaries()
+    # Of one heliostat after the other: its counts then differ little from row to row.
+    heliostat = table["heliostat"].combine_chunks().indices.to_numpy()
+    order = np.lexsort((table["time"].to_numpy(), heliostat))
+    beside = final.with_suffix(".tmp")
+    differences = dict.fromkeys(("time", "primary", "secondary"), "DELTA_BINARY_PACKED")
+    try:
+        with beside.open("wb") as file:
+            pq.write_table(
+                table.take(order), file, compression="zstd",
+                use_dictionary=["heliostat", "state", "age"], column_encoding=differences,
+            )  # fmt: skip
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(final)
+    finally:
+        beside.unlink(missing_ok=True)
+    place = os.open(final.parent, os.O_RDONLY)
+    try:
+        os.fsync(place)
+    finally:
+        os.close(place)
+
+
+def retain(folder: Path, days: int, today: date) -> list[str]:
+    """Remove the days of an archive that lie more than some days back; return them."""
+    gone = []
+    for place in sorted(folder.glob("????-??-??")):
+        try:
+            day = date.fromisoformat(place.name)
+        except ValueError:
+            continue
+        if today - day > timedelta(days=days):
+            shutil.rmtree(place)
+            gone.append(place.name)
+    return gone

@@ -1,0 +1,109 @@
+"""Questions to the telemetry archive in SQL, by DuckDB; reading only.
+
+The table is called ``telemetry``; its columns stand in `telemetry`; times are UTC without a zone.
+The day that is being written
+is in it up to its last whole batch.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from heliotrope.errors import InputError
+from heliotrope.store.records import StoreError
+from heliotrope.store.telemetry import SCHEMA, read_part
+
+#: A part may become a Parquet file while it is being looked for.
+_TRIES = 5
+#: Extensions would be sought on the network.
+_CONFIG: dict[str, Any] = {
+    "memory_limit": "1GB",
+    "autoinstall_known_extensions": False,
+    "autoload_known_extensions": False,
+}
+
+
+def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
+    """Return the answer to one SELECT.
+
+    Parameters
+    ----------
+    folder
+        Of the archive.
+    sql
+        One statement that reads, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
+        state = ? GROUP BY ALL``. It sees no files, settings or variables.
+    parameters
+        For its question marks.
+
+    Raises
+    ------
+    InputError
+        If it cannot be understood, or does something else than read.
+    StoreError
+        If there is no archive, or it cannot be read.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise StoreError(f"telemetry {place}: there is no such folder; is it the right one?")
+    files, parts = _content(place)
+    with duckdb.connect(config=_CONFIG) as connection:
+        try:
+            _show(connection, files, parts)
+        except duckdb.Error as error:
+            raise StoreError(f"telemetry {place}: {_line(error)}") from None
+        try:
+            _check(connection.extract_statements(sql))
+            answer = connection.sql(sql, params=list(parameters) or None)
+            return answer.to_arrow_table()
+        except duckdb.IOException as error:
+            raise StoreError(f"telemetry {place}: {_line(error)}") from None
+        except duckdb.Error as error:
+            raise InputError(f"query: {_line(error)}") from None
+
+
+def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa.Table) -> None:
+    """Make the archive the one thing that a connection sees."""
+    connection.register("parts", parts)
+    sources = ["SELECT * FROM parts"]
+    if files:
+        listed = ", ".join("'" + f.replace("'", "''") + "'" for f in files)
+        sources.insert(0, f"SELECT * FROM read_parquet([{listed}])")  # noqa: S608 - our files
+        connection.execute(f"SET allowed_paths=[{listed}]")
+    rows = " UNION ALL BY NAME ".join(sources)
+    connection.execute(
+        "CREATE VIEW telemetry AS "  # noqa: S608 - our files
+        f"SELECT * REPLACE (CAST(time AS TIMESTAMP) AS time) FROM ({rows})"
+    )
+    for setting in (
+        "python_enable_replacements=false", "enable_external_access=false",
+        "lock_configuration=true",
+    ):  # fmt: skip
+        connection.execute(f"SET {setting}")
+
+
+def _check(statements: Sequence[Any]) -> None:
+    kinds = [statement.type for statement in statements]
+    if kinds not in ([duckdb.StatementType.SELECT], [duckdb.StatementType.EXPLAIN]):
+        raise InputError("query: give one SELECT; nothing else is done here")
+
+
+def _line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
+
+
+def _content(folder: Path) -> tuple[list[str], pa.Table]:
+    """Return the Parquet files, and what stands in parts that are not among them."""
+    for _ in range(_TRIES):
+        found = sorted(folder.glob("????-??-??/*.*"))
+        files = [p for p in found if p.suffix == ".parquet"]
+        parts = [p for p in found if p.suffix == ".part" and p.with_suffix(".parquet") not in files]
+        try:
+            batches = [batch for part in parts for batch in read_part(part)]
+        except FileNotFoundError:
+            continue
+        return [str(file) for file in files], pa.Table.from_batches(batches, SCHEMA)
+    raise StoreError(f"telemetry {folder}: its files change all the time; try again")

@@ -1,0 +1,306 @@
+"""One thread that writes: a bounded queue before it, one commit for all that waits.
+
+Whoever records something puts a piece of work into the queue and goes on. The thread takes what
+is there, runs it in one transaction, and only then tells those who wait for it. If the database
+fails (disk full, read-only, server gone) nothing is lost and the queue is kept: the thread tries
+again, and `Writer.problem` says why. A piece of work that the database refuses for what it is
+(not for the state of the disk) is given up, told in `Writer.refused`, and holds up nothing else.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from concurrent.futures import TimeoutError as NotYetError
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import (
+    DataError,
+    DBAPIError,
+    IntegrityError,
+    SQLAlchemyError,
+    StatementError,
+)
+
+from heliotrope.store.database import Database, cause
+from heliotrope.store.records import StoreError
+
+T = TypeVar("T")
+Work = Callable[[Connection], T]
+
+#: Pieces of work in one transaction at most: nobody waits long behind the others.
+MOST = 256
+#: Wait after a failure, s: the first, and at most.
+_PAUSE = (0.25, 5.0)
+#: How long work may wait for other work to share its commit, s.
+_LINGER = 0.05
+
+
+@dataclass
+class _Entry:
+    """Work that waits; ``kept``: until it is written, else only for one attempt."""
+
+    work: Work[Any]
+    future: "Future[Any] | None"
+    kept: bool
+
+
+class Writer:
+    """Writes to a database.
+
+    Parameters
+    ----------
+    database
+        Ready, and locked by this process.
+    limit
+        Pieces of work that may wait.
+    inline
+        Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
+    """
+
+    def __init__(self, database: Database, *, limit: int = 50_000, inline: bool = False) -> None:
+        self._database, self._limit, self.inline = database, limit, inline
+        self._queue: deque[_Entry] = deque()
+        self._news = threading.Condition()
+        self._attempt = threading.Lock()
+        self._connection: Connection | None = None
+        self._closing = self._hasty = False
+        #: Why nothing can be written now, "" if it can.
+        self.problem = ""
+        #: The last work that was given up, and how many there were.
+        self.refused, self.refused_count = "", 0
+        self._thread: threading.Thread | None = None
+        if not inline:
+            self._thread = threading.Thread(target=self._run, name="store writer", daemon=True)
+            self._thread.start()
+
+    @property
+    def backlog(self) -> int:
+        """How many pieces of work wait."""
+        return len(self._queue)
+
+    def put(self, work: Work[Any]) -> None:
+        """Let work be done, whenever that is possible.
+
+        Raises
+        ------
+        StoreError
+            If too much waits already, or the writer was closed.
+        """
+        if len(self._queue) >= self._limit:
+            raise StoreError(
+                f"store {self._database.name}: {len(self._queue)} records wait to be written, and "
+                f"no more are taken ({self.problem or 'the disk is too slow'}); see to its disk"
+            )
+        self._add(_Entry(work, None, kept=True))
+
+    def do(self, work: Work[T], timeout: float = 5.0) -> T:
+        """Let work be done, and return what it gives: it is safe then.
+
+        Raises
+        ------
+        StoreError
+            If it could not be written, now; it is given up. After a timeout (s) it may still come
+            through: work must bear to be given again.
+        """
+        future = self.attempt(work)
+        try:
+            return future.result(timeout)
+        except NotYetError:
+            future.cancel()
+            why = self.problem or f"it took more than {timeout:g} s"
+            raise StoreError(f"store {self._database.name}: not written: {why}") from None
+        except CancelledError:
+            raise StoreError(f"store {self._database.name}: it is closed") from None
+
+    def attempt(self, work: Work[T]) -> "Future[T]":
+        """Let work be done at the next attempt; what is returned is done when it is safe.
+
+        It fails with `StoreError` if that attempt fails: then the work is given up.
+
+        Raises
+        ------
+        StoreError
+            If the writer was closed.
+        """
+        future: Future[T] = Future()
+        self._add(_Entry(work, future, kept=False))
+        return future
+
+    def confirmed(self) -> "Future[None]":
+        """Return what is done when all work of before is safe, or fails when an attempt has."""
+        return self.attempt(_nothing)
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Write what waits, and end.
+
+        Raises
+        ------
+        StoreError
+            If something could not be written.
+        """
+        with self._news:
+            self._closing = True
+            self._news.notify_all()
+        if self._thread is not None:
+            self._thread.join(timeout)
+        elif self._queue:
+            self._step()
+        if self._thread is None or not self._thread.is_alive():
+            self._drop_connection()
+        if self._queue:
+            raise StoreError(
+                f"store {self._database.name}: {len(self._queue)} records are lost, since they "
+                f"could not be written ({self.problem or 'no time was left'})"
+            )
+
+    def _add(self, entry: _Entry) -> None:
+        with self._news:
+            if self._closing:
+                raise StoreError(f"store {self._database.name}: it is closed")
+            self._queue.append(entry)
+            # Whoever waits does not wait for a pause to end.
+            self._hasty |= entry.future is not None
+            self._news.notify_all()
+        if self.inline:
+            self._step()
+
+    def _run(self) -> None:
+        pause = _PAUSE[0]
+        while True:
+            with self._news:
+                self._news.wait_for(lambda: self._queue or self._closing)
+                if not self._queue:
+                    return
+                # Nobody waits for it: let some more come for the same commit.
+                self._news.wait_for(self._in_haste, _LINGER)
+            self._hasty = False
+            if self._step():
+                pause = _PAUSE[0]
+                continue
+            with self._news:
+                if self._closing:
+                    return
+                self._news.wait_for(lambda: self._hasty or self._closing, pause)
+            pause = min(2.0 * pause, _PAUSE[1])
+
+    def _in_haste(self) -> bool:
+        return self._hasty or self._closing or len(self._queue) >= MOST
+
+    def _step(self) -> bool:
+        """Write all that waits; False if the database failed."""
+        with self._attempt:
+            while self._queue:
+                batch = [self._queue[i] for i in range(min(MOST, len(self._queue)))]
+                if not self._write(batch):
+                    return False
+        return True
+
+    def _write(self, batch: list[_Entry]) -> bool:
+        wanted = [e for e in batch if e.future is None or e.future.set_running_or_notify_cancel()]
+        try:
+            results = self._transact(wanted)
+        except Exception as error:  # noqa: BLE001 - whatever work does, the thread goes on
+            if _is_of_database(error):
+                self._fail(wanted, error)
+                return False
+            if len(wanted) > 1:
+                return self._write_singly(batch, wanted)
+            self._remove(batch)
+            self._refuse(wanted[0], error)
+        else:
+            self._remove(batch)
+            self.problem = ""
+            self._deliver(wanted, results)
+        return True
+
+    def _write_singly(self, batch: list[_Entry], wanted: list[_Entry]) -> bool:
+        """Find the work that was refused; the others of its batch are written."""
+        left = {id(entry) for entry in wanted}
+        self._remove([entry for entry in batch if id(entry) not in left])
+        for count, entry in enumerate(wanted):
+            try:
+                results = self._transact([entry])
+            except Exception as error:  # noqa: BLE001 - whatever work does, the thread goes on
+                if _is_of_database(error):
+                    self._fail(wanted[count:], error)
+                    return False
+                self._remove([entry])
+                self._refuse(entry, error)
+            else:
+                self._remove([entry])
+                self.problem = ""
+                self._deliver([entry], results)
+        return True
+
+    def _transact(self, entries: list[_Entry]) -> list[Any]:
+        try:
+            if self._connection is None:
+                self._connection = self._database.connect()
+            with self._connection.begin():
+                return [entry.work(self._connection) for entry in entries]
+        except BaseException:
+            # Whatever it was: the next attempt begins with a connection that knows nothing of it.
+            self._drop_connection()
+            raise
+
+    def _drop_connection(self) -> None:
+        connection, self._connection = self._connection, None
+        if connection is not None:
+            try:
+                connection.close()
+            except SQLAlchemyError:
+                connection.invalidate()
+
+    def _remove(self, entries: list[_Entry]) -> None:
+        """Take work that is done out of the queue, at whose head it stands."""
+        with self._news:
+            for entry in entries:
+                if self._queue[0] is not entry:
+                    raise AssertionError("the writer's queue has lost its order")
+                self._queue.popleft()
+
+    def _deliver(self, entries: list[_Entry], results: list[Any]) -> None:
+        for entry, result in zip(entries, results, strict=True):
+            if entry.future is not None:
+                entry.future.set_result(result)
+
+    def _refuse(self, entry: _Entry, error: Exception) -> None:
+        text = f"store {self._database.name}: a record is refused: {cause(error)}"
+        if entry.future is not None:
+            own = not isinstance(error, SQLAlchemyError)
+            entry.future.set_exception(error if own else StoreError(text))
+        else:
+            self.refused, self.refused_count = text, self.refused_count + 1
+
+    def _fail(self, entries: list[_Entry], error: Exception) -> None:
+        """Tell those who wait, who then are out; what is to be kept stays in its order."""
+        why = str(error) if isinstance(error, StoreError) else cause(error)
+        self.problem = f"store {self._database.name}: cannot be written ({why}); see to its disk"
+        with self._news:
+            gone = {id(e) for e in entries if not e.kept}
+            kept = [e for e in self._queue if id(e) not in gone and not _cancelled(e)]
+            self._queue.clear()
+            self._queue.extend(kept)
+        for entry in entries:
+            if entry.future is not None:
+                entry.future.set_exception(StoreError(self.problem))
+
+
+def _is_of_database(error: Exception) -> bool:
+    """Whether the state of the database is at fault, and not the work."""
+    if isinstance(error, StatementError) and not isinstance(error, DBAPIError):
+        return False  # a value that cannot be written
+    if isinstance(error, IntegrityError | DataError):
+        return False
+    return isinstance(error, SQLAlchemyError | StoreError | OSError)
+
+
+def _nothing(_: Connection) -> None:
+    return None
+
+
+def _cancelled(entry: _Entry) -> bool:
+    return entry.future is not None and entry.future.cancelled()

@@ -1,0 +1,281 @@
+"""Backup, restore and migration, of SQLite and PostgreSQL, and from one to the other."""
+
+import json
+import sqlite3
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import select, text
+
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.errors import FormatError
+from heliotrope.store import backup as backups
+from heliotrope.store import tables
+from heliotrope.store.audit import begin, change_points
+from heliotrope.store.database import HEAD, Database
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import (
+    AuditEntry,
+    CampaignEntry,
+    Event,
+    ParameterVersion,
+    PlannedVisit,
+    StoreError,
+    VisitEntry,
+)
+from heliotrope.store.telemetry import Look, Telemetry
+from heliotrope.store.telemetry_query import query
+
+NOW = datetime(2026, 6, 21, 12, tzinfo=UTC)
+NAMES = ("A", "B", "C")
+
+
+def fill(keeper: Keeper, seen: Sightings) -> None:
+    """Put something into every table."""
+    numbers = keeper.record_sightings(NAMES, seen, target="west")
+    keeper.record_parameters(
+        ParameterVersion(
+            "A", 1.0, ("tilt_north",), np.array([1 / 3]), np.eye(1), np.ones(1),
+            sightings=numbers[:2], residual_before=np.ones((2, 2)), residual_after=np.zeros((2, 2)),
+        )
+    )  # fmt: skip
+    keeper.record_visit(VisitEntry("A", "west", 1.0, 2.0, good=True))
+    keeper.record_plan([PlannedVisit("B", "west", 3.0)])
+    keeper.record_campaign(CampaignEntry("spring", 1.0))
+    keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
+    keeper.record_alarm("wind", "", "alarm", "too much", 1.0, active=True)
+    keeper.hold(["B"], "broken", "anna", 5.0)
+    keeper.writer.do(lambda c: begin(c, AuditEntry("p-1", "anna", "operator", "AIM", "t", (1.0,))))
+    keeper.writer.do(lambda c: change_points(c, {"AIM": {"A": (1.0, 2.0, 3.0)}}, {}))
+    keeper.writer.do(lambda c: c.execute(tables.about.insert().values(name="plant", value="x")))
+    keeper.people.add("anna", "hash", "engineer", 1.0)
+    keeper.people.open_session("anna", 1.0, 1e12)
+    keeper.people.add_token("anna", "report", "viewer", 1.0)
+    keeper.writer.confirmed().result(10.0)
+
+
+def content(database: Database) -> dict[str, list[tuple]]:
+    with database.reading() as connection:
+        return {
+            table.name: [
+                tuple(row) for row in connection.execute(select(table).order_by(*table.primary_key))
+            ]
+            for table in tables.metadata.sorted_tables
+        }
+
+
+def write_telemetry(folder: Path) -> None:
+    made = Telemetry(folder, NAMES, ("STOWED",), inline=True)
+    zeros = np.zeros(3, np.uint8)
+    made.take(1.8e9, Look(zeros, zeros, zeros.astype(np.uint16), np.zeros((3, 2), np.int32), zeros))
+    made.close()
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def other(request: pytest.FixtureRequest, tmp_path: Path) -> str | Path:
+    """Where a backup is restored to."""
+    if request.param == "sqlite":
+        return tmp_path / "restored"
+    return f"{request.getfixturevalue('server')}&options=-csearch_path%3D{_schema(request)}"
+
+
+def _schema(request: pytest.FixtureRequest) -> str:
+    import psycopg
+
+    name = f"other{abs(hash(request.node.name))}"
+    with psycopg.connect(request.getfixturevalue("server"), autocommit=True) as connection:
+        connection.execute(f"CREATE SCHEMA {name}")
+    return name
+
+
+def test_everything_comes_back_wherever_it_goes(
+    keeper: Keeper, seen: Sightings, other: str | Path, tmp_path: Path
+) -> None:
+    fill(keeper, seen)
+    write_telemetry(tmp_path / "live")
+    made = backups.backup(keeper.database, tmp_path / "backup", NOW, tmp_path / "live")
+    assert made.made == "2026-06-21T12:00:00+00:00"
+    found = backups.restore(tmp_path / "backup", other, tmp_path / "archive")
+    assert (found.revision, found.size) == (HEAD, made.size)
+    restored = Database(other)
+    assert all(len(rows) > 0 for rows in content(keeper.database).values())
+    assert content(restored) == content(keeper.database)
+    restored.close()
+    assert query(tmp_path / "archive", "SELECT * FROM telemetry").num_rows == 3
+    again = Keeper(other)
+    assert again.people.account("anna") is not None
+    assert again.record_sightings(NAMES, seen).min() == len(seen) + 1
+    again.close()
+
+
+def test_one_state_while_the_plant_writes(keeper: Keeper, tmp_path: Path) -> None:
+    """Two records that belong together are both in a backup, or neither is."""
+    stop = threading.Event()
+
+    def pair(k: int) -> None:
+        def work(connection: object) -> None:
+            for name in ("left", "right"):
+                row = {"name": f"{name} {k}", "value": ""}
+                connection.execute(tables.about.insert().values(row))  # type: ignore[attr-defined]
+
+        keeper.writer.do(work)
+
+    def write() -> None:
+        k = 0
+        while not stop.is_set():
+            pair(k := k + 1)
+
+    writing = threading.Thread(target=write)
+    writing.start()
+    try:
+        for i in range(3):
+            backups.backup(keeper.database, tmp_path / f"b{i}", NOW)
+    finally:
+        stop.set()
+        writing.join()
+    counts = []
+    for i in range(3):
+        with closing(sqlite3.connect(tmp_path / f"b{i}" / "store.sqlite")) as raw:
+            names = [name for (name,) in raw.execute("SELECT name FROM about")]
+        lefts = {n.split()[1] for n in names if n.startswith("left")}
+        assert lefts == {n.split()[1] for n in names if n.startswith("right")}
+        counts.append(len(lefts))
+    assert counts == sorted(counts)
+    assert counts[-1] > 0
+
+
+class TestRefusals:
+    @pytest.fixture
+    def made(self, tmp_path: Path, opened: Callable[..., Keeper], seen: Sightings) -> Path:
+        keeper = opened(tmp_path / "data")
+        fill(keeper, seen)
+        backups.backup(keeper.database, tmp_path / "backup", NOW)
+        return tmp_path / "backup"
+
+    def test_nothing_is_overwritten(self, made: Path, tmp_path: Path) -> None:
+        with pytest.raises(StoreError, match=r"backup .*: it exists"):
+            backups.backup(Database(tmp_path / "data"), made, NOW)
+        backups.restore(made, tmp_path / "new")
+        with pytest.raises(StoreError, match="there is one already"):
+            backups.restore(made, tmp_path / "new")
+
+    def test_not_under_a_plant_that_runs(self, made: Path, tmp_path: Path) -> None:
+        with pytest.raises(StoreError, match="another process writes to it"):
+            backups.restore(made, tmp_path / "data")
+
+    def test_a_damaged_backup(self, made: Path, tmp_path: Path) -> None:
+        data = bytearray((made / "store.sqlite").read_bytes())
+        data[len(data) // 2] ^= 1
+        (made / "store.sqlite").write_bytes(data)
+        with pytest.raises(FormatError, match=r"store\.sqlite: its checksum is another"):
+            backups.restore(made, tmp_path / "new")
+        assert not (tmp_path / "new").exists()
+
+    @pytest.mark.parametrize(
+        ("change", "wanted"),
+        [
+            (lambda m: None, "this is no manifest"),
+            (lambda m: m["files"].clear(), r"store\.sqlite is not in it"),
+            (lambda m: m["files"].update({"../x": "0"}), "lies outside the backup"),
+            (lambda m: m["files"].update({"gone": "0"}), "the file is missing"),
+        ],
+        ids=["no manifest", "no store", "outside", "missing"],
+    )
+    def test_a_manifest_that_is_none(
+        self, made: Path, tmp_path: Path, change: Callable[[dict], object], wanted: str
+    ) -> None:
+        path = made / "manifest.json"
+        manifest = json.loads(path.read_text())
+        change(manifest)
+        path.write_text("[]" if wanted.startswith("this") else json.dumps(manifest))
+        with pytest.raises(FormatError, match=wanted):
+            backups.restore(made, tmp_path / "new")
+
+    def test_no_backup_and_no_store(self, tmp_path: Path) -> None:
+        with pytest.raises(FormatError, match="give the folder of a backup"):
+            backups.restore(tmp_path, tmp_path / "new")
+        with pytest.raises(StoreError, match="there is none"):
+            backups.backup(Database(tmp_path / "none"), tmp_path / "backup", NOW)
+        assert not (tmp_path / "none").exists()
+
+    def test_a_disk_that_fails_leaves_no_half_backup(
+        self, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def full(path: Path) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(backups, "_sync", full)
+        with pytest.raises(StoreError, match=r"it cannot be made \(No space left on device"):
+            backups.backup(Database(tmp_path / "data"), tmp_path / "second", NOW)
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["backup", "data"]
+
+
+def test_hashes_are_not_for_everybody(
+    tmp_path: Path, opened: Callable[..., Keeper], seen: Sightings
+) -> None:
+    keeper = opened(tmp_path / "data")
+    fill(keeper, seen)
+    backups.backup(keeper.database, tmp_path / "backup", NOW)
+    backups.restore(tmp_path / "backup", tmp_path / "new")
+    files = [p for p in tmp_path.rglob("store.sqlite*") if p.is_file()]
+    assert len(files) >= 5  # with the log of the open one, and locks
+    assert [p for p in files if p.stat().st_mode & 0o007] == []
+
+
+def test_the_summary_counts(keeper: Keeper, seen: Sightings) -> None:
+    fill(keeper, seen)
+    found = backups.summary(keeper.database)
+    assert found["revision"] == HEAD
+    assert found["rows"]["sighting"] == 10
+    assert found["audit_without_result"] == 1
+    assert found["first_sighting"] == seen.time.min()
+    assert found["last_sighting"] == seen.time.max()
+
+
+class TestMigrations:
+    def test_the_tables_are_those_of_the_program(self, keeper: Keeper) -> None:
+        from alembic.autogenerate import compare_metadata
+        from alembic.migration import MigrationContext
+
+        with keeper.database._writer.connect() as connection:
+            differences = compare_metadata(MigrationContext.configure(connection), tables.metadata)
+        assert differences == []
+
+    def test_the_newest_step_is_the_one_that_is_asked_for(self) -> None:
+        from alembic.config import Config
+        from alembic.script import ScriptDirectory
+
+        config = Config()
+        folder = Path(backups.__file__).with_name("migrations")
+        config.set_main_option("script_location", str(folder))
+        assert ScriptDirectory.from_config(config).get_current_head() == HEAD
+
+    def test_a_store_of_another_revision_is_told(self, keeper: Keeper) -> None:
+        for revision, advice in (("0000", "run `heliotrope store migrate`"), ("9999", "update")):
+            keeper.writer.do(
+                lambda c, r=revision: c.execute(
+                    text("UPDATE alembic_version SET version_num = :r"), {"r": r}
+                )
+            )
+            with pytest.raises(StoreError, match=f"of revision {revision}.*{advice}"):
+                keeper.database.require()
+
+    def test_nothing_to_do(self, keeper: Keeper, place: str | Path) -> None:
+        assert backups.migrate(place) == (HEAD, None)
+
+    def test_an_old_store_is_copied_first(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        Keeper(tmp_path).close()
+        steps = []
+        monkeypatch.setattr(backups, "HEAD", "0002")
+        monkeypatch.setattr(Database, "migrate", lambda self: steps.append(self.locked))
+        before, copy = backups.migrate(tmp_path)
+        assert (before, steps) == ("0001", [True])
+        assert copy == tmp_path / "store.before-0001.sqlite"
+        assert content(Database(copy)) == content(Database(tmp_path))

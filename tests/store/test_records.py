@@ -1,0 +1,324 @@
+"""What is recorded is found again, on SQLite and on PostgreSQL."""
+
+import asyncio
+import math
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.estimator import fit
+from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.sightings import Sightings, camera_target
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.example import prototype
+from heliotrope.geometry import normalize, reflect
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import (
+    CampaignEntry,
+    Event,
+    Hold,
+    ParameterVersion,
+    PlannedVisit,
+    StoreError,
+    VisitEntry,
+    version_of,
+)
+
+NAMES = ("A1", "Größe/2", "c'; DROP TABLE sighting")
+
+
+def confirm(keeper: Keeper) -> None:
+    asyncio.run(keeper.confirm())
+    assert not keeper.refused
+
+
+def assert_same(found: Sightings, wanted: Sightings) -> None:
+    for field in fields(Sightings):
+        a, b = getattr(found, field.name), getattr(wanted, field.name)
+        assert a.dtype == b.dtype, field.name
+        np.testing.assert_array_equal(a, b, err_msg=field.name)
+
+
+def version(
+    heliostat: str, numbers: np.ndarray, seed: int = 0, **given: object
+) -> ParameterVersion:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(2, 2))
+    count = len(numbers)
+    whole = ParameterVersion(
+        heliostat, 1.8e9 + seed, ("tilt_north", "tilt_east"), rng.normal(size=2), root @ root.T,
+        np.array([0.01, 0.02]), 0.015, 0.0003, 1.1, "converged", numbers,
+        rng.normal(size=(count, 2)), rng.normal(size=(count, 2)), "two", "anna", "first", "note",
+        ("POSITION", "AXES"),
+    )  # fmt: skip
+    return replace(whole, **given)
+
+
+class TestSightings:
+    def test_come_back_to_the_last_bit(self, keeper: Keeper, seen: Sightings) -> None:
+        numbers = keeper.record_sightings(NAMES, seen, target="west", campaign="first")
+        confirm(keeper)
+        found = keeper.sightings()
+        np.testing.assert_array_equal(found.identities, numbers)
+        assert found.names == NAMES  # the first sightings are theirs, in this order
+        assert_same(found.sightings, seen)
+        assert set(found.kinds) == {"camera_target"}
+        assert set(found.targets) == {"west"}
+        assert set(found.campaigns) == {"first"}
+
+    def test_can_be_chosen(self, keeper: Keeper, seen: Sightings) -> None:
+        keeper.record_sightings(NAMES, seen, kind="drone")
+        keeper.record_sightings(NAMES, seen.of(0), campaign="second")
+        confirm(keeper)
+        assert_same(keeper.sightings([NAMES[1]]).of(NAMES[1]), seen.of(1))
+        assert len(keeper.sightings([NAMES[1]]).of("nobody")) == 0
+        assert len(keeper.sightings(campaign="second")) == len(seen.of(0))
+        middle = float(seen.time[4])
+        early, late = keeper.sightings(until=middle), keeper.sightings(since=middle)
+        assert early.sightings.time.max() == late.sightings.time.min() == middle
+        many = [f"x{i}" for i in range(1000)] + [NAMES[2]]
+        assert keeper.sightings(many).names == (NAMES[2],)
+        assert len(keeper.sightings([])) == 0
+
+    def test_without_a_time(self, keeper: Keeper, seen: Sightings) -> None:
+        never = replace(seen, time=np.full(len(seen), np.nan))
+        keeper.record_sightings(NAMES, never)
+        confirm(keeper)
+        assert np.isnan(keeper.sightings().sightings.time).all()
+
+    def test_of_nobody_are_refused(self, keeper: Keeper, seen: Sightings) -> None:
+        with pytest.raises(InputError, match="heliostat row 2 of 2 names"):
+            keeper.record_sightings(NAMES[:2], seen)
+
+    def test_are_numbered_on_over_a_restart(
+        self, place: str | Path, opened: Callable[..., Keeper], seen: Sightings
+    ) -> None:
+        first = opened(place)
+        numbers = first.record_sightings(NAMES, seen)
+        first.close()
+        more = opened(place).record_sightings(NAMES, seen)
+        assert more.min() == numbers.max() + 1
+
+
+class TestParameters:
+    def test_come_back_with_where_they_are_from(self, keeper: Keeper, seen: Sightings) -> None:
+        numbers = keeper.record_sightings(NAMES, seen)
+        kept = version("A1", numbers[seen.heliostat == 0])
+        assert keeper.record_parameters(kept) == 1
+        assert keeper.record_parameters(version("A1", numbers[:0], 1, after=math.nan)) == 2
+        assert keeper.record_parameters(version("B", numbers[:2], 2)) == 1
+        confirm(keeper)
+        first, second = keeper.parameter_history("A1")
+        for field in fields(ParameterVersion):
+            wanted = 1 if field.name == "version" else getattr(kept, field.name)
+            np.testing.assert_array_equal(getattr(first, field.name), wanted, err_msg=field.name)
+        assert (second.version, len(second.sightings)) == (2, 0)
+        assert math.isnan(second.after)
+        assert keeper.parameter_history("nobody") == []
+
+    def test_the_latest_of_each(self, keeper: Keeper) -> None:
+        none = np.zeros(0, np.int64)
+        for seed, name in enumerate(("A", "B", "A", "A", "C")):
+            keeper.record_parameters(version(name, none, seed))
+        confirm(keeper)
+        assert {n: v.version for n, v in keeper.latest_parameters().items()} == {
+            "A": 3, "B": 1, "C": 1,
+        }  # fmt: skip
+        (latest,) = keeper.latest_parameters(["A"]).values()
+        np.testing.assert_array_equal(latest.values, version("A", none, 3).values)
+        many = [f"x{i}" for i in range(1000)] + ["B"]
+        assert list(keeper.latest_parameters(many)) == ["B"]
+
+    def test_are_numbered_on_over_a_restart(
+        self, place: str | Path, opened: Callable[..., Keeper]
+    ) -> None:
+        none = np.zeros(0, np.int64)
+        first = opened(place)
+        first.record_parameters(version("A", none))
+        first.close()
+        assert opened(place).record_parameters(version("A", none)) == 2
+
+    def test_must_fit_together(self) -> None:
+        good = version("A", np.arange(3))
+        with pytest.raises(InputError, match=r"covariance of shape \(3, 3\).*need \(2, 2\)"):
+            replace(good, covariance=np.eye(3))
+        with pytest.raises(InputError, match=r"residual_after of shape \(3, 2\).*2 sightings"):
+            replace(good, sightings=np.arange(2), residual_before=np.zeros((2, 2)))
+        with pytest.raises(InputError, match="values is not finite"):
+            replace(good, values=np.array([np.nan, 0.0]))
+
+    def test_sightings_that_are_not_kept_are_told(self, keeper: Keeper) -> None:
+        keeper.record_parameters(version("A", np.array([77])))
+        keeper.record_event(Event(1.0, "test", "goes on"))
+        asyncio.run(keeper.confirm())
+        assert "a record is refused" in keeper.refused
+        assert keeper.parameter_history("A") == []
+        assert [e.text for e in keeper.events()] == ["goes on"]
+
+    def test_of_a_fit(self) -> None:
+        nominal, seen = _small_case()
+        fitted = fit(nominal, seen, ("tilt_north", "tilt_east"))
+        numbers = np.arange(len(seen)) + 5
+        made = version_of("A", 9.0, fitted, nominal, seen, numbers, model="two", person="anna")
+        assert made.after < 1e-6 < made.before
+        assert made.before == pytest.approx(2.0 * 0.004, rel=0.5)
+        assert made.outcome == "converged"
+        np.testing.assert_allclose(
+            np.hypot(*made.residual_before.T), errors(nominal, seen).beam, rtol=1e-6
+        )
+        assert made.parameters["tilt_north"] == pytest.approx(0.004, abs=1e-6)
+        np.testing.assert_allclose(made.sigma**2, np.diagonal(made.covariance))
+        with pytest.raises(InputError, match=r"2 numbers of \d+ sightings"):
+            version_of("A", 9.0, fitted, nominal, seen, numbers[:2], model="two")
+
+
+def _small_case() -> tuple[Mechanism, Sightings]:
+    """A mechanism whose pedestal leans to north by 4 mrad, and what it does."""
+    nominal = prototype().groups["azel"].mechanism[np.array([0])]
+    leaning = nominal.with_parameters({"tilt_north": np.array([0.004])})
+    rng = np.random.default_rng(3)
+    counts = rng.uniform(2000.0, 20000.0, (12, 2))
+    pose = leaning[np.zeros(12, np.intp)].pose(counts)
+    sun = normalize(pose.normal + 0.3 * rng.normal(size=(12, 3)))
+    far = pose.vertex + 60.0 * reflect(sun, pose.normal)
+    return nominal, camera_target(0, counts, sun, far, time=1.8e9 + 600.0 * np.arange(12))
+
+
+class TestSchedule:
+    def test_visits(self, keeper: Keeper) -> None:
+        first = VisitEntry("A", "west", 10.0, 20.0, good=True, text="calibrated", gain=0.3,
+                           sigma_before=0.01, sightings=3, version=1, campaign="c")  # fmt: skip
+        second = VisitEntry("B", "east", 11.0, 21.0, good=False, text="no spot")
+        for visit in (first, second):
+            keeper.record_visit(visit)
+        confirm(keeper)
+        last, other = keeper.visits()
+        assert (last.heliostat, last.number, last.good) == ("B", 2, False)
+        assert math.isnan(last.gain)
+        assert (other.gain, other.sigma_before, other.text) == (0.3, 0.01, "calibrated")
+        assert [v.heliostat for v in keeper.visits(heliostat="A")] == ["A"]
+        assert len(keeper.visits(limit=1)) == 1
+
+    def test_a_plan_replaces_the_one_before(self, keeper: Keeper) -> None:
+        keeper.record_plan([PlannedVisit("A", "west", 50.0, 0.5, "old")])
+        keeper.record_plan([PlannedVisit("C", "east", 70.0), PlannedVisit("B", "west", 60.0, 0.1)])
+        confirm(keeper)
+        assert [p.heliostat for p in keeper.plan()] == ["B", "C"]
+        keeper.record_plan([])
+        confirm(keeper)
+        assert keeper.plan() == []
+
+    def test_campaigns(self, keeper: Keeper) -> None:
+        begun = CampaignEntry("spring", 5.0, model="malan8", expected={"rms": 0.3, "odd": math.nan})
+        keeper.record_campaign(begun)
+        keeper.record_campaign(replace(begun, finished=9.0, found={"rms": 0.31}))
+        keeper.record_campaign(CampaignEntry("summer", 10.0))
+        confirm(keeper)
+        summer, spring = keeper.campaigns()
+        assert (summer.name, summer.finished) == ("summer", None)
+        assert (spring.finished, spring.found, spring.expected["rms"]) == (9.0, {"rms": 0.31}, 0.3)
+        assert math.isnan(spring.expected["odd"])
+
+    def test_holds_hold_at_once_and_over_a_restart(
+        self, place: str | Path, opened: Callable[..., Keeper]
+    ) -> None:
+        keeper = opened(place)
+        keeper.hold(["A", "B", "A"], "drive replaced", "anna", 10.0, until=50.0)
+        keeper.hold(["B"], "mirror broken", "ben", 20.0)
+        keeper.hold(["C"], "for a moment", "ben", 20.0)
+        keeper.unhold(["C", "never held"], "anna", 30.0)
+        wanted = {
+            "A": Hold("A", "drive replaced", "anna", 10.0, 50.0),
+            "B": Hold("B", "mirror broken", "ben", 20.0),
+        }
+        assert keeper.holds(40.0) == wanted
+        keeper.close()
+        again = opened(place)
+        assert again.holds(40.0) == wanted
+        assert list(again.holds(50.0)) == ["B"]
+
+
+class TestEventsAndAlarms:
+    def test_events(self, keeper: Keeper) -> None:
+        for i, severity in enumerate(("info", "warning", "alarm", "info")):
+            keeper.record_event(
+                Event(float(i), "test", f"text {i}", severity, "A" if i else "", {"x": i / 3})
+            )
+        confirm(keeper)
+        assert [e.text[-1] for e in keeper.events()] == ["3", "2", "1", "0"]
+        assert [e.text[-1] for e in keeper.events(severity="warning")] == ["2", "1"]
+        assert [e.text[-1] for e in keeper.events(1, before=3)] == ["1"]
+        assert [e.text[-1] for e in keeper.events(heliostat="A", severity="alarm")] == ["2"]
+        assert keeper.events(1)[0].values == {"x": 1.0}
+        with pytest.raises(UnknownNameError, match="severity 'bad'"):
+            keeper.record_event(Event(0.0, "test", "", "bad"))
+
+    def test_an_alarm_from_its_beginning_to_its_end(self, keeper: Keeper) -> None:
+        def alarm(at: float, text: str = "12 m/s", *, active: bool = True) -> None:
+            keeper.record_alarm("wind", "mast", "warning", text, at, active=active)
+
+        alarm(1.0)
+        alarm(2.0, "14 m/s")
+        confirm(keeper)
+        (stands,) = keeper.alarms(standing=True)
+        assert (stands.text, stands.raised, stands.cleared) == ("14 m/s", 1.0, None)
+        alarm(3.0, active=False)
+        confirm(keeper)
+        (over,) = keeper.alarms(standing=True)
+        assert (over.raised, over.cleared, over.acknowledged) == (1.0, 3.0, None)
+        keeper.record_acknowledgement("wind", "mast", "anna", 4.0)
+        alarm(5.0)
+        confirm(keeper)
+        new, old = keeper.alarms()
+        assert (old.acknowledged, old.acknowledged_by) == (4.0, "anna")
+        assert (new.raised, new.acknowledged, new.cleared) == (5.0, None, None)
+        assert keeper.alarms(standing=True) == [new]
+
+    def test_what_is_old_and_settled_is_forgotten(self, keeper: Keeper) -> None:
+        for at in (1.0, 2.0, 9.0):
+            keeper.record_event(Event(at, "test", str(at)))
+            keeper.record_alarm(f"c{at}", "", "alarm", "", at, active=True)
+        keeper.record_alarm("c1.0", "", "alarm", "", 3.0, active=False)
+        keeper.record_acknowledgement("c1.0", "", "anna", 4.0)
+        keeper.forget_events(5.0)
+        confirm(keeper)
+        assert [e.at for e in keeper.events()] == [9.0]
+        assert [a.raised for a in keeper.alarms()] == [9.0, 2.0]
+
+
+class TestOpening:
+    def test_one_process_at_a_time(self, place: str | Path, opened: Callable[..., Keeper]) -> None:
+        first = opened(place)
+        with pytest.raises(StoreError, match="another process writes to it"):
+            opened(place)
+        first.close()
+        opened(place)
+
+    def test_a_url_of_something_else(self) -> None:
+        with pytest.raises(StoreError, match="a URL of mysql; give a folder"):
+            Keeper("mysql://plant@/x")
+        with pytest.raises(StoreError, match="the URL cannot be read"):
+            Keeper("post gres://:::/")
+
+    def test_a_place_where_no_folder_can_be(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(StoreError, match=r"file/data.*may be written to"):
+            Keeper(tmp_path / "file" / "data")
+
+    def test_a_file_that_is_no_database(self, tmp_path: Path) -> None:
+        (tmp_path / "store.sqlite").write_text("no database at all, but long enough\n" * 100)
+        with pytest.raises(StoreError, match="not a database"):
+            Keeper(tmp_path)
+
+    def test_no_server(self, tmp_path: Path) -> None:
+        with pytest.raises(StoreError, match=r"connection to server .* failed"):
+            Keeper(f"postgresql://plant:secret@/x?host={tmp_path}")
+
+    def test_a_password_is_not_shown(self, tmp_path: Path) -> None:
+        with pytest.raises(StoreError) as caught:
+            Keeper(f"postgresql://plant:secret@/x?host={tmp_path}")
+        assert "secret" not in str(caught.value)
