@@ -1,0 +1,103 @@
+"""``heliotrope field layout``: a generated field as a plant file."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from heliotrope.cli._common import print_json
+
+if TYPE_CHECKING:
+    from heliotrope.field.layouts import Mirror
+    from heliotrope.field.plant import Plant
+
+
+def layout(
+    kind: Annotated[str, typer.Argument(help="six-packs, radial or rows.")],
+    out: Annotated[Path, typer.Option("--out", help="Plant file to write (TOML).")],
+    heliostats: Annotated[int, typer.Option(help="How many.")] = 10_000,
+    width: Annotated[float, typer.Option(help="Of a mirror, m.")] = 2.5,
+    height: Annotated[float, typer.Option(help="Of a mirror, m.")] = 2.0,
+    pivot: Annotated[
+        float | None, typer.Option(help="Height of the pivots, m; default 0.7 above half a mirror.")
+    ] = None,
+    clearance: Annotated[
+        float, typer.Option(help="Between two mirrors however they turn, m.")
+    ] = 0.3,
+    tower: Annotated[
+        float | None,
+        typer.Option(help="Receiver above the pivots, m; default in proportion to the field."),
+    ] = None,
+    latitude: Annotated[float, typer.Option(help="Degrees, north positive.")] = -28.5,
+    longitude: Annotated[float, typer.Option(help="Degrees, east positive.")] = 21.2,
+    altitude: Annotated[float, typer.Option(help="Of the site, m.")] = 830.0,
+    name: Annotated[str, typer.Option(help="Of the plant; default the kind.")] = "",
+    table: Annotated[str, typer.Option(help="Of the heliostats: csv or parquet.")] = "csv",
+    picture: Annotated[
+        Path | None, typer.Option(help="Draw the field to this file (PNG, SVG or PDF).")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Write a plant of a pattern: heliostats in clusters, tower, two targets with cameras.
+
+    The field lies on the side of the tower that is away from the equator; rows lie on both.
+    """
+    from heliotrope.errors import InputError
+    from heliotrope.field.formats.plant_file import write_plant
+    from heliotrope.field.layouts import Mirror, lay_out
+    from heliotrope.sun import Site
+
+    kinds = ("png", "svg", "pdf")
+    if picture is not None and picture.suffix.removeprefix(".").lower() not in kinds:
+        raise InputError(f"picture {picture}: give a file that ends in .png, .svg or .pdf")
+    mirror = Mirror(width, height, 0.5 * height + 0.7 if pivot is None else pivot,
+                    clearance=clearance)  # fmt: skip
+    plant = lay_out(
+        kind, heliostats, mirror=mirror, tower_height=tower,
+        site=Site(latitude, longitude, altitude, name=name), name=name,
+    )  # fmt: skip
+    write_plant(plant, out, _table(table))
+    if picture is not None:
+        _draw(plant, picture)
+    _tell(plant, mirror, out, as_json)
+
+
+def _tell(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
+    from heliotrope.field.layouts import nearest_gap
+
+    area = mirror.width * mirror.height
+    facts = {
+        "file": str(out),
+        "heliostats": len(plant),
+        "clusters": len({c for g in plant.groups.values() for c in g.cluster}),
+        "mirror_area_m2": len(plant) * area,
+        "receiver_height_m": float(plant.receivers[0].center[2]),
+        "nearest_gap_m": nearest_gap(plant.position, mirror),
+        "farthest_m": float((plant.position[:, :2] ** 2).sum(axis=1).max() ** 0.5),
+    }
+    if as_json:
+        print_json(facts)
+        return
+    print(f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
+          f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
+          f"farthest {facts['farthest_m']:.0f} m away; mirrors keep {facts['nearest_gap_m']:.2f} m "
+          "apart however they turn")  # fmt: skip
+
+
+def _table(name: str) -> Literal["csv", "parquet"]:
+    from heliotrope.errors import InputError
+
+    if name == "csv":
+        return "csv"
+    if name == "parquet":
+        return "parquet"
+    raise InputError(f"table {name!r}: give csv or parquet")
+
+
+def _draw(plant: "Plant", place: Path) -> None:
+    from heliotrope.field._layout_picture import picture
+    from heliotrope.field.formats._textfile import write_file
+
+    figure = picture(plant)
+    ending = place.suffix.removeprefix(".").lower()
+    write_file(place, lambda stream: figure.savefig(stream, dpi=110, format=ending))

@@ -1,0 +1,462 @@
+"""Generated fields: where heliostats stand, and whole plants around them.
+
+Three patterns: rings whose mirrors stand before the gaps of the ring in front (radial staggered),
+rows in two fields north and south of the tower, and Malan's triangles of six on arcs. A mirror
+turns in any direction about its pivot, so two mirrors stand further apart than a diagonal and a
+clearance; each generator keeps to it, and `nearest_gap` proves it.
+
+What can be known from the sources of Malan's plant is its size: 5 MWe, 10,000 heliostats of 5 m²,
+a cluster controller for every 32 of them. Place, tower, receiver, targets and gears are ours.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field import _layout_tower as tower
+from heliotrope.field.camera import Camera
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.geometry import FloatArray, direction
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import rotary
+from heliotrope.sun import Site
+
+#: Heliostats of one cluster controller, at most.
+CLUSTER = 32
+#: Heliostats of a triangle.
+PACK = 6
+#: Most heliostats that are laid out.
+MOST = 1_000_000
+#: Clear of mirrors around masts and cameras, m.
+FREE = 6.0
+#: Steps of a turn of a joint; steps/s of its motor.
+_STEPS, _RATE = 400_000, 8000.0
+_SITE = Site(-28.5, 21.2, 830.0, name="Northern Cape")
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """One heliostat's size.
+
+    Attributes
+    ----------
+    width, height
+        Of the mirror, m.
+    pivot_height, pivot_offset
+        Of the crossing of the axes above ground, and of the mirror in front of it, m.
+    clearance
+        Between two mirrors however they turn, m.
+    """
+
+    width: float = 2.5
+    height: float = 2.0
+    pivot_height: float = 1.7
+    pivot_offset: float = 0.1
+    clearance: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height", "pivot_height"):
+            value = getattr(self, name)
+            if not 0.0 < value < 50.0:
+                raise InputError(f"mirror: {name} {value} m must be above 0 and below 50 m")
+        for name in ("pivot_offset", "clearance"):
+            value = getattr(self, name)
+            if not 0.0 <= value < 10.0:
+                raise InputError(f"mirror: {name} {value} m must be 0 or more and below 10 m")
+        if self.pivot_height < 0.5 * self.height:
+            raise InputError(
+                f"mirror: pivot {self.pivot_height} m above ground but {self.height} m high; "
+                "upright it would touch the ground: raise the pivot to half the height"
+            )
+
+    @property
+    def reach(self) -> float:
+        """Least distance of two pivots, m: a diagonal, both offsets, and the clearance."""
+        swing = np.hypot(np.hypot(self.width, self.height) / 2.0, self.pivot_offset)
+        return float(2.0 * swing + self.clearance)
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Where mirrors may stand.
+
+    Attributes
+    ----------
+    tower_height
+        Of the receiver's centre above the pivots, m.
+    nearest
+        From the tower to the nearest mirror, m.
+    bearing, half_angle
+        Azimuth from the tower to the middle of the field, and how far it goes to either side
+        of it, rad; π is all around.
+    free
+        Circles that are kept free, (east, north, radius) each, m.
+    """
+
+    tower_height: float = 80.0
+    nearest: float = 60.0
+    bearing: float = np.pi
+    half_angle: float = float(np.radians(70.0))
+    free: tuple[tuple[float, float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("tower_height", "nearest"):
+            value = getattr(self, name)
+            if not 0.0 < value < 1000.0:
+                raise InputError(f"layout: {name} {value} m must be above 0 and below 1000 m")
+        if not 0.05 <= self.half_angle <= np.pi + 1e-9:
+            raise InputError(
+                f"layout: half angle {np.degrees(self.half_angle):.0f}° must be 3° to 180°"
+            )
+
+    def elevation(self, radius: float) -> float:
+        """Elevation of the receiver from a distance, rad."""
+        return float(np.arctan2(self.tower_height, radius))
+
+    def bearings(self, radius: float, pitch: float, shift: float = 0.0) -> FloatArray:
+        """Azimuths of places ``pitch`` m apart on an arc, the middle of which is free to shift."""
+        # The chord is shorter than the arc.
+        step = 2.0 * np.arcsin(min(1.0, 0.5 * pitch / radius))
+        if self.half_angle >= np.pi - 1e-9:
+            count = int(2.0 * np.pi / step)
+            step = 2.0 * np.pi / max(1, count)
+            return np.asarray(self.bearing + (np.arange(count) + shift) * step)
+        half = int(self.half_angle / step)
+        around = np.arange(-half - 1, half + 2) + shift
+        return np.asarray(self.bearing + around[np.abs(around) * step <= self.half_angle] * step)
+
+    def clear(self, places: FloatArray) -> np.ndarray:
+        """Return which places (N, 2) are in no circle that is kept free."""
+        kept = np.ones(len(places), dtype=np.bool_)
+        for east, north, radius in self.free:
+            kept &= np.hypot(places[:, 0] - east, places[:, 1] - north) > radius
+        return kept
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where heliostats stand.
+
+    Attributes
+    ----------
+    names
+        Unique, (N).
+    position
+        Of their feet, ENU m, (N, 3).
+    """
+
+    names: tuple[str, ...]
+    position: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def radial_staggered(count: int, mirror: Mirror, ground: Ground) -> Places:
+    """Return mirrors on rings around the tower, each before a gap of the ring in front.
+
+    A zone begins as densely as mirrors can turn: ``reach`` apart along the ring and √3/2 of that
+    between rings (Collado & Guallar 2012, Renewable Energy 46). Azimuths are the same throughout
+    a zone, so that its mirrors spread with the radius; when there is room for two where one
+    stood, a new zone begins. Rings are at least h / (2 sin θ) apart, θ the receiver's elevation:
+    a mirror then looks over the one two rings in front.
+
+    Names: ring and number, "R012-034".
+    """
+    _check_count(count)
+    parts: list[FloatArray] = []
+    names: list[str] = []
+    radius, ring, pitch = ground.nearest, 0, mirror.reach
+    zone = radius
+    shift = 0.0
+    while len(names) < count:
+        if radius >= 2.0 * zone:
+            # One ring of the next zone is as far out as if it began alone.
+            zone, shift = radius, 0.0
+        around = ground.bearings(zone, pitch, shift)
+        flat = radius * np.stack([np.sin(around), np.cos(around)], axis=-1)
+        flat = _central(flat[ground.clear(flat)], count - len(names))
+        ring += 1
+        names += [f"R{ring:03d}-{k:03d}" for k in range(1, len(flat) + 1)]
+        parts.append(flat)
+        shift = 0.5 - shift
+        radius += _ring_step(radius, zone, mirror, ground)
+    return _places(names, parts)
+
+
+def _ring_step(radius: float, zone: float, mirror: Mirror, ground: Ground) -> float:
+    """From a ring to the next, m."""
+    dense = 0.5 * np.sqrt(3.0) * mirror.reach
+    # Where the next ring begins a zone its azimuths are others: no stagger can be counted on.
+    seen = 0.5 * mirror.height / np.sin(ground.elevation(radius))
+    step = float(max(dense, seen))
+    return float(max(step, mirror.reach)) if radius + step >= 2.0 * zone else step
+
+
+def rows(count: int, mirror: Mirror, ground: Ground) -> Places:
+    """Return mirrors in straight rows east to west, in two fields north and south of the tower.
+
+    Each field is twice as wide as it is deep. Rows are ``reach`` apart near the tower and
+    h / sin θ further out, θ the receiver's elevation, so that a mirror looks over the row in
+    front; every other row is shifted by half a place. The bearing and angle of the ground are
+    not used.
+
+    Names: field, row and number, "N012-034".
+    """
+    _check_count(count)
+    pitch = 1.1 * mirror.reach
+    halves = {"N": (count + 1) // 2, "S": count // 2}
+    parts: list[FloatArray] = []
+    names: list[str] = []
+    for field, wanted in halves.items():
+        sign = 1.0 if field == "N" else -1.0
+        across = _row_length(wanted, mirror, ground)
+        north, row, made = ground.nearest, 0, 0
+        while made < wanted:
+            shift = 0.5 if row % 2 else 0.0
+            half = max(0, int(across / 2.0))
+            east = (np.arange(-half, half + 1) + shift) * pitch
+            flat = np.stack([east, np.full(len(east), sign * north)], axis=-1)
+            flat = flat[ground.clear(flat)]
+            flat = _central(flat, wanted - made)
+            row += 1
+            names += [f"{field}{row:03d}-{k:03d}" for k in range(1, len(flat) + 1)]
+            parts.append(flat)
+            made += len(flat)
+            north += max(mirror.reach, mirror.height / np.sin(ground.elevation(north)))
+    return _places(names, parts)
+
+
+def _row_length(wanted: int, mirror: Mirror, ground: Ground) -> float:
+    """Places of a row, so that a field of ``wanted`` mirrors is about twice as wide as deep."""
+    pitch, north, rows_made = 1.1 * mirror.reach, ground.nearest, 0
+    while rows_made * 2.0 * (north - ground.nearest) / pitch < wanted:
+        north += max(mirror.reach, mirror.height / np.sin(ground.elevation(north)))
+        rows_made += 1
+    return 2.0 * (north - ground.nearest) / pitch
+
+
+def six_packs(count: int, mirror: Mirror, ground: Ground) -> Places:
+    """Return Malan's triangles of six mirrors on arcs around the tower.
+
+    A triangle has a mirror at each corner and at the middle of each side. On an arc triangles
+    with their point to the tower and away from it alternate, a way for a person between two.
+    Arcs are apart by a road, which is as broad as a mirror reaches, or h / sin θ where that is
+    more (θ the receiver's elevation), so that triangles look over those in front.
+
+    Names: triangle and place in it, "P0001A" to "P0001F".
+    """
+    _check_count(count)
+    step = mirror.reach
+    depth = 0.5 * np.sqrt(3.0) * step
+    parts: list[FloatArray] = []
+    made, radius = 0, ground.nearest
+    while made * PACK < count:
+        # The inner corners come closest on a curved arc.
+        around = ground.bearings(radius, 2.0 * step + 0.5)
+        middle = radius + depth
+        packs = _triangles(around, middle, step)
+        packs = packs[ground.clear(packs.reshape(-1, 2)).reshape(-1, PACK).all(axis=1)]
+        left = -(-count // PACK) - made
+        packs = _central(packs, left)
+        parts.append(packs.reshape(-1, 2))
+        made += len(packs)
+        road = max(step, mirror.height / np.sin(ground.elevation(radius)))
+        # The outer corners of a triangle are further out than its side.
+        radius = float(np.hypot(radius + 2.0 * depth, step)) + road
+    names = [f"P{pack:04d}{'ABCDEF'[k]}" for pack in range(1, made + 1) for k in range(PACK)]
+    return _places(names[:count], [np.concatenate(parts)[:count]])
+
+
+def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
+    """Triangles at azimuths (n,) on an arc, (n, 6, 2); those with odd number turned about."""
+    depth = 0.5 * np.sqrt(3.0) * step
+    # Right of the bearing and outwards, from the middle of the triangle's height.
+    own = np.array(
+        [[0.0, -depth], [-0.5 * step, 0.0], [0.5 * step, 0.0], [-step, depth], [0.0, depth],
+         [step, depth]]
+    )  # fmt: skip
+    turned = own * [1.0, -1.0]
+    shape = np.where((np.arange(len(around)) % 2 == 0)[:, None, None], own, turned)
+    outward = np.stack([np.sin(around), np.cos(around)], axis=-1)[:, None, :]
+    right = np.stack([np.cos(around), -np.sin(around)], axis=-1)[:, None, :]
+    return np.asarray(shape[..., :1] * right + (radius + shape[..., 1:]) * outward)
+
+
+def _central(along: FloatArray, room: int) -> FloatArray:
+    """What has room of a ring, row or arc: its middle."""
+    first = max(0, (len(along) - room) // 2)
+    return along[first : first + room]
+
+
+def _check_count(count: int) -> None:
+    if not 1 <= count <= MOST:
+        raise InputError(f"layout: {count} heliostats; give 1 to {MOST}")
+
+
+def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
+    flat = np.concatenate(list(parts))
+    return Places(tuple(names), np.concatenate([flat, np.zeros((len(flat), 1))], axis=1))
+
+
+def nearest_gap(position: FloatArray, mirror: Mirror) -> float:
+    """Return the least gap between two mirrors however they turn, m; below 0 they can touch.
+
+    Parameters
+    ----------
+    position
+        Of the pivots or feet, (N, 3); inf is returned for fewer than two.
+    mirror
+        Of all; its clearance counts as gap.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(position) < 2:
+        return float("inf")
+    apart, _ = cKDTree(position).query(position, k=2)
+    return float(np.asarray(apart)[:, 1].min() - (mirror.reach - mirror.clearance))
+
+
+PATTERNS: dict[str, Callable[[int, Mirror, Ground], Places]] = {
+    "radial": radial_staggered,
+    "rows": rows,
+    "six-packs": six_packs,
+}
+
+
+def clusters(count: int, each: int = CLUSTER) -> tuple[str, ...]:
+    """Return the cluster of each heliostat in the order of their places, from "C001" on."""
+    return tuple(f"C{1 + i // each:03d}" for i in range(count))
+
+
+def stepped(position: FloatArray, mirror: Mirror) -> Mechanism:
+    """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
+
+    400,000 steps to a turn of a joint (15.7 µrad each), 8000 steps/s: 7.2 °/s. Stops at ±200° of
+    azimuth, where 0 is north, and at -3.6° and 93.6° of elevation.
+    """
+    gear = {"microsteps": 4, "speed": _RATE}
+    ratio = _STEPS / 800
+    azimuth = rotary(200, ratio, min_angle=-np.radians(200.0), max_angle=np.radians(200.0), **gear)
+    elevation = rotary(200, ratio, min_angle=np.radians(-3.6), max_angle=np.radians(93.6), **gear)
+    return kinds.azimuth_elevation(
+        position, pivot_height=mirror.pivot_height, pivot_offset=mirror.pivot_offset,
+        drives=(azimuth, elevation),
+    )  # fmt: skip
+
+
+def malan_plant(heliostats: int = 10_000) -> Plant:
+    """Return a plant of the size of Malan's: 5 MWe, 10,000 heliostats of 5 m² in 313 clusters.
+
+    Triangles of six south of the tower; a cavity 80 m above the pivots; two calibration targets
+    of 12 m on masts 45 m east and west of it, off the way that beams take up the tower, each with
+    a camera. Place, tower, receiver, targets and gears are ours.
+
+    Parameters
+    ----------
+    heliostats
+        Fewer make a smaller plant of the same kind, around the same tower.
+    """
+    return lay_out("six-packs", heliostats, tower_height=80.0, name="5 MWe")
+
+
+def lay_out(
+    kind: str,
+    heliostats: int,
+    *,
+    mirror: Mirror | None = None,
+    tower_height: float | None = None,
+    site: Site = _SITE,
+    name: str = "",
+) -> Plant:
+    """Return a whole plant: heliostats, tower, two targets with cameras.
+
+    The field lies on the side of the tower that is away from the equator's sun: south in the
+    southern hemisphere; rows lie on both.
+
+    Parameters
+    ----------
+    kind
+        One of `PATTERNS`.
+    heliostats
+        1 to `MOST`.
+    mirror
+        By default of 5 m².
+    tower_height
+        Of the receiver above the pivots, m, 20 to 500; by default in proportion to the field:
+        80 m for 10,000 heliostats of 5 m², at least 30 m and at most 250 m.
+    site
+        By default in the Northern Cape.
+    name
+        Of the plant; default the kind.
+
+    Raises
+    ------
+    InputError
+        If a number cannot be built, or two mirrors could touch.
+    UnknownNameError
+        If there is no such kind.
+    """
+    if kind not in PATTERNS:
+        raise UnknownNameError("layout", kind, PATTERNS)
+    _check_count(heliostats)
+    size = mirror or Mirror()
+    tall = _tower_height(heliostats, size) if tower_height is None else tower_height
+    if not 20.0 <= tall <= 500.0:
+        raise InputError(f"layout: tower height {tall} m; give 20 to 500 m")
+    facing = np.pi if site.latitude_deg < 0.0 else 0.0
+    targets, cameras, receiver = _middle(tall, size.pivot_height, facing, kind == "rows")
+    masts = [t.center for t in targets] + [c.position for c in cameras if c.position is not None]
+    radius = FREE + 0.5 * size.reach
+    free = tuple((float(place[0]), float(place[1]), radius) for place in masts)
+    ground = Ground(tall, 0.75 * tall, bearing=facing, free=free)
+    places = PATTERNS[kind](heliostats, size, ground)
+    gap = nearest_gap(places.position, size)
+    if gap < -1e-9:
+        raise InputError(
+            f"layout {kind}: two mirrors would overlap by {-gap:.2f} m; raise the clearance"
+        )
+    count = len(places)
+    return Plant(
+        name or kind, site,
+        {"azel": Heliostats(places.names, stepped(places.position, size),
+                            np.full(count, size.width), np.full(count, size.height),
+                            cluster=clusters(count))},
+        targets, (receiver,), cameras=cameras,
+    )  # fmt: skip
+
+
+def _tower_height(heliostats: int, mirror: Mirror) -> float:
+    """In proportion to the field, m."""
+    area = heliostats * mirror.width * mirror.height
+    return float(np.clip(80.0 * np.sqrt(area / 50_000.0), 30.0, 250.0))
+
+
+def _middle(
+    height: float, pivot: float, facing: float, both: bool
+) -> tuple[tuple[Target, ...], tuple[Camera, ...], Receiver]:
+    """Targets, cameras and the receiver, in proportion to the height of the tower."""
+    share = height / 80.0
+    aside, up, away = 45.0 * share, 36.0 * share, 150.0 * share
+    right = direction(facing - 0.5 * np.pi, 0.0)
+    base = np.array([0.0, 0.0, pivot])
+    # Seen by who looks at the tower. For two fields each has its own target.
+    ways = {"left": (-1.0, facing), "right": (1.0, facing + np.pi if both else facing)}
+    targets, cameras = [], []
+    for name, (side, front) in ways.items():
+        center = side * aside * right + np.array([0.0, 0.0, up])
+        target = tower.square_target(name, center, 12.0 * share, front)
+        targets.append(target)
+        cameras.append(tower.watching_camera(target, f"camera-{name}", away, 6.0, 20.0 * share))
+    top = base + np.array([0.0, 0.0, height])
+    receiver = (
+        tower.cylinder("receiver", top, 7.0 * share, 8.0 * share)
+        if both
+        else tower.aperture("receiver", top, 7.0 * share, facing, np.radians(20.0))
+    )
+    return tuple(targets), tuple(cameras), receiver
