@@ -62,7 +62,7 @@ def gram(
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):  # fmt: skip
-    """As `gram` of the same rows, half of it mirrored; fills ``decay`` (n, n, G) below the diagonal.
+    """As `gram` of the same rows, half of it mirrored; fills ``decay`` (n, n, G) up to i = j.
 
     Processes of one group have one time, so that one exponential serves them all. What shares
     nothing, because a time is not known, decays to 0.

@@ -217,7 +217,8 @@ def _finite(value: float) -> float:
     return value if np.isfinite(value) else 0.0
 
 
-def _picture(figure: "Figure", alt: str, dpi: int = 80) -> str:
+def picture(figure: "Figure", alt: str, dpi: int = 80) -> str:
+    """Return a figure as an image inside a page; ``alt`` is for those who do not see it."""
     data = io.BytesIO()
     figure.savefig(data, dpi=dpi, format="png")
     code = base64.b64encode(data.getvalue()).decode("ascii")
@@ -253,7 +254,7 @@ def _section(result: Result, row: Row) -> str:
         listed = ", ".join(html.escape(result.ids[k]) if result.ids else str(k) for k in out)
         notes.append(f"Outliers, left out: {listed}.")
     notes += [b.text[0].upper() + b.text[1:] + "." for b in blind_spots(result, i)[:4]]
-    figure = _picture(pictures.heliostat_figure(result, i), f"Errors of {row.name}", 70)
+    figure = picture(pictures.heliostat_figure(result, i), f"Errors of {row.name}", 70)
     body = "".join(f"<li>{note}</li>" for note in notes)
     return (
         f'<section id="{name}"><h2>{name}</h2>{figure}<ul>{body}</ul>'
@@ -277,7 +278,8 @@ def _parameter_table(result: Result, i: int) -> str:
     return f"<details><summary>parameters</summary>{table}</details>"
 
 
-_STYLE = """
+#: Of the pages.
+STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1rem }
 table { border-collapse: collapse } td, th { padding: .15rem .8rem; text-align: right }
 td:first-child, th:first-child, td:last-child, th:last-child { text-align: left }
@@ -312,9 +314,9 @@ def _page(result: Result, sections: list[str]) -> str:
     return (
         '<!doctype html><html lang="en"><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
-        f"<title>Calibration</title><style>{_STYLE}</style><h1>Calibration</h1>"
-        f"{_summary(result)}{_picture(pictures.overview(result), 'Median beam error')}"
-        f"{_picture(pictures.field_map(result), 'Map of the field')}"
+        f"<title>Calibration</title><style>{STYLE}</style><h1>Calibration</h1>"
+        f"{_summary(result)}{picture(pictures.overview(result), 'Median beam error')}"
+        f"{picture(pictures.field_map(result), 'Map of the field')}"
         f"<table>{head}{''.join(body)}</table>{linked}</html>"
     )
 
