@@ -1,0 +1,1 @@
+"""Calibration from the air: a drone with a lamp beside its camera (HelioPoint)."""

@@ -1,0 +1,179 @@
+"""EXIF and XMP as the drones of DJI write them into their photographs: read, and made."""
+
+import math
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from heliotrope.errors import FormatError
+from heliotrope.geometry import FloatArray
+
+DJI = "http://www.dji.com/drone-dji/1.0/"
+_RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
+_XAP = "http://ns.adobe.com/xap/1.0/"
+_EXIF_IFD, _TAKEN, _OFFSET, _SUBSECOND = 0x8769, 0x9003, 0x9011, 0x9291
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a photograph says of itself; NaN where it says nothing.
+
+    Attributes
+    ----------
+    size
+        Width and height, pixels.
+    time
+        UTC, if the file states the zone.
+    latitude_deg, longitude_deg, altitude
+        Of the projection centre; the altitude in m.
+    yaw_deg, pitch_deg, roll_deg
+        Of the gimbal.
+    sigma
+        Standard deviations east, north, up that the RTK receiver states, m, (3,).
+    rtk_flag
+        50 for a fixed solution; None if the file has none.
+    """
+
+    size: tuple[int, int]
+    time: datetime | None = None
+    latitude_deg: float = math.nan
+    longitude_deg: float = math.nan
+    altitude: float = math.nan
+    yaw_deg: float = math.nan
+    pitch_deg: float = math.nan
+    roll_deg: float = math.nan
+    sigma: FloatArray = field(default_factory=lambda: np.full(3, math.nan))
+    rtk_flag: int | None = None
+
+    @property
+    def angles_deg(self) -> tuple[float, float, float]:
+        """Yaw, pitch and roll."""
+        return self.yaw_deg, self.pitch_deg, self.roll_deg
+
+
+def read_metadata(path: str | Path) -> Metadata:
+    """Return what a JPEG says of itself; its pixels are not decoded.
+
+    Raises
+    ------
+    FormatError
+        If it is no image, or its XMP is damaged.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    file = Path(path)
+    try:
+        with Image.open(file) as image:
+            size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
+            tags = dict(exif.get_ifd(_EXIF_IFD))
+    except FileNotFoundError:
+        raise FormatError(file, "there is no such file; give a photograph") from None
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        text = str(error).split(":")[-1].strip() or "damaged"
+        raise FormatError(file, f"this is no readable image ({text}); copy it again") from None
+    values = _xmp(file, packet) if packet else {}
+
+    def number(*names: str) -> float:
+        for name in names:
+            try:
+                return float(values[name])
+            except (KeyError, ValueError):
+                continue
+        return math.nan
+
+    flag = number("RtkFlag")
+    return Metadata(
+        size=(int(size[0]), int(size[1])),
+        time=_time(values, tags),
+        latitude_deg=number("GpsLatitude"),
+        # Firmware of some drones spells it with a missing letter.
+        longitude_deg=number("GpsLongitude", "GpsLongtitude"),
+        altitude=number("AbsoluteAltitude"),
+        yaw_deg=number("GimbalYawDegree"),
+        pitch_deg=number("GimbalPitchDegree"),
+        roll_deg=number("GimbalRollDegree"),
+        sigma=np.array([number("RtkStdLon"), number("RtkStdLat"), number("RtkStdHgt")]),
+        rtk_flag=None if math.isnan(flag) else int(flag),
+    )
+
+
+def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
+    """Return DJI's values and the creation date, by name; as attributes or as elements."""
+    from lxml import etree
+
+    data = packet.encode() if isinstance(packet, str) else packet
+    parser = etree.XMLParser(resolve_entities=False, no_network=True, huge_tree=False)
+    try:
+        root = etree.fromstring(data.strip(b"\0 \n\r\t"), parser)
+    except etree.XMLSyntaxError as error:
+        raise FormatError(file, f"its XMP is damaged ({error.msg}); copy it again") from None
+    values: dict[str, str] = {}
+    for description in root.iter(f"{{{_RDF}}}Description"):
+        items = [(str(k), str(v)) for k, v in description.attrib.items()]
+        items += [(str(child.tag), child.text or "") for child in description]
+        for key, value in items:
+            space, _, name = key.removeprefix("{").partition("}")
+            if space == DJI or (space == _XAP and name == "CreateDate"):
+                values[name] = value.strip()
+    return values
+
+
+def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
+    """Return the time of exposure in UTC, the most exact statement first."""
+    taken = str(tags.get(_TAKEN, "")).replace(":", "-", 2)
+    part = str(tags.get(_SUBSECOND, "")).strip()
+    taken += f".{part}" if taken and part.isdigit() else ""
+    for text, zone in (
+        (values.get("UTCAtExposure", ""), "+00:00"),
+        (taken, str(tags.get(_OFFSET, ""))),
+        (values.get("CreateDate", ""), ""),
+    ):
+        try:
+            time = datetime.fromisoformat(text.strip() + zone.strip())
+        except ValueError:
+            continue
+        if time.tzinfo is not None:
+            return time.astimezone(UTC)
+    return None
+
+
+def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
+    """Return the EXIF block and the XMP packet that say what ``found`` says."""
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x010F], exif[0x0110] = "Heliotrope", "rendered"
+    stamp = ""
+    if found.time is not None:
+        utc = found.time.astimezone(UTC)
+        stamp = utc.replace(tzinfo=None).isoformat(timespec="microseconds")
+        exif.get_ifd(_EXIF_IFD)[_TAKEN] = utc.strftime("%Y:%m:%d %H:%M:%S")
+        exif.get_ifd(_EXIF_IFD)[_OFFSET] = "+00:00"
+        exif.get_ifd(_EXIF_IFD)[_SUBSECOND] = f"{utc.microsecond:06d}"
+    values = {
+        "GpsLatitude": f"{found.latitude_deg:+.10f}",
+        "GpsLongitude": f"{found.longitude_deg:+.10f}",
+        "AbsoluteAltitude": f"{found.altitude:+.4f}",
+        "GimbalYawDegree": f"{found.yaw_deg:+.3f}",
+        "GimbalPitchDegree": f"{found.pitch_deg:+.3f}",
+        "GimbalRollDegree": f"{found.roll_deg:+.3f}",
+        "RtkFlag": str(RTK_FLAG if found.rtk_flag is None else found.rtk_flag),
+        "RtkStdLon": f"{found.sigma[0]:.5f}",
+        "RtkStdLat": f"{found.sigma[1]:.5f}",
+        "RtkStdHgt": f"{found.sigma[2]:.5f}",
+        **({"UTCAtExposure": stamp} if stamp else {}),
+    }
+    inside = "".join(f' drone-dji:{name}="{value}"' for name, value in values.items())
+    packet = (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>'
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        f'<rdf:RDF xmlns:rdf="{_RDF}"><rdf:Description rdf:about="" xmlns:drone-dji="{DJI}"'
+        f'{inside}/></rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+    )
+    return exif.tobytes(), packet.encode()
+
+
+#: Written where nothing else is known: a fixed solution.
+RTK_FLAG = 50

@@ -1,0 +1,237 @@
+"""Clusters: heliostats that one hover pattern serves at once.
+
+Clusters have equal areas of ground and are as round as that allows: they are the cells
+of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions of given
+areas its cells have the smallest sum of squared distances from their centres).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors
+
+#: Squares of ground in a mean heliostat's share when areas are counted.
+_SQUARES = 16
+#: Ground further from every heliostat than this, in typical spacings, is not field.
+_EDGE = 0.8
+#: Rounds in which cells become round, and at most.
+_SETTLED, _ROUNDS = 60, 200
+#: Areas are equal when none differs from their mean by more than this share.
+_EVEN = 0.02
+
+
+@dataclass(frozen=True)
+class Clusters:
+    """A partition of N heliostats into K clusters.
+
+    Attributes
+    ----------
+    of
+        Row of each heliostat's cluster, 0 … K − 1, (N,).
+    center
+        Mean of the positions, ENU metres, (K, 3).
+    area
+        Ground that the heliostats stand on, m², (K,).
+    radius
+        Largest horizontal distance of a heliostat from the centre, m, (K,).
+    roundness
+        Mean squared distance from the centre that a disc of that area has, over that of
+        the heliostats, (K,): 1 for a disc, 0.95 for a square, 0.6 for an oblong of 1:3.
+    """
+
+    of: npt.NDArray[np.intp]
+    center: FloatArray
+    area: FloatArray
+    radius: FloatArray
+    roundness: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def rows(self, cluster: int) -> npt.NDArray[np.intp]:
+        """Return the rows of the heliostats of one cluster."""
+        return np.flatnonzero(self.of == cluster)
+
+
+def ground_areas(position: npt.ArrayLike) -> FloatArray:
+    """Return the ground that is nearest to each heliostat, m², (N,).
+
+    Parameters
+    ----------
+    position
+        ENU metres, (N, 3).
+
+    Notes
+    -----
+    The Voronoi cell, without ground that is further than 0.8 typical spacings from every
+    heliostat; counted in squares, so exact to a few per cent of a cell.
+    """
+    flat = _flat(position)
+    if len(flat) == 1:
+        return np.ones(1)
+    tree = cKDTree(flat)
+    near = np.asarray(tree.query(flat, k=min(5, len(flat)))[0])[:, 1:]
+    spacing = float(np.median(near.mean(axis=1)))
+    if spacing <= 0.0:
+        raise InputError("clusters: most heliostats stand at one and the same place")
+    side = spacing / np.sqrt(_SQUARES)
+    low, high = flat.min(axis=0) - spacing, flat.max(axis=0) + spacing
+    counts = np.ceil((high - low) / side).astype(np.int64)
+    while counts.prod() > max(100_000, 4 * _SQUARES * len(flat)):
+        # Stray heliostats far away need no finer squares.
+        side *= 2.0
+        counts = np.ceil((high - low) / side).astype(np.int64)
+    east, north = (low[k] + side * (np.arange(counts[k]) + 0.5) for k in (0, 1))
+    squares = np.stack(np.meshgrid(east, north), axis=-1).reshape(-1, 2)
+    nearest = tree.query(squares, distance_upper_bound=_EDGE * spacing)
+    distance, owner = (np.asarray(part) for part in nearest)
+    found = np.bincount(owner[np.isfinite(distance)], minlength=len(flat))
+    # Two at one place share a cell; none may weigh nothing.
+    return np.asarray(np.maximum(found, 1) * side**2)
+
+
+def clusters(
+    position: npt.ArrayLike, *, size: float = 100.0, max_radius: float = np.inf
+) -> Clusters:
+    """Return roundish clusters of equal area.
+
+    Parameters
+    ----------
+    position
+        Of the heliostats, ENU metres, (N, 3).
+    size
+        Diameter of a disc of a cluster's area, m.
+    max_radius
+        No heliostat is further from the centre of its cluster, m; clusters become
+        smaller than ``size`` where it asks for it.
+
+    Raises
+    ------
+    InputError
+        If there is no heliostat, or a size or radius is not above 0.
+    """
+    place = as_vectors(position, "position").reshape(-1, 3)
+    if not len(place):
+        raise InputError("clusters: there is no heliostat")
+    for name, value in (("size", size), ("largest radius", max_radius)):
+        if not value > 0.0:
+            raise InputError(f"cluster {name} {value:g} m: give a length above 0")
+    area = ground_areas(place)
+    count = max(1, int(np.ceil(area.sum() / (0.25 * np.pi * size**2))))
+    while True:
+        found = _described(_partition(place[:, :2], area, min(count, len(place))), place, area)
+        if count >= len(place) or found.radius.max() <= max_radius:
+            return found
+        count = max(count + 1, int(count * min(1.5, (found.radius.max() / max_radius) ** 2)))
+
+
+def tour(center: npt.ArrayLike, start: npt.ArrayLike) -> npt.NDArray[np.intp]:
+    """Return a short order in which to visit places, from ``start`` (nearest first, then 2-opt).
+
+    Parameters
+    ----------
+    center
+        (K, M) coordinates.
+    start
+        Where the way begins, (M,); it need not end there.
+    """
+    points = np.asarray(center, dtype=np.float64)
+    gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    first = np.linalg.norm(points - np.asarray(start, dtype=np.float64), axis=-1)
+    order, left = [int(np.argmin(first))], set(range(len(points)))
+    left.discard(order[0])
+    while left:
+        rest = sorted(left)
+        order.append(rest[int(np.argmin(gap[order[-1], rest]))])
+        left.discard(order[-1])
+    way = np.array(order, dtype=np.intp)
+    improved = len(way) > 2
+    while improved:
+        improved = False
+        for i in range(len(way) - 1):
+            ahead = way[i + 1 :]
+            before = first[way[0]] if i == 0 else gap[way[i - 1], way[i]]
+            enter = first[ahead] if i == 0 else gap[way[i - 1], ahead]
+            after = np.append(gap[ahead[:-1], ahead[1:]], 0.0)
+            leave = np.append(gap[way[i], ahead[1:]], 0.0)
+            gain = before + after - enter - leave
+            j = int(np.argmax(gain))
+            if gain[j] > 1e-9:
+                way[i : i + j + 2] = way[i : i + j + 2][::-1].copy()
+                improved = True
+    return way
+
+
+def _flat(position: npt.ArrayLike) -> FloatArray:
+    return np.ascontiguousarray(as_vectors(position, "position").reshape(-1, 3)[:, :2])
+
+
+def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np.intp]:
+    """Cell of each heliostat in a power diagram of ``count`` cells of equal area."""
+    if count == 1:
+        return np.zeros(len(flat), dtype=np.intp)
+    order = _along_curve(flat)
+    share = np.cumsum(area[order]) - 0.5 * area[order]
+    of = np.empty(len(flat), dtype=np.intp)
+    of[order] = np.minimum((share / area.sum() * count).astype(np.intp), count - 1)
+    wanted, weight = area.sum() / count, np.zeros(count)
+    flat = flat - flat.mean(axis=0)
+    best, worst = of, np.inf
+    for k in range(_ROUNDS):
+        inside = np.bincount(of, weights=area, minlength=count)
+        unequal = float(np.abs(inside / wanted - 1.0).max())
+        # The curve's pieces are equal from the first, but long: time to become round.
+        if k >= _SETTLED and unequal < worst and inside.min() > 0.0:
+            best, worst = of, unequal
+            if worst < _EVEN:
+                break
+        held = np.maximum(inside, 1e-9)
+        center = np.stack(
+            [np.bincount(of, weights=area * flat[:, d], minlength=count) / held for d in (0, 1)],
+            axis=-1,
+        )
+        # A cell without heliostats begins again beside the fullest one.
+        center[inside <= 0.0] = center[int(np.argmax(inside))] + 1e-3
+        # A weight is a squared radius: where area lacks, so much of it is added.
+        weight += 0.5 * (wanted - inside) / np.pi
+        weight -= weight.mean()
+        # Squared distance less weight, without what all cells have in common.
+        power = (center**2).sum(axis=-1) - weight - 2.0 * flat @ center.T
+        of = np.argmin(power, axis=1).astype(np.intp)
+    return best
+
+
+def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
+    """Order along Hilbert's curve, which keeps neighbours together."""
+    low = flat.min(axis=0)
+    extent = max(float((flat.max(axis=0) - low).max()), 1e-9)
+    bits = 16
+    x, y = ((flat - low) / extent * (2**bits - 1)).astype(np.int64).T
+    place = np.zeros(len(flat), dtype=np.int64)
+    for step in (1 << b for b in range(bits - 1, -1, -1)):
+        right, upper = ((x & step) > 0).astype(np.int64), ((y & step) > 0).astype(np.int64)
+        place += step * step * ((3 * right) ^ upper)
+        turn = upper == 0
+        flip = turn & (right == 1)
+        x, y = np.where(flip, step - 1 - x, x), np.where(flip, step - 1 - y, y)
+        x, y = np.where(turn, y, x), np.where(turn, x, y)
+    return np.argsort(place, kind="stable")
+
+
+def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) -> Clusters:
+    # Numbered without gaps, whatever cells stayed empty.
+    of = np.unique(of, return_inverse=True)[1].astype(np.intp)
+    number = np.bincount(of)
+    center = np.stack([np.bincount(of, weights=place[:, d]) / number for d in range(3)], axis=-1)
+    away = np.linalg.norm(place[:, :2] - center[of, :2], axis=-1)
+    whole = as_float(np.bincount(of, weights=area))
+    radius = np.zeros(len(number))
+    np.maximum.at(radius, of, away)
+    spread = np.bincount(of, weights=area * away**2) / whole
+    # A lone heliostat's ground spreads about it, though its place does not.
+    spread += np.bincount(of, weights=area**2) / whole / (2.0 * np.pi)
+    return Clusters(of, center, whole, radius, whole / (2.0 * np.pi) / spread)

@@ -1,0 +1,446 @@
+"""What one photograph shows: mirrors as bright patches, their outlines, the lamp's spots.
+
+Readings are turned into light by the inverse of sRGB's curve before anything is measured:
+edges and spots would be displaced otherwise.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import FormatError
+from heliotrope.geometry import FloatArray, as_float
+
+Picture = npt.NDArray[np.uint8]
+Rows = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+#: Readings from here on are clipped.
+CLIPPED = 253
+#: Quantiles of brightness that are taken for a mirror's.
+_FILLED = (0.995, 0.9995, 0.97)
+#: Of an edge, where it is looked at, and how many points are measured on it.
+_ENDS, _PROFILES, _GROUPS = 0.1, 32, 8
+#: A spot stands out by this many standard deviations of the mirror's noise, and by this
+#: share of the full scale.
+_SPOT_SIGMAS, _SPOT_LEAST = 7.0, 0.02
+#: Half the side of the window in which a spot is measured, and the spread of its weight, px.
+_WINDOW, _WEIGHT = 5, 1.8
+
+
+@dataclass(frozen=True)
+class Patches:
+    """K bright patches that may be mirrors: centre (K, 2) and area (K,), px."""
+
+    center: FloatArray
+    area: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """Edges of M mirrors.
+
+    Attributes
+    ----------
+    corners
+        Pixels, in the order of the outline that was looked for, (M, 4, 2).
+    sigma
+        Standard deviation of a corner in each direction, px, (M,).
+    contrast
+        Of the weakest edge, full scales, (M,).
+    found
+        Whether all four edges were, (M,).
+    """
+
+    corners: FloatArray
+    sigma: FloatArray
+    contrast: FloatArray
+    found: Mask
+
+
+@dataclass(frozen=True)
+class Spots:
+    """S spots on mirrors.
+
+    Attributes
+    ----------
+    mirror
+        Index of the outline, (S,).
+    pixel
+        Centre, (S, 2).
+    sigma
+        Its standard deviation in each direction, px, (S,).
+    flux
+        Light above the mirror's, full scales times pixels, (S,).
+    clipped
+        Number of clipped pixels, (S,).
+    """
+
+    mirror: Rows
+    pixel: FloatArray
+    sigma: FloatArray
+    flux: FloatArray
+    clipped: Rows
+
+    def __len__(self) -> int:
+        return len(self.mirror)
+
+
+def decode(path: str | Path) -> Picture:
+    """Return a photograph, blue-green-red, (H, W, 3), as the sensor's rows and columns lie.
+
+    Raises
+    ------
+    FormatError
+        If there is none, or it broke off or is damaged.
+    """
+    import cv2
+
+    file = Path(path)
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise FormatError(file, f"cannot be read ({error.strerror}); give a photograph") from None
+    if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]:
+        raise FormatError(file, f"it breaks off after {len(data)} bytes; copy it again")
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    if picture is None:
+        raise FormatError(file, "this is no readable image; copy it again")
+    return np.asarray(picture, np.uint8)
+
+
+@lru_cache(maxsize=1)
+def _linear() -> npt.NDArray[np.float32]:
+    share = np.arange(256) / 255.0
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)
+
+
+# -- patches ---------------------------------------------------------------------------
+
+
+def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
+    """Return patches of about ``expected`` px of area that differ from what is around them.
+
+    Mirrors show the sky: they are brighter than the ground, or at least bluer. How much of the
+    frame they fill is not known. So there are several answers, the likeliest first: brighter
+    ones for mirrors that fill more than 0.5 %, 0.05 % and 3 % of it, then bluer ones. Darker
+    ones are shadows, which lie like the mirrors, and so are not looked for.
+    """
+    import cv2
+
+    scale = float(np.clip(12.0 / np.sqrt(expected), 0.05, 1.0))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    light = _linear()[small]
+    grey = light.mean(axis=2)
+    blue = light[..., 0] / np.maximum(light.sum(axis=2), 1e-4)
+    side = max(3, int(10.0 * np.sqrt(expected) * scale)) | 1
+    found = []
+    for feature in (grey, blue):
+        above = np.clip(feature - cv2.blur(feature, (side, side)), 0.0, None)
+        # The lamp is brighter than any mirror, and small.
+        for top in np.quantile(above, _FILLED):
+            levels = np.clip(above * (255.0 / max(float(top), 1e-6)), 0.0, 255.0)
+            _, mask = cv2.threshold(
+                levels.astype(np.uint8), 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU
+            )
+            closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+            patches = _whole_patches(np.asarray(closed, np.uint8), expected * scale**2)
+            # The centre of a small picture's pixel lies in the middle of those it stands for.
+            center = (patches.center + 0.5) / scale - 0.5
+            found.append(Patches(center, patches.area / scale**2))
+    return tuple(found)
+
+
+def _whole_patches(mask: npt.NDArray[np.uint8], expected: float) -> Patches:
+    import cv2
+
+    count, _, stats, centers = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    if count < 2:
+        return Patches(np.empty((0, 2)), np.empty(0))
+    area = stats[1:, cv2.CC_STAT_AREA].astype(np.float64)
+    left, top = stats[1:, cv2.CC_STAT_LEFT], stats[1:, cv2.CC_STAT_TOP]
+    width, height = stats[1:, cv2.CC_STAT_WIDTH], stats[1:, cv2.CC_STAT_HEIGHT]
+    inside = (left > 0) & (top > 0)
+    inside &= (left + width < mask.shape[1]) & (top + height < mask.shape[0])
+    full = area > 0.45 * width * height
+    good = inside & full & (area > 0.4 * expected) & (area < 2.2 * expected)
+    return Patches(as_float(centers[1:][good]), area[good])
+
+
+# -- outlines --------------------------------------------------------------------------
+
+
+def sample(picture: Picture, places: FloatArray) -> FloatArray:
+    """Return the light at places (..., 2), bilinear, (..., 3); the border goes on outside."""
+    height, width = picture.shape[:2]
+    x = np.clip(places[..., 0], 0.0, width - 1.001)
+    y = np.clip(places[..., 1], 0.0, height - 1.001)
+    j, i = x.astype(np.intp), y.astype(np.intp)
+    a, b = (x - j)[..., None], (y - i)[..., None]
+    curve = _linear()
+    upper = curve[picture[i, j]] * (1 - a) + curve[picture[i, j + 1]] * a
+    lower = curve[picture[i + 1, j]] * (1 - a) + curve[picture[i + 1, j + 1]] * a
+    return as_float(upper * (1 - b) + lower * b)
+
+
+def find_outlines(picture: Picture, expected: FloatArray, reach: float) -> Outlines:
+    """Return the outlines of mirrors near the expected ones.
+
+    Across each edge profiles are read, projected on the colour in which both sides differ most,
+    and averaged in eight groups; the edge of each lies at the centroid of its slope. A straight
+    line goes through them by weights that leave out what lies off it (a neighbour, a shadow).
+
+    Parameters
+    ----------
+    picture
+        Blue-green-red.
+    expected
+        Corners in turn, px, (M, 4, 2).
+    reach
+        Farthest distance of an edge from the expected one, px.
+    """
+    count = len(expected)
+    if count == 0:
+        none = np.empty(0)
+        return Outlines(np.empty((0, 4, 2)), none, none, none.astype(np.bool_))
+    start, end = expected, np.roll(expected, -1, axis=1)
+    along = end - start
+    length = np.linalg.norm(along, axis=-1, keepdims=True)
+    unit = along / np.maximum(length, 1e-9)
+    outward = np.stack([unit[..., 1], -unit[..., 0]], axis=-1)
+    # Corners may run either way round: outward is away from the middle.
+    middle = expected.mean(axis=1, keepdims=True)
+    side = np.sum((0.5 * (start + end) - middle) * outward, axis=-1, keepdims=True)
+    outward = outward * np.sign(side)
+    part = _ENDS + (1.0 - 2.0 * _ENDS) * (np.arange(_PROFILES) + 0.5) / _PROFILES
+    steps = np.arange(-reach - 3.0, reach + 3.01, 0.5)
+    places = (
+        start[:, :, None, None]
+        + part[None, None, :, None, None] * along[:, :, None, None]
+        + steps[None, None, None, :, None] * outward[:, :, None, None]
+    )
+    colour = sample(picture, places)
+    offset, contrast, known = _edges(colour, steps, reach)
+    middles = part.reshape(_GROUPS, -1).mean(axis=1)
+    points = start[:, :, None] + middles[:, None] * along[:, :, None]
+    points = points + offset[..., None] * outward[:, :, None]
+    lines, spread, enough = _lines(points, known, outward)
+    corners = _crossings(lines)
+    # The corner's error: that of both lines at their ends, about twice that in the middle.
+    sigma = np.sqrt(np.sum(spread**2, axis=1) / 4.0) * 2.0
+    found: Mask = np.asarray(enough.all(axis=1) & np.isfinite(corners).all(axis=(1, 2)))
+    return Outlines(np.where(found[:, None, None], corners, np.nan), sigma, contrast, found)
+
+
+def _edges(
+    colour: FloatArray, steps: FloatArray, reach: float
+) -> tuple[FloatArray, FloatArray, Mask]:
+    """Return offsets (M, 4, groups) of the edges, the least contrast (M,), what is known."""
+    inner, outer = steps < -reach, steps > reach
+    levels = colour[..., inner, :].mean(axis=(2, 3)), colour[..., outer, :].mean(axis=(2, 3))
+    apart = levels[0] - levels[1]
+    contrast = np.linalg.norm(apart, axis=-1)
+    direction = apart / np.maximum(contrast, 1e-9)[..., None]
+    profile = np.einsum("mepsc,mec->meps", colour, direction)
+    grouped = profile.reshape(*profile.shape[:2], _GROUPS, -1, len(steps)).mean(axis=3)
+    slope = -np.diff(grouped, axis=-1)
+    at = 0.5 * (steps[1:] + steps[:-1])
+    usable = np.abs(at) <= reach + 1.0
+    smooth = slope[..., :-2] + 2.0 * slope[..., 1:-1] + slope[..., 2:]
+    smooth = np.where(usable[1:-1], smooth, -np.inf)
+    peak = at[1:-1][np.argmax(smooth, axis=-1)]
+    near = np.abs(at - peak[..., None]) <= 2.6
+    highest = np.max(np.where(near, slope, 0.0), axis=-1, keepdims=True)
+    weight = np.where(near, np.clip(slope - 0.1 * highest, 0.0, None), 0.0)
+    total = weight.sum(axis=-1)
+    offset = np.sum(weight * at, axis=-1) / np.maximum(total, 1e-12)
+    # A real edge has most of the contrast.
+    jump = np.sum(np.where(near, slope, 0.0), axis=-1)
+    known = (jump > 0.5 * contrast[..., None]) & (total > 0.0)
+    return offset, contrast.min(axis=1) / np.sqrt(3.0), known
+
+
+def _lines(
+    points: FloatArray, known: Mask, outward: FloatArray
+) -> tuple[FloatArray, FloatArray, Mask]:
+    """Return lines a x + b y = c, (M, 4, 3), the deviation of each in its middle, enough points."""
+    weight = known.astype(np.float64)
+    enough = weight.sum(axis=-1) >= 4
+    weight = np.where(enough[..., None], weight, 1.0)
+    lines, residual = np.empty((*points.shape[:2], 3)), np.zeros(points.shape[:3])
+    base = weight
+    for _ in range(6):
+        total = weight.sum(axis=-1)
+        center = np.sum(weight[..., None] * points, axis=2) / total[..., None]
+        gap = points - center[:, :, None]
+        spread = np.einsum("mek,meki,mekj->meij", weight, gap, gap)
+        normal = np.linalg.eigh(spread)[1][..., 0]
+        normal = normal * np.sign(np.sum(normal * outward, axis=-1, keepdims=True))
+        lines = np.concatenate([normal, np.sum(normal * center, axis=-1, keepdims=True)], axis=-1)
+        residual = np.sum(gap * normal[:, :, None], axis=-1)
+        typical = 1.4826 * np.median(np.abs(residual), axis=-1, keepdims=True)
+        weight = base / (1.0 + (residual / (2.0 * np.maximum(typical, 0.03))) ** 2) ** 2
+        weight = np.maximum(weight, 1e-9)
+    deviation = np.sqrt(
+        np.sum(weight * residual**2, axis=-1) / weight.sum(axis=-1) / np.maximum(
+            base.sum(axis=-1) - 2.0, 1.0
+        )
+    )  # fmt: skip
+    return lines, np.hypot(deviation, 0.01), enough
+
+
+def _crossings(lines: FloatArray) -> FloatArray:
+    """Return where each edge's line crosses that of the edge before it, (M, 4, 2)."""
+    before = np.roll(lines, 1, axis=1)
+    det = before[..., 0] * lines[..., 1] - before[..., 1] * lines[..., 0]
+    det = np.where(np.abs(det) < 0.05, np.nan, det)
+    x = (before[..., 2] * lines[..., 1] - before[..., 1] * lines[..., 2]) / det
+    y = (before[..., 0] * lines[..., 2] - before[..., 2] * lines[..., 0]) / det
+    return np.stack([x, y], axis=-1)
+
+
+# -- spots -----------------------------------------------------------------------------
+
+
+def find_spots(
+    picture: Picture, corners: FloatArray, most: int = 12
+) -> tuple[Spots, tuple[str, ...]]:
+    """Return the lamp's spots on mirrors, and why a mirror gives none ("" where it may).
+
+    Parameters
+    ----------
+    picture
+        Blue-green-red.
+    corners
+        Of the mirrors, px, (M, 4, 2).
+    most
+        More spots than this on one mirror are no lamp's: it is left out as "cluttered".
+    """
+    found: list[tuple[int, FloatArray, float, float, int]] = []
+    reasons = []
+    for k, outline in enumerate(corners):
+        seen, reason = _spots_of(picture, outline)
+        if len(seen) > most:
+            seen, reason = [], f"cluttered: {len(seen)} bright spots"
+        reasons.append(reason)
+        found += [(k, *one) for one in seen]
+    return Spots(
+        np.array([f[0] for f in found], dtype=np.intp),
+        as_float([f[1] for f in found]).reshape(-1, 2),
+        as_float([f[2] for f in found]),
+        as_float([f[3] for f in found]),
+        np.array([f[4] for f in found], dtype=np.intp),
+    ), tuple(reasons)
+
+
+def _spots_of(
+    picture: Picture, outline: FloatArray
+) -> tuple[list[tuple[FloatArray, float, float, int]], str]:
+    """Return centre, sigma, flux and clipped pixels of the spots on one mirror."""
+    import cv2
+
+    height, width = picture.shape[:2]
+    low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
+    high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
+    if (high - low < 8).any():
+        return [], "too small: fewer than 8 pixels across"
+    raw = picture[low[1] : high[1], low[0] : high[0]]
+    inside = np.zeros(raw.shape[:2], np.uint8)
+    cv2.fillConvexPoly(inside, np.round((outline - low) * 16).astype(np.int32), 1, shift=4)
+    inside = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.uint8)
+    bright = raw.min(axis=2) >= CLIPPED
+    area = int(inside.sum())
+    if area < 30:
+        return [], "too small: fewer than 30 pixels"
+    if int((bright & (inside > 0)).sum()) > max(60, 0.3 * area):
+        return [], "overexposed: the mirror is clipped"
+    light = _linear()[raw].mean(axis=2)
+    share = inside.astype(np.float32)
+    fine = _mean(light, share, 0.9)
+    coarse = _mean(light, share, 3.5)
+    raised = np.where(inside > 0, fine - coarse, 0.0).astype(np.float32)
+    values = raised[inside > 0]
+    noise = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    limit = max(_SPOT_SIGMAS * noise, _SPOT_LEAST)
+    top = cv2.dilate(raised, np.ones((7, 7), np.uint8))
+    peaks = np.argwhere((raised >= top) & (raised > limit))
+    found = []
+    for i, j in peaks:
+        one = _centroid(light, bright, inside, int(i), int(j), noise, float(raised[i, j]))
+        if one is not None:
+            found.append((one[0] + low, *one[1:]))
+    return found, ""
+
+
+def _mean(light: FloatArray, share: npt.NDArray[np.float32], sigma: float) -> FloatArray:
+    """Return the Gaussian mean of what lies inside the mirror."""
+    import cv2
+
+    weight = cv2.GaussianBlur(share, (0, 0), sigma)
+    total = cv2.GaussianBlur((light * share).astype(np.float32), (0, 0), sigma)
+    return as_float(total / np.maximum(weight, 1e-6))
+
+
+def _centroid(
+    light: FloatArray,
+    bright: Mask,
+    inside: npt.NDArray[np.uint8],
+    i: int,
+    j: int,
+    noise: float,
+    raised: float,
+) -> tuple[FloatArray, float, float, int] | None:
+    """Return centre (x, y), sigma, flux and clipped pixels of the spot at row i, column j.
+
+    The centre is the mean of light above the mirror's under a Gaussian weight that moves with
+    it; of a clipped spot the plain mean of what is above half of the peak.
+    """
+    rows = np.arange(max(i - _WINDOW, 0), min(i + _WINDOW + 1, light.shape[0]))
+    columns = np.arange(max(j - _WINDOW, 0), min(j + _WINDOW + 1, light.shape[1]))
+    part = light[np.ix_(rows, columns)]
+    held = inside[np.ix_(rows, columns)] > 0
+    far = np.hypot(rows[:, None] - i, columns[None] - j)
+    ring = held & (far >= 3.5)
+    if int(ring.sum()) < 6:
+        return None
+    above = np.where(held, part - np.median(part[ring]), 0.0)
+    # Beside a crossing of gaps between facets the mean around is low, but nothing is brighter
+    # than the brighter part of the mirror around.
+    if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.8)) < 0.8 * raised:
+        return None
+    clipped = int(np.sum(bright[np.ix_(rows, columns)] & (far <= _WINDOW)))
+    peak = float(above.max())
+    center = np.array([float(j), float(i)])
+    if clipped > 3:
+        weight = np.where((above > 0.5 * peak) & (far <= _WINDOW), above, 0.0)
+        center = np.array([
+            np.sum(weight * columns[None]), np.sum(weight * rows[:, None])
+        ]) / weight.sum()  # fmt: skip
+    else:
+        for _ in range(12):
+            away = np.hypot(rows[:, None] - center[1], columns[None] - center[0])
+            weight = above * np.exp(-0.5 * (away / _WEIGHT) ** 2)
+            total = float(weight.sum())
+            if total <= 0.0:
+                return None
+            mean = np.array([np.sum(weight * columns[None]), np.sum(weight * rows[:, None])])
+            step = mean / total - center
+            center = center + step
+            if np.abs(center - [j, i]).max() > 2.5:
+                return None
+            if np.abs(step).max() < 1e-4:
+                break
+    flux = float(above[far <= 3.5].sum())
+    if flux <= 0.0:
+        return None
+    # Noise of a centroid: that of a pixel times its lever, over the light.
+    sigma = float(np.hypot(noise * 1.2 * np.sqrt(20.0) * 1.5 / flux, 0.03 + 0.02 * (clipped > 3)))
+    return center, sigma, flux, clipped

@@ -1,0 +1,544 @@
+"""Flights: in which order stations are flown, from which take-off, and how long it takes.
+
+A station is one cluster in one pose: a hover pattern. While a drone flies the stations of
+some clusters, the mirrors of the others move to their next pose; so clusters are flown
+in groups, each pose of the whole group before the next.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.airspace import Airspace
+from heliotrope.airborne.hover import Pattern
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, azimuth_elevation
+from heliotrope.sun import Site, position
+
+#: Largest group of clusters that is tried.
+_GROUPS = 8
+#: Drones in the air stay so far apart, m.
+APART = 15.0
+#: Take-offs wait for other drones so long at most, s.
+_LATEST = 7200.0
+#: Mirrors rest so long before the first photograph, s.
+REST = 5.0
+
+
+@dataclass(frozen=True)
+class Craft:
+    """What the drones can do.
+
+    Attributes
+    ----------
+    count
+        Drones that fly at the same time.
+    speed
+        Between stations, m/s, up to 15.
+    acceleration
+        m/s².
+    photo
+        To come to rest at a hover point and take a photograph, s.
+    endurance
+        From take-off to landing on one battery, its reserve not counted, s.
+    change
+        From landing to the next take-off, s.
+    """
+
+    count: int = 1
+    speed: float = 8.0
+    acceleration: float = 2.0
+    photo: float = 2.5
+    endurance: float = 1500.0
+    change: float = 300.0
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.count <= 50:
+            raise InputError(f"{self.count} drones: give 1 to 50")
+        if not 0.0 < self.speed <= 15.0:
+            raise InputError(f"speed {self.speed:g} m/s: give more than 0 and at most 15")
+        for name in ("acceleration", "photo", "endurance"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"{name} {value:g}: give a number above 0")
+        if not (np.isfinite(self.change) and self.change >= 0.0):
+            raise InputError(f"battery change {self.change:g} s must not be below 0")
+
+    def time(self, length: float) -> float:
+        """Return how long a leg takes from rest to rest, s."""
+        if length >= self.speed**2 / self.acceleration:
+            return length / self.speed + self.speed / self.acceleration
+        return 2.0 * float(np.sqrt(length / self.acceleration))
+
+    def way(self, points: FloatArray) -> float:
+        """Return how long a way through points (M, 3) takes, stopping at each, s."""
+        return sum(self.time(float(d)) for d in np.linalg.norm(np.diff(points, axis=0), axis=-1))
+
+
+@dataclass(frozen=True)
+class Station:
+    """One cluster in one pose.
+
+    Attributes
+    ----------
+    cluster, point
+        Rows of the cluster and of its calibration point.
+    pattern
+        The hover points.
+    travel
+        Time that the mirrors need from their pose before, s; 0 for the first.
+    """
+
+    cluster: int
+    point: int
+    pattern: Pattern
+    travel: float
+
+    @property
+    def yaw(self) -> float:
+        """Heading of the drone, rad clockwise from north in [0, 2π)."""
+        return float(azimuth_elevation(-self.pattern.direction)[0])
+
+    @property
+    def pitch(self) -> float:
+        """Of the gimbal, rad; −π/2 is straight down."""
+        return float(azimuth_elevation(-self.pattern.direction)[1])
+
+
+@dataclass(frozen=True)
+class Visit:
+    """Hover points of a station that are flown in one go.
+
+    Attributes
+    ----------
+    station
+        Row of the station.
+    first, last
+        Rows of its hover points, ``last`` not included.
+    approach
+        Points between the place before and the first hover point, ENU metres, (M, 3).
+    begin, end
+        Of photographing, s since the campaign began.
+    wait
+        In the air before, for mirrors that are still moving, s.
+    """
+
+    station: int
+    first: int
+    last: int
+    approach: FloatArray
+    begin: float
+    end: float
+    wait: float
+
+
+@dataclass(frozen=True)
+class Sortie:
+    """One flight on one battery.
+
+    Attributes
+    ----------
+    drone, number
+        0 …; the number counts the drone's sorties.
+    start, end
+        Take-off and landing, s since the campaign began.
+    home
+        Where it takes off and lands, ENU metres, (3,).
+    visits
+        In order.
+    back
+        Points between the last hover point and the landing, ENU metres, (M, 3).
+    """
+
+    drone: int
+    number: int
+    start: float
+    end: float
+    home: FloatArray
+    visits: tuple[Visit, ...]
+    back: FloatArray
+
+    @property
+    def photos(self) -> int:
+        """Photographs taken."""
+        return sum(v.last - v.first for v in self.visits)
+
+
+@dataclass(frozen=True)
+class _Ways:
+    """Ways between stations and homes, found once."""
+
+    airspace: Airspace
+    stations: Sequence[Station]
+    labels: Sequence[str]
+    known: dict[tuple[int, int, int], FloatArray]
+    #: Times home by drone and station.
+    backs: dict[tuple[int, int], float]
+
+    def between(
+        self, a: FloatArray, b: FloatArray, whence: int, whither: int, home: FloatArray, drone: int
+    ) -> FloatArray:
+        """Points between a place of one station and one of another; row -1 is the home."""
+        legs = self.airspace.free_legs
+        if legs(a[None], b[None])[0]:
+            return np.empty((0, 3))
+        key = (drone, whence, whither)
+        if key not in self.known:
+            ends = [home if r < 0 else self.stations[r].pattern.center for r in (whence, whither)]
+            self.known[key] = self._found(ends[0], ends[1], max(whence, whither))
+        # The way from middle to middle serves if it can be joined and left from here.
+        way = self.known[key]
+        if len(way) and legs(np.stack([a, way[-1]]), np.stack([way[0], b])).all():
+            return way
+        return self._found(a, b, max(whence, whither))
+
+    def _found(self, a: FloatArray, b: FloatArray, whose: int) -> FloatArray:
+        way = self.airspace.route(a, b)
+        if way is None:
+            station = self.stations[whose]
+            raise InputError(
+                f"{self.labels[station.cluster]}, calibration point {station.point + 1}: there is "
+                "no free way to it and back; widen the fence, raise the greatest height or move "
+                "the home point"
+            )
+        return way
+
+
+def fly(
+    stations: Sequence[Station], order: Sequence[int], airspace: Airspace, home: FloatArray,
+    craft: Craft, labels: Sequence[str],
+) -> list[Sortie]:  # fmt: skip
+    """Return the sorties of the drones.
+
+    Parameters
+    ----------
+    stations
+        Of all clusters; those of one cluster stand in the order of its points.
+    order
+        Clusters in the order of a short tour.
+    airspace, craft
+        What is allowed and possible.
+    home
+        Where drones take off, ENU metres, (count, 3).
+    labels
+        Names of the clusters, for errors.
+
+    Notes
+    -----
+    Each drone gets a connected part of the tour with an equal share of the photographs,
+    and the size of groups, of 1 to 8 clusters, with which it is home first.
+
+    Raises
+    ------
+    InputError
+        If a station cannot be reached, or not on one battery.
+    """
+    place: dict[int, list[int]] = {int(c): [] for c in order}
+    for row, station in enumerate(stations):
+        place[station.cluster].append(row)
+    load = np.array([sum(len(stations[r].pattern) for r in place[int(c)]) for c in order], float)
+    share = (np.cumsum(load) - 0.5 * load) / load.sum() * craft.count
+    ways = _Ways(airspace, stations, labels, {}, {})
+    flown: list[Sortie] = []
+    for drone in range(craft.count):
+        mine = [int(c) for c, s in zip(order, share, strict=True) if int(s) == drone]
+        if not mine:
+            continue
+        best, rest = list[Sortie](), list[int]()
+        for size in range(1, min(_GROUPS, len(mine)) + 1):
+            rows = grouped(mine, place, size)
+            tried = _one(drone, rows, stations, home[drone], craft, ways)
+            if best and tried[-1].end > 0.995 * best[-1].end:
+                # Mirrors move unnoticed already; larger groups only fly further.
+                break
+            best, rest = tried, rows
+        if flown:
+            others = [timeline(flown, stations, craft, d) for d in range(drone)]
+            best = _one(drone, rest, stations, home[drone], craft, ways, others)
+        flown += best
+    return flown
+
+
+def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> list[int]:
+    """Return rows of stations, all clusters of a group in one pose before the next pose."""
+    rows: list[int] = []
+    groups = max(1, len(clusters) // size)
+    for group in np.array_split(np.array(clusters), groups):
+        members = [int(c) for c in group]
+        for k in range(max(len(place[c]) for c in members)):
+            # There and back, so that the way to the next pose is short.
+            way = members if k % 2 == 0 else members[::-1]
+            rows.extend(place[c][k] for c in way if k < len(place[c]))
+    return rows
+
+
+def _one(
+    drone: int, rows: Sequence[int], stations: Sequence[Station], home: FloatArray, craft: Craft,
+    ways: _Ways, others: "Sequence[Timeline]" = (),
+) -> list[Sortie]:  # fmt: skip
+    """Sorties of one drone that flies ``rows`` in order and keeps away from others."""
+    work = _Work(drone, stations, home, craft, ways, others, {}, [], [])
+    for row in rows:
+        work.station(row)
+    work.land()
+    return work.sorties
+
+
+@dataclass
+class _Work:
+    """Where one drone is in its work."""
+
+    drone: int
+    stations: Sequence[Station]
+    home: FloatArray
+    craft: Craft
+    ways: _Ways
+    others: "Sequence[Timeline]"
+    #: When each cluster's last photograph was taken.
+    seen: dict[int, float]
+    sorties: list[Sortie]
+    visits: list[Visit]
+    now: float = 0.0
+    start: float = 0.0
+    place: FloatArray | None = None
+    row: int = -1
+
+    def station(self, row: int) -> None:
+        """Fly one station, with landings in between where the battery asks for them."""
+        station = self.stations[row]
+        camera = station.pattern.camera
+        step = self.craft.photo + self.craft.time(station.pattern.spacing)
+        ready = self.seen.get(station.cluster, -np.inf) + station.travel + REST
+        first = 0
+        while first < len(camera):
+            at_home = self.place is None
+            here = self.home if self.place is None else self.place
+            approach = self._way(here, camera[first], -1 if at_home else self.row, row)
+            travel = self.craft.way(np.vstack([here, approach, camera[first]]))
+            if at_home:
+                # Who waits does so on the ground.
+                self.start = self.now = max(self.now, ready - travel)
+            begin = max(self.now + travel, ready)
+            left = self.start + self.craft.endurance - begin - self.back(row)
+            count = min(len(camera) - first, int(left // step))
+            if count < 1:
+                if at_home:
+                    raise InputError(
+                        f"{self.ways.labels[station.cluster]}: {travel:.0f} s to fly there and "
+                        f"{self.back(row):.0f} s back leave no time for a photograph in "
+                        f"{self.craft.endurance:.0f} s; take off closer to it"
+                    )
+                self.land()
+                continue
+            end = begin + count * step
+            wait = begin - self.now - travel
+            self.visits.append(Visit(row, first, first + count, approach, begin, end, wait))
+            first += count
+            self.now, self.place, self.row = end, camera[first - 1], row
+        self.seen[station.cluster] = self.now
+
+    def _way(self, a: FloatArray, b: FloatArray, whence: int, whither: int) -> FloatArray:
+        return self.ways.between(a, b, whence, whither, self.home, self.drone)
+
+    def back(self, row: int) -> float:
+        """Longest way home from a station, s."""
+        known = self.ways.backs
+        if (self.drone, row) not in known:
+            known[self.drone, row] = self._back(row)
+        return known[self.drone, row]
+
+    def _back(self, row: int) -> float:
+        pattern = self.stations[row].pattern
+        way = self._way(pattern.center, self.home, row, -1)
+        half = 0.5 * pattern.spacing * float(np.hypot(pattern.columns, pattern.rows))
+        return self.craft.way(np.vstack([pattern.center, way, self.home])) + half / self.craft.speed
+
+    def land(self) -> None:
+        """Fly home and change the battery."""
+        if self.place is None:
+            return
+        way = self._way(self.place, self.home, self.row, -1)
+        end = self.now + self.craft.way(np.vstack([self.place, way, self.home]))
+        sortie = Sortie(
+            self.drone, len(self.sorties), self.start, end, self.home, tuple(self.visits), way
+        )
+        late = _delay(sortie, self.stations, self.craft, self.others) if self.others else 0.0
+        if late:
+            visits = [replace(v, begin=v.begin + late, end=v.end + late) for v in sortie.visits]
+            sortie = replace(
+                sortie, start=sortie.start + late, end=end + late, visits=tuple(visits)
+            )
+            for visit in visits:
+                self.seen[self.stations[visit.station].cluster] = visit.end
+        self.sorties.append(sortie)
+        self.visits, self.place = [], None
+        self.now = sortie.end + self.craft.change
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Where a drone is when.
+
+    Attributes
+    ----------
+    time
+        s since the campaign began, rising, (W,).
+    place
+        ENU metres, (W, 3).
+    """
+
+    time: FloatArray
+    place: FloatArray
+
+    def at(self, clock: FloatArray) -> FloatArray:
+        """Return its places at times (M,), ENU metres, (M, 3)."""
+        return np.stack([np.interp(clock, self.time, self.place[:, k]) for k in range(3)], -1)
+
+
+def _delay(
+    sortie: Sortie, stations: Sequence[Station], craft: Craft, others: Sequence[Timeline]
+) -> float:
+    """How much later a sortie must begin to stay away from other drones, s."""
+    line = timeline([sortie], stations, craft, sortie.drone)
+    clock = np.arange(sortie.start, sortie.end, 1.0)
+    mine = line.at(clock)
+    for late in np.arange(0.0, _LATEST, 10.0):
+        if all(
+            np.linalg.norm(mine - other.at(clock + late), axis=-1).min() >= APART
+            for other in others
+        ):
+            return float(late)
+    raise InputError(
+        f"drones: number {sortie.drone + 1} comes within {APART:g} m of another whenever it takes "
+        "off; fly with fewer drones"
+    )
+
+
+def timeline(
+    sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft, drone: int
+) -> Timeline:
+    """Return the way of one drone through all its sorties."""
+    time, place = [0.0], []
+    mine = [s for s in sorties if s.drone == drone]
+    place.append(mine[0].home)
+
+    def add(moment: float, point: FloatArray) -> None:
+        time.append(max(moment, time[-1]))
+        place.append(point)
+
+    for sortie in mine:
+        add(sortie.start, sortie.home)
+        for visit in sortie.visits:
+            station = stations[visit.station]
+            camera = station.pattern.camera[visit.first : visit.last]
+            moment, here = time[-1], place[-1]
+            for point in (*visit.approach, camera[0]):
+                moment, here = moment + craft.time(float(np.linalg.norm(point - here))), point
+                add(moment, point)
+            step = (visit.end - visit.begin) / len(camera)
+            for k, point in enumerate(camera):
+                add(visit.begin + k * step, point)
+            add(visit.end, camera[-1])
+        for point in sortie.back:
+            add(time[-1] + craft.time(float(np.linalg.norm(point - place[-1]))), point)
+        add(sortie.end, sortie.home)
+    return Timeline(np.array(time), np.array(place))
+
+
+def separation(sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft) -> float:
+    """Return how close two drones come, m, looked at every second; infinite for one drone."""
+    drones = sorted({s.drone for s in sorties})
+    if len(drones) < 2:
+        return float(np.inf)
+    clock = np.arange(0.0, max(s.end for s in sorties), 1.0)
+    lines = [timeline(sorties, stations, craft, d) for d in drones]
+    at = [line.at(clock) for line in lines]
+    near = np.inf
+    for i in range(len(at)):
+        for j in range(i):
+            near = min(near, float(np.linalg.norm(at[i] - at[j], axis=-1).min()))
+    return near
+
+
+@dataclass(frozen=True)
+class CameraTarget:
+    """How long photographs of beams on a target take.
+
+    Attributes
+    ----------
+    hours
+        Of sun, h.
+    days, months
+        Calendar time.
+    sunny
+        Hours a day in which it can be done, h.
+    """
+
+    hours: float
+    days: float
+    months: float
+    sunny: float
+
+
+def camera_target(
+    site: Site, photographs: int, *, minutes: float = 2.0, targets: int = 1, clear: float = 0.7,
+    year: int = 2026, min_elevation: float = float(np.radians(10.0)),
+) -> CameraTarget:  # fmt: skip
+    """Return how long the same number of poses takes with camera and target.
+
+    Parameters
+    ----------
+    site
+        Place and air.
+    photographs
+        Heliostats times calibration points.
+    minutes
+        From one photograph to the next on a target, min.
+    targets
+        With a camera each.
+    clear
+        Share of the hours of sun that are clear enough.
+    year, min_elevation
+        In which, and the lowest sun that serves, rad.
+
+    Raises
+    ------
+    InputError
+        If a number is not above 0, or the sun is never so high.
+    """
+    for name, value in (("minutes", minutes), ("targets", targets), ("clear share", clear)):
+        if not (np.isfinite(value) and value > 0.0):
+            raise InputError(f"{name} {value:g}: give a number above 0")
+    begin = np.datetime64(f"{year}-01-01").astype("datetime64[s]").astype(np.float64)
+    # Every 29 minutes of a year: all hours of all days come alike.
+    moments = begin + np.arange(0.0, 365.0 * 86400.0, 29.0 * 60.0)
+    up = position(moments, site).elevation >= min_elevation
+    sunny = 24.0 * float(up.mean()) * min(clear, 1.0)
+    if sunny <= 0.0:
+        raise InputError(
+            f"site {site.name!r}: the sun is never {np.degrees(min_elevation):g}° high"
+        )
+    hours = photographs * minutes / 60.0 / targets
+    return CameraTarget(hours, hours / sunny, hours / sunny / 30.44, sunny)
+
+
+def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
+    """Return how long mirrors move from pose to pose, s, (K,), the first 0.
+
+    Parameters
+    ----------
+    counts
+        Of K poses of n mirrors, (K, n, D).
+    speed
+        Of the drives, counts/s, (n, D).
+    """
+    seconds = (np.abs(np.diff(counts, axis=0)) / np.asarray(speed, dtype=np.float64)).max(axis=-1)
+    return np.concatenate([[0.0], seconds.max(axis=-1)])
+
+
+def homes(home: FloatArray, count: int, apart: float = 20.0) -> FloatArray:
+    """Return one place to take off for each drone, in a row from west to east, (count, 3)."""
+    shift = apart * (np.arange(count) - 0.5 * (count - 1))
+    return np.asarray(home + shift[:, None] * np.array([1.0, 0.0, 0.0]))

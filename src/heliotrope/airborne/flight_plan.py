@@ -1,0 +1,308 @@
+"""The plan of a campaign: clusters, poses, hover patterns, flights and what they take."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne import flight
+from heliotrope.airborne.airspace import Airspace
+from heliotrope.airborne.clusters import Clusters, clusters, tour
+from heliotrope.airborne.flight import CameraTarget, Craft, Sortie, Station
+from heliotrope.airborne.hover import Mirrors, Sampling, mirrors, pattern
+from heliotrope.airborne.look_points import Choosing, LookPoints, look_points
+from heliotrope.calibration.information import suns_of_year
+from heliotrope.errors import InputError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import SLOTS
+from heliotrope.mechanism.parameters import MODELS
+from heliotrope.mechanism.parameters import model as model_names
+
+#: A home point lies so far south of the field, m.
+_OUTSIDE = 20.0
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a campaign is to be.
+
+    Attributes
+    ----------
+    size
+        Diameter of a cluster, m.
+    spread
+        Largest angle between an optical axis and the cluster's mean one, rad: it limits
+        the radius of clusters to distance · tan(spread).
+    view
+        Angle that the camera sees across its shorter side, rad: a cluster fits into a
+        photograph.
+    model
+        Whose unknowns are to be found; "auto" takes jacks or malan8.
+    sampling, choosing, craft, airspace
+        Patterns, calibration points, drones, and where they may fly.
+    home
+        Where they take off, ENU metres, (3,); None takes a point south of the field.
+    hours_a_day
+        In which is flown, h.
+    photo_minutes, clear
+        Of camera and target for comparison: from photograph to photograph, min, and the
+        share of the hours of sun that are clear.
+    """
+
+    size: float = 100.0
+    spread: float = float(np.radians(25.0))
+    view: float = float(np.radians(56.0))
+    model: str = "auto"
+    sampling: Sampling = field(default_factory=Sampling)
+    choosing: Choosing = field(default_factory=Choosing)
+    craft: Craft = field(default_factory=Craft)
+    airspace: Airspace = field(default_factory=Airspace)
+    home: FloatArray | None = None
+    hours_a_day: float = 8.0
+    photo_minutes: float = 2.0
+    clear: float = 0.7
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.spread <= np.radians(45.0):
+            raise InputError(f"spread {np.degrees(self.spread):g}°: give more than 0°, up to 45°")
+        if not 0.0 < self.view < np.pi:
+            raise InputError(f"view {np.degrees(self.view):g}°: give more than 0°, below 180°")
+        if not 0.0 < self.hours_a_day <= 24.0:
+            raise InputError(f"{self.hours_a_day:g} hours a day: give more than 0, up to 24")
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """A planned campaign.
+
+    Attributes
+    ----------
+    plant, wishes, mirrors
+        What it is for.
+    clusters
+        K of them.
+    labels
+        Their names, (K,).
+    look
+        Calibration points of each, (K,).
+    stations
+        All clusters' poses, cluster by cluster.
+    sorties
+        Of all drones.
+    homes
+        Where each drone takes off, ENU metres, (drones, 3).
+    separation
+        Least distance of two drones in the air, m.
+    camera_target
+        What the same number of poses takes with camera and target.
+    """
+
+    plant: Plant
+    wishes: Wishes
+    mirrors: Mirrors
+    clusters: Clusters
+    labels: tuple[str, ...]
+    look: tuple[LookPoints, ...]
+    stations: tuple[Station, ...]
+    sorties: tuple[Sortie, ...]
+    homes: FloatArray
+    separation: float
+    camera_target: CameraTarget
+
+    @property
+    def photos(self) -> int:
+        """Photographs of the campaign."""
+        return sum(s.photos for s in self.sorties)
+
+    @property
+    def seconds(self) -> float:
+        """From the first take-off to the last landing, s."""
+        return max(s.end for s in self.sorties)
+
+    @property
+    def airborne(self) -> float:
+        """Time in the air of all drones together, s."""
+        return sum(s.end - s.start for s in self.sorties)
+
+    @property
+    def poses(self) -> int:
+        """Orientations to be measured: heliostats times calibration points within their stops."""
+        return sum(int(k.facing.able.sum()) for k in self.look)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of the campaign, for tables and JSON."""
+        radius, able = self.clusters.radius, np.ones(len(self.mirrors), dtype=np.int64)
+        for k, look in enumerate(self.look):
+            able[self.clusters.rows(k)] = look.facing.able.sum(axis=0)
+        patterns = [s.pattern for s in self.stations]
+        hours = self.seconds / 3600.0
+        flown = [look.plan for look in self.look]
+        return {
+            "heliostats": len(self.mirrors),
+            "clusters": len(self.clusters),
+            "cluster_area_m2": float(self.clusters.area.mean()),
+            "cluster_radius_m": [float(np.median(radius)), float(radius.max())],
+            "calibration_points": self.wishes.choosing.points,
+            "fewest_points_of_a_heliostat": int(able.min()),
+            "orientations": self.poses,
+            "hover_points_of_a_pattern": [min(map(len, patterns)), max(map(len, patterns))],
+            "spacing_m": [min(p.spacing for p in patterns), max(p.spacing for p in patterns)],
+            "samples_of_a_facet": min(p.samples for p in patterns),
+            "photographs": self.photos,
+            "drones": len(self.homes),
+            "sorties": len(self.sorties),
+            "hours": hours,
+            "hours_in_the_air": self.airborne / 3600.0,
+            "hours_waiting_in_the_air": sum(v.wait for s in self.sorties for v in s.visits)
+            / 3600.0,
+            "working_days": hours / self.wishes.hours_a_day,
+            "separation_m": self.separation,
+            "beam_error_before_mrad": 1e3 * float(np.median([p.before for p in flown])),
+            "beam_error_after_mrad": 1e3 * float(np.median([p.error[-1] for p in flown])),
+            "camera_target": {
+                "photographs": self.poses,
+                "hours": self.camera_target.hours,
+                "sunny_hours_a_day": self.camera_target.sunny,
+                "days": self.camera_target.days,
+                "months": self.camera_target.months,
+            },
+        }
+
+
+def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) -> FlightPlan:
+    """Return the plan of a campaign over all heliostats of a plant.
+
+    Parameters
+    ----------
+    plant
+        With its calibrated mechanisms, if any.
+    wishes
+        See there; the ground of its airspace is that of the plant if it has none.
+    progress
+        Called with (done, all) clusters.
+
+    Raises
+    ------
+    InputError
+        If the model has as many unknowns as points or more, or heights, keep-outs, stops
+        or the battery leave no flight.
+    """
+    all_mirrors = mirrors(plant)
+    airspace = wishes.airspace
+    if not len(airspace.ground):
+        airspace = replace(airspace, ground=plant.position)
+    wishes = replace(wishes, airspace=airspace)
+    limit = wishes.sampling.distance * float(np.tan(min(wishes.spread, 0.5 * wishes.view)))
+    found = clusters(plant.position, size=wishes.size, max_radius=limit)
+    digits = len(str(len(found)))
+    labels = tuple(f"C{k + 1:0{digits}d}" for k in range(len(found)))
+    suns = suns_of_year(plant.site, 2026)
+    look, stations = [], list[Station]()
+    for k in range(len(found)):
+        if progress is not None:
+            progress(k, len(found))
+        rows = found.rows(k)
+        one = _look(plant, all_mirrors, found.center[k], rows, suns, wishes, labels[k])
+        look.append(one)
+        stations += _stations(all_mirrors, rows, one, k, wishes)
+    _check_patterns(stations, labels, airspace)
+    start = _home(plant, wishes)
+    homes = flight.homes(start, wishes.craft.count)
+    order = tour(found.center[:, :2], start[:2])
+    sorties = flight.fly(stations, order.tolist(), airspace, homes, wishes.craft, labels)
+    poses = sum(int(one.facing.able.sum()) for one in look)
+    return FlightPlan(
+        plant, wishes, all_mirrors, found, labels, tuple(look), tuple(stations), tuple(sorties),
+        homes, flight.separation(sorties, stations, wishes.craft),
+        flight.camera_target(
+            plant.site, poses, minutes=wishes.photo_minutes,
+            targets=max(1, len(plant.targets)), clear=wishes.clear,
+        ),
+    )  # fmt: skip
+
+
+def _look(
+    plant: Plant, all_mirrors: Mirrors, center: FloatArray, rows: npt.NDArray[np.intp],
+    suns: FloatArray, wishes: Wishes, label: str,
+) -> LookPoints:  # fmt: skip
+    """Calibration points of one cluster, chosen for the heliostat in its middle."""
+    away = np.linalg.norm(plant.position[rows] - center, axis=-1)
+    group, row = plant.find(all_mirrors.names[int(rows[np.argmin(away)])])
+    middle = group.calibrated[np.array([row])]
+    kind = _model(middle) if wishes.model == "auto" else wishes.model
+    names = model_names(kind, middle.parameters)
+    wishes.choosing.check(names, kind)
+    if group.aim is not None and np.isfinite(group.aim[row]).all():
+        aim = group.aim[row]
+    else:
+        surfaces = [r.center for r in plant.receivers] + [t.center for t in plant.targets]
+        if not surfaces:
+            raise InputError("the plant has no receiver and no target; beams must go somewhere")
+        aim = surfaces[0]
+    return look_points(
+        all_mirrors, rows, middle, aim, names, suns, wishes.airspace, wishes.sampling,
+        wishes.choosing, label,
+    )  # fmt: skip
+
+
+def _model(mechanism: Mechanism) -> str:
+    for name in ("jacks", "malan8"):
+        if all(p in mechanism.parameters for p in MODELS[name]):
+            return name
+    return "full"
+
+
+def _stations(
+    all_mirrors: Mirrors, rows: npt.NDArray[np.intp], look: LookPoints, cluster: int,
+    wishes: Wishes,
+) -> list[Station]:  # fmt: skip
+    speed = all_mirrors.drives.table[rows][..., SLOTS["speed"]]
+    travel = flight.mirror_travel(look.facing.counts, speed)
+    return [
+        Station(
+            cluster, k,
+            pattern(
+                look.facing.vertex[k], all_mirrors.corners[rows], all_mirrors.slopes[rows],
+                all_mirrors.facet_area[rows], look.point[k], look.direction[k], wishes.sampling,
+            ),
+            float(travel[k]),
+        )
+        for k in range(len(look))
+    ]  # fmt: skip
+
+
+def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: Airspace) -> None:
+    """Refuse patterns that leave the air that may be flown in."""
+    sizes = np.array([len(s.pattern) for s in stations])
+    free = airspace.free(np.concatenate([s.pattern.camera for s in stations]))
+    whose = np.repeat(np.arange(len(stations)), sizes)
+    if not free.all():
+        station = stations[int(whose[np.argmin(free)])]
+        raise InputError(
+            f"{labels[station.cluster]}, calibration point {station.point + 1}: its pattern of "
+            f"{station.pattern.columns} by {station.pattern.rows} points, "
+            f"{station.pattern.spacing:g} m apart, leaves the heights, the fence or comes too near "
+            "to a keep-out; lower the pointing error, or the elevations, or widen the airspace"
+        )
+
+
+def _home(plant: Plant, wishes: Wishes) -> FloatArray:
+    """Where drones take off: as given, else south of the middle of the field."""
+    if wishes.home is not None:
+        start = np.asarray(wishes.home, dtype=np.float64)
+    else:
+        place = plant.position
+        start = np.array([place[:, 0].mean(), place[:, 1].min() - _OUTSIDE, 0.0])
+        start[2] = wishes.airspace.ground_below(start[None])[0]
+    up = start + np.array([0.0, 0.0, wishes.airspace.min_height])
+    if not wishes.airspace.free_legs(start[None], up[None])[0]:
+        raise InputError(
+            f"home at {start[0]:.1f} m east, {start[1]:.1f} m north: it lies in a keep-out or "
+            "outside the fence; give another with --home"
+        )
+    return start

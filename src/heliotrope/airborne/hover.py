@@ -1,0 +1,343 @@
+r"""Hover patterns: where the drone must be so that all of every mirror is sampled.
+
+Lamp and camera hang side by side, so a mirror shows the lamp where its normal points at
+the drone. A place of the mirror at height x above its vertex (either direction of the
+mirror's plane), whose normal leans by the slope s(x) against the optical axis, meets a
+plane across the axis at distance D in
+
+.. math:: q(x) = x + D \, s(x) + D \, e
+
+for a mirror that points wrong by e. All of a mirror is seen by a drone that covers the
+range of x + D s(x), widened by D e on all sides. A facet of focal length f has
+s = -x / 2f within it, so that a step g of the drone moves the reflection by
+
+.. math:: g / |1 - D / 2f|
+
+and n samples on a facet of w by h want :math:`g = \sqrt{w h / n} \, |1 - D / 2f|`. A
+wrong normal thus moves the reflection on a flat facet by D e: 0.75 m at 150 m and 5 mrad.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_float, normalize, tangent_axes
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import track
+
+#: Rounds of the fixed point on the vertex; each gains a factor of distance over offset.
+_ROUNDS = 4
+#: Where a step of the drone moves a reflection by 20 steps or more, it has no place.
+_BLURRED = 0.05
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How reflections are to be sampled.
+
+    Attributes
+    ----------
+    distance
+        From the middle of a cluster to its hover plane, m.
+    pointing
+        Error of normals that the pattern covers, rad: of freshly installed heliostats a
+        few times their standard deviation, later less.
+    samples
+        On each facet.
+    focal
+        Focal length of the facets, m; infinite for flat ones.
+    led_offset
+        Lamp from the camera, in the camera's axes (right, down, ahead), m, (3,).
+    least_spacing
+        Points of the pattern are no closer, m; Litchi refuses less than 0.6 m.
+    """
+
+    distance: float = 150.0
+    pointing: float = 5e-3
+    samples: float = 9.0
+    focal: float = np.inf
+    led_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    least_spacing: float = 0.6
+
+    def __post_init__(self) -> None:
+        for name, unit in (("distance", " m"), ("samples", ""), ("least_spacing", " m")):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise InputError(f"{name} {value:g}{unit}: give a number above 0")
+        if not 0.0 <= self.pointing <= 0.1:
+            raise InputError(
+                f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; align mirrors "
+                "that point worse roughly first"
+            )
+        if not abs(self.focal) > 0.0:
+            raise InputError("focal length 0 m: give another, or infinity for flat facets")
+        if np.shape(self.led_offset) != (3,) or not np.isfinite(self.led_offset).all():
+            raise InputError("led_offset: give three numbers, right, down and ahead, in metres")
+
+
+@dataclass(frozen=True)
+class Mirrors:
+    """What hover patterns depend on, of all N heliostats of a plant.
+
+    Attributes
+    ----------
+    names
+        Of the heliostats.
+    armature, drives
+        Calibrated, batch shapes (N,) and (N, 2).
+    corners
+        Facets' corners in the mirror's plane (x to the right as seen from in front, y
+        up), m, (N, F, 4, 2); facets that a heliostat lacks are NaN.
+    slopes
+        Of the facets' normals against the mirror's, rad, (N, F, 2).
+    facet_area
+        Of the smallest facet, m², (N,).
+    """
+
+    names: tuple[str, ...]
+    armature: Armature
+    drives: Drive
+    corners: FloatArray
+    slopes: FloatArray
+    facet_area: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+def mirrors(plant: Plant) -> Mirrors:
+    """Return the mirrors of a plant, group after group.
+
+    Raises
+    ------
+    InputError
+        If the plant has no heliostats, or a mechanism has not two drives.
+    """
+    if not len(plant):
+        raise InputError("the plant has no heliostats; there is nothing to fly for")
+    for name, group in plant.groups.items():
+        if len(group.mechanism.driven) != 2:
+            raise InputError(
+                f"group {name}: its mechanism has {len(group.mechanism.driven)} drive; a flight "
+                "needs heliostats that turn about two axes"
+            )
+    parts = []
+    for group in plant.groups.values():
+        if group.facets is None:
+            centre = np.zeros((len(group), 1, 3))
+            right, up = np.zeros_like(centre), np.zeros_like(centre)
+            right[:, 0, 0], up[:, 0, 1] = 0.5 * group.width, 0.5 * group.height
+        else:
+            centre, right, up = (
+                group.facets.center, group.facets.half_width, group.facets.half_height
+            )  # fmt: skip
+        parts.append((centre, right, up))
+    facets = max(part[0].shape[1] for part in parts)
+    corners, slopes, areas = [], [], []
+    for centre, right, up in parts:
+        normal = np.cross(right, up)
+        signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+        four = np.stack([centre + i * right + j * up for i, j in signs], axis=-2)[..., :2]
+        missing = ((0, 0), (0, facets - centre.shape[1]))
+        corners.append(np.pad(four, (*missing, (0, 0), (0, 0)), constant_values=np.nan))
+        slope = normal[..., :2] / normal[..., 2:]
+        slopes.append(np.pad(slope, (*missing, (0, 0)), constant_values=np.nan))
+        areas.append(4.0 * np.linalg.norm(normal, axis=-1).min(axis=1))
+    return Mirrors(
+        plant.names, plant.armature, plant.drives, np.concatenate(corners),
+        np.concatenate(slopes), np.concatenate(areas),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Facing:
+    """Mirrors that look at a point; batch shape (...).
+
+    Attributes
+    ----------
+    counts
+        Of the drives, (..., 2).
+    normal, vertex
+        ENU, (..., 3).
+    able
+        Within the stops, (...).
+    """
+
+    counts: FloatArray
+    normal: FloatArray
+    vertex: FloatArray
+    able: npt.NDArray[np.bool_]
+
+
+def face(
+    armature: Armature, drives: Drive, point: npt.ArrayLike, current: FloatArray | None = None
+) -> Facing:
+    """Return the poses in which optical axes go through points.
+
+    Parameters
+    ----------
+    armature, drives
+        Batch shapes (N,) and (N, 2).
+    point
+        ENU metres, (..., 1, 3) or (..., N, 3).
+    current
+        Counts where the drives stand, to choose the nearer branch.
+
+    Notes
+    -----
+    Lamp and eye are at the same point, so the law asks for the normal n ∥ p − m. The
+    vertex m moves with the pose; the direction to p is taken from the vertex before, and
+    the error of that shrinks with (offset / distance) in each of four rounds: at 100 m
+    and 0.5 m of offset to below a nanometre.
+    """
+    goal = as_float(point)
+    start = armature.origin_1
+    sun = normalize(goal - start, "direction to the look point")
+    for _ in range(_ROUNDS):
+        solved = track(armature, sun, goal, drives=drives, current=current)
+        vertex = solved.chosen(solved.vertex)
+        sun = normalize(goal - vertex, "direction to the look point")
+    return Facing(
+        solved.chosen(solved.counts), solved.chosen(solved.normal), vertex,
+        solved.chosen(solved.reachable),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """A grid of hover points in a plane.
+
+    Attributes
+    ----------
+    center
+        Its middle, ENU metres, (3,).
+    direction
+        Unit vector from the field to the drone, normal of the plane, (3,).
+    columns, rows
+        Points across and upwards.
+    spacing
+        Between neighbours, m.
+    samples
+        Expected on each facet; less than asked for where the least spacing forbids more.
+    camera
+        The camera's places, row by row there and back, ENU metres, (H, 3).
+    """
+
+    center: FloatArray
+    direction: FloatArray
+    columns: int
+    rows: int
+    spacing: float
+    samples: float
+    camera: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.camera)
+
+
+def reach(
+    corners: FloatArray, slopes: FloatArray, vertex: FloatArray, point: FloatArray,
+    direction: FloatArray, sampling: Sampling,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Return the lower and upper bound of drone places that mirrors ask for.
+
+    Parameters
+    ----------
+    corners, slopes
+        Of n mirrors, (n, F, 4, 2) and (n, F, 2).
+    vertex
+        Of the mirrors, ENU metres, (n, 3); their axes go through ``point``.
+    point, direction
+        A point of the hover plane, and its normal, (3,).
+    sampling
+        Focal length and pointing error.
+
+    Returns
+    -------
+    Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
+    ``direction``), from ``point``, m, (2,) each. The mirrors' x is taken as horizontal.
+    """
+    away = point - vertex
+    slant = np.linalg.norm(away, axis=-1)
+    normal = away / slant[:, None]
+    axes = tangent_axes(normal)
+    right, up = -axes[:, 0, None, None], axes[:, 1, None, None]
+    middle = corners.mean(axis=2, keepdims=True)
+    # Within a curved facet the slope falls with the distance from its middle.
+    slope = slopes[:, :, None] - (corners - middle) / (2.0 * sampling.focal)
+    place = vertex[:, None, None] + corners[..., :1] * right + corners[..., 1:] * up
+    ray = normal[:, None, None] + slope[..., :1] * right + slope[..., 1:] * up
+    along = (point - place) @ direction / (ray @ direction)
+    plane = tangent_axes(direction)
+    met = (place + along[..., None] * ray - point) @ plane.T
+    tilt = normal @ direction
+    widen = float((sampling.pointing * slant / tilt).max())
+    flat = met.reshape(-1, 2)
+    return np.nanmin(flat, axis=0) - widen, np.nanmax(flat, axis=0) + widen
+
+
+def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tuple[float, float]:
+    """Return the spacing of a pattern, m, and the samples that it gives to the worst facet.
+
+    Parameters
+    ----------
+    facet_area, slant
+        Smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
+    sampling
+        What is wanted.
+
+    Raises
+    ------
+    InputError
+        If the drone is at the centre of curvature of curved facets.
+    """
+    scale = np.abs(1.0 - slant / (2.0 * sampling.focal))
+    if scale.min() < _BLURRED:
+        raise InputError(
+            f"facets of {sampling.focal:g} m focal length, seen from "
+            f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length a facet lights "
+            "up as a whole; change the distance"
+        )
+    # What a step of the drone is on the mirror, in steps that give one sample.
+    wanted = float((np.sqrt(facet_area / sampling.samples) * scale).min())
+    step = max(wanted, sampling.least_spacing)
+    return step, sampling.samples * (wanted / step) ** 2
+
+
+def pattern(
+    facing_vertex: FloatArray, corners: FloatArray, slopes: FloatArray, facet_area: FloatArray,
+    point: npt.ArrayLike, direction: npt.ArrayLike, sampling: Sampling,
+) -> Pattern:  # fmt: skip
+    """Return the hover points from which all of n mirrors are sampled.
+
+    Parameters
+    ----------
+    facing_vertex
+        Of the mirrors as they look at ``point``, ENU metres, (n, 3).
+    corners, slopes, facet_area
+        As :class:`Mirrors`, of the n mirrors.
+    point, direction
+        Where the mirrors look at, and the normal of the plane, (3,).
+    sampling
+        What is wanted.
+    """
+    p, d = as_float(point), as_float(direction)
+    low, high = reach(corners, slopes, facing_vertex, p, d, sampling)
+    step, samples = spacing(facet_area, np.linalg.norm(p - facing_vertex, axis=-1), sampling)
+    columns, rows = (max(1, int(np.ceil(v - 1e-9))) for v in (high - low) / step)
+    plane = tangent_axes(d)
+    middle = p + 0.5 * (low + high) @ plane
+    across = step * (np.arange(columns) - 0.5 * (columns - 1))
+    upwards = step * (np.arange(rows) - 0.5 * (rows - 1))
+    grid = np.stack(np.meshgrid(across, upwards), axis=-1)
+    grid[1::2] = grid[1::2, ::-1].copy()
+    # The mirror's normal points half-way between lamp and camera. Who looks back along d
+    # has the plane's first axis to the left.
+    right, down, ahead = sampling.led_offset
+    lamp = -right * plane[0] - down * plane[1] - ahead * d
+    camera = middle + grid.reshape(-1, 2) @ plane - 0.5 * lamp
+    return Pattern(middle, d, columns, rows, step, samples, camera)

@@ -1,0 +1,230 @@
+"""Calibration points of a flight: from which directions clusters of mirrors are seen.
+
+A direction is one pose of each mirror of the cluster. Directions are chosen as sightings
+are planned for a target: those that together tell most about the mechanism.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.airspace import Airspace
+from heliotrope.airborne.clusters import tour
+from heliotrope.airborne.hover import Facing, Mirrors, Sampling, face
+from heliotrope.calibration.information import expectation, precision
+from heliotrope.calibration.planning import Candidates, Criterion, Plan, plan
+from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.sightings import drone
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, direction, tangent_axes
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive
+
+#: Candidates stand about so far apart, rad.
+_STEP = float(np.radians(12.0))
+#: Mirrors of a cluster that candidates are tried on.
+_SOME = 24
+
+
+@dataclass(frozen=True)
+class Choosing:
+    """How calibration points are chosen.
+
+    Attributes
+    ----------
+    points
+        Per heliostat; more than the model has unknowns.
+    criterion
+        "d": most information; "v": smallest beam error over the year.
+    sigma
+        Of a measured normal in each of two directions, rad.
+    min_elevation, max_elevation
+        Of the drone as seen from the cluster, rad. Low ones are seen past other mirrors.
+    share
+        Of a cluster's mirrors that must be able to look there.
+    priors
+        Standard deviations instead of the parameter table's, by name.
+    """
+
+    points: int = 20
+    criterion: Criterion = "d"
+    sigma: float = 3e-4
+    min_elevation: float = float(np.radians(20.0))
+    max_elevation: float = float(np.radians(85.0))
+    share: float = 0.95
+    priors: Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.points < 1:
+            raise InputError(f"{self.points} calibration points: give 1 or more")
+        if not (np.isfinite(self.sigma) and self.sigma > 0.0):
+            raise InputError(f"sigma {self.sigma} rad of a normal must be above 0")
+        if not 0.0 <= self.min_elevation < self.max_elevation <= 0.5 * np.pi:
+            raise InputError(
+                f"elevations {np.degrees(self.min_elevation):g}° to "
+                f"{np.degrees(self.max_elevation):g}°: give 0° to 90°, the lower first"
+            )
+        if not 0.0 < self.share <= 1.0:
+            raise InputError(f"share {self.share}: give a number above 0, up to 1")
+
+    def check(self, names: tuple[str, ...], model: str) -> None:
+        """Refuse fewer points than a model's unknowns and one more."""
+        if self.points <= len(names):
+            raise InputError(
+                f"{self.points} calibration points: the model {model} has {len(names)} unknowns; "
+                f"give {len(names) + 1} or more"
+            )
+
+
+@dataclass(frozen=True)
+class LookPoints:
+    """The K calibration points of one cluster of n mirrors, in the order of flight.
+
+    Attributes
+    ----------
+    direction
+        Unit vectors from the cluster's middle to the drone, (K, 3).
+    point
+        That all mirrors look at, ENU metres, (K, 3).
+    facing
+        Poses, batch shape (K, n).
+    plan
+        The choice for the mirror in the middle, with the errors to expect.
+    """
+
+    direction: FloatArray
+    point: FloatArray
+    facing: Facing
+    plan: Plan
+
+    def __len__(self) -> int:
+        return len(self.direction)
+
+
+def directions(choosing: Choosing) -> FloatArray:
+    """Return unit vectors about 12° apart between the least and the greatest elevation, (M, 3)."""
+    low, high = choosing.min_elevation, choosing.max_elevation
+    rings = max(2, int(np.ceil((high - low) / _STEP)) + 1)
+    found = []
+    for k, elevation in enumerate(np.linspace(low, high, rings)):
+        count = max(1, int(np.ceil(2.0 * np.pi * np.cos(elevation) / _STEP)))
+        # Rings are turned against each other, or columns would stand above columns.
+        azimuth = 2.0 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
+        found.append(direction(azimuth, np.full(count, elevation)))
+    return np.concatenate(found)
+
+
+def look_points(
+    mirrors: Mirrors, rows: npt.NDArray[np.intp], middle: Mechanism, aim: npt.ArrayLike,
+    names: tuple[str, ...], suns: FloatArray, airspace: Airspace, sampling: Sampling,
+    choosing: Choosing, label: str = "cluster",
+) -> LookPoints:  # fmt: skip
+    """Return the calibration points of one cluster.
+
+    Parameters
+    ----------
+    mirrors, rows
+        Of the plant, and which of them are the cluster, (n,).
+    middle
+        Mechanism for which the points are chosen, batch shape (1,).
+    aim
+        Where it sends the sun in operation, (3,).
+    names
+        P parameters of its model.
+    suns
+        Of the year, (K, 3), see :func:`~heliotrope.calibration.information.suns_of_year`.
+    airspace, sampling, choosing
+        What is allowed and wanted.
+    label
+        The cluster's name, for errors.
+
+    Raises
+    ------
+    InputError
+        If fewer directions are possible than points are wanted.
+    """
+    armature, drives = Armature(mirrors.armature.table[rows]), Drive(mirrors.drives.table[rows])
+    centre = armature.origin_1.mean(axis=0)
+    towards = directions(choosing)
+    points = centre + sampling.distance * towards
+    free = _free(airspace, points, towards, mirrors, rows, sampling)
+    if not free.any():
+        raise InputError(
+            f"{label}: heights, fence or keep-outs leave no place at {sampling.distance:g} m; "
+            "lower the distance or the elevations, or raise the greatest height"
+        )
+    towards, points = towards[free], points[free]
+    # Neighbours can look where their neighbours can: some of the mirrors stand for all.
+    some = np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.intp))
+    facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
+    able = facing.able.mean(axis=1) >= choosing.share
+    there, there_points = towards[able], points[able]
+    found = _candidates(middle, there, there_points, names, choosing.sigma)
+    if len(found) < choosing.points:
+        raise InputError(
+            f"{label}: {len(found)} directions are possible for {choosing.points} calibration "
+            f"points; {len(towards)} of {len(free)} lie in free air, {int(able.sum())} of them "
+            "within the stops; lower the distance, widen the elevations or ask for fewer points"
+        )
+    information = precision(middle, names, priors=choosing.priors)[0]
+    form = expectation(middle, aim, suns, names).form[0]
+    chosen = plan(found, choosing.points, information, form, criterion=choosing.criterion)
+    index = chosen.chosen.time.astype(np.intp)
+    # A short way through the directions is a short way for mirrors and drone.
+    south = np.array([0.0, -1.0, 0.0])
+    index = index[tour(there[index], south)]
+    # Each from the pose before, so that mirrors stay on their branch.
+    counts, normal, vertex, ok = [], [], [], []
+    current = None
+    for point in there_points[index]:
+        step = face(armature, drives, point, current)
+        current = step.counts
+        counts.append(step.counts)
+        normal.append(step.normal)
+        vertex.append(step.vertex)
+        ok.append(step.able)
+    flown = Facing(np.stack(counts), np.stack(normal), np.stack(vertex), np.stack(ok))
+    return LookPoints(there[index], there_points[index], flown, chosen)
+
+
+def _free(
+    airspace: Airspace, points: FloatArray, towards: FloatArray, mirrors: Mirrors,
+    rows: npt.NDArray[np.intp], sampling: Sampling,
+) -> npt.NDArray[np.bool_]:  # fmt: skip
+    """Around which points there is room for a pattern."""
+    corners, distance = mirrors.corners[rows], sampling.distance
+    middle = corners.mean(axis=2, keepdims=True)
+    slope = mirrors.slopes[rows][:, :, None] - (corners - middle) / (2.0 * sampling.focal)
+    wide = float(np.nanmax(np.linalg.norm(corners + distance * slope, axis=-1)))
+    # Patterns grow a little where axes are oblique to their plane.
+    half = 1.2 * (wide + distance * sampling.pointing) + sampling.least_spacing
+    plane = half * tangent_axes(towards)
+    found = airspace.free(points)
+    for i, j in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
+        found &= airspace.free(points + i * plane[:, 0] + j * plane[:, 1])
+    return found
+
+
+def _candidates(
+    middle: Mechanism, towards: FloatArray, points: FloatArray, names: tuple[str, ...],
+    sigma: float,
+) -> Candidates:  # fmt: skip
+    """Sightings of the drone by one mirror; their "time" is the row of the direction."""
+    facing = face(middle.armature, middle.drives, points[:, None])
+    rows = np.flatnonzero(facing.able[:, 0])
+    counts = facing.counts[rows, 0]
+    # A normal that turns by σ turns the ray by 2 σ.
+    zero = np.zeros(len(rows), dtype=np.intp)
+    if len(rows):
+        seen = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma)
+        jacobian = linearise(middle[zero], seen, names).jacobian
+    else:
+        jacobian = np.empty((0, 2, len(names)))
+    angle = np.zeros(len(rows))
+    return Candidates(
+        names, ("drone",), zero, zero, as_float(rows), towards[rows], counts,
+        facing.normal[rows, 0], angle, angle, jacobian,
+    )  # fmt: skip

@@ -1,0 +1,468 @@
+r"""The orientation of mirrors from reflections of the drone's lamp.
+
+Each reflection measures one normal: the bisector of the ways to lamp and camera. The mirror's
+shape says which normal is expected at that point. The small rotation ω, about the
+concentrator's own x and y axes, that turns the expected normal n into the measured one v is
+
+.. math:: ω = \frac{n × v}{|n × v|} \arcsin |n × v|
+
+and the orientation is moved by the mean of all ω, over the points or over the mirror's area. As
+the points on the mirror move with the orientation, that is done twice; then outliers are left
+out (Rosner's test of each component), and the last mean is the result. What is left of ω at
+each point, the *difference*, carries all that is told of accuracy and of the facets.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.budget import Budget
+from heliotrope.airborne.mirror import MirrorShape, measured_normal
+from heliotrope.airborne.reflections import Reflections
+from heliotrope.airborne.statistics import ALPHA, normality, plain_sigma, rosner, spread_mean
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
+
+#: Which mean over the points is the mirror's: as they are, or weighted for the whole area.
+Mean = Literal["plain", "area"]
+
+#: Rounds of mean and update before outliers are looked for.
+ROUNDS = 2
+#: Fewer points than this give no standard deviation that is worth its name.
+FEWEST = 5
+# The centre of the points from the mirror's, in half widths, above which a warning is given.
+_OFF_CENTRE = 0.25
+# A facet whose mean stands this many standard errors and this far (rad) off the others.
+_CANTED_SIGMA, _CANTED = 4.0, 0.5e-3
+# p of the test of normality below which the differences are called not normal.
+_NORMAL = 1e-3
+
+
+@dataclass(frozen=True)
+class FacetMean:
+    """What the points on one facet say.
+
+    Attributes
+    ----------
+    facet, count
+        Its number, and how many points it has: without outliers, unless they are the most.
+    mean
+        Of the differences, rotX and rotY, rad, (2,): its canting error, as seen from the
+        mean of all; NaN without points.
+    sigma
+        Plain standard error of the mean, rad, (2,).
+    """
+
+    facet: int
+    count: int
+    mean: FloatArray
+    sigma: FloatArray
+
+
+@dataclass(frozen=True)
+class Orientation:
+    """The orientation of one heliostat in one pose, from n reflections.
+
+    Attributes
+    ----------
+    heliostat
+        Row.
+    rotation
+        From concentrator coordinates to ENU, (3, 3).
+    vertex
+        ENU metres, (3,).
+    correction
+        rotX and rotY, rad: how the mirror stands turned, about its own axes, from where it
+        was expected, (2,).
+    reflections
+        The n rows this is from, outliers included.
+    point
+        Where each stands, ENU metres, (n, 3).
+    outlier
+        (n,).
+    difference
+        Of each point from the result, rotX and rotY, rad, (n, 2).
+    sigma
+        Standard deviation of the differences without outliers, rad, (2,).
+    sigma_plain
+        σ_mean as σ/√n, rad, (2,).
+    sigma_mean
+        σ_mean with the fixed field of slopes counted as what it is, rad, (2,).
+    systematic
+        What all points share, rad, (2,).
+    normality
+        p of Shapiro and Wilk's test, (2,).
+    facets
+        One for each facet.
+    distance
+        Mean, from mirror to camera, m.
+    mean
+        Which mean was taken.
+    warnings
+        One line each.
+    """
+
+    heliostat: int
+    rotation: FloatArray
+    vertex: FloatArray
+    correction: FloatArray
+    reflections: Reflections
+    point: FloatArray
+    outlier: npt.NDArray[np.bool_]
+    difference: FloatArray
+    sigma: FloatArray
+    sigma_plain: FloatArray
+    sigma_mean: FloatArray
+    systematic: FloatArray
+    normality: FloatArray
+    facets: tuple[FacetMean, ...]
+    distance: float
+    mean: Mean
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Number of points that were used."""
+        return int((~self.outlier).sum())
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normal, ENU, (3,)."""
+        return self.rotation[:, 2]
+
+    @property
+    def azimuth(self) -> float:
+        """Of the normal, clockwise from north, rad."""
+        return float(azimuth_elevation(self.normal)[0])
+
+    @property
+    def elevation(self) -> float:
+        """Of the normal, rad."""
+        return float(azimuth_elevation(self.normal)[1])
+
+    @property
+    def sigma_total(self) -> FloatArray:
+        """σ_tot of rotX and rotY: the mean's and the systematic one together, rad, (2,)."""
+        return np.hypot(self.sigma_mean, self.systematic)
+
+
+@dataclass(frozen=True)
+class Orientations:
+    """The orientations of a field.
+
+    Attributes
+    ----------
+    names
+        Of all N heliostats.
+    found
+        Of those that could be measured, in their order.
+    left_out
+        For each other one that was to be measured its name and the reason.
+    """
+
+    names: tuple[str, ...]
+    found: tuple[Orientation, ...]
+    left_out: Mapping[str, str]
+
+    def of(self, name: str) -> Orientation | None:
+        """Return the orientation of heliostat ``name``, None if it has none."""
+        return next((o for o in self.found if self.names[o.heliostat] == name), None)
+
+
+def differences(
+    reflections: Reflections,
+    shape: MirrorShape,
+    rotation: npt.ArrayLike,
+    vertex: npt.ArrayLike,
+    *,
+    slopes: bool = True,
+) -> FloatArray:
+    """Return the rotations from expected to measured normals about x and y, rad, (n, 2).
+
+    Parameters
+    ----------
+    reflections
+        Of one heliostat, n rows.
+    shape
+        Of its mirror.
+    rotation, vertex
+        Its orientation, (3, 3), and place, ENU metres, (3,).
+    slopes
+        Whether the normals are expected with the slope map, if there is one.
+    """
+    R, v = as_float(rotation), as_float(vertex)
+    point = v + shape.point_at(reflections.facet, reflections.xy) @ R.T
+    measured = measured_normal(point, reflections.camera, reflections.led) @ R
+    expected = shape.normal_at(reflections.facet, reflections.xy, slopes=slopes)
+    turn = np.cross(expected, measured)
+    sine = np.linalg.norm(turn, axis=-1, keepdims=True)
+    angle = np.arctan2(sine[:, 0], np.sum(expected * measured, axis=-1))[:, None]
+    return as_float(turn[:, :2] * np.where(sine > 0.0, angle / np.maximum(sine, 1e-300), 1.0))
+
+
+def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
+    """Return an orientation (3, 3) turned by rotX and rotY (2,), rad, about its own axes."""
+    x, y = as_float(rot)
+    axis = np.array([x, y, 0.0])
+    return as_float(R) @ rotation(axis, float(np.hypot(x, y)))
+
+
+def rotation_between(R: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
+    """Return rotX, rotY and rotZ, rad, (3,), that turn orientation ``R`` into ``other``.
+
+    They are the components, along R's own axes, of the one rotation between both.
+    """
+    from scipy.spatial.transform import Rotation
+
+    return as_float(Rotation.from_matrix(as_float(R).T @ as_float(other)).as_rotvec())
+
+
+def measure(
+    reflections: Reflections,
+    shape: MirrorShape,
+    rotation: npt.ArrayLike,
+    vertex: npt.ArrayLike,
+    *,
+    pivot: npt.ArrayLike = (0.0, 0.0, 0.0),
+    slopes: bool = True,
+    budget: Budget | None = None,
+    mean: Mean = "area",
+    alpha: float = ALPHA,
+    rounds: int = ROUNDS,
+) -> Orientation:
+    """Return the orientation of one heliostat.
+
+    Parameters
+    ----------
+    reflections
+        Of this heliostat in this pose.
+    shape
+        Of its mirror.
+    rotation, vertex
+        Orientation (3, 3) and place, ENU metres, (3,), that are expected.
+    pivot
+        About which the mirror turns, m in concentrator coordinates from the vertex, (3,).
+    slopes
+        Whether the slope map is used, if the mirror has one.
+    budget
+        Of what all points share; the default one if None.
+    mean
+        "area", weighted for the whole mirror, or "plain", all points alike, as in the paper.
+        Without slope map that is worse: points crowd where the surface looks alike.
+    alpha, rounds
+        Of the test for outliers, and of mean and update before it.
+
+    Raises
+    ------
+    InputError
+        If there are no reflections, or not of one heliostat with these facets.
+    """
+    own = _checked(reflections, shape)
+    start, foot, lever = as_float(rotation), as_float(vertex), as_float(pivot)
+    R, keep = start, np.ones(len(own), dtype=np.bool_)
+
+    def place(R: FloatArray) -> FloatArray:
+        return as_float(foot + (start - R) @ lever)
+
+    def update(R: FloatArray, mean: Mean) -> FloatArray:
+        omega = differences(own, shape, R, place(R), slopes=slopes)
+        return turned(R, _mean(omega, own, shape, keep, mean))
+
+    for _ in range(rounds):
+        # Any mean brings the points to their places.
+        R = update(R, "plain")
+    omega = differences(own, shape, R, place(R), slopes=slopes)
+    keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
+    R = update(R, mean)
+    found = differences(own, shape, R, place(R), slopes=slopes)
+    return _told(own, shape, R, place(R), start, found, keep, budget or Budget(), mean)
+
+
+def measure_field(
+    reflections: Reflections,
+    names: Sequence[str],
+    shape: Callable[[int], MirrorShape],
+    rotation: npt.ArrayLike,
+    vertex: npt.ArrayLike,
+    *,
+    wanted: npt.ArrayLike | None = None,
+    slopes: bool = True,
+    budget: Budget | None = None,
+    mean: Mean = "area",
+) -> Orientations:
+    """Return the orientations of all heliostats of a table of reflections.
+
+    Parameters
+    ----------
+    reflections
+        Of one pose of the field.
+    names
+        Of the N heliostats.
+    shape
+        Gives the mirror of a row.
+    rotation, vertex
+        Expected, (N, 3, 3) and (N, 3).
+    wanted
+        Rows that were to be measured; all if None.
+    slopes, budget, mean
+        As :func:`measure`.
+
+    Notes
+    -----
+    A heliostat that cannot be measured is named with the reason; the others go on.
+    """
+    turns, feet = as_float(rotation), as_float(vertex)
+    rows = np.arange(len(names)) if wanted is None else np.unique(np.asarray(wanted, dtype=np.intp))
+    found, left_out = [], {}
+    for row in rows.tolist():
+        mine = reflections.of(row)
+        if not len(mine):
+            left_out[names[row]] = "no reflection in any photograph"
+            continue
+        try:
+            one = measure(
+                mine, shape(row), turns[row], feet[row], slopes=slopes, budget=budget, mean=mean
+            )
+        except InputError as error:
+            left_out[names[row]] = str(error)
+            continue
+        found.append(one)
+    return Orientations(tuple(names), tuple(found), left_out)
+
+
+def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
+    if not len(reflections):
+        raise InputError("orientation: no reflections; a heliostat needs at least one")
+    if (reflections.heliostat != reflections.heliostat[0]).any():
+        raise InputError("orientation: reflections of several heliostats; take those of one")
+    highest = int(reflections.facet.max())
+    if highest >= len(shape):
+        raise InputError(
+            f"orientation: a reflection on facet {highest}, but the mirror has {len(shape)} "
+            "facets, counted from 0; is this another kind of heliostat?"
+        )
+    return reflections
+
+
+def _mean(
+    omega: FloatArray, own: Reflections, shape: MirrorShape, keep: npt.NDArray[np.bool_],
+    mean: Mean,
+) -> FloatArray:  # fmt: skip
+    if mean == "plain":
+        return as_float(omega[keep].mean(axis=0))
+    if mean != "area":
+        raise InputError(f"orientation: there is no mean {mean!r}; give 'plain' or 'area'")
+    part = own.take(keep)
+    uv = shape.along_facet(part.facet, part.xy)
+    return as_float(spread_mean(omega[keep], shape, part.facet, uv).weights @ omega[keep])
+
+
+def _told(
+    own: Reflections, shape: MirrorShape, R: FloatArray, vertex: FloatArray, start: FloatArray,
+    found: FloatArray, keep: npt.NDArray[np.bool_], budget: Budget, mean: Mean,
+) -> Orientation:  # fmt: skip
+    part, kept = own.take(keep), found[keep]
+    uv = shape.along_facet(part.facet, part.xy)
+    known = spread_mean(kept, shape, part.facet, uv)
+    every = vertex + shape.point_at(own.facet, own.xy) @ R.T
+    point = every[keep]
+    # A turn about x moves the normal towards −y, one about y towards x.
+    axes = np.stack([-R[:, 1], R[:, 0]])
+    shared = budget.covariance(point, part.camera, part.led, axes)
+    told = Orientation(
+        heliostat=int(own.heliostat[0]),
+        rotation=R,
+        vertex=vertex,
+        correction=rotation_between(start, R)[:2],
+        reflections=own,
+        point=every,
+        outlier=~keep,
+        difference=found,
+        sigma=kept.std(axis=0, ddof=1) if len(kept) > 1 else np.full(2, np.nan),
+        sigma_plain=plain_sigma(kept),
+        sigma_mean=known.sigma_weighted if mean == "area" else known.sigma,
+        systematic=np.sqrt(np.diag(shared)),
+        normality=np.array([normality(column) for column in kept.T]),
+        facets=_facet_means(shape, own.facet, found, keep),
+        distance=float(np.linalg.norm(part.camera - point, axis=-1).mean()),
+        mean=mean,
+    )
+    return replace(told, warnings=tuple(_warnings(told, shape, part.xy)))
+
+
+def _facet_means(
+    shape: MirrorShape, facet: npt.NDArray[np.intp], found: FloatArray,
+    keep: npt.NDArray[np.bool_],
+) -> tuple[FacetMean, ...]:  # fmt: skip
+    means = []
+    for k in range(len(shape)):
+        on = facet == k
+        used = on & keep
+        # A facet that is canted off has nothing but outliers: they are its truth.
+        mine = found[used if 2 * used.sum() >= on.sum() else on]
+        mean = mine.mean(axis=0) if len(mine) else np.full(2, np.nan)
+        means.append(FacetMean(k, len(mine), mean, plain_sigma(mine)))
+    return tuple(means)
+
+
+def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
+    lines = []
+    if o.count < FEWEST:
+        lines.append(f"only {o.count} reflections; fly more points, {FEWEST} at the least")
+    area = np.prod(shape.half_size, axis=-1)
+    share = area / area.sum()
+    corners = shape.corners[..., :2].reshape(-1, 2)
+    half = 0.5 * np.ptp(corners, axis=0)
+    off = (xy.mean(axis=0) - share @ shape.center[:, :2]) / half
+    if o.count >= FEWEST and (np.abs(off) > _OFF_CENTRE).any():
+        effect = " and ".join(
+            f"{1e3 * value:+.2f} mrad {name}"
+            for value, name in zip(
+                _tilt_by_gradient(o, xy, off * half), ("rotX", "rotY"), strict=True
+            )
+        )
+        lines.append(
+            f"unsymmetric sampling: the points' centre stands {off[0]:+.2f} half widths to the "
+            f"right and {off[1]:+.2f} half heights above the mirror's; a linear change of the "
+            f"differences would make that {effect}"
+        )
+    total = sum(f.count for f in o.facets)
+    for f in o.facets:
+        if f.count < 0.4 * share[f.facet] * total and len(o.facets) > 1:
+            lines.append(
+                f"facet {f.facet} has {f.count} of {total} reflections; it may be canted off, "
+                "dirty or shaded"
+            )
+        away = _off_the_others(o, f)
+        if away is not None:
+            lines.append(
+                f"facet {f.facet} is canted off by {1e3 * away[0]:+.2f} mrad rotX and "
+                f"{1e3 * away[1]:+.2f} mrad rotY from the others"
+            )
+    for name, p in zip(("rotX", "rotY"), o.normality, strict=True):
+        if p < _NORMAL:
+            lines.append(f"the differences in {name} are not normally distributed (p = {p:.1e})")
+    return lines
+
+
+def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> FloatArray:
+    """Return what a plane through the differences has at ``offset`` from its centre, (2,)."""
+    centred = xy - xy.mean(axis=0)
+    plane, *_ = np.linalg.lstsq(centred, o.difference[~o.outlier], rcond=None)
+    return as_float(offset @ plane)
+
+
+def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
+    """Return a facet's mean less the median of the others', if it is beyond chance."""
+    others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
+    if f.count < 3 or not others:
+        return None
+    # The median, so that the one that is off is named and not all the others.
+    away = f.mean - np.median([g.mean for g in others], axis=0)
+    error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
+    if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():
+        return as_float(away)
+    return None

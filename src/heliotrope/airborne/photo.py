@@ -1,0 +1,381 @@
+"""Photographs from the air: which camera, from where, looking where.
+
+Camera axes are those of :class:`heliotrope.field.camera.Camera`: x right, y down, z ahead.
+A rotation here turns camera axes into ENU, so ``point = position + rotation @ local``.
+"""
+
+import csv
+import io
+import math
+import tomllib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne._photo_metadata import Metadata, read_metadata
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._textfile import read_text, write_text
+from heliotrope.geometry import (
+    FloatArray,
+    as_float,
+    as_vectors,
+    geodetic_to_enu,
+    normalize,
+    rotation,
+)
+
+#: What :func:`read_photos` takes for a photograph.
+SUFFIXES = (".jpg", ".jpeg")
+#: Of a position that states no deviation of its own: a fixed RTK solution, m.
+RTK_SIGMA = 0.01
+#: Value of RtkFlag for a fixed solution; what is below is known to decimetres or metres.
+RTK_FIXED = 50
+
+
+@dataclass(frozen=True)
+class LedCamera:
+    """A camera with a lamp beside it, in the lens model of OpenCV (Brown and Conrady).
+
+    Attributes
+    ----------
+    size
+        Width and height of a photograph, pixels.
+    matrix
+        Focal lengths and principal point, pixels; the first pixel's centre is (0, 0), (3, 3).
+    distortion
+        k1, k2, p1, p2, k3, (5,).
+    led_offset
+        From the projection centre to the lamp, m, in camera axes, (3,).
+    """
+
+    size: tuple[int, int]
+    matrix: FloatArray
+    distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
+    led_offset: FloatArray = field(default_factory=lambda: np.array([0.0, -0.1, 0.0]))
+
+    def __post_init__(self) -> None:
+        width, height = (int(n) for n in self.size)
+        if not (16 <= width <= 100_000 and 16 <= height <= 100_000):
+            raise InputError(f"camera: photographs of {width} × {height} px; give 16 to 100000")
+        matrix = as_float(self.matrix)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+            raise InputError(f"camera: matrix of shape {matrix.shape} must be (3, 3) and finite")
+        if min(matrix[0, 0], matrix[1, 1]) <= 0.0:
+            raise InputError(
+                f"camera: focal lengths {matrix[0, 0]}, {matrix[1, 1]} px must be above 0"
+            )
+        distortion = as_float(self.distortion)
+        if distortion.shape != (5,) or not np.isfinite(distortion).all():
+            raise InputError("camera: distortion needs k1, k2, p1, p2, k3, each finite")
+        offset = as_vectors(self.led_offset, "camera: led_offset")
+        if offset.shape != (3,) or np.linalg.norm(offset) > 5.0:
+            raise InputError(f"camera: led_offset {offset} m; give right, down, ahead within 5 m")
+        object.__setattr__(self, "size", (width, height))
+        object.__setattr__(self, "matrix", matrix)
+        object.__setattr__(self, "distortion", distortion)
+        object.__setattr__(self, "led_offset", offset)
+
+    @property
+    def focal(self) -> float:
+        """Mean focal length, pixels."""
+        return float(0.5 * (self.matrix[0, 0] + self.matrix[1, 1]))
+
+
+@dataclass(frozen=True)
+class Photo:
+    """One photograph and what the drone says of it.
+
+    Attributes
+    ----------
+    name
+        Of the file.
+    time
+        UTC; None if nothing states it with its zone.
+    position
+        Of the projection centre, ENU metres, (3,).
+    rotation
+        Camera axes to ENU, (3, 3).
+    sigma_position
+        Standard deviation of the position east, north, up, m, (3,).
+    path
+        The file; None if there is no image.
+    """
+
+    name: str
+    time: datetime | None
+    position: FloatArray
+    rotation: FloatArray
+    sigma_position: FloatArray = field(default_factory=lambda: np.full(3, RTK_SIGMA))
+    path: Path | None = None
+
+    def __post_init__(self) -> None:
+        position = as_vectors(self.position, f"photo {self.name}: position")
+        turned = as_float(self.rotation)
+        if position.shape != (3,) or turned.shape != (3, 3):
+            raise InputError(f"photo {self.name}: needs a position (3,) and a rotation (3, 3)")
+        if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-6) or np.linalg.det(turned) < 0:
+            raise InputError(f"photo {self.name}: its rotation is not a right-handed rotation")
+        sigma = np.array(np.broadcast_to(as_float(self.sigma_position), (3,)))
+        if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+            raise InputError(f"photo {self.name}: sigma_position {sigma} m must be above 0")
+        if self.time is not None and self.time.tzinfo is None:
+            raise InputError(f"photo {self.name}: time {self.time} has no zone; give UTC")
+        object.__setattr__(self, "position", position)
+        object.__setattr__(self, "rotation", turned)
+        object.__setattr__(self, "sigma_position", sigma)
+
+    def led_position(self, camera: LedCamera) -> FloatArray:
+        """Return where the lamp is, ENU metres, (3,)."""
+        return as_float(self.position + self.rotation @ camera.led_offset)
+
+    def moved(self, position: npt.ArrayLike, rotation: npt.ArrayLike) -> "Photo":
+        """Return the photograph with another exterior orientation."""
+        return replace(self, position=as_float(position), rotation=as_float(rotation))
+
+
+def rotation_of_gimbal(yaw: float, pitch: float, roll: float) -> FloatArray:
+    """Return the rotation from camera axes to ENU, (3, 3), of a gimbal's angles in rad.
+
+    Angles are those of DJI: turned about the axes of a body x ahead, y right, z down, in the
+    order yaw, pitch, roll from north-east-down. Yaw is clockwise from north, pitch is 0 at
+    the horizon and −π/2 straight down, roll lowers the right side.
+    """
+    ned = rotation([0.0, 0.0, 1.0], yaw) @ rotation([0.0, 1.0, 0.0], pitch)
+    ned = ned @ rotation([1.0, 0.0, 0.0], roll)
+    # Camera x right, y down, z ahead are the body's y, z, x; ENU are NED's y, x, −z.
+    return as_float(ned[[1, 0, 2]][:, [1, 2, 0]] * np.array([[1.0], [1.0], [-1.0]]))
+
+
+def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
+    """Return yaw in [−π, π], pitch and roll, rad, that :func:`rotation_of_gimbal` turns back.
+
+    Straight down yaw and roll are one: all of it is given to the yaw.
+    """
+    enu = as_float(turned)
+    ned = (enu * np.array([[1.0], [1.0], [-1.0]]))[[1, 0, 2]][:, [2, 0, 1]]
+    level = math.hypot(ned[0, 0], ned[1, 0])
+    pitch = math.atan2(-ned[2, 0], level)
+    if level < 1e-9:
+        return math.atan2(-ned[0, 1], ned[1, 1]), pitch, 0.0
+    return math.atan2(ned[1, 0], ned[0, 0]), pitch, math.atan2(ned[2, 1], ned[2, 2])
+
+
+def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
+    """Return the rotation (3, 3) of a camera without roll at ``position``, looking at ``point``."""
+    ahead = normalize(as_float(point) - as_float(position), "line of sight")
+    yaw = math.atan2(ahead[0], ahead[1]) if math.hypot(ahead[0], ahead[1]) > 1e-9 else 0.0
+    return rotation_of_gimbal(yaw, math.asin(float(np.clip(ahead[2], -1.0, 1.0))), 0.0)
+
+
+# -- camera file -----------------------------------------------------------------------
+
+
+def read_camera(path: str | Path) -> LedCamera:
+    """Return the camera of a TOML file as :func:`write_camera` writes it.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read, or a value is missing or wrong.
+    """
+    text = read_text(path, "a camera file (TOML)")
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(path, f"not TOML ({error}); write size_px, focal_px, …") from None
+    lengths = {
+        "size_px": 2, "focal_px": 2, "principal_point_px": 2, "distortion": 5, "led_offset_m": 3,
+    }  # fmt: skip
+    values: dict[str, list[float]] = {}
+    for key, length in lengths.items():
+        given = table.get(key)
+        numbers = isinstance(given, list) and all(
+            isinstance(v, int | float) and not isinstance(v, bool) for v in given
+        )
+        if not numbers or given is None or len(given) != length:
+            raise FormatError(path, f"needs {length} numbers, not {given!r}", key)
+        values[key] = given
+    (fx, fy), (cx, cy) = values["focal_px"], values["principal_point_px"]
+    width, height = values["size_px"]
+    try:
+        return LedCamera(
+            (int(width), int(height)),
+            np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+            as_float(values["distortion"]),
+            as_float(values["led_offset_m"]),
+        )
+    except InputError as error:
+        raise FormatError(path, str(error)) from None
+
+
+def write_camera(path: str | Path, camera: LedCamera) -> None:
+    """Write a camera as a TOML file; offsets of the lamp are right, down and ahead of it."""
+    m = camera.matrix
+    rows = {
+        "size_px": list(camera.size),
+        "focal_px": [m[0, 0], m[1, 1]],
+        "principal_point_px": [m[0, 2], m[1, 2]],
+        "distortion": camera.distortion.tolist(),
+        "led_offset_m": camera.led_offset.tolist(),
+    }
+    lines = [f"{key} = [{', '.join(repr(v + 0) for v in row)}]" for key, row in rows.items()]
+    write_text(path, "\n".join(lines).replace("np.float64(", "").replace(")", "") + "\n")
+
+
+# -- photographs -----------------------------------------------------------------------
+
+
+def read_photos(
+    folder: str | Path, plant_origin: tuple[float, float, float]
+) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    """Return the photographs of a folder in the order of their names, and what is wrong.
+
+    Position, gimbal angles and time come from ``photos.csv`` in the folder if there is one,
+    else from the EXIF and XMP that DJI writes.
+
+    Parameters
+    ----------
+    folder
+        Of JPEG files, as :data:`SUFFIXES`.
+    plant_origin
+        Latitude and longitude (degrees) and height (m) of ENU's origin. Heights of photographs
+        are taken as of the same kind (both above the ellipsoid, or both above the geoid).
+
+    Returns
+    -------
+    Photographs, and one line for each that cannot be used: positions or angles missing, no
+    fixed RTK solution, a size unlike that of most of the others (mixed cameras).
+
+    Raises
+    ------
+    InputError
+        If there is no such folder, or no photograph in it.
+    FormatError
+        If ``photos.csv`` is no such table.
+    """
+    place = Path(folder)
+    if not place.is_dir():
+        raise InputError(f"{place}: there is no such folder; give one with photographs")
+    files = sorted(f for f in place.iterdir() if f.suffix.lower() in SUFFIXES)
+    table = place / "photos.csv"
+    rows = _read_table(table) if table.exists() else {}
+    if not files and not rows:
+        raise InputError(f"{place}: there is no photograph ({', '.join(SUFFIXES)}) in it")
+    photos: list[Photo] = []
+    problems: list[str] = []
+    sizes: dict[str, tuple[int, int]] = {}
+    for file in files:
+        try:
+            found = read_metadata(file)
+            sizes[file.name] = found.size
+            if rows:
+                if file.name not in rows:
+                    raise FormatError(file, f"{table.name} has no row for it; add one")
+                photos.append(_of_row(rows[file.name], table, file, plant_origin))
+            else:
+                photos.append(_of_metadata(found, file, plant_origin))
+        except InputError as error:
+            problems.append(str(error))
+    missing = sorted(set(rows) - {f.name for f in files})
+    problems += [f"{place / name}: {table.name} names it, but there is no file" for name in missing]
+    return _of_one_camera(photos, problems, sizes, place)
+
+
+def _of_one_camera(
+    photos: list[Photo], problems: list[str], sizes: Mapping[str, tuple[int, int]], place: Path
+) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
+    counted = Counter(sizes[p.name] for p in photos)
+    if len(counted) > 1:
+        usual = counted.most_common(1)[0][0]
+        for photo in [p for p in photos if sizes[p.name] != usual]:
+            width, height = sizes[photo.name]
+            problems.append(
+                f"{place / photo.name}: {width} × {height} px, but most photographs have "
+                f"{usual[0]} × {usual[1]} px; evaluate each camera's in a folder of its own"
+            )
+        photos = [p for p in photos if sizes[p.name] == usual]
+    return tuple(photos), tuple(problems)
+
+
+def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]) -> Photo:
+    missing = [
+        name
+        for name, value in (
+            ("GpsLatitude", found.latitude_deg), ("GpsLongitude", found.longitude_deg),
+            ("AbsoluteAltitude", found.altitude), ("GimbalYawDegree", found.yaw_deg),
+            ("GimbalPitchDegree", found.pitch_deg), ("GimbalRollDegree", found.roll_deg),
+        )
+        if not math.isfinite(value)
+    ]  # fmt: skip
+    if missing:
+        raise FormatError(
+            file, f"its XMP lacks {', '.join(missing)}; copy the original file from the drone, or "
+            "write the values into photos.csv"
+        )  # fmt: skip
+    if found.rtk_flag is not None and found.rtk_flag != RTK_FIXED:
+        raise FormatError(
+            file, f"RtkFlag {found.rtk_flag} is no fixed solution ({RTK_FIXED}): its position is "
+            "known to decimetres at best; leave it out, or correct it and write photos.csv"
+        )  # fmt: skip
+    position = geodetic_to_enu(found.latitude_deg, found.longitude_deg, found.altitude, origin)
+    known = np.isfinite(found.sigma) & (found.sigma > 0.0)
+    return Photo(
+        file.name,
+        found.time,
+        position,
+        rotation_of_gimbal(*(math.radians(a) for a in found.angles_deg)),
+        np.where(known, found.sigma, RTK_SIGMA),
+        file,
+    )
+
+
+def _read_table(path: Path) -> dict[str, dict[str, str]]:
+    reader = csv.DictReader(io.StringIO(read_text(path, "a table of photographs")))
+    columns = set(reader.fieldnames or ())
+    places = ({"east_m", "north_m", "up_m"}, {"latitude_deg", "longitude_deg", "altitude_m"})
+    needed = {"name", "yaw_deg", "pitch_deg", "roll_deg"}
+    if needed - columns or not any(p <= columns for p in places):
+        raise FormatError(
+            path, "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
+            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m may be given"
+        )  # fmt: skip
+    return {row["name"].strip(): row for row in reader}
+
+
+def _of_row(
+    row: Mapping[str, str], table: Path, file: Path, origin: tuple[float, float, float]
+) -> Photo:
+    def number(key: str) -> float:
+        try:
+            value = float(row[key])
+        except (TypeError, ValueError):
+            value = math.nan
+        if not math.isfinite(value):
+            raise FormatError(table, f"{row[key]!r} is no number", f"{row['name']}, column {key}")
+        return value
+
+    yaw, pitch, roll = (math.radians(number(f"{k}_deg")) for k in ("yaw", "pitch", "roll"))
+    if "east_m" in row:
+        position = np.array([number(k) for k in ("east_m", "north_m", "up_m")])
+    else:
+        latitude, longitude, height = (
+            number(k) for k in ("latitude_deg", "longitude_deg", "altitude_m")
+        )
+        position = geodetic_to_enu(latitude, longitude, height, origin)
+    time, text = None, (row.get("time") or "").strip()
+    if text:
+        try:
+            time = datetime.fromisoformat(text)
+        except ValueError:
+            raise FormatError(table, f"time {text!r} is not ISO 8601", row["name"]) from None
+        if time.tzinfo is None:
+            raise FormatError(table, f"time {text} has no zone; append Z", row["name"])
+        time = time.astimezone(UTC)
+    sigma = number("sigma_m") if (row.get("sigma_m") or "").strip() else RTK_SIGMA
+    turned = rotation_of_gimbal(yaw, pitch, roll)
+    return Photo(file.name, time, position, turned, np.full(3, sigma), file)

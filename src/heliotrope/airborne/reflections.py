@@ -1,0 +1,202 @@
+"""Reflections of the drone's lamp as image evaluation finds them: the table of a flight.
+
+One row is one reflection in one photograph. The orientation of the mirrors is computed from
+this table and from nothing else of the images.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration._cells import Rows, find_heliostats, read_parquet, read_rows
+from heliotrope.calibration.report import write_beside
+from heliotrope.errors import FormatError, InputError
+from heliotrope.geometry import FloatArray, as_float
+
+_VECTORS = ("camera", "led")
+_AXES = ("east", "north", "up")
+_COLUMNS = (
+    "photo", "heliostat", "facet", "x_m", "y_m",
+    *(f"{end}_{axis}_m" for end in _VECTORS for axis in _AXES), "sigma_m",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Reflections:
+    """N reflections.
+
+    Attributes
+    ----------
+    photo
+        Number of the photograph, (N,).
+    heliostat
+        Row of the heliostat in a list of names kept beside, (N,).
+    facet
+        (N,).
+    x, y
+        Where on the mirror, m in concentrator coordinates, (N,).
+    camera, led
+        Centre of projection and lamp when the photograph was taken, ENU metres, (N, 3).
+    sigma
+        Standard deviation of x and y each, m on the mirror, (N,).
+    """
+
+    photo: npt.NDArray[np.intp]
+    heliostat: npt.NDArray[np.intp]
+    facet: npt.NDArray[np.intp]
+    x: FloatArray
+    y: FloatArray
+    camera: FloatArray
+    led: FloatArray
+    sigma: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.photo)
+
+    @property
+    def xy(self) -> FloatArray:
+        """Where on the mirror, m in concentrator coordinates, (N, 2)."""
+        return np.stack([self.x, self.y], axis=-1)
+
+    def take(self, rows: npt.ArrayLike) -> "Reflections":
+        """Return the reflections at ``rows`` (indices or a mask), in that order."""
+        index = np.asarray(rows)
+        # An empty list is an array of floats to NumPy.
+        index = index if index.size else index.astype(np.intp)
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+    def of(self, heliostat: int) -> "Reflections":
+        """Return the reflections of one heliostat; its row stays as it is."""
+        return self.take(np.flatnonzero(self.heliostat == heliostat))
+
+
+def reflections(
+    photo: npt.ArrayLike,
+    heliostat: npt.ArrayLike,
+    facet: npt.ArrayLike,
+    xy: npt.ArrayLike,
+    camera: npt.ArrayLike,
+    led: npt.ArrayLike,
+    sigma: npt.ArrayLike,
+) -> Reflections:
+    """Return checked reflections; everything broadcasts to the N rows of ``xy`` (N, 2).
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, an index is below 0, or sigma is not above 0.
+    """
+    place = as_float(xy).reshape(-1, 2)
+    rows = len(place)
+
+    def index(given: npt.ArrayLike, name: str) -> npt.NDArray[np.intp]:
+        values = np.array(np.broadcast_to(np.asarray(given, dtype=np.intp), (rows,)))
+        if (values < 0).any():
+            i = int(np.flatnonzero(values < 0)[0])
+            raise InputError(f"reflection {i}: {name} {values[i]} is below 0")
+        return values
+
+    spread = np.array(np.broadcast_to(as_float(sigma), (rows,)))
+    ends = [np.array(np.broadcast_to(as_float(end), (rows, 3))) for end in (camera, led)]
+    for name, values in (("xy", place), ("camera", ends[0]), ("led", ends[1])):
+        wrong = ~np.isfinite(values).all(axis=-1)
+        if wrong.any():
+            i = int(np.flatnonzero(wrong)[0])
+            raise InputError(f"reflection {i}: {name} {values[i]} is not finite; leave it out")
+    wrong = ~(np.isfinite(spread) & (spread > 0.0))
+    if wrong.any():
+        i = int(np.flatnonzero(wrong)[0])
+        raise InputError(f"reflection {i}: sigma {spread[i]} m must be above 0")
+    return Reflections(
+        index(photo, "photo"), index(heliostat, "heliostat"), index(facet, "facet"),
+        place[:, 0].copy(), place[:, 1].copy(), ends[0], ends[1], spread,
+    )  # fmt: skip
+
+
+def join(parts: Sequence[Reflections]) -> Reflections:
+    """Return several tables as one, in the order given; none gives an empty table."""
+    if not parts:
+        return reflections([], [], [], np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3)), [])
+    return Reflections(
+        **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Reflections)}
+    )
+
+
+def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]) -> None:
+    """Write reflections as ``.csv`` or ``.parquet``: whole or not at all.
+
+    Columns: photo, heliostat (name), facet, x_m, y_m, camera_east_m …, led_up_m, sigma_m.
+
+    Raises
+    ------
+    InputError
+        If the suffix is another one, or a row names no heliostat of ``names``.
+    """
+    import pandas as pd
+
+    file = _checked(path)
+    if len(found) and int(found.heliostat.max()) >= len(names):
+        raise InputError(
+            f"reflections: heliostat row {int(found.heliostat.max())} of {len(names)} names"
+        )
+    columns: dict[str, object] = {
+        "photo": found.photo,
+        "heliostat": [str(names[i]) for i in found.heliostat],
+        "facet": found.facet,
+        "x_m": found.x,
+        "y_m": found.y,
+    }
+    for end in _VECTORS:
+        for k, axis in enumerate(_AXES):
+            columns[f"{end}_{axis}_m"] = getattr(found, end)[:, k]
+    table = pd.DataFrame({**columns, "sigma_m": found.sigma})
+    if file.suffix.casefold() == ".csv":
+        write_beside(file, lambda part: table.to_csv(part, index=False))
+    else:
+        write_beside(file, lambda part: table.to_parquet(part, index=False))
+
+
+def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflections, list[str]]:
+    """Return the reflections of a file and one line for each row that was left out.
+
+    Raises
+    ------
+    FormatError
+        If the file cannot be read or lacks a column.
+    """
+    file = _checked(path)
+    reader = read_rows if file.suffix.casefold() == ".csv" else read_parquet
+    rows: Rows = reader(file, "a table of reflections")
+    rows.need(_COLUMNS)
+    heliostat = find_heliostats(rows, "heliostat", names)
+    numbers = {name: rows.numbers(name, "a number") for name in _COLUMNS if name != "heliostat"}
+    for name in ("photo", "facet"):
+        given = numbers[name]
+        rows.check(
+            name, ~((given >= 0) & (given == np.floor(given))) & np.isfinite(given), given,
+            " is no whole number from 0",
+        )  # fmt: skip
+    sigma = numbers["sigma_m"]
+    rows.check("sigma_m", ~(sigma > 0.0) & np.isfinite(sigma), sigma, " m must be above 0")
+    good = rows.good
+    ends = [
+        np.stack([numbers[f"{end}_{axis}_m"][good] for axis in _AXES], axis=-1) for end in _VECTORS
+    ]
+    return reflections(
+        numbers["photo"][good].astype(np.intp), heliostat[good],
+        numbers["facet"][good].astype(np.intp),
+        np.stack([numbers["x_m"][good], numbers["y_m"][good]], axis=-1),
+        ends[0], ends[1], sigma[good],
+    ), rows.left_out  # fmt: skip
+
+
+def _checked(path: str | Path) -> Path:
+    file = Path(path)
+    if file.suffix.casefold() not in (".csv", ".parquet"):
+        raise FormatError(
+            file, f"the name ends in {file.suffix!r}; reflections are .csv or .parquet"
+        )
+    return file

@@ -1,0 +1,436 @@
+"""Photographs of a simulated flight: ground, shadows, mirrors that show the sky, and the lamp.
+
+Light is counted in full scales of the sensor. Facets cover pixels by an 8-fold finer grid; the
+lamp's reflections stand at the exact places of :mod:`heliotrope.airborne.mirror`. A blur of
+the lens and of motion goes over all of it, then noise, clipping, the curve of sRGB and JPEG.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne._photo_metadata import Metadata, exif_and_xmp
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, write_camera
+from heliotrope.airborne.pinhole import local_pixels, project, undistort
+from heliotrope.airborne.reflections import Reflections
+from heliotrope.airborne.simulation import Flight, exact_reflections
+from heliotrope.airborne.standing import Standing, write_commands
+from heliotrope.errors import InputError
+from heliotrope.field.formats._textfile import write_file
+from heliotrope.geometry import FloatArray, as_float, direction, enu_to_geodetic, normalize
+
+Light = npt.NDArray[np.float32]
+Picture = npt.NDArray[np.uint8]
+
+#: Blue, green, red of sky, ground and lamp, relative.
+SKY_TINT, GROUND_TINT, LED_TINT = (1.25, 1.0, 0.80), (0.72, 0.95, 1.15), (1.0, 1.0, 1.0)
+#: Of a facet's edge, how much finer than a pixel it is drawn.
+FINER = 8
+_TEXTURE, _TEXEL = 1024, 0.04
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Light, lens and sensor.
+
+    Attributes
+    ----------
+    sky
+        Light of the sky at 45° of elevation, full scales.
+    ground
+        Mean light of the ground.
+    contrast
+        Relative standard deviation of the ground's texture.
+    sun
+        Azimuth and elevation of the sun, rad, for shadows; None for none.
+    led
+        Light of the lamp's reflection in a flat mirror when lamp and camera are 100 m from
+        it: the sum over its pixels. It falls with the square of the distance.
+    led_spread
+        Standard deviation of its spot on the mirror from the roughness of the glass, m.
+    blur
+        Standard deviation of the lens's blur, pixels.
+    motion
+        Way of the picture during the exposure, pixels right and down.
+    electrons
+        At full scale.
+    read_noise
+        Electrons.
+    quality
+        Of JPEG, 1 to 100.
+    """
+
+    sky: float = 0.55
+    ground: float = 0.16
+    contrast: float = 0.25
+    sun: tuple[float, float] | None = (math.radians(150.0), math.radians(50.0))
+    led: float = 6.0
+    led_spread: float = 0.01
+    blur: float = 0.8
+    motion: tuple[float, float] = (0.0, 0.0)
+    electrons: float = 9000.0
+    read_noise: float = 6.0
+    quality: int = 95
+
+    def __post_init__(self) -> None:
+        for name in ("sky", "ground", "contrast", "led", "led_spread", "blur", "read_noise"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise InputError(f"conditions: {name} {value} must be 0 or more")
+        if not (self.electrons > 0.0 and 1 <= self.quality <= 100):
+            raise InputError(
+                f"conditions: {self.electrons} electrons must be above 0 and quality "
+                f"{self.quality} from 1 to 100"
+            )
+
+
+def night(led: float = 6.0) -> Conditions:
+    """Return conditions of a moonlit night with a longer exposure and a dimmed lamp."""
+    return Conditions(sky=0.05, ground=0.012, sun=None, led=led, electrons=2500.0, read_noise=8.0)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a photograph shows.
+
+    Attributes
+    ----------
+    stand, shapes
+        The mirrors.
+    ground
+        Height of the ground, ENU m.
+    conditions
+        Light, lens and sensor.
+    """
+
+    stand: Standing
+    shapes: Sequence[MirrorShape]
+    ground: float = 0.0
+    conditions: Conditions = field(default_factory=Conditions)
+
+
+def render(
+    scene: Scene, camera: LedCamera, photo: Photo, lamp: Reflections, seed: int = 0
+) -> Picture:
+    """Return the photograph, blue-green-red, uint8 (H, W, 3).
+
+    Parameters
+    ----------
+    scene
+        What there is.
+    camera, photo
+        Lens, and true exterior orientation.
+    lamp
+        The lamp's reflections in this photograph: ``heliostat`` is the row in the scene.
+    seed
+        Of the noise, 0 or more.
+    """
+    conditions = scene.conditions
+    image = _ground(camera, photo, scene)
+    order = np.argsort(-np.linalg.norm(scene.stand.vertex - photo.position, axis=-1))
+    if conditions.sun is not None:
+        _shadows(image, camera, photo, scene)
+    hit = {int(h): np.flatnonzero(lamp.heliostat == h) for h in np.unique(lamp.heliostat)}
+    for row in order:
+        # What is nearer hides mirrors and spots behind it.
+        _mirror(image, camera, photo, scene, int(row))
+        for k in hit.get(int(row), ()):
+            _spot(image, camera, photo, scene, lamp, int(k))
+    return _expose(_blurred(image, conditions), conditions, seed)
+
+
+def sky_light(way: npt.ArrayLike, conditions: Conditions) -> FloatArray:
+    """Return the light (...) of the sky in unit directions (..., 3): brighter to the horizon."""
+    up = np.clip(as_float(way)[..., 2], 0.0, 1.0)
+    return as_float(conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up)))
+
+
+# -- parts of a picture ----------------------------------------------------------------
+
+
+@lru_cache(maxsize=1)
+def _texture() -> Light:
+    """Return a ground that repeats every 41 m: grains, stones and patches, mean 0, spread 1."""
+    rng = np.random.default_rng(20)
+    k = np.hypot(*np.meshgrid(*[np.fft.fftfreq(_TEXTURE)] * 2)) * _TEXTURE
+    spectrum = np.fft.fft2(rng.standard_normal((_TEXTURE, _TEXTURE)))
+    rough = np.fft.ifft2(spectrum / np.maximum(k, 3.0) ** 0.8).real
+    return np.asarray(rough / rough.std(), np.float32)
+
+
+def _ground(camera: LedCamera, photo: Photo, scene: Scene) -> Light:
+    import cv2
+
+    width, height = camera.size
+    conditions, step = scene.conditions, 16
+    columns, rows = width // step + 2, height // step + 2
+    grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1) * float(step)
+    plane = undistort(camera, grid)
+    way = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ photo.rotation.T
+    down = -way[..., 2] / np.linalg.norm(way, axis=-1)
+    # What looks at the horizon or above it sees haze.
+    depth = (photo.position[2] - scene.ground) / np.maximum(-way[..., 2], 0.02)
+    place = (photo.position[:2] + depth[..., None] * way[..., :2]) / _TEXEL
+    place = np.mod(place - place.min(axis=(0, 1)), 1e7).astype(np.float32)
+    matrix = np.array([[1.0 / step, 0.0, 0.0], [0.0, 1.0 / step, 0.0]])
+    turned: dict[str, Any] = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
+    maps = [
+        np.mod(cv2.warpAffine(place[..., k], matrix, (width, height), **turned), _TEXTURE)
+        for k in (0, 1)
+    ]
+    grains = cv2.remap(
+        _texture(), maps[0], maps[1], cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_WRAP,
+    )  # fmt: skip
+    light = conditions.ground * np.maximum(1.0 + conditions.contrast * grains, 0.05)
+    if (down < 0.05).any():
+        share = cv2.warpAffine((down < 0.05).astype(np.float32), matrix, (width, height), **turned)
+        light = light + share * (conditions.sky - light)
+    return np.asarray(light[..., None] * np.array(GROUND_TINT, np.float32), np.float32)
+
+
+def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: Scene) -> None:
+    sun = scene.conditions.sun
+    if sun is None or sun[1] <= 0.05:
+        return
+    ray = -direction(*sun)
+    corners = scene.stand.corners
+    fall = (corners[..., 2] - scene.ground) / -ray[2]
+    for outline in corners + fall[..., None] * ray:
+        seen = project(camera, photo.position, photo.rotation, outline)
+        if np.isfinite(seen).all():
+            _cover(image, seen, np.zeros(3), 0.55)
+
+
+def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: Scene, row: int) -> None:
+    shape, turned = scene.shapes[row], scene.stand.rotation[row]
+    vertex = scene.stand.vertex[row]
+    away = photo.position - vertex
+    if away @ turned[:, 2] <= 0.0:
+        return
+    corners = vertex + shape.corners @ turned.T
+    middle = vertex + shape.center @ turned.T
+    seen = project(camera, photo.position, photo.rotation, corners)
+    width, height = camera.size
+    inside = np.isfinite(seen).all()
+    if (
+        not inside
+        or (seen.max(axis=(0, 1)) < 0).any()
+        or (seen.min((0, 1)) > [width, height]).any()
+    ):
+        return
+    way = normalize(photo.position - middle)
+    normals = shape.axes[:, 2] @ turned.T
+    back = 2.0 * np.sum(way * normals, axis=-1, keepdims=True) * normals - way
+    light = sky_light(back, scene.conditions)
+    for outline, bright in zip(seen, light, strict=True):
+        _cover(image, outline, bright * np.asarray(SKY_TINT), 1.0)
+
+
+def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: float) -> None:
+    """Lay a colour over the pixels in a polygon (K, 2), each by its covered share."""
+    import cv2
+
+    height, width = image.shape[:2]
+    low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
+    high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
+    if (high <= low).any():
+        return
+    size = high - low
+    fine = np.zeros((size[1] * FINER, size[0] * FINER), np.uint8)
+    # Pixel centres are whole numbers: the first fine cell's centre lies at -1/2 + 1/(2 FINER).
+    places = (_shrunk(outline, 0.5 / FINER) - low + 0.5) * FINER - 0.5
+    cv2.fillPoly(fine, [np.round(places * 16.0).astype(np.int32)], 255, shift=4)
+    share = cv2.resize(fine, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
+    part = image[low[1] : high[1], low[0] : high[0]]
+    alpha = (np.float32(strength / 255.0) * share)[..., None]
+    part += alpha * (colour.astype(np.float32) - part)
+
+
+def _shrunk(outline: FloatArray, by: float) -> FloatArray:
+    """Move the edges of a convex polygon (K, 2) inwards: fillPoly also fills what it touches."""
+    ahead = np.roll(outline, -1, axis=0) - outline
+    normal = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    before = np.roll(normal, 1, axis=0)
+    turn = 1.0 + np.sum(normal * before, axis=-1, keepdims=True)
+    area = np.sum(
+        outline[:, 0] * np.roll(outline[:, 1], -1) - outline[:, 1] * np.roll(outline[:, 0], -1)
+    )
+    return as_float(outline + math.copysign(by, area) * (normal + before) / np.maximum(turn, 0.1))
+
+
+def _spot(
+    image: Light, camera: LedCamera, photo: Photo, scene: Scene, lamp: Reflections, k: int
+) -> None:
+    row, facet = int(lamp.heliostat[k]), lamp.facet[k : k + 1]
+    point = scene.shapes[row].point_at(facet, lamp.xy[k : k + 1])[0]
+    place = scene.stand.vertex[row] + scene.stand.rotation[row] @ point
+    local = (place - photo.position) @ photo.rotation
+    seen = local_pixels(camera, local)
+    width, height = camera.size
+    if not np.isfinite(seen).all():
+        return
+    distance = float(np.linalg.norm(local))
+    # Narrower than a third of a pixel nothing changes any more.
+    sigma = max(scene.conditions.led_spread * camera.focal / distance, 0.3)
+    reach = math.ceil(4.0 * sigma) + 1
+    x, y = (np.arange(round(c) - reach, round(c) + reach + 1) for c in seen.tolist())
+    spread = [_bell(axis, c, sigma) for axis, c in zip((x, y), seen, strict=True)]
+    light = scene.conditions.led * (100.0 / distance) ** 2 * np.outer(spread[1], spread[0])
+    keep_x, keep_y = (x >= 0) & (x < width), (y >= 0) & (y < height)
+    if not (keep_x.any() and keep_y.any()):
+        return
+    part = image[y[keep_y][0] : y[keep_y][-1] + 1, x[keep_x][0] : x[keep_x][-1] + 1]
+    part += np.asarray(light[keep_y][:, keep_x, None] * np.asarray(LED_TINT), np.float32)
+
+
+def _bell(cells: npt.NDArray[np.intp], center: float, sigma: float) -> FloatArray:
+    """Return the share of a normal distribution in each cell of width 1."""
+    from scipy.special import ndtr
+
+    edges = np.concatenate([cells - 0.5, cells[-1:] + 0.5])
+    return as_float(np.diff(ndtr((edges - center) / sigma)))
+
+
+def _blurred(image: Light, conditions: Conditions) -> Light:
+    import cv2
+
+    edge = cv2.BORDER_REPLICATE
+    if conditions.blur > 0.0:
+        reach = 2 * math.ceil(3.5 * conditions.blur) + 1
+        smooth = cv2.GaussianBlur(image, (reach, reach), conditions.blur, borderType=edge)
+        image = np.asarray(smooth, np.float32)
+    length = math.hypot(*conditions.motion)
+    if length > 0.0:
+        reach = math.ceil(0.5 * length) + 1
+        line = np.zeros((2 * reach + 1, 2 * reach + 1))
+        count = 8 * reach
+        for part in (np.arange(count) + 0.5) / count - 0.5:
+            u, v = (reach + part * m for m in conditions.motion)
+            i, j = int(v), int(u)
+            a, b = u - j, v - i
+            line[i : i + 2, j : j + 2] += np.outer((1 - b, b), (1 - a, a)) / count
+        image = np.asarray(cv2.filter2D(image, -1, line[::-1, ::-1], borderType=edge), np.float32)
+    return image
+
+
+@lru_cache(maxsize=1)
+def _curve() -> npt.NDArray[np.uint8]:
+    share = np.linspace(0.0, 1.0, 16384)
+    curve = np.where(share <= 0.0031308, 12.92 * share, 1.055 * share ** (1 / 2.4) - 0.055)
+    return np.round(255.0 * curve).astype(np.uint8)
+
+
+def _expose(image: Light, conditions: Conditions, seed: int) -> Picture:
+    if seed < 0:
+        raise InputError(f"render: seed {seed} must be 0 or more")
+    rng = np.random.Generator(np.random.SFC64(seed))
+    flat = image.reshape(-1)
+    out = np.empty(flat.size, np.uint8)
+    curve, block = _curve(), 2**20
+    variance = np.float32((conditions.read_noise / conditions.electrons) ** 2)
+    per = np.float32(1.0 / conditions.electrons)
+    for a in range(0, flat.size, block):
+        level = flat[a : a + block]
+        noise = rng.standard_normal(level.size, dtype=np.float32)
+        level = level + noise * np.sqrt(level * per + variance)
+        index = np.clip(level, 0.0, 1.0) * np.float32(len(curve) - 1) + np.float32(0.5)
+        out[a : a + block] = curve[index.astype(np.uint16)]
+    return out.reshape(image.shape)
+
+
+# -- files -----------------------------------------------------------------------------
+
+
+def write_photo(
+    path: str | Path,
+    picture: Picture,
+    told: Photo,
+    origin: tuple[float, float, float],
+    quality: int = 95,
+) -> None:
+    """Write a JPEG with what the drone tells in EXIF and DJI's XMP.
+
+    Parameters
+    ----------
+    path
+        The file.
+    picture
+        Blue-green-red, (H, W, 3).
+    told
+        Position, rotation and time as the drone tells them.
+    origin
+        Latitude and longitude (degrees) and height (m) of ENU's origin.
+    quality
+        Of JPEG.
+    """
+    import cv2
+
+    latitude, longitude, height = enu_to_geodetic(told.position, origin)
+    yaw, pitch, roll = (math.degrees(a) for a in gimbal_of_rotation(told.rotation))
+    exif, xmp = exif_and_xmp(
+        Metadata(
+            (picture.shape[1], picture.shape[0]), told.time, float(latitude), float(longitude),
+            float(height), yaw, pitch, roll, told.sigma_position,
+        )
+    )  # fmt: skip
+    good, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
+    if not good:
+        raise InputError(f"{path}: the picture cannot be encoded as JPEG")
+    data = encoded.tobytes()
+    segments = b""
+    for body in (exif, b"http://ns.adobe.com/xap/1.0/\0" + xmp):
+        segments += b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body
+    whole = data[:2] + segments + data[2:]
+    write_file(path, lambda stream: stream.write(whole))
+
+
+def render_flight(
+    flight: Flight,
+    folder: str | Path,
+    origin: tuple[float, float, float],
+    *,
+    conditions: Conditions | None = None,
+    seed: int = 0,
+    progress: Any = None,
+) -> Reflections:
+    """Write the photographs of a flight with camera.toml and commands.csv; return the truth.
+
+    Parameters
+    ----------
+    flight
+        Of :func:`heliotrope.airborne.simulation.fly`.
+    folder
+        Where to; it is made if need be.
+    origin
+        As :func:`write_photo`.
+    conditions
+        By default those of a clear day.
+    seed
+        Of the noise.
+    progress
+        Is told how many photographs are done, of how many.
+    """
+    light = conditions or Conditions()
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    exact = exact_reflections(flight)
+    ground = float(np.median(flight.heliostats.position[:, 2]))
+    scene = Scene(flight.truth, flight.shapes, ground, light)
+    write_camera(place / "camera.toml", flight.camera)
+    write_commands(place / "commands.csv", flight.heliostats.names, flight.counts)
+    for k, (taken, told) in enumerate(zip(flight.taken, flight.told, strict=True)):
+        lamp = exact.take(np.flatnonzero(exact.photo == k))
+        picture = render(scene, flight.camera, taken, lamp, seed + k)
+        write_photo(place / told.name, picture, told, origin, light.quality)
+        if progress is not None:
+            progress(k + 1, len(flight.taken))
+    return exact

@@ -1,0 +1,284 @@
+"""A flight with its truth: mirrors as they really stand, positions as the drone tells them.
+
+A flight holds two pictures of the same thing. What is *true*: mechanisms with imperfections,
+surveyed positions that are off, facets with slope errors, where the camera really was. What is
+*told*: the plant file, the commands, and for each photograph a position from RTK and the
+angles of a gimbal. :func:`fly` makes both; :func:`reflections_of` gives the reflections that
+an image evaluation would find, without images; :mod:`heliotrope.airborne.rendering` draws them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.mirror import MirrorShape, ideal, reflection_points
+from heliotrope.airborne.photo import LedCamera, Photo, look_at
+from heliotrope.airborne.reflections import Reflections, join, reflections
+from heliotrope.airborne.slopes import smooth_slopes
+from heliotrope.airborne.standing import Standing, standing
+from heliotrope.errors import InputError
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, rotation
+from heliotrope.mechanism.tracking import Status, track
+
+#: Deviations of mechanisms that were roughly adjusted, standard deviations in rad.
+ADJUSTED: Mapping[str, float] = {
+    "tilt_north": 1e-3, "tilt_east": 1e-3, "azimuth_bias": 2e-3, "elevation_bias": 2e-3,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far what is told differs from what is true; standard deviations but for the offset.
+
+    Attributes
+    ----------
+    rtk
+        Of each position east, north, up, independent from photograph to photograph, m, (3,).
+    rtk_offset
+        Told less true, the same in all photographs, m, (3,).
+    gimbal
+        Of each of three turns of the camera, rad.
+    survey
+        Of each coordinate of a heliostat's position, m.
+    slope
+        RMS of each component of the slope deviations of the mirrors, rad.
+    slope_length
+        Over which slopes stay alike, m.
+    reflection
+        Of where a reflection is seen on the mirror, each of x and y, m.
+    mechanism
+        Of parameters of the mechanisms, rad.
+    """
+
+    rtk: tuple[float, float, float] = (0.008, 0.008, 0.008)
+    rtk_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gimbal: float = float(np.radians(0.5))
+    survey: float = 0.005
+    slope: float = 0.8e-3
+    slope_length: float = 0.3
+    reflection: float = 0.015
+    mechanism: Mapping[str, float] = field(default_factory=lambda: ADJUSTED)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A simulated flight over N heliostats with P photographs.
+
+    Attributes
+    ----------
+    camera
+        With its lamp.
+    heliostats
+        As the plant file has them.
+    counts
+        Drive positions during the flight, (N, D).
+    truth
+        How the mirrors really stand.
+    shapes
+        Their surfaces with slope deviations, N of them.
+    taken
+        Photographs as they were taken.
+    told
+        The same as the drone tells them.
+    """
+
+    camera: LedCamera
+    heliostats: Heliostats
+    counts: FloatArray
+    truth: Standing
+    shapes: tuple[MirrorShape, ...]
+    taken: tuple[Photo, ...]
+    told: tuple[Photo, ...]
+
+
+def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
+    """Return the drive counts (N, D) at which all mirrors look at one point.
+
+    Raises
+    ------
+    InputError
+        If a heliostat cannot.
+    """
+    to = as_vectors(point, "point")
+    mechanism = heliostats.calibrated
+    vertex = mechanism.position
+    for _ in range(4):
+        # A mirror looks at what it sends light back to; its vertex moves with it.
+        result = track(mechanism, normalize(to - vertex), to)
+        vertex = result.chosen(result.vertex)
+    status = result.chosen(result.status)
+    if (status != Status.OK).any():
+        i = int(np.flatnonzero(status != Status.OK)[0])
+        raise InputError(
+            f"heliostat {heliostats.names[i]}: cannot look at {to.tolist()} m; choose another point"
+        )
+    return as_float(result.chosen(result.counts))
+
+
+def hover_grid(
+    center: npt.ArrayLike, focus: npt.ArrayLike, columns: int, rows: int, step: float
+) -> FloatArray:
+    """Return hover positions (columns · rows, 3) across the line from ``focus`` to ``center``.
+
+    Parameters
+    ----------
+    center
+        Middle of the pattern, ENU metres.
+    focus
+        What the camera looks at.
+    columns, rows
+        Level, and along the slope.
+    step
+        Between neighbours, m. Lines are flown back and forth.
+    """
+    turned = look_at(center, focus)
+    across = (np.arange(columns) - 0.5 * (columns - 1)) * step
+    along = (np.arange(rows) - 0.5 * (rows - 1)) * step
+    places = [
+        as_float(center) + x * turned[:, 0] + y * turned[:, 1]
+        for k, y in enumerate(along)
+        for x in (across if k % 2 == 0 else across[::-1])
+    ]
+    return as_float(places).reshape(-1, 3)
+
+
+def fly(
+    heliostats: Heliostats,
+    camera: LedCamera,
+    counts: npt.ArrayLike,
+    positions: npt.ArrayLike,
+    focus: npt.ArrayLike,
+    *,
+    errors: Errors | None = None,
+    focal: npt.ArrayLike = np.inf,
+    start: datetime = datetime(2026, 6, 21, 10, 0, tzinfo=UTC),
+    interval: float = 3.0,
+    seed: int = 0,
+) -> Flight:
+    """Return a flight over heliostats with its truth; the same seed gives the same flight.
+
+    Parameters
+    ----------
+    heliostats
+        As the plant file has them.
+    camera
+        With its lamp.
+    counts
+        Drive positions, (N, D).
+    positions
+        Where photographs are to be taken, ENU metres, (P, 3).
+    focus
+        What the camera is to look at, ENU metres, (3,).
+    errors
+        By default those of :class:`Errors`.
+    focal
+        Of the facets, m; inf if flat.
+    start, interval
+        Time of the first photograph, and seconds between two.
+    seed
+        Of all randomness.
+    """
+    wrong = errors or Errors()
+    rng = np.random.default_rng(seed)
+    really = _installed(heliostats, wrong, rng)
+    shapes = []
+    for row in range(len(heliostats)):
+        shape = ideal(heliostats, row, focal)
+        if wrong.slope > 0.0:
+            slopes = smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length)
+            shape = shape.with_slopes(slopes)
+        shapes.append(shape)
+    places = as_vectors(positions, "positions").reshape(-1, 3)
+    times = [start + timedelta(seconds=k * interval) for k in range(len(places))]
+    pairs = [
+        _photograph(f"DJI_{k + 1:04d}.JPG", time, place, as_float(focus), wrong, rng)
+        for k, (time, place) in enumerate(zip(times, places, strict=True))
+    ]
+    return Flight(
+        camera, heliostats, as_float(counts), standing(really, counts), tuple(shapes),
+        tuple(p[0] for p in pairs), tuple(p[1] for p in pairs),
+    )  # fmt: skip
+
+
+def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) -> Heliostats:
+    """Return the heliostats as they really are."""
+    count = len(heliostats)
+    sizes = {f"position_{axis}": wrong.survey for axis in ("east", "north", "up")}
+    moved = dict(heliostats.parameters)
+    for name, sigma in {**sizes, **wrong.mechanism}.items():
+        moved[name] = moved.get(name, 0.0) + rng.normal(0.0, sigma, count)
+    return heliostats.with_parameters(moved)
+
+
+def _photograph(
+    name: str, time: datetime, place: FloatArray, focus: FloatArray, wrong: Errors,
+    rng: np.random.Generator,
+) -> tuple[Photo, Photo]:  # fmt: skip
+    """Return a photograph as it was taken and as the drone tells it."""
+    # The drone steers by its own RTK: what it believes is where it was sent.
+    true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
+    wanted = look_at(place, focus)
+    lean = rng.normal(0.0, wrong.gimbal, 3)
+    turned = rotation(lean, np.linalg.norm(lean)) @ wanted
+    return (
+        Photo(name, time, true, turned),
+        Photo(name, time, place, wanted, np.maximum(wrong.rtk, 1e-4)),
+    )
+
+
+def exact_reflections(flight: Flight) -> Reflections:
+    """Return every reflection of the flight by the exact law: true places, true positions.
+
+    ``sigma`` is 1e-9 m. Mirrors that hide others are not looked at.
+    """
+    camera = as_float([p.position for p in flight.taken]).reshape(-1, 3)
+    led = as_float([p.led_position(flight.camera) for p in flight.taken]).reshape(-1, 3)
+    parts = []
+    for row, shape in enumerate(flight.shapes):
+        stand = flight.truth
+        seen = reflection_points(shape, stand.rotation[row], stand.vertex[row], camera, led)
+        if len(seen):
+            parts.append(
+                reflections(
+                    seen.position, row, seen.facet, seen.xy, camera[seen.position],
+                    led[seen.position], 1e-9,
+                )
+            )  # fmt: skip
+    found = join(parts)
+    return found.take(np.lexsort((found.heliostat, found.photo)))
+
+
+def reflections_of(
+    flight: Flight, errors: Errors | None = None, *, seed: int = 0, corrected: bool = False
+) -> Reflections:
+    """Return the reflections that an evaluation would find, without images.
+
+    Parameters
+    ----------
+    flight
+        Of :func:`fly`.
+    errors
+        Only ``reflection`` is used: noise of the places on the mirror.
+    seed
+        Of that noise.
+    corrected
+        Whether the common offset of RTK is known and taken off, as the evaluation of images
+        does. The angles of the camera, which place the lamp, are known to 0.1 mrad from the
+        images and taken as true.
+    """
+    wrong = errors or Errors()
+    exact = exact_reflections(flight)
+    rng = np.random.default_rng(seed)
+    noisy = exact.xy + rng.normal(0.0, wrong.reflection, (len(exact), 2))
+    told = as_float([p.position for p in flight.told]).reshape(-1, 3)
+    true = as_float([p.position for p in flight.taken]).reshape(-1, 3)
+    off = (told - true).mean(axis=0) if corrected and len(told) else np.zeros(3)
+    camera = told[exact.photo] - off
+    return replace(
+        exact, x=noisy[:, 0], y=noisy[:, 1], camera=camera, led=camera + exact.led - exact.camera,
+        sigma=np.full(len(exact), max(wrong.reflection, 1e-6)),
+    )  # fmt: skip

@@ -1,0 +1,179 @@
+"""How mirrors stand: vertex and rotation of each at its drive positions, and where its edges are.
+
+Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up
+along the mirror, z the normal.
+"""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.mirror import orientation
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.formats._textfile import read_text, write_text
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.geometry import FloatArray, as_float
+
+
+@dataclass(frozen=True)
+class Standing:
+    """N mirrors as they stand, or are believed to.
+
+    Attributes
+    ----------
+    names
+        Of the heliostats.
+    vertex
+        ENU metres, (N, 3).
+    rotation
+        Concentrator to ENU, (N, 3, 3).
+    outline
+        Corners of the mirror in concentrator coordinates, m: upper left, upper right, lower
+        right, lower left as seen from the front, (N, 4, 3).
+    """
+
+    names: tuple[str, ...]
+    vertex: FloatArray
+    rotation: FloatArray
+    outline: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def corners(self) -> FloatArray:
+        """Corners in ENU metres, (N, 4, 3)."""
+        turned = np.einsum("nij,nkj->nki", self.rotation, self.outline)
+        return as_float(self.vertex[:, None, :] + turned)
+
+    def take(self, rows: npt.ArrayLike) -> "Standing":
+        """Return the mirrors at ``rows``, in that order."""
+        index = np.asarray(rows, dtype=np.intp).reshape(-1)
+        return Standing(
+            tuple(self.names[i] for i in index),
+            self.vertex[index],
+            self.rotation[index],
+            self.outline[index],
+        )
+
+
+def standing(heliostats: Heliostats, counts: npt.ArrayLike) -> Standing:
+    """Return how calibrated heliostats stand at drive counts (N, D)."""
+    turned, vertex = orientation(heliostats.calibrated, counts)
+    return Standing(heliostats.names, vertex, turned, outline(heliostats))
+
+
+def join_standing(parts: Sequence[Standing]) -> Standing:
+    """Return several groups of mirrors as one, in the order given.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    if not parts:
+        raise InputError("no mirror is commanded; name those that the photographs show")
+    return Standing(
+        tuple(name for p in parts for name in p.names),
+        np.concatenate([p.vertex for p in parts]),
+        np.concatenate([p.rotation for p in parts]),
+        np.concatenate([p.outline for p in parts]),
+    )
+
+
+def outline(heliostats: Heliostats) -> FloatArray:
+    """Return the corners of mirrors in concentrator coordinates, (N, 4, 3).
+
+    Of facets the outermost corners, with their heights; else a flat rectangle.
+    """
+    signs = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
+    facets = heliostats.facets
+    if facets is None:
+        half = 0.5 * np.stack([heliostats.width, heliostats.height], axis=-1)
+        flat = half[:, None, :] * signs
+        return np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=-1)
+    every = facets.center[:, :, None, :] + (
+        signs[:, :1] * facets.half_width[:, :, None, :]
+        + signs[:, 1:] * facets.half_height[:, :, None, :]
+    )
+    every = every.reshape(len(every), -1, 3)
+    index = np.argmax(every[:, :, :2] @ signs.T, axis=1)
+    return np.take_along_axis(every, index[:, :, None], axis=1)
+
+
+# -- commands --------------------------------------------------------------------------
+
+
+def read_commands(
+    path: str | Path, names: Sequence[str], cluster: str = "", point: str = ""
+) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    """Return rows of heliostats and their drive counts (M, D) from a table of commands.
+
+    Parameters
+    ----------
+    path
+        CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); those
+        of a flight plan have ``cluster``, ``point`` and ``reachable`` besides.
+    names
+        Of the plant's heliostats.
+    cluster, point
+        Only rows of this cluster and this calibration point; "" for all.
+
+    Raises
+    ------
+    FormatError
+        If a column is missing, a value is no number or a heliostat stands in it twice.
+    UnknownNameError
+        If a heliostat is not in the plant: the wrong field.
+    """
+    reader = csv.DictReader(io.StringIO(read_text(path, "a table of commands")))
+    columns = list(reader.fieldnames or ())
+    counts = [c for c in ("count_1", "count_2") if c in columns]
+    if "heliostat" not in columns or not counts:
+        raise FormatError(path, "needs the columns heliostat, count_1, count_2")
+    index = {name: i for i, name in enumerate(names)}
+    found: dict[int, list[float]] = {}
+    for line, row in enumerate(reader, start=2):
+        other = [w for w, k in ((cluster, "cluster"), (point, "point")) if w and row.get(k) != w]
+        if other or row.get("reachable") == "false":
+            continue
+        name = (row["heliostat"] or "").strip()
+        if name not in index:
+            raise UnknownNameError(f"heliostat ({path}, line {line}) in this field:", name, names)
+        if index[name] in found:
+            raise FormatError(
+                path, f"heliostat {name} stands in it twice; photographs show one pose: give the "
+                "cluster and the point that they are of", f"line {line}",
+            )  # fmt: skip
+        found[index[name]] = _counts(path, line, name, [row[c] for c in counts])
+    if not found:
+        of = f" of cluster {cluster!r}, point {point!r}" if cluster or point else ""
+        raise InputError(f"{path}: no heliostat{of} in it; list those that the photographs show")
+    return np.fromiter(found, dtype=np.intp), as_float(list(found.values()))
+
+
+def _counts(path: str | Path, line: int, name: str, texts: Sequence[str]) -> list[float]:
+    try:
+        values = [float(text) for text in texts]
+    except (TypeError, ValueError):
+        values = [np.nan]
+    if not np.isfinite(values).all():
+        raise FormatError(path, f"counts of {name} are no numbers", f"line {line}")
+    return values
+
+
+def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:
+    """Write drive counts (N, D) of heliostats so that :func:`read_commands` reads them."""
+    table = as_float(counts)
+    header = ["heliostat", *(f"count_{k + 1}" for k in range(table.shape[1]))]
+    lines = [",".join(header)]
+    lines += [
+        ",".join([name, *(repr(float(v)) for v in row)])
+        for name, row in zip(names, table, strict=True)
+    ]
+    write_text(path, "\n".join(lines) + "\n")

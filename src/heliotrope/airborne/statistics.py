@@ -1,0 +1,295 @@
+r"""Outliers, normality, and how well a mean over points of a mirror is known.
+
+The plain figure, σ/√n, takes the differences at n points as n independent draws. They are
+not: the slope deviations of a mirror are one fixed, smooth field, and points that are spread
+over it average it better than chance would. What the mean over points misses of the mean over
+the mirror V is, with the covariance C of the field,
+
+.. math:: σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n
+
+(the extension variance: Matheron 1963, Economic Geology 58, 1246; Chilès & Delfiner 2012,
+*Geostatistics*, section 2.6) with τ the noise of one point. The field is taken as Gaussian with
+Matérn's covariance of smoothness 3/2, the same on all facets and independent between them, so
+that canting errors are part of it. Variance, correlation length and noise come from the
+differences themselves by restricted maximum likelihood, averaged over all lengths and noise
+ratios by their likelihood, since one mirror says little about either.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float
+
+#: Probability of a false alarm of Rosner's test.
+ALPHA = 0.05
+#: No more than this share of the values can be outliers.
+SHARE = 0.2
+# Correlation lengths that are tried, as shares of a facet's diagonal, and ratios τ²/s².
+_LENGTHS = np.geomspace(0.04, 1.2, 8)
+_RATIOS = np.geomspace(1e-3, 1e2, 11)
+# Points along an edge of a facet that stand for its area. Two grids without common points, so
+# that the mean of C over pairs is not raised by pairs of a point with itself.
+_AREA = (9, 8)
+
+
+def rosner(
+    values: npt.ArrayLike, *, alpha: float = ALPHA, share: float = SHARE
+) -> npt.NDArray[np.bool_]:
+    """Return the mask of outliers among n values: generalised extreme Studentized deviates.
+
+    Parameters
+    ----------
+    values
+        (n,), from a normal distribution but for the outliers.
+    alpha
+        Probability of calling any of n good values an outlier.
+    share
+        Largest share of outliers.
+
+    Raises
+    ------
+    InputError
+        If alpha or share does not lie between 0 and 1.
+
+    Notes
+    -----
+    Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are the values' own;
+    :func:`heliotrope.calibration.outliers.generalised_esd` is the test where the covariance
+    is known.
+    """
+    for name, value in (("alpha", alpha), ("share", share)):
+        if not 0.0 < value < 1.0:
+            raise InputError(f"{name} {value}: it must lie between 0 and 1")
+    data = as_float(values)
+    mask = np.zeros(len(data), dtype=np.bool_)
+    # Rosner's critical values hold from n = 15 on well, and need two values that stay.
+    most = min(int(np.ceil(share * len(data))), len(data) - 3)
+    if most < 1:
+        return mask
+    which, extreme, critical = studentized_deviates(data, most, alpha)
+    beyond = np.flatnonzero(extreme > critical)
+    if len(beyond):
+        mask[which[: beyond[-1] + 1]] = True
+    return mask
+
+
+def studentized_deviates(
+    values: npt.ArrayLike, most: int, alpha: float = ALPHA
+) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
+    """Return rows, extreme Studentized deviates R and critical values λ, each (most,).
+
+    Rosner 1983, (2.1) and (2.5): what is farthest from the mean is taken away ``most`` times.
+    """
+    from scipy.stats import t as student
+
+    data = as_float(values)
+    left = np.arange(len(data))
+    which = np.empty(most, dtype=np.intp)
+    extreme = np.zeros(most)
+    for i in range(most):
+        part = data[left]
+        spread = float(part.std(ddof=1))
+        away = np.abs(part - part.mean())
+        k = int(np.argmax(away))
+        # Values that are all alike have no extreme one.
+        extreme[i] = away[k] / spread if spread > 0.0 else 0.0
+        which[i] = left[k]
+        left = np.delete(left, k)
+    rest = len(data) - np.arange(most)
+    quantile = student.ppf(1.0 - alpha / (2.0 * rest), rest - 2)
+    critical = (rest - 1) * quantile / np.sqrt((rest - 2 + quantile**2) * rest)
+    return which, extreme, as_float(critical)
+
+
+def normality(values: npt.ArrayLike) -> float:
+    """Return the p value of Shapiro and Wilk's test; NaN for fewer than 3 or equal values."""
+    from scipy.stats import shapiro
+
+    data = as_float(values)
+    if len(data) < 3 or float(np.ptp(data)) <= 0.0:
+        return float("nan")
+    return float(shapiro(data).pvalue)
+
+
+def plain_sigma(values: npt.ArrayLike) -> FloatArray:
+    """Return σ/√n of each column of (n, c) values, (c,); NaN for fewer than 2."""
+    data = as_float(values)
+    if len(data) < 2:
+        return np.full(data.shape[1:], np.nan)
+    return as_float(data.std(axis=0, ddof=1) / np.sqrt(len(data)))
+
+
+@dataclass(frozen=True)
+class SpreadMean:
+    """Means of c components over a mirror, from n points on it.
+
+    Attributes
+    ----------
+    sigma
+        Standard deviation of the points' plain mean about the mean over the mirror, (c,).
+    weights
+        With which the points give the mean over the mirror with the least variance (ordinary
+        block kriging); their sum is 1, (n,).
+    sigma_weighted
+        Standard deviation of that weighted mean, (c,).
+    length
+        Correlation length, m: mean over the likelihood.
+    noise
+        Share of the variance that belongs to no field: τ² / (s² + τ²).
+    """
+
+    sigma: FloatArray
+    weights: FloatArray
+    sigma_weighted: FloatArray
+    length: float
+    noise: float
+
+
+def spread_mean(
+    values: npt.ArrayLike, shape: MirrorShape, facet: npt.ArrayLike, uv: npt.ArrayLike
+) -> SpreadMean:
+    """Return what n points say about the mean over the mirror.
+
+    Parameters
+    ----------
+    values
+        (n, c): differences at the points, rad.
+    shape
+        Of the mirror.
+    facet, uv
+        Of each point, (n,), and where it stands along the facet's axes, m, (n, 2).
+
+    Returns
+    -------
+    For fewer than 8 points the plain figures: they say nothing about a field.
+    """
+    data, k, place = as_float(values), np.asarray(facet, dtype=np.intp), as_float(uv)
+    n = len(data)
+    if n < 8:
+        return SpreadMean(
+            plain_sigma(data), np.full(n, 1.0 / max(n, 1)), plain_sigma(data), float("nan"), 1.0
+        )
+    scale = float(np.linalg.norm(2.0 * shape.half_size, axis=-1).mean())
+    lengths = scale * _LENGTHS
+    same = k[:, None] == k[None, :]
+    apart = np.linalg.norm(place[:, None] - place[None, :], axis=-1)
+    areas = _Areas.of(shape, k, place)
+    one = np.full(n, 1.0 / n)
+    fits = [
+        _Fit.of(data, np.where(same, matern(apart / ell), 0.0), *areas.at(float(ell)), one)
+        for ell in lengths
+    ]
+    score = np.array([fit.score for fit in fits])
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    plain, kriged = (
+        np.einsum("lr,lrc->c", weight, np.array([getattr(fit, name) for fit in fits]))
+        for name in ("plain", "kriged")
+    )
+    weights = np.einsum("lr,lrn->n", weight, np.array([fit.weights for fit in fits]))
+    share = _RATIOS / (1.0 + _RATIOS)
+    return SpreadMean(
+        np.sqrt(plain), weights, np.sqrt(kriged),
+        float(weight.sum(axis=1) @ lengths), float(weight.sum(axis=0) @ share),
+    )  # fmt: skip
+
+
+def matern(distance: npt.ArrayLike) -> FloatArray:
+    """Return Matérn's correlation of smoothness 3/2 at distances in correlation lengths."""
+    h = np.sqrt(3.0) * as_float(distance)
+    return as_float((1.0 + h) * np.exp(-h))
+
+
+@dataclass(frozen=True)
+class _Areas:
+    """Distances between points and area and within the area, by facet."""
+
+    shape: MirrorShape
+    facet: npt.NDArray[np.intp]
+    to_area: FloatArray
+
+    @classmethod
+    def of(cls, shape: MirrorShape, facet: npt.NDArray[np.intp], uv: FloatArray) -> "_Areas":
+        grid = _grid(_AREA[0])[None] * shape.half_size[facet][:, None]
+        return cls(shape, facet, np.linalg.norm(uv[:, None] - grid, axis=-1))
+
+    def at(self, length: float) -> tuple[FloatArray, float]:
+        """Return mean correlation of each point with the mirror, (n,), and of the mirror."""
+        area = np.prod(self.shape.half_size, axis=-1)
+        share = area / area.sum()
+        to_mirror = share[self.facet] * matern(self.to_area / length).mean(axis=-1)
+        first, second = (_grid(n) for n in _AREA)
+        within = 0.0
+        for size, part in zip(self.shape.half_size, share, strict=True):
+            apart = _apart(float(size[0]), float(size[1]))
+            within += float(part**2 * matern(apart / length).mean())
+        assert len(first) != len(second)
+        return as_float(to_mirror), within
+
+
+@lru_cache(maxsize=64)
+def _apart(half_width: float, half_height: float) -> FloatArray:
+    size = np.array([half_width, half_height])
+    first, second = (_grid(n) * size for n in _AREA)
+    return as_float(np.linalg.norm(first[:, None] - second[None, :], axis=-1))
+
+
+def _grid(count: int) -> FloatArray:
+    """Return the middles of count × count cells of the square from −1 to 1, (count², 2)."""
+    line = (2.0 * np.arange(count) + 1.0) / count - 1.0
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """All noise ratios at one correlation length.
+
+    Attributes
+    ----------
+    score
+        Restricted log likelihood, (R,).
+    plain, kriged
+        Variance of the plain and of the weighted mean, (R, c).
+    weights
+        (R, n).
+    """
+
+    score: FloatArray
+    plain: FloatArray
+    kriged: FloatArray
+    weights: FloatArray
+
+    @classmethod
+    def of(
+        cls, data: FloatArray, correlation: FloatArray, to_mirror: FloatArray, within: float,
+        one: FloatArray,
+    ) -> "_Fit":  # fmt: skip
+        n = len(data)
+        root, basis = np.linalg.eigh(correlation)
+        root = np.maximum(root, 0.0)
+        ones, values = basis.sum(axis=0), basis.T @ data
+        towards, plain_weights = basis.T @ to_mirror, basis.T @ one
+        diagonal = root[None, :] + _RATIOS[:, None]
+        inverse = 1.0 / diagonal
+        unit = inverse @ ones**2
+        mean = (inverse * ones) @ values / unit[:, None]
+        gap = values[None] - ones[None, :, None] * mean[:, None, :]
+        # s² of each component, as REML has it at this length and ratio.
+        variance = np.einsum("rn,rnc->rc", inverse, gap**2) / (n - 1)
+        score = -0.5 * (
+            (n - 1) * np.log(np.maximum(variance, 1e-300))
+            + np.log(diagonal).sum(axis=1)[:, None]
+            + np.log(unit)[:, None]
+        ).sum(axis=1)
+        best = inverse * (towards + ones * ((1.0 - inverse @ (ones * towards)) / unit)[:, None])
+        spread = [
+            np.sum(diagonal * w**2, axis=-1) - 2.0 * w @ towards + within
+            for w in (np.broadcast_to(plain_weights, best.shape), best)
+        ]
+        low, high = (np.maximum(s, 1e-12)[:, None] * variance for s in spread)
+        return cls(score, low, high, best @ basis.T)

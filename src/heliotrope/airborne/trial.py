@@ -1,0 +1,246 @@
+"""Trials of the orientation on simulated reflections: how many images are needed, how well.
+
+One mirror is measured again and again, with other slope errors, positions and noise each time.
+As the truth is known, its error can be set beside what the evaluation says of it.
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from heliotrope.airborne.budget import Budget
+from heliotrope.airborne.mirror import MirrorShape, reflection_points, tiled
+from heliotrope.airborne.orientation import Mean, measure, rotation_between, turned
+from heliotrope.airborne.reflections import Reflections, reflections
+from heliotrope.airborne.slopes import smooth_slopes
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, direction, normalize
+
+#: 90 % of a normal distribution lie within this many standard deviations.
+_NINETY = 1.6448536269514722
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Of a flight over one mirror; lengths in m, angles in rad, standard deviations per axis.
+
+    Attributes
+    ----------
+    distance
+        From mirror to drone.
+    columns, rows
+        Of the hover positions; they reach two slope errors beyond its edge.
+    slope, length
+        RMS of each component of the slope deviations, and over which they stay alike.
+    rtk
+        Of each photograph's position.
+    reflection
+        Of where the reflection is seen on the mirror.
+    hover
+        How far the drone stands off its place (and knows it).
+    pointing
+        How far the mirror is turned from where it is expected.
+    lamp
+        Beside the camera, to the right.
+    budget
+        Of what all points share.
+    """
+
+    distance: float = 150.0
+    columns: int = 8
+    rows: int = 6
+    slope: float = 0.8e-3
+    length: float = 0.3
+    rtk: float = 0.008
+    reflection: float = 0.015
+    hover: float = 0.1
+    pointing: float = 2e-3
+    lamp: float = 0.12
+    budget: Budget = field(default_factory=lambda: Budget(0.010, 0.030, 0.0, 0.0))
+
+    def __post_init__(self) -> None:
+        if not (self.distance > 0.0 and self.columns > 0 and self.rows > 0):
+            raise InputError(
+                f"trial: distance {self.distance} m, {self.columns} × {self.rows} positions; all "
+                "must be above 0"
+            )
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One mirror with its truth, and what is told of it.
+
+    Attributes
+    ----------
+    shape
+        With its true slopes.
+    rotation, vertex
+        True, (3, 3) and (3,).
+    told_rotation, told_vertex
+        Expected.
+    reflections
+        As image evaluation would find them.
+    """
+
+    shape: MirrorShape
+    rotation: FloatArray
+    vertex: FloatArray
+    told_rotation: FloatArray
+    told_vertex: FloatArray
+    reflections: Reflections
+
+
+@dataclass(frozen=True)
+class Trials:
+    """K trials, rad; rotX and rotY.
+
+    Attributes
+    ----------
+    count
+        Points that were used, (K,).
+    error
+        Of the mean alone: the mirror's true place known, (K, 2).
+    total_error
+        With all that was wrong, (K, 2).
+    sigma_plain, sigma_mean, systematic
+        As the evaluation gives them, (K, 2).
+    """
+
+    count: FloatArray
+    error: FloatArray
+    total_error: FloatArray
+    sigma_plain: FloatArray
+    sigma_mean: FloatArray
+    systematic: FloatArray
+
+    @property
+    def coverage(self) -> float:
+        """Share of the total errors within 90 % of what σ_tot says."""
+        total = np.hypot(self.sigma_mean, self.systematic)
+        return float(np.mean(np.abs(self.total_error) < _NINETY * total))
+
+
+def four_facets() -> MirrorShape:
+    """Return four facets, 3.2 m by 2.5 m together, canted and curved for 200 m."""
+    return tiled(2, 2, 1.6, 1.25, gap=0.02, focal=200.0)
+
+
+def scene(shape: MirrorShape, conditions: Conditions, seed: int) -> Scene:
+    """Return a mirror of the given ideal shape with random slopes, measured once."""
+    c, rng = conditions, np.random.default_rng(seed)
+    real = shape
+    if c.slope > 0.0:
+        real = shape.with_slopes(smooth_slopes(shape, rng, c.slope, length=c.length))
+    out = direction(rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(35.0, 70.0)))
+    right = normalize(np.cross((0.0, 0.0, 1.0), out))
+    told = np.stack([right, np.cross(out, right), out], axis=-1)
+    true = turned(told, c.pointing * rng.standard_normal(2))
+    told_vertex = np.array([0.0, 100.0, 3.0])
+    vertex = told_vertex + np.hypot(c.budget.position, c.budget.kinematics) * rng.standard_normal(3)
+    # The foot of the perpendicular runs over the mirror with the drone, slower where it focuses.
+    corners = shape.corners[..., :2].reshape(-1, 2)
+    narrow = abs(1.0 - c.distance / (2.0 * float(shape.focal.mean())))
+    # Beyond its edge, so that parts of the surface that look outwards are not missed.
+    half = narrow * 0.5 * np.ptp(corners, axis=0) + 2.0 * c.slope * c.distance
+    places = np.stack(np.meshgrid(_line(c.columns) * half[0], _line(c.rows) * half[1]), axis=-1)
+    places = places.reshape(-1, 2) + c.hover * rng.standard_normal((c.columns * c.rows, 2))
+    own = np.concatenate([places, np.full((len(places), 1), c.distance)], axis=-1)
+    # Roughly where the mirror really looks: a first look of the camera shows it.
+    camera = told_vertex + own @ true.T
+    led = camera + c.lamp * right
+    seen = reflection_points(real, true, vertex, camera, led)
+    off = c.rtk * rng.standard_normal(camera.shape) + c.budget.rtk * rng.standard_normal(3)
+    lamp_off = c.budget.lamp * rng.standard_normal(3)
+    xy = seen.xy + c.reflection * rng.standard_normal(seen.xy.shape)
+    found = reflections(
+        seen.position, 0, seen.facet, xy, (camera + off)[seen.position],
+        (led + off + lamp_off)[seen.position], max(c.reflection, 1e-6),
+    )  # fmt: skip
+    return Scene(real, true, vertex, told, told_vertex, found)
+
+
+def trials(
+    conditions: Conditions,
+    count: int,
+    *,
+    shape: MirrorShape | None = None,
+    map_known: bool = False,
+    mean: Mean = "area",
+    seed: int = 0,
+) -> Trials:
+    """Return ``count`` trials of a mirror.
+
+    Parameters
+    ----------
+    conditions
+        Of the flight.
+    shape
+        As designed; four facets of 1.6 m by 1.25 m if None.
+    map_known
+        Whether the evaluation has the mirror's slope map.
+    mean
+        As :func:`heliotrope.airborne.orientation.measure`.
+    seed
+        Of the first; the others follow.
+
+    Raises
+    ------
+    InputError
+        If no position shows a reflection.
+    """
+    ideal = shape or four_facets()
+    bare = replace(conditions.budget, position=0.0, kinematics=0.0)
+    rows = []
+    for k in range(count):
+        s = scene(ideal, conditions, seed + k)
+        known = s.shape if map_known else ideal
+        alone = measure(s.reflections, known, s.told_rotation, s.vertex, budget=bare, mean=mean)
+        told = measure(
+            s.reflections,
+            known,
+            s.told_rotation,
+            s.told_vertex,
+            budget=conditions.budget,
+            mean=mean,
+        )
+        rows.append(
+            (
+                np.full(2, float(told.count)),
+                rotation_between(s.rotation, alone.rotation)[:2],
+                rotation_between(s.rotation, told.rotation)[:2],
+                told.sigma_plain,
+                told.sigma_mean,
+                told.systematic,
+            )
+        )
+    columns = np.array(rows)
+    return Trials(columns[:, 0, 0], *(columns[:, k] for k in range(1, 6)))
+
+
+def table(count: int = 40, *, seed: int = 0) -> str:
+    """Return the figures of the paper's conditions as a table of text, mrad.
+
+    Three patterns of hover positions, with the ideal surface (both means) and the measured one;
+    ``count`` mirrors each. Errors are RMS over the mirrors and both components.
+    """
+    lines = ["surface   mean   points  σ/√n   σ_mean  error  systematic  σ_tot  error  in 90 %"]
+    kinds: list[tuple[str, Mean]] = [("ideal", "plain"), ("ideal", "area"), ("measured", "area")]
+    for name, mean in kinds:
+        for columns, rows, reflection in ((7, 6, 0.010), (10, 8, 0.015), (13, 10, 0.020)):
+            c = Conditions(columns=columns, rows=rows, reflection=reflection)
+            t = trials(c, count, map_known=name == "measured", mean=mean, seed=seed)
+            total = np.hypot(t.sigma_mean, t.systematic)
+            figures = [
+                1e3 * float(np.sqrt(np.mean(np.square(v))))
+                for v in (t.sigma_plain, t.sigma_mean, t.error, t.systematic, total, t.total_error)
+            ]
+            lines.append(
+                f"{name:9} {mean:6} {t.count.mean():6.0f}  {figures[0]:.3f}  {figures[1]:.3f}   "
+                f"{figures[2]:.3f}  {figures[3]:.3f}       {figures[4]:.3f}  {figures[5]:.3f}  "
+                f"{100 * t.coverage:.0f} %"
+            )
+    return "\n".join(lines)
+
+
+def _line(count: int) -> FloatArray:
+    return np.asarray((2.0 * np.arange(count) + 1.0) / count - 1.0)

@@ -1,0 +1,216 @@
+"""``heliotrope drone plan``: a campaign of a drone over a field, as waypoint files."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from heliotrope.cli._common import open_plant, parse_duration, parse_point, print_json, print_table
+
+if TYPE_CHECKING:
+    from heliotrope.airborne.airspace import Airspace
+    from heliotrope.field.plant import Plant
+    from heliotrope.geometry import FloatArray
+
+
+def plan(
+    field: Annotated[Path, typer.Argument(metavar="PLANT", help="Plant file or PAINT folder.")],
+    into: Annotated[Path, typer.Option(help="Folder for the plan.")] = Path("flight"),
+    points: Annotated[int, typer.Option(help="Calibration points of each heliostat.")] = 20,
+    model: Annotated[
+        str, typer.Option(help="auto, or jacks, malan8, guo6, khalsa8, full.")
+    ] = "auto",
+    criterion: Annotated[
+        Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
+    ] = "d",
+    distance: Annotated[float, typer.Option(help="Of the drone from a cluster, m.")] = 150.0,
+    size: Annotated[float, typer.Option(help="Diameter of a cluster, m.")] = 100.0,
+    spread_deg: Annotated[
+        float, typer.Option(help="Largest angle of an axis from its cluster's.")
+    ] = 25.0,
+    view_deg: Annotated[
+        float, typer.Option(help="What the camera sees across its shorter side.")
+    ] = 56.0,
+    pointing_mrad: Annotated[
+        float, typer.Option(help="Error of the normals that patterns must cover.")
+    ] = 5.0,
+    samples: Annotated[float, typer.Option(help="Reflections on each facet.")] = 9.0,
+    facet_focal: Annotated[
+        float | None, typer.Option(help="Focal length of the facets, m. Default: flat.")
+    ] = None,
+    least_spacing: Annotated[float, typer.Option(help="Of hover points, m.")] = 0.6,
+    led: Annotated[
+        str, typer.Option(help="Lamp from the camera: right,down,ahead in m.")
+    ] = "0,0,0",
+    sigma_mrad: Annotated[float, typer.Option(help="Of a measured normal.")] = 0.3,
+    elevations: Annotated[
+        str, typer.Option(help="Lowest,highest of the drone as mirrors see it, degrees.")
+    ] = "20,85",
+    airspace: Annotated[
+        Path | None, typer.Option(help="JSON with keep-outs, fence, heights, home.")
+    ] = None,
+    tower: Annotated[
+        bool, typer.Option("--tower/--no-tower", help="Keep away from receivers and targets.")
+    ] = True,
+    min_height: Annotated[float, typer.Option(help="Above ground, m.")] = 15.0,
+    max_height: Annotated[float, typer.Option(help="Above ground, m.")] = 120.0,
+    home: Annotated[str | None, typer.Option(help="Place of take-off: east,north,up in m.")] = None,
+    drones: Annotated[int, typer.Option(help="That fly at the same time.")] = 1,
+    speed: Annotated[float, typer.Option(help="m/s.")] = 8.0,
+    photo: Annotated[str, typer.Option(help="Time to come to rest and take one.")] = "2.5s",
+    endurance: Annotated[str, typer.Option(help="Flight on one battery.")] = "25min",
+    change: Annotated[str, typer.Option(help="Time on the ground between.")] = "5min",
+    hours_a_day: Annotated[float, typer.Option(help="In which is flown.")] = 8.0,
+    target_minutes: Annotated[
+        float, typer.Option(help="Of camera and target, to compare: from photo to photo.")
+    ] = 2.0,
+    formats: Annotated[
+        str, typer.Option(help="Of waypoint files: some of dji,qgc,litchi, or none.")
+    ] = "dji,qgc,litchi",
+    aircraft: Annotated[str, typer.Option(help="Of DJI's files.")] = "M3E",
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+) -> None:
+    """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
+    import numpy as np
+
+    from heliotrope.airborne.flight import Craft
+    from heliotrope.airborne.flight_files import write_plan
+    from heliotrope.airborne.flight_map import flight_map
+    from heliotrope.airborne.flight_plan import Wishes, plan_flight
+    from heliotrope.airborne.hover import Sampling
+    from heliotrope.airborne.look_points import Choosing
+    from heliotrope.calibration.planning_report import write_picture
+
+    plant = open_plant(field)
+    air, place = _airspace(plant, airspace, tower, (min_height, max_height))
+    low, high = np.radians(_numbers(elevations, 2, "--elevations"))
+    wanted = _formats(formats)
+    wishes = Wishes(
+        size=size,
+        spread=float(np.radians(spread_deg)),
+        view=float(np.radians(view_deg)),
+        model=model,
+        sampling=Sampling(
+            distance=distance, pointing=1e-3 * pointing_mrad, samples=samples,
+            focal=np.inf if facet_focal is None else facet_focal,
+            led_offset=parse_point(led, "--led"), least_spacing=least_spacing,
+        ),
+        choosing=Choosing(points, criterion, 1e-3 * sigma_mrad, float(low), float(high)),
+        craft=Craft(
+            drones, speed, photo=parse_duration(photo).total_seconds(),
+            endurance=parse_duration(endurance).total_seconds(),
+            change=parse_duration(change).total_seconds(),
+        ),
+        airspace=air,
+        home=place if home is None else np.array(parse_point(home, "--home")),
+        hours_a_day=hours_a_day,
+        photo_minutes=target_minutes,
+    )  # fmt: skip
+    _check_aircraft(aircraft)
+    with _bar(as_json, "choosing directions") as step:
+        made = plan_flight(plant, wishes, step)
+    with _bar(as_json, "writing sorties") as step:
+        written = write_plan(made, into, formats=wanted, aircraft=aircraft, progress=step)
+    write_picture(into / "map.png", flight_map(made))
+    summary = made.summary()
+    if as_json:
+        print_json({"folder": str(into), "files": len(written) + 1, **summary})
+        return
+    _print(summary)
+    print(f"plan: {into / 'plan.json'}, commands: {into / 'commands.csv'}, map: {into / 'map.png'}")
+    if wanted:
+        print(f"waypoints of {summary['sorties']} sorties: {into} ({', '.join(wanted)})")
+
+
+def _check_aircraft(aircraft: str) -> None:
+    from heliotrope.airborne.waypoints import AIRCRAFT
+    from heliotrope.errors import UnknownNameError
+
+    if aircraft not in AIRCRAFT:
+        raise UnknownNameError("aircraft", aircraft, AIRCRAFT)
+
+
+def _formats(text: str) -> tuple[str, ...]:
+    from heliotrope.airborne.flight_files import FORMATS
+    from heliotrope.errors import InputError
+
+    names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
+    if names == ("none",):
+        return ()
+    for name in names:
+        if name not in FORMATS:
+            raise InputError(f"--formats {name!r}: give some of {','.join(FORMATS)}, or none")
+    return names
+
+
+def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
+    import math
+
+    from heliotrope.errors import InputError
+
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count or not all(math.isfinite(v) for v in values):
+        raise InputError(f"{what} {text!r}: give {count} numbers with a comma between them")
+    return values
+
+
+def _airspace(
+    plant: "Plant", path: Path | None, tower: bool, heights: tuple[float, float]
+) -> "tuple[Airspace, FloatArray | None]":
+    from heliotrope.airborne.airspace import Airspace
+    from heliotrope.airborne.airspace import tower as keep_from_tower
+    from heliotrope.airborne.flight_files import read_airspace
+
+    base = Airspace(keep_from_tower(plant) if tower else (), None, *heights, ground=plant.position)
+    return (base, None) if path is None else read_airspace(path, base)
+
+
+@contextmanager
+def _bar(quiet: bool, text: str) -> Iterator[Callable[[int, int], None]]:
+    """A progress bar on the terminal, fed with (done, all)."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(
+        console=console, transient=True, disable=quiet or not console.is_terminal
+    ) as shown:
+        task = shown.add_task(text, total=None)
+        yield lambda done, total: shown.update(task, completed=done, total=total)
+
+
+def _print(s: dict[str, Any]) -> None:
+    patterns, spaces = s["hover_points_of_a_pattern"], s["spacing_m"]
+    target = s["camera_target"]
+    rows = [
+        ["heliostats", f"{s['heliostats']:,}"],
+        ["clusters", f"{s['clusters']:,}"],
+        ["radius of the largest, m", f"{s['cluster_radius_m'][1]:.1f}"],
+        ["calibration points of each", f"{s['calibration_points']}"],
+        ["orientations", f"{s['orientations']:,}"],
+        ["hover points of a pattern", f"{patterns[0]} to {patterns[1]}"],
+        ["their spacing, m", f"{spaces[0]:.2f} to {spaces[1]:.2f}"],
+        ["reflections on a facet", f"{s['samples_of_a_facet']:.1f}"],
+        ["photographs", f"{s['photographs']:,}"],
+        ["drones", f"{s['drones']}"],
+        ["sorties", f"{s['sorties']:,}"],
+        ["hours", f"{s['hours']:.1f}"],
+        ["working days", f"{s['working_days']:.1f}"],
+        ["beam error before, mrad", f"{s['beam_error_before_mrad']:.2f}"],
+        ["beam error after, mrad", f"{s['beam_error_after_mrad']:.2f}"],
+        ["camera and target, days", f"{target['days']:.1f}"],
+        ["camera and target, months", f"{target['months']:.1f}"],
+    ]
+    print_table(["campaign", ""], rows)
+    if s["drones"] > 1:
+        print(f"drones come no closer to each other than {s['separation_m']:.0f} m")
+    if s["fewest_points_of_a_heliostat"] < s["calibration_points"]:
+        print(
+            f"some heliostats are stopped short of a direction; the worst has "
+            f"{s['fewest_points_of_a_heliostat']} calibration points: see commands.csv"
+        )

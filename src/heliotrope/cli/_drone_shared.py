@@ -1,0 +1,149 @@
+"""What the commands of a drone's flight share: a folder of photographs beside its field."""
+
+import os
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from heliotrope.cli import _calibration as shared
+from heliotrope.cli._common import open_plant
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from distributed import Client
+
+    from heliotrope.airborne.mirror import MirrorShape
+    from heliotrope.airborne.photo import LedCamera, Photo
+    from heliotrope.airborne.reading import Seen
+    from heliotrope.airborne.standing import Standing
+    from heliotrope.field.plant import Plant
+    from heliotrope.geometry import FloatArray
+
+FolderArgument = Annotated[
+    Path, typer.Argument(help="Folder with photographs, camera.toml and commands.csv.")
+]
+FieldOption = Annotated[Path, typer.Option("--field", help="Plant file or folder.")]
+CameraOption = Annotated[
+    Path | None, typer.Option(help="Camera file (TOML); default: camera.toml in the folder.")
+]
+CommandsOption = Annotated[
+    Path | None,
+    typer.Option(help="Table of commands (CSV); default: commands.csv in the folder."),
+]
+ClusterOption = Annotated[str, typer.Option(help="Cluster of the commands that was flown over.")]
+PointOption = Annotated[str, typer.Option(help="Calibration point of the commands.")]
+SurveyOption = Annotated[
+    float, typer.Option(min=0.1, help="Standard deviation of surveyed positions, mm.")
+]
+ProcessesOption = Annotated[
+    int, typer.Option(min=0, help="Processes on this machine; 0: one a core.")
+]
+FocalOption = Annotated[
+    float | None, typer.Option(min=1.0, help="Focal length of the facets, m; default: flat.")
+]
+OutOption = Annotated[Path, typer.Option(help="Folder for what is written.")]
+
+
+@dataclass(frozen=True)
+class FlightFolder:
+    """Photographs with the mirrors that they show.
+
+    Attributes
+    ----------
+    plant
+        The field.
+    photos
+        As the drone tells them.
+    problems
+        A line for each that cannot be used.
+    camera
+        With its lamp.
+    stand
+        The commanded mirrors.
+    counts
+        Of their drives, (N, D).
+    focal
+        Of the facets, m; inf if flat.
+    """
+
+    plant: "Plant"
+    photos: "tuple[Photo, ...]"
+    problems: tuple[str, ...]
+    camera: "LedCamera"
+    stand: "Standing"
+    counts: "FloatArray"
+    focal: float
+
+    def shape(self, row: int) -> "MirrorShape":
+        """Return the designed surface of a mirror."""
+        from heliotrope.airborne.mirror import ideal
+
+        return ideal(*self.plant.find(self.stand.names[row]), focal=self.focal)
+
+
+def open_flight(
+    folder: Path, field: Path, camera: Path | None, commands: Path | None, cluster: str,
+    point: str, focal: float | None,
+) -> FlightFolder:  # fmt: skip
+    """Return the photographs of a folder with the field, the camera and the commands."""
+    import numpy as np
+
+    from heliotrope.airborne.photo import read_camera, read_photos
+    from heliotrope.airborne.standing import join_standing, read_commands, standing
+    from heliotrope.errors import InputError
+
+    plant = open_plant(field)
+    site = plant.site
+    photos, problems = read_photos(folder, (site.latitude_deg, site.longitude_deg, site.height))
+    lens = read_camera(camera or folder / "camera.toml")
+    rows, counts = read_commands(commands or folder / "commands.csv", plant.names, cluster, point)
+    parts, values, first = [], [], 0
+    for heliostats in plant.groups.values():
+        mine = np.flatnonzero((rows >= first) & (rows < first + len(heliostats)))
+        if len(mine):
+            chosen = heliostats.take(rows[mine] - first)
+            drives = len(chosen.mechanism.driven)
+            values.append(counts[mine, :drives])
+            parts.append(standing(chosen, values[-1]))
+        first += len(heliostats)
+    if len({v.shape[1] for v in values}) > 1:
+        raise InputError(
+            f"{field}: the commanded heliostats have mechanisms with different numbers of drives; "
+            "evaluate the groups one by one, each with a table of its own commands"
+        )
+    return FlightFolder(
+        plant, photos, problems, lens, join_standing(parts), np.concatenate(values),
+        np.inf if focal is None else focal,
+    )  # fmt: skip
+
+
+def read_flight(
+    flight: FlightFolder, keep: Path | None, processes: int, scheduler: str | None, quiet: bool
+) -> "tuple[Seen, ...]":
+    """Read all photographs behind a progress bar; what was read before is not read again."""
+    from heliotrope.airborne.evaluation import read_many
+
+    with _cluster(scheduler) as client, shared.progress("reading", quiet) as advance:
+        return read_many(
+            flight.photos, flight.camera, flight.stand,
+            processes=processes or len(os.sched_getaffinity(0)), client=client, keep=keep,
+            progress=advance,
+        )  # fmt: skip
+
+
+@contextmanager
+def _cluster(scheduler: str | None) -> "Iterator[Client | None]":
+    if scheduler is None:
+        yield None
+        return
+    from heliotrope.calibration import cluster
+
+    client = cluster.connect(scheduler)
+    try:
+        yield client
+    finally:
+        cluster.disconnect(client)

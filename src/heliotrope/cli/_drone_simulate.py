@@ -1,0 +1,135 @@
+"""``heliotrope drone simulate``: photographs of a simulated flight, with the truth."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from heliotrope.cli import _calibration as calibration
+from heliotrope.cli._common import open_plant, parse_point
+
+if TYPE_CHECKING:
+    from heliotrope.airborne.photo import LedCamera
+    from heliotrope.airborne.simulation import Flight
+    from heliotrope.field.heliostats import Heliostats
+
+
+def simulate(
+    field: Annotated[Path, typer.Argument(help="Plant file or folder.")],
+    folder: Annotated[Path, typer.Argument(help="Folder for the photographs.")],
+    group: Annotated[str, typer.Option(help="Group of heliostats; default: the first.")] = "",
+    heliostats: Annotated[
+        int, typer.Option(min=1, help="How many, those nearest to the middle.")
+    ] = 80,
+    hover: Annotated[
+        str, typer.Option(help="Middle of the pattern, E,N,U in m; default: towards the tower.")
+    ] = "",
+    distance: Annotated[float, typer.Option(min=5.0, help="From the mirrors, m.")] = 100.0,
+    columns: Annotated[int, typer.Option(min=1, help="Of the pattern.")] = 6,
+    rows: Annotated[int, typer.Option(min=1, help="Of the pattern.")] = 6,
+    step: Annotated[float, typer.Option(min=0.01, help="Between hover positions, m.")] = 0.5,
+    size: Annotated[str, typer.Option(help="Of a photograph, WIDTHxHEIGHT, pixels.")] = "4000x3000",
+    focal_px: Annotated[
+        float, typer.Option(min=0.0, help="Focal length, pixels; 0: three quarters of the width.")
+    ] = 0.0,
+    slope_mrad: Annotated[float, typer.Option(min=0.0, help="RMS of slope deviations.")] = 0.8,
+    rtk_mm: Annotated[float, typer.Option(min=0.0, help="Of each position.")] = 8.0,
+    offset_mm: Annotated[str, typer.Option(help="Common offset, E,N,U.")] = "0,0,0",
+    survey_mm: Annotated[float, typer.Option(min=0.0, help="Of the heliostats' positions.")] = 5.0,
+    focal: Annotated[
+        float | None, typer.Option(min=1.0, help="Of the facets, m; default: flat.")
+    ] = None,
+    night: Annotated[bool, typer.Option("--night", help="By moonlight.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of all randomness.")] = 0,
+) -> None:
+    """Render a flight: photographs as a drone of DJI writes them, commands, camera, truth."""
+    import numpy as np
+
+    from heliotrope.airborne import rendering
+    from heliotrope.airborne.simulation import Errors, fly, hover_grid, look_counts
+
+    plant = open_plant(field)
+    chosen = _nearest(plant.groups[_group(group, tuple(plant.groups))], heliostats)
+    middle = chosen.position.mean(axis=0)
+    # By default as seen from the tower's side, half way up to the zenith.
+    level = -middle[:2] / max(float(np.linalg.norm(middle[:2])), 1e-9)
+    place = middle + distance * np.sqrt(0.5) * np.array([*level, 1.0])
+    place = np.array(parse_point(hover, "--hover")) if hover else place
+    errors = Errors(
+        rtk=(1e-3 * rtk_mm,) * 3,
+        rtk_offset=tuple(1e-3 * v for v in parse_point(offset_mm, "--offset-mm")),  # type: ignore[arg-type]  # three
+        survey=1e-3 * survey_mm,
+        slope=1e-3 * slope_mrad,
+    )
+    flight = fly(
+        chosen, _camera(size, focal_px), look_counts(chosen, place),
+        hover_grid(place, middle, columns, rows, step), middle, errors=errors,
+        focal=np.inf if focal is None else focal, seed=seed,
+    )  # fmt: skip
+    site = plant.site
+    origin = (site.latitude_deg, site.longitude_deg, site.height)
+    light = rendering.night() if night else rendering.Conditions()
+    with calibration.progress("rendering", False) as advance:
+        rendering.render_flight(
+            flight, folder, origin, conditions=light, seed=seed, progress=advance
+        )
+    _write_truth(folder / "truth", flight)
+    print(f"{len(flight.taken)} photographs of {len(chosen)} heliostats: {folder}")
+    print(f"truth (orientations.csv, photographs.csv, slopes): {folder / 'truth'}")
+
+
+def _group(name: str, known: tuple[str, ...]) -> str:
+    from heliotrope.errors import InputError, UnknownNameError
+
+    if not known:
+        raise InputError("the plant has no heliostats; add a group of them")
+    if name and name not in known:
+        raise UnknownNameError("group", name, known)
+    return name or known[0]
+
+
+def _nearest(heliostats: "Heliostats", count: int) -> "Heliostats":
+    import numpy as np
+
+    position = heliostats.position
+    away = np.linalg.norm(position - position.mean(axis=0), axis=-1)
+    return heliostats.take(np.sort(np.argsort(away, kind="stable")[:count]))
+
+
+def _camera(size: str, focal_px: float) -> "LedCamera":
+    import numpy as np
+
+    from heliotrope.airborne.photo import LedCamera
+    from heliotrope.errors import InputError
+
+    match = re.fullmatch(r"(\d{2,5})[x×](\d{2,5})", size)
+    if not match:
+        raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, as 4000x3000")
+    width, height = int(match[1]), int(match[2])
+    f = focal_px or 0.75 * width
+    matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
+    return LedCamera((width, height), matrix, np.array([-0.08, 0.06, 3e-4, -2e-4, -0.01]))
+
+
+def _write_truth(folder: Path, flight: "Flight") -> None:
+    import numpy as np
+
+    from heliotrope.airborne.slopes import write_slopes
+    from heliotrope.field.formats._textfile import write_text
+    from heliotrope.geometry import azimuth_elevation
+
+    (folder / "slopes").mkdir(parents=True, exist_ok=True)
+    stand = flight.truth
+    azimuth, elevation = azimuth_elevation(stand.rotation[:, :, 2])
+    lines = ["heliostat,azimuth_deg,elevation_deg,east_m,north_m,up_m"]
+    for k, name in enumerate(stand.names):
+        numbers = (np.degrees(azimuth[k]), np.degrees(elevation[k]), *stand.vertex[k])
+        lines.append(",".join([name, *(f"{v:.7f}" for v in numbers)]))
+        slope = flight.shapes[k].slope
+        if slope is not None:
+            write_slopes(folder / "slopes" / f"{name}.npz", slope)
+    write_text(folder / "orientations.csv", "\n".join(lines) + "\n")
+    lines = ["name,east_m,north_m,up_m"]
+    lines += [f"{p.name},{','.join(f'{v:.6f}' for v in p.position)}" for p in flight.taken]
+    write_text(folder / "photographs.csv", "\n".join(lines) + "\n")

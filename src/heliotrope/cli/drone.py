@@ -1,0 +1,20 @@
+"""``heliotrope drone``: plan, evaluate, check and simulate flights of a drone with a lamp."""
+
+import typer
+
+from heliotrope.cli._drone_evaluate import evaluate
+from heliotrope.cli._drone_plan import plan
+from heliotrope.cli._drone_rtk import rtk
+from heliotrope.cli._drone_simulate import simulate
+
+app = typer.Typer(help="Measure a field with a drone, its lamp and its camera.",
+                  no_args_is_help=True)  # fmt: skip
+
+
+@app.callback()
+def _root() -> None:
+    """Measure a field with a drone, its lamp and its camera."""
+
+
+for command in (plan, evaluate, rtk, simulate):
+    app.command()(command)

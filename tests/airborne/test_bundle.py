@@ -1,0 +1,144 @@
+"""The bundle adjustment: derivatives, what it recovers, what it says of itself."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from drone_case import flight
+from heliotrope.airborne.bundle import (
+    Adjusted,
+    Corners,
+    Priors,
+    State,
+    adjust,
+    jacobian_matrix,
+    residuals,
+)
+from heliotrope.airborne.simulation import Errors, Flight
+from heliotrope.airborne.standing import standing
+from heliotrope.errors import InputError
+from heliotrope.geometry import rotation
+
+SIGMA = 0.1 / 1140.0
+
+
+def turn(small: np.ndarray) -> np.ndarray:
+    return rotation(small, np.linalg.norm(small))
+
+
+def corners_of(flown: Flight, seed: int, growth: float = 0.0) -> Corners:
+    """Exact corners with white noise; all outlines may look smaller or larger than they are."""
+    rng = np.random.default_rng(seed)
+    stand = flown.truth
+    seen = replace(stand, outline=stand.outline * (1.0 + growth)).corners
+    places = []
+    for photo in flown.taken:
+        local = (seen - photo.position) @ photo.rotation
+        places.append(local[..., :2] / local[..., 2:])
+    shape = (len(flown.taken), *seen.shape[:2])
+    index = [i.ravel() for i in np.indices(shape)]
+    place = np.array(places).reshape(-1, 2)
+    noise = rng.normal(0.0, SIGMA, place.shape)
+    return Corners(*index, place + noise, np.full(len(place), SIGMA))
+
+
+def run(flown: Flight, corners: Corners, survey: float, seed: int = 0) -> Adjusted:
+    rng = np.random.default_rng(seed)
+    turns = np.array([p.rotation @ turn(rng.normal(0.0, 1e-3, 3)) for p in flown.taken])
+    return adjust(
+        np.array([p.position for p in flown.told]),
+        np.array([p.sigma_position for p in flown.told]),
+        turns, standing(flown.heliostats, flown.counts), corners, Priors(position=survey),
+    )  # fmt: skip
+
+
+def test_derivatives_against_finite_differences() -> None:
+    flown = flight(Errors(slope=0.0), columns=2, rows=1)
+    corners = corners_of(flown, 1)
+    stand = standing(flown.heliostats, flown.counts)
+    state = State(
+        np.array([p.position for p in flown.told]), np.array([p.rotation for p in flown.told]),
+        np.zeros((2, 3)), np.zeros(3), stand,
+    )  # fmt: skip
+    gap, parts = residuals(state, corners)
+    J = jacobian_matrix(corners, parts, 2, len(stand)).toarray()
+    step, at = 1e-6, 12
+
+    def moved(unknown: int) -> State:
+        e = np.zeros(8)
+        if unknown < at:
+            photo, which = divmod(unknown, 6)
+            e[which] = step
+            turns, error = state.rotation.copy(), state.error.copy()
+            turns[photo] = turns[photo] @ turn(e[:3])
+            error[photo] += e[3:6]
+            return replace(state, rotation=turns, error=error)
+        if unknown < at + 3:
+            e[unknown - at] = step
+            return replace(state, offset=e[:3])
+        mirror, which = divmod(unknown - at - 3, 8)
+        e[which] = step
+        vertex, turns, outline = stand.vertex.copy(), stand.rotation.copy(), stand.outline.copy()
+        vertex[mirror] += e[:3]
+        turns[mirror] = turns[mirror] @ turn(e[3:6])
+        outline[mirror, :, :2] *= 1.0 + e[6:]
+        return replace(state, stand=replace(stand, vertex=vertex, rotation=turns, outline=outline))
+
+    for unknown in (*range(at + 3), *range(at + 3 + 8 * 7, at + 3 + 8 * 8)):
+        changed, _ = residuals(moved(unknown), corners, derivative=False)
+        numeric = (gap - changed).ravel() / step
+        np.testing.assert_allclose(J[:, unknown], numeric, atol=3e-7, err_msg=str(unknown))
+
+
+def test_common_offset_and_attitudes_are_found() -> None:
+    offset = (0.018, -0.018, 0.016)
+    flown = flight(Errors(slope=0.0, survey=0.001, rtk_offset=offset))
+    found = run(flown, corners_of(flown, 2), 0.001)
+    assert found.converged
+    error = found.state.offset - offset
+    sigma = np.sqrt(np.diag(found.offset_covariance))
+    assert (np.abs(error) < 3.5 * sigma).all()
+    assert (sigma < 0.012).all()
+    assert 0.9 < found.deviation < 1.1
+    for R, taken in zip(found.state.rotation, flown.taken, strict=True):
+        assert np.arccos(0.5 * (np.trace(R.T @ taken.rotation) - 1.0)) < 0.5e-3
+
+
+def test_stated_accuracy_of_the_offset_is_honest() -> None:
+    ratios = []
+    for seed in range(12):
+        flown = flight(Errors(slope=0.0, mechanism={}), columns=2, rows=2, seed=seed)
+        found = run(flown, corners_of(flown, seed), 0.005, seed)
+        ratios.append(found.state.offset / np.sqrt(np.diag(found.offset_covariance)))
+    # 36 numbers of mean square 1: beyond these limits in one of 10,000.
+    assert 0.35 < np.mean(np.square(ratios)) < 2.0
+
+
+def test_outlines_that_look_too_small_do_not_move_the_camera() -> None:
+    flown = flight(Errors(slope=0.0, survey=0.001))
+    plain = run(flown, corners_of(flown, 4), 0.001)
+    shrunk = run(flown, corners_of(flown, 4, growth=-0.01), 0.001)
+    # One per cent of size, taken for distance, would be half a metre.
+    moved = np.abs(shrunk.state.position - plain.state.position)
+    assert moved.max() < 0.01
+
+
+def test_wrong_corners_lose_their_weight() -> None:
+    flown = flight(Errors(slope=0.0, survey=0.001))
+    corners = corners_of(flown, 5)
+    wrong = np.arange(0, len(corners), 40)
+    place = corners.place.copy()
+    place[wrong] += 30.0 * SIGMA
+    clean, soiled = run(flown, corners, 0.001), run(flown, replace(corners, place=place), 0.001)
+    assert soiled.outlier[wrong].mean() > 0.95
+    assert np.delete(soiled.outlier, wrong).mean() < 0.01
+    assert np.abs(clean.state.offset - soiled.state.offset).max() < 0.01
+
+
+def test_no_corner_is_refused() -> None:
+    flown = flight(Errors(slope=0.0), columns=1, rows=1)
+    corners = corners_of(flown, 1)
+    none = Corners(*(a[:0] for a in vars(corners).values()))
+    with pytest.raises(InputError, match="no corner of a mirror"):
+        run(flown, none, 0.01)
