@@ -9,15 +9,20 @@ from typing import Annotated
 import typer
 
 from heliotrope import __version__
+from heliotrope.cli._ctl import app as ctl_app
+from heliotrope.cli._field_layout import layout
+from heliotrope.cli._store import app as store_app
 from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.cluster import cluster
 from heliotrope.cli.demo import demo
+from heliotrope.cli.drone import app as drone_app
 from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
 from heliotrope.cli.image import image
 from heliotrope.cli.plan import plan
+from heliotrope.cli.run import run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
@@ -49,6 +54,8 @@ def _root(
     """Run the heliostat field of a solar power tower."""
 
 
+field_app.command()(layout)
+
 app.command()(sun)
 app.command()(track)
 app.add_typer(field_app, name="field")
@@ -57,6 +64,10 @@ app.command()(image)
 app.command()(calibrate)
 app.command()(plan)
 app.command()(evaluate)
+app.add_typer(drone_app, name="drone")
+app.command()(run)
+app.add_typer(ctl_app, name="ctl")
+app.add_typer(store_app, name="store")
 app.command()(cluster)
 app.command()(simulate)
 app.command()(fetch)

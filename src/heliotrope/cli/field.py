@@ -1,4 +1,4 @@
-"""``heliotrope field``: look at plant files."""
+"""``heliotrope field``: make and look at plant files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,12 +7,12 @@ import typer
 
 from heliotrope.cli._common import print_json
 
-app = typer.Typer(help="Check plant files.", no_args_is_help=True)
+app = typer.Typer(help="Make and check plant files.", no_args_is_help=True)
 
 
 @app.callback()
 def _root() -> None:
-    """Check plant files."""
+    """Make and check plant files."""
 
 
 @app.command()

@@ -5,12 +5,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from heliotrope import sun
 from heliotrope.control._cluster_end import ClusterEnd
 from heliotrope.control._emergency import Reading, proof_readings
 from heliotrope.control._joining import JoinQueue
 from heliotrope.control._plant_orders import PlantOrders
 from heliotrope.control._plant_watch import PlantWatch
+from heliotrope.control._sun_line import sun_now
 from heliotrope.control._tickets import Ticket
 from heliotrope.control.authority import Authority
 from heliotrope.control.clock import Clock
@@ -82,7 +82,7 @@ class Sentinel:
         """Return what the plant itself knows for its rows."""
         if now - self._sun_at >= SUN_PERIOD:
             self._sun_at = now
-            self._sun = sun.vector(self._clock.utc(), self._site)
+            self._sun = sun_now(self._clock.utc().timestamp(), self._site)
         order = self.order if self.on else None
         own = {
             **proof_readings(None if order is None else order.proof, now),

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from heliotrope import sun
+from heliotrope.geometry import FloatArray
 from heliotrope.sun import Site
 
 STEP = 10.0
@@ -68,6 +69,13 @@ def sun_at(utc_s: float, site: Site) -> tuple[Vector, Vector]:
             (dp * a[2] + dq * b[2] + dr * c[2] + ds * d[2]) / STEP,
         ),
     )
+
+
+def sun_now(utc_s: float, site: Site) -> FloatArray:
+    """Return the unit vector to the apparent sun, ENU, (3,); see `sun_at`."""
+    here, _ = sun_at(utc_s, site)
+    # Across the jump below the horizon no cubic is good.
+    return sun.vector(utc_s, site) if here[2] < 0.0 else np.array(here)
 
 
 def sun_values(second: int, utc_s: float, site: Site) -> tuple[int, ...] | None:

@@ -174,6 +174,18 @@ class Visit:
             self._counts[after - 1] + share * (self._counts[after] - self._counts[after - 1])
         )
 
+    async def __aenter__(self) -> "Visit":
+        """Begin what ends with the heliostat at home."""
+        return self
+
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Bring it home. Who is cancelled ends as that, also if coming home is refused."""
+        try:
+            await self.home()
+        except RefusedError:
+            if kind is None or not issubclass(kind, asyncio.CancelledError):
+                raise
+
     async def home(self) -> None:
         """Bring it back to standby; where that is not possible, take its beam off the target."""
         if not self.away:

@@ -196,11 +196,9 @@ class CalibrationCycle:
         visit = Visit(plant, person, token, heliostat, plant.design.target(target))
         tracked = visit.state == states.TRACKING
         aim = plant.aims[visit.row].copy()
-        try:
+        async with visit:
             await visit.go(self._settings.arrival)
             seen, rejected = await self._shoot(visit)
-        finally:
-            await visit.home()
         result = await self._learn(visit, seen, tuple(rejected))
         if tracked and np.isfinite(aim).all():
             await visit.aim(aim)

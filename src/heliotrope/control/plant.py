@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope import sun
 from heliotrope.control._cluster_end import ClusterEnd
 from heliotrope.control._joining import Job, Joiner, JoinQueue
 from heliotrope.control._plant_orders import PlantOrders, whole
 from heliotrope.control._plant_watch import PlantWatch
 from heliotrope.control._pushing import Pusher, stored_items
 from heliotrope.control._sentinel import Sentinel
+from heliotrope.control._sun_line import sun_now
 from heliotrope.control._tickets import Ticket
 from heliotrope.control.aims import BeamCheck, default_aims
 from heliotrope.control.assigned import Assigned, Points, grouped, points_of
@@ -374,7 +374,7 @@ class PlantController:
 
     def sun_vector(self) -> FloatArray:
         """Return the unit vector to the sun now, ENU, (3,)."""
-        return sun.vector(self._clock.utc(), self.design.site)
+        return sun_now(self._clock.utc().timestamp(), self.design.site)
 
     @property
     def clock(self) -> Clock:

@@ -138,12 +138,10 @@ async def search(
         detector.update(await camera.frame())
         await sleep_until(plant.clock, plant.now() + wanted.period)
     visit.away = True
-    try:
+    async with visit:
         await visit.aim(visit.target.center)
         await visit.command("SEARCH", (wanted.pitch, wanted.radius))
         return await _watch(visit, camera, detector, wanted)
-    finally:
-        await visit.home()
 
 
 async def _watch(

@@ -1,0 +1,139 @@
+"""Makes the pictures of the console for the documentation, from a plant of the twin at work.
+
+python scripts/screenshots.py [--heliostats 10000] [--learnt 20] [--speed 4] [--into docs/images]
+"""
+
+import argparse
+import asyncio
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from heliotrope.console import _secrets
+from heliotrope.console.serve import ConsoleServer
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.control.clock import VirtualClock
+from heliotrope.control.link import running
+from heliotrope.field.layouts import malan_plant
+from heliotrope.store.keeper import Keeper
+from heliotrope.twin._live_loop import PacedLoop
+from heliotrope.twin.live import LiveOptions, LivePlant
+
+NAME = "olga"
+CHROMIUM = "/usr/bin/chromium"
+ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+WIDE, TABLET = {"width": 1600, "height": 900}, {"width": 1024, "height": 768}
+
+
+class Shown:
+    """A plant with its console in a thread of its own."""
+
+    def __init__(self, folder: Path, heliostats: int, speed: float) -> None:
+        self.password, self.address = _secrets.new_password(), ""
+        self._of, self._over = (folder, heliostats, speed), threading.Event()
+        self._ready = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+        self._ready.wait(120.0)
+
+    def _run(self) -> None:
+        try:
+            with asyncio.Runner(loop_factory=lambda: PacedLoop(self._of[2])) as runner:
+                runner.run(self._main())
+        finally:
+            self._ready.set()
+
+    async def _main(self) -> None:
+        folder, heliostats, speed = self._of
+        clock = VirtualClock(asyncio.get_running_loop().time)
+        keeper = Keeper(folder / "store.sqlite")
+        kept = _secrets.hash_password(self.password)
+        keeper.people.add(NAME, kept, "engineer", time.time())
+        live = LivePlant(
+            malan_plant(heliostats), clock, LiveOptions(), records=keeper,
+            extra=lambda: {"speed": speed},
+        )  # fmt: skip
+        async with live.running():
+            server = ConsoleServer(live.operations, keeper.people, ConsoleSettings(port=0))
+            async with running(server):
+                self.address = await server.address()
+                self._ready.set()
+                while not self._over.is_set():
+                    await asyncio.sleep(0.2)
+        keeper.close()
+
+    def close(self) -> None:
+        """End it."""
+        self._over.set()
+        self._thread.join()
+
+
+def take(page: Any, into: Path) -> None:
+    """Take all pictures."""
+
+    def shot(name: str) -> None:
+        page.wait_for_timeout(1500)
+        page.screenshot(path=into / f"console-{name}.png")
+        print(into / f"console-{name}.png")
+
+    def tab(title: str) -> None:
+        page.click(f".hx-tabs >> text={title}")
+
+    tab("Plant")
+    shot("plant")
+    tab("Calibration")
+    page.select_option(".hx-tools select", "error")
+    shot("calibration")
+    tab("Targets")
+    shot("targets")
+    page.fill(".hx-query", "sightings > 0")
+    page.keyboard.press("Enter")
+    page.evaluate("heliotrope.store.select([...heliotrope.store.selection].slice(0, 1))")
+    tab("Heliostat")
+    page.select_option(".hx-tools select", "state")
+    shot("heliostat")
+    page.set_viewport_size(TABLET)
+    page.click("[aria-label='Dark or light']")
+    tab("Clusters")
+    shot("tablet")
+    page.set_viewport_size(WIDE)
+    tab("Plant")
+    shot("light")
+    page.click("#emergency")
+    shot("emergency")
+
+
+def main() -> None:
+    """Make the pictures."""
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description="Pictures of the console.")
+    parser.add_argument("--heliostats", type=int, default=10_000)
+    parser.add_argument("--learnt", type=int, default=20, help="heliostats to wait for")
+    parser.add_argument("--speed", type=float, default=4.0)
+    parser.add_argument("--into", type=Path, default=Path("docs/images"))
+    given = parser.parse_args()
+    given.into.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        shown = Shown(Path(folder), given.heliostats, given.speed)
+        try:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+            page = browser.new_page(viewport=WIDE)
+            page.set_default_timeout(60_000)
+            page.goto(f"{shown.address}login")
+            page.fill("[name=name]", NAME)
+            page.fill("[name=password]", shown.password)
+            page.click("button")
+            page.wait_for_selector(".hx-legend b")
+            done = f"heliotrope.store.head?.calibration.done >= {given.learnt}"
+            page.wait_for_function(done, timeout=1_800_000)
+            take(page, given.into)
+            browser.close()
+        finally:
+            shown.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""``heliotrope ctl``: look at and command a plant that runs, through its console."""
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from heliotrope.cli._common import parse_point, print_json, print_table
+from heliotrope.errors import InputError
+
+if TYPE_CHECKING:
+    from heliotrope.console.client import Client
+
+app = typer.Typer(help="Look at and command a plant that runs, through its console.",
+                  no_args_is_help=True)  # fmt: skip
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
+All = Annotated[bool, typer.Option("--all", help="The whole field.")]
+Wait = Annotated[float, typer.Option("--wait", help="Wait so long for the end, s; 0: do not.")]
+
+
+@app.callback()
+def _where(
+    context: typer.Context,
+    url: Annotated[
+        str, typer.Option(envvar="HELIOTROPE_URL", help="Address of the console.")
+    ] = "http://127.0.0.1:8080/",
+    token_file: Annotated[
+        Path | None,
+        typer.Option(help="File with the API token; else HELIOTROPE_TOKEN.", show_default=False),
+    ] = None,
+) -> None:
+    """Look at and command a plant that runs, through its console."""
+    context.obj = (url, token_file)
+
+
+def _client(context: typer.Context, *, token: bool = True) -> "Client":
+    from heliotrope.console.client import Client
+
+    url, file = context.obj
+    secret = os.environ.get("HELIOTROPE_TOKEN", "") if token else ""
+    if token and file is not None:
+        try:
+            secret = file.read_text(encoding="utf-8").strip()
+        except OSError as error:
+            raise InputError(f"token file {file}: {error.strerror}") from None
+    if token and not secret:
+        raise InputError(
+            "ctl: no token; make one with `heliotrope ctl token LABEL`, then set HELIOTROPE_TOKEN "
+            "or give --token-file"
+        )
+    return Client(secret, url)
+
+
+@app.command()
+def token(
+    context: typer.Context,
+    label: Annotated[str, typer.Argument(help="What it is for.")],
+    name: Annotated[str, typer.Option(help="Of your account.")] = "engineer",
+    role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "operator",
+    days: Annotated[float, typer.Option(help="How long it is valid.")] = 90.0,
+    password: Annotated[
+        str, typer.Option(prompt=True, hide_input=True, help="Of your account; asked for.")
+    ] = "",
+) -> None:
+    """Make an API token; it is printed once."""
+    with _client(context, token=False) as client:
+        client.sign_in(name, password)
+        made = client.ask("POST", "tokens", {"label": label, "role": role, "days": days})
+        client.ask("DELETE", "session")
+    print(made["secret"])
+
+
+@app.command()
+def account(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="Of the person.")],
+    role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "viewer",
+    by: Annotated[str, typer.Option(help="Your account; it must be an engineer's.")] = "engineer",
+    disable: Annotated[bool, typer.Option("--disable", help="Keep the person out.")] = False,
+) -> None:
+    """Let a person in, or keep them out."""
+    own = typer.prompt("Your password", hide_input=True)
+    with _client(context, token=False) as client:
+        client.sign_in(by, own)
+        if disable:
+            client.ask("PATCH", f"accounts/{name}", {"disabled": True})
+        else:
+            password = typer.prompt(
+                f"Password of {name}", hide_input=True, confirmation_prompt=True
+            )
+            new = {"name": name, "role": role, "password": password}
+            client.ask("POST", "accounts", new)
+        client.ask("DELETE", "session")
+    print(f"account {name}: {'kept out' if disable else role}")
+
+
+@app.command()
+def status(context: typer.Context, as_json: Json = False) -> None:
+    """Show the plant in one look."""
+    with _client(context) as client:
+        found = client.get("summary")
+    if as_json:
+        print_json(found)
+        return
+    print(f"{found['name']}, {found['at']}")
+    print_table(("state", "heliostats"), [(k, str(v)) for k, v in found["states"].items()])
+    print(f"{found['clusters_alive']} of {found['clusters']} clusters are heard")
+    print(f"{found['alarms']} alarms are active or not acknowledged")
+    print(f"{found['holder'] or 'nobody'} has the command authority")
+    if found["emergency"]:
+        print("EMERGENCY")
+
+
+@app.command()
+def show(
+    context: typer.Context,
+    what: Annotated[
+        str,
+        typer.Argument(help="alarms, events, packets, clusters, calibration, schedule, holds, "
+                       "emergency, sun, or the name of a heliostat."),
+    ],
+) -> None:  # fmt: skip
+    """Print something of the plant as JSON."""
+    from urllib.parse import quote
+
+    known = ("alarms", "events", "packets", "clusters", "calibration", "schedule", "holds",
+             "emergency", "sun", "authority", "field")  # fmt: skip
+    path = what if what in known else f"heliostats/{quote(what, safe='')}"
+    with _client(context) as client:
+        print_json(client.get(path))
+
+
+@app.command()
+def stow(
+    context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
+) -> None:
+    """Send heliostats to stow; needs no authority."""
+    _give(context, "STOW", _names(heliostats, everybody), (), wait)
+
+
+@app.command()
+def defocus(
+    context: typer.Context, heliostats: Whom = None, everybody: All = False, wait: Wait = 0.0
+) -> None:
+    """Take beams off the receiver; needs no authority."""
+    _give(context, "DEFOCUS", _names(heliostats, everybody), (), wait)
+
+
+@app.command()
+def command(
+    context: typer.Context,
+    name: Annotated[str, typer.Argument(help="APPROACH, TRACK, IDLE, REFOCUS, LOCK, JOG, ...")],
+    heliostats: Whom = None,
+    everybody: All = False,
+    value: Annotated[
+        list[float] | None, typer.Option(help="Values, in their order.", show_default=False)
+    ] = None,
+    wait: Wait = 60.0,
+) -> None:
+    """Take the authority, give a command, wait for its end, and give the authority back."""
+    _give(context, name.upper(), _names(heliostats, everybody), tuple(value or ()), wait)
+
+
+@app.command()
+def aim(
+    context: typer.Context,
+    where: Annotated[str, typer.Argument(help="A receiver, a target, or east,north,up in m.")],
+    heliostats: Whom = None,
+    everybody: All = False,
+    wait: Wait = 60.0,
+) -> None:
+    """Aim heliostats at something."""
+    names = _names(heliostats, everybody)
+    order: dict[str, Any] = {"heliostats": names, "where": where}
+    if "," in where:
+        if not names:
+            raise InputError("ctl: a point is given to named heliostats, not to all")
+        order = {"points": dict.fromkeys(names, parse_point(where, "aim"))}
+    with _client(context) as client:
+        client.ask("POST", "authority")
+        try:
+            _follow(client, client.ask("POST", "aim", order), wait)
+        finally:
+            client.ask("DELETE", "authority")
+
+
+@app.command()
+def emergency(
+    context: typer.Context,
+    act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
+    reason: Annotated[str, typer.Option(help="Why, for the audit.")] = "",
+    withdraw: Annotated[bool, typer.Option("--withdraw", help="Take it back instead.")] = False,
+) -> None:
+    """Take all beams off the receiver, now."""
+    with _client(context) as client:
+        if withdraw:
+            found = client.ask("DELETE", "emergency")
+        else:
+            found = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
+    print(f"emergency {'holds' if found['on'] else 'does not hold'}: {found['text']}")
+
+
+@app.command()
+def acknowledge(
+    context: typer.Context,
+    condition: Annotated[str, typer.Argument(help="As the alarm tells it.")],
+    subject: Annotated[str, typer.Argument(help="Of what, as the alarm tells it.")] = "",
+) -> None:
+    """Acknowledge an alarm."""
+    with _client(context) as client:
+        client.ask("POST", "alarms/acknowledge", {"condition": condition, "subject": subject})
+
+
+@app.command()
+def calibration(
+    context: typer.Context,
+    on: Annotated[bool, typer.Option("--on/--off", help="Let it work, or not.")],
+) -> None:
+    """Switch the automatic calibration."""
+    with _client(context) as client:
+        found = client.ask("PUT", "calibration", {"on": on})
+    print(f"calibration {'works' if found['on'] else 'is off'}; {found['done']} calibrated")
+
+
+def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:
+    if bool(heliostats) == everybody:
+        raise InputError("ctl: name heliostats, or give --all for the whole field")
+    return heliostats or []
+
+
+def _give(
+    context: typer.Context, name: str, heliostats: list[str], values: tuple[float, ...], wait: float
+) -> None:
+    safe = name in ("STOW", "DEFOCUS")
+    with _client(context) as client:
+        if not safe:
+            client.ask("POST", "authority")
+        try:
+            _follow(client, client.command(name, heliostats, values), wait)
+        finally:
+            if not safe:
+                client.ask("DELETE", "authority")
+
+
+def _follow(client: "Client", ticket: dict[str, Any], wait: float) -> None:
+    """Wait for the end of a command and print it; exit code 1 if it did not come about."""
+    until = time.monotonic() + wait
+    while not ticket["finished"] and time.monotonic() < until:
+        time.sleep(0.5)
+        ticket = client.get(f"commands/{ticket['identity']}")
+        if not ticket["finished"] and ticket["command"] not in ("STOW", "DEFOCUS"):
+            client.ask("PUT", "authority")
+    print(ticket["text"])
+    if wait > 0.0 and not ticket["good"]:
+        raise typer.Exit(1)

@@ -1,0 +1,52 @@
+"""How many log-ins have failed lately: by address, and by name."""
+
+from collections import deque
+from collections.abc import Callable
+
+
+class Attempts:
+    """Counts failures by key within a span of time.
+
+    Parameters
+    ----------
+    most, span
+        Failures that are let through within ``span`` s.
+    monotonic
+        Tells the time, s.
+    largest
+        Keys that are kept; the oldest go first.
+    """
+
+    def __init__(
+        self, most: int, span: float, monotonic: Callable[[], float], largest: int = 10_000
+    ) -> None:
+        self._most, self._span, self._now, self._largest = most, span, monotonic, largest
+        self._failures: dict[str, deque[float]] = {}
+
+    def wait(self, *keys: str) -> float:
+        """Return how long to wait before the next attempt, s; 0 if it may be made."""
+        now, longest = self._now(), 0.0
+        for key in keys:
+            times = self._failures.get(key)
+            while times and now - times[0] >= self._span:
+                times.popleft()
+            if times is not None and not times:
+                del self._failures[key]
+            elif times and len(times) >= self._most:
+                longest = max(longest, times[-self._most] + self._span - now)
+        return longest
+
+    def begin(self, *keys: str) -> None:
+        """Count an attempt as failed until `good` says otherwise.
+
+        What is counted only after the slow check of a password lets many through at once.
+        """
+        for key in keys:
+            self._failures.setdefault(key, deque(maxlen=self._most)).append(self._now())
+            if len(self._failures) > self._largest:
+                del self._failures[next(iter(self._failures))]
+
+    def good(self, *keys: str) -> None:
+        """Forget the failures of keys that have logged in."""
+        for key in keys:
+            self._failures.pop(key, None)

@@ -1,0 +1,59 @@
+"""Passwords, which are kept as argon2id hashes, and the word that protects a session."""
+
+import hashlib
+import hmac
+import secrets
+
+import argon2
+
+from heliotrope.errors import InputError
+
+#: Shortest password; longest, so that nobody makes the server hash a book.
+SHORTEST, LONGEST = 10, 200
+_HASHER = argon2.PasswordHasher()
+#: Verified where there is no account, so that both take the same time.
+_NOBODY = _HASHER.hash(secrets.token_hex(16))
+
+
+def check_password(password: str) -> str:
+    """Return a password that may be used.
+
+    Raises
+    ------
+    InputError
+        If it is too short or too long.
+    """
+    if not SHORTEST <= len(password) <= LONGEST:
+        raise InputError(f"password: {len(password)} characters; give {SHORTEST} to {LONGEST}")
+    return password
+
+
+def hash_password(password: str) -> str:
+    """Return the argon2id hash; takes some 50 ms."""
+    return _HASHER.hash(check_password(password))
+
+
+def verify_password(kept: str | None, password: str) -> bool:
+    """Return whether a password is that of a hash; the same time if there is none."""
+    try:
+        good = _HASHER.verify(kept if kept is not None else _NOBODY, password)
+    except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
+        return False
+    return bool(good) and kept is not None
+
+
+def new_password() -> str:
+    """Return a random password of 100 bits in groups that can be read aloud."""
+    letters = "abcdefghjkmnpqrstuvwxyz23456789"
+    groups = ("".join(secrets.choice(letters) for _ in range(5)) for _ in range(4))
+    return "-".join(groups)
+
+
+def csrf_of(session: str) -> str:
+    """Return the word that a page must send with what it does in a session."""
+    return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
+
+
+def same(one: str, other: str) -> bool:
+    """Return whether two words are the same, in constant time."""
+    return hmac.compare_digest(one.encode(), other.encode())

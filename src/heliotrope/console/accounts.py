@@ -1,0 +1,157 @@
+"""The HTTP API, version 1: signing in and out, accounts and tokens."""
+
+import asyncio
+from dataclasses import asdict
+
+from fastapi import APIRouter, HTTPException, Request, Response
+
+from heliotrope.console import _secrets, models
+from heliotrope.console.api import REFUSALS, Named
+from heliotrope.console.auth import (
+    COOKIE,
+    Anyone,
+    Caller,
+    Console,
+    Engineer,
+    Here,
+    log_in,
+    same_origin,
+)
+from heliotrope.console.people import ROLES
+from heliotrope.control.authority import Role
+from heliotrope.store.people import Account
+
+router = APIRouter(prefix="/api/v1", responses=REFUSALS)
+
+
+def _who(who: Caller) -> models.Who:
+    return models.Who(
+        name=who.person.name, role=who.person.role.name.lower(), by=who.by, expires=who.expires,
+        csrf=who.csrf,
+    )  # fmt: skip
+
+
+@router.get("/session", response_model=models.Who, tags=["people"])
+async def session(who: Anyone) -> models.Who:
+    """Return who asks."""
+    return _who(who)
+
+
+@router.post(
+    "/session", response_model=models.Who, tags=["people"],
+    responses={429: {"model": models.Problem, "description": "Too many failures"}},
+)  # fmt: skip
+async def sign_in(
+    console: Here, request: Request, response: Response, given: models.LogIn
+) -> models.Who:
+    """Sign in: the answer sets the session's cookie."""
+    if not same_origin(console, request):
+        raise HTTPException(403, "this page is from elsewhere; sign in at the console itself")
+    address = request.client.host if request.client else ""
+    secret, expires = await log_in(console, given.name, given.password, address)
+    response.set_cookie(
+        COOKIE, secret, max_age=int(console.settings.session_s), path="/", httponly=True,
+        samesite="strict", secure=console.settings.tls or console.settings.plain,
+    )  # fmt: skip
+    account = console.people.account(given.name)
+    role = account.role if account is not None else "viewer"
+    return models.Who(
+        name=given.name, role=role, by="session", expires=expires, csrf=_secrets.csrf_of(secret)
+    )
+
+
+@router.delete("/session", status_code=204, tags=["people"])
+async def sign_out(console: Here, who: Anyone, response: Response) -> None:
+    """Sign out."""
+    if who.by == "session":
+        await asyncio.to_thread(console.people.close_session, who.secret)
+        console.known.clear()
+        response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+
+
+@router.get("/accounts", response_model=list[models.AccountState], tags=["people"])
+async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
+    """Return who may come in."""
+    del who
+    return [_account(one) for one in console.people.accounts()]
+
+
+@router.post("/accounts", response_model=models.AccountState, status_code=201, tags=["people"])
+async def new_account(
+    console: Here, who: Engineer, given: models.NewAccount
+) -> models.AccountState:
+    """Let a person in."""
+    kept = await _hashed(console, given.password)
+    made = await asyncio.to_thread(console.people.add, given.name, kept, given.role, console.now())
+    console.operations.logbook.event(
+        "people", who.person.name, f"account {given.name} made, {given.role}"
+    )
+    return _account(made)
+
+
+@router.patch("/accounts/{name}", response_model=models.AccountState, tags=["people"])
+async def change_account(
+    console: Here, who: Engineer, name: Named, given: models.AccountChange
+) -> models.AccountState:
+    """Change role or password of a person, or keep them out."""
+    if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
+        raise HTTPException(409, f"{name}: nobody takes away their own role; another must do it")
+    if console.people.account(name) is None:
+        raise HTTPException(404, f"there is no account {name}")
+    kept = await _hashed(console, given.password) if given.password is not None else None
+    made = await asyncio.to_thread(
+        console.people.change, name, console.now(), role=given.role, password_hash=kept,
+        disabled=given.disabled,
+    )  # fmt: skip
+    console.known.clear()
+    console.operations.logbook.event("people", who.person.name, f"account {name} changed")
+    return _account(made)
+
+
+@router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
+async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
+    """Return the tokens: one's own, or all to an engineer."""
+    found = console.people.tokens(_whose(who))
+    return [models.TokenState(**asdict(one)) for one in found]
+
+
+@router.post("/tokens", response_model=models.TokenState, status_code=201, tags=["people"])
+async def new_token(console: Here, who: Anyone, given: models.NewToken) -> models.TokenState:
+    """Make a token for a program; its secret is in this answer and nowhere else."""
+    if who.by != "session":
+        raise HTTPException(403, "a token cannot make tokens; sign in for it")
+    if ROLES[given.role] > who.person.role:
+        raise HTTPException(403, f"token: its role {given.role} is higher than one's own")
+    made, secret = await asyncio.to_thread(
+        console.people.add_token, who.person.name, given.label, given.role, console.now(),
+        86_400.0 * given.days,
+    )  # fmt: skip
+    console.operations.logbook.event(
+        "people", who.person.name, f"token {given.label} made, {given.role}"
+    )
+    return models.TokenState(**asdict(made), secret=secret)
+
+
+@router.delete("/tokens/{key}", status_code=204, tags=["people"])
+async def revoke(console: Here, who: Anyone, key: Named) -> None:
+    """Revoke a token: one's own, or any as an engineer."""
+    if key not in {one.key for one in console.people.tokens(_whose(who))}:
+        raise HTTPException(404, f"there is no token {key}")
+    await asyncio.to_thread(console.people.revoke_token, key)
+    console.known.clear()
+
+
+async def _hashed(console: Console, password: str) -> str:
+    async with console.hashing:
+        return await asyncio.to_thread(_secrets.hash_password, password)
+
+
+def _whose(who: Caller) -> str:
+    """Return whose tokens one may see: "" for everybody's."""
+    return "" if who.person.role >= Role.ENGINEER else who.person.name
+
+
+def _account(one: Account) -> models.AccountState:
+    return models.AccountState(
+        name=one.name, role=one.role, disabled=one.disabled, created=one.created
+    )

@@ -1,0 +1,104 @@
+"""The application: API, live stream and page over one plant at work.
+
+`create` makes it; `console.serve` runs it in the plant's own event loop.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from fastapi.responses import FileResponse, JSONResponse, Response
+from starlette.staticfiles import StaticFiles
+
+from heliotrope import __version__
+from heliotrope.console import accounts, api, commands
+from heliotrope.console._attempts import Attempts
+from heliotrope.console.auth import Console
+from heliotrope.console.guard import Guard
+from heliotrope.console.live import Stream
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.control.audit import AuditError
+from heliotrope.control.authority import RefusedError
+from heliotrope.control.operations import Operations
+from heliotrope.errors import HeliotropeError, UnknownNameError
+from heliotrope.store.people import People
+from heliotrope.store.records import StoreError
+
+STATIC = Path(__file__).with_name("static")
+ABOUT = (
+    "Reads and commands a heliostat field. Sign in (POST /api/v1/session) or send a token "
+    "(Authorization: Bearer). In a session, all that changes anything needs the header "
+    "X-CSRF-Token with the word that the sign-in answered."
+)
+
+
+def create(
+    operations: Operations, people: People, settings: ConsoleSettings | None = None
+) -> FastAPI:
+    """Return the application.
+
+    Parameters
+    ----------
+    operations
+        The plant at work.
+    people
+        Accounts, sessions and tokens.
+    settings
+        Of the console. A process can have one page (NiceGUI is global), and any number of
+        applications without.
+    """
+    chosen = settings or ConsoleSettings()
+    stream = Stream(operations, chosen.period)
+    attempts = Attempts(chosen.failures, chosen.failures_s, time.monotonic)
+    console = Console(operations, people, chosen, stream, attempts)
+
+    @contextlib.asynccontextmanager
+    async def alive(app: FastAPI) -> AsyncIterator[None]:
+        del app
+        async with asyncio.TaskGroup() as group:
+            works = [group.create_task(stream.run()), group.create_task(console.keep_authority())]
+            yield
+            for work in works:
+                work.cancel()
+
+    app = FastAPI(
+        title="Heliotrope", version=__version__, description=ABOUT, lifespan=alive,
+        openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None,
+    )  # fmt: skip
+    app.state.console = console
+    for router in (api.router, commands.router, accounts.router):
+        app.include_router(router)
+    for kind, status in ((HeliotropeError, 422), (UnknownNameError, 404), (RefusedError, 409),
+                         (AuditError, 503), (StoreError, 503)):  # fmt: skip
+        app.add_exception_handler(kind, _problem(status))
+    app.add_middleware(Guard, console=lambda: console)
+    _pages(app)
+    if chosen.page:
+        from heliotrope.console import page
+
+        page.attach(app)
+    return app
+
+
+def _problem(status: int) -> Callable[[Request, Exception], Response]:
+    def answer(request: Request, error: Exception) -> Response:
+        del request
+        return JSONResponse({"detail": str(error)}, status)
+
+    return answer
+
+
+def _pages(app: FastAPI) -> None:
+    """Add the files of the page, and signing in: plain, without the frame."""
+    app.mount("/console/static", StaticFiles(directory=STATIC), name="console")
+
+    @app.get("/login", include_in_schema=False)
+    async def login() -> Response:
+        return FileResponse(STATIC / "login.html", media_type="text/html; charset=utf-8")
+
+    @app.get("/emergency", include_in_schema=False)
+    async def emergency() -> Response:
+        return FileResponse(STATIC / "emergency.html", media_type="text/html; charset=utf-8")

@@ -1,0 +1,236 @@
+"""Who asks: sessions by cookie, tokens by header, roles, and protection against what others send.
+
+A browser has a session: its cookie is out of the reach of scripts (HttpOnly), is not sent from
+other sites (SameSite=Strict), and what changes anything needs the session's own word in a header
+besides, which a page from elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
+"""
+
+import asyncio
+import math
+import time
+from dataclasses import dataclass, field
+from typing import Annotated, Any, cast
+from urllib.parse import urlsplit
+
+from fastapi import Depends, HTTPException
+from starlette.requests import HTTPConnection
+
+from heliotrope.console import _secrets
+from heliotrope.console._attempts import Attempts
+from heliotrope.console.live import Stream
+from heliotrope.console.people import person_of
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.console.tickets import Tickets
+from heliotrope.control.authority import Person, RefusedError, Role
+from heliotrope.control.operations import Operations
+from heliotrope.store.people import People
+
+COOKIE = "heliotrope_session"
+#: A session that was found valid is trusted for so long without the store, s.
+TRUSTED = 5.0
+MOST_KNOWN = 2000
+#: Who has kept the authority up counts as there for so long, s.
+PRESENT = 8.0
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+
+
+@dataclass
+class Console:
+    """What the routes work on."""
+
+    operations: Operations
+    people: People
+    settings: ConsoleSettings
+    stream: Stream
+    attempts: Attempts
+    tickets: Tickets = field(default_factory=Tickets)
+    #: Checks of passwords at once: each takes 50 ms of a core and 64 MiB.
+    hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
+
+    #: Who was found valid lately, and when, by the kind and secret of what they showed.
+    known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
+
+    #: When each holder of the authority was there last, machine's monotonic s.
+    present: dict[str, float] = field(default_factory=dict)
+
+    #: Answers that all viewers ask for, and when they were made: made at most twice a second.
+    shared: dict[str, tuple[float, bytes]] = field(default_factory=dict)
+
+    async def keep_authority(self) -> None:
+        """Keep the authority up for a holder whose page (or program) has said so lately.
+
+        The authority lasts by the plant's time, which may run faster than people do.
+        """
+        while True:
+            await asyncio.sleep(0.2 * self.operations.plant.authority.lifetime)
+            grant = self.operations.plant.authority.grant
+            if grant is None:
+                continue
+            if time.monotonic() - self.present.get(grant.holder.name, -math.inf) < PRESENT:
+                self.operations.keep_authority(grant.holder, grant.token)
+
+    def now(self) -> float:
+        """Return the machine's time, POSIX s: sessions end by it, whatever time the plant has."""
+        return time.time()
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks.
+
+    Attributes
+    ----------
+    person
+        With the role that counts now.
+    by
+        "session" or "token".
+    secret
+        Of the session or token.
+    expires
+        POSIX s; None for never.
+    """
+
+    person: Person
+    by: str
+    secret: str = field(repr=False)
+    expires: float | None
+
+    @property
+    def csrf(self) -> str:
+        """What must be sent with all that changes anything; "" for a token."""
+        return _secrets.csrf_of(self.secret) if self.by == "session" else ""
+
+
+def console_of(connection: HTTPConnection) -> Console:
+    """Return the console of an application."""
+    return cast("Console", connection.app.state.console)
+
+
+Here = Annotated[Console, Depends(console_of)]
+
+
+def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
+    """Return who asks, None if they are not known (any more)."""
+    bearer = connection.headers.get("authorization", "")
+    kind, _, word = bearer.partition(" ")
+    if bearer and kind.lower() != "bearer":
+        return None
+    by, secret = ("token", word.strip()) if bearer else ("session", "")
+    secret = secret or connection.cookies.get(COOKIE, "")
+    if not secret or (bearer and not word.strip()):
+        return None
+    known, now = console.known.get((by, secret)), time.monotonic()
+    if known is None or now - known[0] > TRUSTED:
+        look = console.people.token if by == "token" else console.people.session
+        found = look(secret, console.now())
+        if found is None:
+            console.known.pop((by, secret), None)
+            return None
+        who = Caller(person_of(found.name, found.role), by, secret, found.expires)
+        if len(console.known) > MOST_KNOWN:
+            console.known.clear()
+        known = console.known[by, secret] = (now, who)
+    who = known[1]
+    return who if who.expires is None or who.expires > console.now() else None
+
+
+def same_origin(console: Console, connection: HTTPConnection) -> bool:
+    """Whether a request comes from a page of this console, or from no page at all."""
+    origin = connection.headers.get("origin")
+    if origin is None:
+        return True
+    there = urlsplit(origin)
+    return there.netloc == connection.headers.get("host") and host_known(console, there.netloc)
+
+
+def host_known(console: Console, netloc: str) -> bool:
+    """Whether a request names this machine as it is known here."""
+    host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
+    return host.lower() in console.settings.hosts
+
+
+def caller(connection: HTTPConnection, console: Here) -> Caller:
+    """Return who asks.
+
+    Raises
+    ------
+    HTTPException
+        401 if they are not known; 403 if a page from elsewhere may have sent it.
+    """
+    found = find_caller(console, connection)
+    if found is None:
+        raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
+    changes = connection.scope.get("method", "GET") not in SAFE_METHODS
+    if changes:
+        # Who changes something sees it changed.
+        console.shared.clear()
+    if found.by == "session" and changes:
+        word = connection.headers.get("x-csrf-token", "")
+        if not same_origin(console, connection) or not _secrets.same(word, found.csrf):
+            raise HTTPException(403, "the header X-CSRF-Token is missing or not this session's")
+    return found
+
+
+Anyone = Annotated[Caller, Depends(caller)]
+
+
+def at_least(role: Role) -> Any:
+    """Return a dependency that lets only some in."""
+
+    def allowed(who: Anyone) -> Caller:
+        if who.person.role < role:
+            name, mine = who.person.name, who.person.role.name.lower()
+            raise HTTPException(403, f"{name} is {mine}; it needs {role.name.lower()}")
+        return who
+
+    return Depends(allowed)
+
+
+Operator = Annotated[Caller, at_least(Role.OPERATOR)]
+Engineer = Annotated[Caller, at_least(Role.ENGINEER)]
+
+
+def token_of(console: Console, person: Person) -> int:
+    """Return the token of the command authority that a person has.
+
+    Raises
+    ------
+    RefusedError
+        If they have none.
+    """
+    grant = console.operations.plant.authority.grant
+    if grant is None:
+        raise RefusedError(f"authority: nobody has it; {person.name} must take it first")
+    if grant.holder != person:
+        raise RefusedError(f"authority: {grant.holder.name} has it; take it first")
+    return grant.token
+
+
+async def log_in(console: Console, name: str, password: str, address: str) -> tuple[str, float]:
+    """Check a password; return the secret of a new session and when it ends, POSIX s.
+
+    Raises
+    ------
+    HTTPException
+        401 if name or password is wrong; 429 after too many failures.
+    """
+    keys = (f"name {name}", f"address {address}")
+    if (wait := console.attempts.wait(*keys)) > 0.0:
+        seconds = math.ceil(wait)
+        raise HTTPException(
+            429, f"too many failed log-ins; try again in {seconds} s",
+            {"Retry-After": str(seconds)},
+        )  # fmt: skip
+    console.attempts.begin(*keys)
+    account = console.people.account(name)
+    kept = account.password_hash if account is not None and not account.disabled else None
+    async with console.hashing:
+        good = await asyncio.to_thread(_secrets.verify_password, kept, password)
+    if not good or account is None:
+        raise HTTPException(401, "name or password is wrong")
+    console.attempts.good(*keys)
+    now, lifetime = console.now(), console.settings.session_s
+    secret = await asyncio.to_thread(
+        console.people.open_session, account.name, now, lifetime, address
+    )
+    return secret, now + lifetime

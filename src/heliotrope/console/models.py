@@ -1,0 +1,282 @@
+"""What goes over HTTP: models of the plant's views, made from them, and of what people send.
+
+The views of `control.operations` are frozen dataclasses of plain values and arrays. Their models
+have the same names and fields, so that there is one description of each. Numbers that are not
+known (NaN, infinite) are null.
+"""
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from datetime import datetime
+from enum import Enum
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from heliotrope.control import _operations_views as views
+
+_MADE: dict[type, type[BaseModel]] = {}
+
+
+def model_of(view: type) -> type[BaseModel]:
+    """Return the model of a view."""
+    if view not in _MADE:
+        hints = typing.get_type_hints(view)
+        fields: dict[str, Any] = {f.name: (_type(hints[f.name]), ...) for f in
+                                  dataclasses.fields(view)}  # fmt: skip
+        made = create_model(view.__name__, **fields)
+        made.__doc__ = view.__doc__
+        _MADE[view] = made
+    return _MADE[view]
+
+
+def _type(hint: Any) -> Any:
+    """Return the type that JSON holds for that of a field."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if dataclasses.is_dataclass(hint):
+        return model_of(typing.cast("type", hint))
+    if hint is float:
+        return float | None
+    if origin is np.ndarray:
+        return list[Any]
+    if origin is tuple:
+        if len(inner) == 2 and inner[1] is Ellipsis:
+            return list[_type(inner[0])]  # type: ignore[misc]  # made at run time
+        return list[Any]
+    if isinstance(origin, type) and issubclass(origin, Mapping):
+        return dict[str, _type(inner[1])]  # type: ignore[misc]  # made at run time
+    if origin in (typing.Union, types.UnionType):
+        kinds = [_type(kind) for kind in inner]
+        return typing.Union[tuple(kinds)]  # noqa: UP007 - made at run time
+    if hint in (str, int, bool, datetime):
+        return hint
+    return Any
+
+
+def plain(value: Any) -> Any:
+    """Return what JSON can hold of views: lists, dictionaries, numbers, text; NaN as None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or (isinstance(value, str | bool | int) and not isinstance(value, Enum)):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(one) for one in value]
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return str(value)
+
+
+class Strict(BaseModel):
+    """What people send: nothing else may be in it."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Names = Annotated[list[Name], Field(max_length=200_000, description="Names; [] for all.")]
+Words = Annotated[str, Field(max_length=500, pattern=r"^[^\x00-\x1f\x7f]*$")]
+Coordinate = Annotated[float, Field(ge=-1e5, le=1e5, allow_inf_nan=False)]
+Point = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
+Place = Annotated[list[float], Field(min_length=3, max_length=3)]
+Number = Annotated[float, Field(ge=-2147483648, le=2147483647, allow_inf_nan=False)]
+
+
+class LogIn(Strict):
+    """Name and password."""
+
+    name: Name
+    password: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class Who(BaseModel):
+    """Who asks: the name and role that this plant knows, and how they came in."""
+
+    name: str
+    role: str
+    by: str = Field(description='"session" or "token"')
+    expires: float | None = Field(description="POSIX s")
+    csrf: str = Field("", description="To be sent as X-CSRF-Token with all that changes anything")
+
+
+class Whom(Strict):
+    """Some heliostats, or all."""
+
+    heliostats: Names = []
+
+
+class CommandOrder(Whom):
+    """A command of the wire with its values, see the table of messages."""
+
+    command: Annotated[str, Field(pattern=r"^[A-Z_]{2,20}$")]
+    values: Annotated[list[Number], Field(max_length=8)] = []
+
+
+class AimOrder(Whom):
+    """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
+
+    where: Words = ""
+    points: Annotated[dict[Name, Point], Field(max_length=200_000)] = {}
+
+
+class StandbyOrder(Strict):
+    """Standby points by heliostat, ENU, m."""
+
+    points: Annotated[dict[Name, Point], Field(min_length=1, max_length=200_000)]
+
+
+class Reason(Strict):
+    """Why."""
+
+    reason: Words
+
+
+class EmergencyCall(Strict):
+    """What the whole field is to do, and why."""
+
+    act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
+    reason: Words = ""
+
+
+class Acknowledged(Strict):
+    """Which alarm."""
+
+    condition: Name
+    subject: Words = ""
+
+
+class HoldOrder(Whom):
+    """Heliostats to keep out of calibration, and why."""
+
+    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
+    reason: Words
+
+
+class Switch(Strict):
+    """On or off."""
+
+    on: bool
+
+
+class NewAccount(Strict):
+    """A person to let in."""
+
+    name: Name
+    role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")]
+    password: Annotated[str, Field(min_length=10, max_length=200)]
+
+
+class AccountChange(Strict):
+    """What is to change of an account; null: as it was."""
+
+    role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")] | None = None
+    password: Annotated[str, Field(min_length=10, max_length=200)] | None = None
+    disabled: bool | None = None
+
+
+class NewToken(Strict):
+    """A token for a program."""
+
+    label: Name
+    role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")]
+    days: Annotated[float, Field(gt=0, le=3650)] = 90.0
+
+
+class TicketState(BaseModel):
+    """How far an accepted command has come."""
+
+    identity: str
+    command: str
+    heliostats: int
+    counted: dict[str, int] = Field(description="How many heliostats are at each stage")
+    finished: bool
+    good: bool = Field(description="Whether every heliostat is done")
+    text: str
+    refusals: dict[str, str] = Field(description="Reasons of the first hundred")
+
+
+class AuthorityState(BaseModel):
+    """Who has the command authority."""
+
+    holder: str
+    role: str
+    mine: bool
+    lifetime: float = Field(description="How long it lasts without being kept up, s")
+
+
+class FieldState(BaseModel):
+    """What does not change of the field, in the order of all its rows."""
+
+    plant: str
+    names: list[str]
+    positions: list[Place] = Field(description="ENU, m")
+    clusters: list[str]
+    cluster: list[int] = Field(description="Place in clusters")
+    size: float = Field(description="Larger side of a mirror, m, the median")
+    tower: Place = Field(description="Middle of the receivers, ENU, m")
+    receivers: list[str]
+    targets: list[str]
+    surfaces: list[str] = Field(description="What `on` of a row counts")
+    states: list[str]
+    faults: list[str]
+
+
+class Problem(BaseModel):
+    """Why something was not done."""
+
+    detail: str | list[Any]
+
+
+class CameraReading(BaseModel):
+    """What the software saw in the last photograph of a target."""
+
+    target: str
+    version: int = Field(description="Rises with each photograph; 0 before the first")
+    at: float | None
+    reading: list[str]
+    centroid: list[float] | None = Field(description="Right of and above its centre, m")
+
+
+class AccountState(BaseModel):
+    """A person who may come in."""
+
+    name: str
+    role: str
+    disabled: bool
+    created: float
+
+
+class TokenState(BaseModel):
+    """A token of a program; its secret is shown once, when it is made."""
+
+    key: str
+    name: str
+    label: str
+    role: str
+    created: float
+    expires: float | None
+    last_used: float | None
+    secret: str = ""
+
+
+def many(model: type[BaseModel]) -> Any:
+    """Return the model of a list."""
+    return list[model]  # type: ignore[valid-type]  # models of views are made at run time
+
+
+#: Answers with the data of views.
+Summary, SunView = model_of(views.Summary), model_of(views.SunView)
+FluxView, HeliostatView = model_of(views.FluxView), model_of(views.HeliostatView)
+ClusterRow, AlarmRow = model_of(views.ClusterRow), model_of(views.AlarmRow)
+EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
+CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)
+Hold, EmergencyView = model_of(views.Hold), model_of(views.EmergencyView)

@@ -1,0 +1,110 @@
+"""The operator page: NiceGUI's frame (head, tabs, command bar), filled by the parts in static/.
+
+The page has no powers of its own: all that it shows comes from the live stream and the API, and all
+that it does goes to the API with the session of the person. EMERGENCY is a plain button with a
+script of its own, outside the frame: it works when the frame does not.
+"""
+
+from html import escape
+from pathlib import Path
+
+from fastapi import FastAPI, Request
+from fastapi.responses import RedirectResponse, Response
+from nicegui import ui
+
+from heliotrope.console.auth import Caller, find_caller
+
+#: Tabs: name of the part, title.
+TABS = (
+    ("plant", "Plant"), ("heliostat", "Heliostat"), ("targets", "Targets"),
+    ("calibration", "Calibration"), ("clusters", "Clusters"), ("alarms", "Alarms"),
+    ("logs", "Logs"), ("schedule", "Schedule"),
+)  # fmt: skip
+_EMERGENCY = """
+<div id="emergency-box">
+  <span id="emergency-said" role="status"></span>
+  <button id="emergency" type="button" title="Takes all beams off the receiver, at once">
+    EMERGENCY</button>
+</div>
+<script defer src="/console/static/emergency.js"></script>
+"""
+
+
+class View(ui.element, component="static/view.js"):
+    """A part of the page; what is in it is drawn by static/console.js.
+
+    Parameters
+    ----------
+    kind
+        Which one.
+    """
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self._props["kind"] = kind
+
+
+def attach(app: FastAPI) -> None:
+    """Add the page to an application; a process can have one."""
+    ui.page("/", title="Heliotrope", response_timeout=10.0)(_page)
+    ui.run_with(
+        app, title="Heliotrope", favicon=Path(__file__).with_name("static") / "mark.svg",
+        dark=True, tailwind=False, show_welcome_message=False,
+        # Nothing of the page runs here: bindings need not be looked at.
+        binding_refresh_interval=None, reconnect_timeout=10.0,
+    )  # fmt: skip
+
+
+def _page(request: Request) -> Response | None:
+    """Return the page, or the way to the log-in."""
+    who = find_caller(request.scope["heliotrope"], request)
+    if who is None or who.by != "session":
+        return RedirectResponse("/login", 303)
+    ui.add_head_html(_head(who))
+    ui.add_body_html(_EMERGENCY)
+    with ui.header(elevated=False).classes("hx-header"):
+        View("head")
+        ui.space()
+        View("authority")
+        theme = ui.button(icon="contrast", color=None)
+        theme.props("flat dense round aria-label='Dark or light'")
+        theme.on("click", js_handler="() => heliotrope.theme()")
+        name = f"{who.person.name} · {who.person.role.name.lower()}"
+        person = ui.button(name, icon="person", color=None).props("flat dense no-caps")
+        with person, ui.menu():
+            ui.menu_item("Sign out").on("click", js_handler="() => heliotrope.leave()")
+    View("alert")
+    with ui.element("main").classes("hx-main"):
+        View("map")
+        with ui.element("section").classes("hx-side"):
+            _tabs()
+    with ui.footer(elevated=False).classes("hx-footer"):
+        View("bar")
+    return None
+
+
+def _tabs() -> None:
+    with (
+        ui.tabs()
+        .props("dense no-caps outside-arrows mobile-arrows inline-label")
+        .classes("hx-tabs") as tabs
+    ):
+        for kind, title in TABS:
+            with ui.tab(kind, label=title):
+                if kind == "alarms":
+                    View("badge").classes("hx-badge")
+    with ui.tab_panels(tabs, value="plant", animated=False).classes("hx-panels"):
+        for kind, _ in TABS:
+            with ui.tab_panel(kind):
+                View(kind)
+
+
+def _head(who: Caller) -> str:
+    facts = {
+        "heliotrope-csrf": who.csrf, "heliotrope-person": who.person.name,
+        "heliotrope-role": who.person.role.name.lower(),
+    }  # fmt: skip
+    metas = "".join(
+        f'<meta name="{name}" content="{escape(text)}">' for name, text in facts.items()
+    )
+    return metas + '<link rel="stylesheet" href="/console/static/console.css">'

@@ -1,0 +1,35 @@
+"""Who may come in: persons of the store's accounts, and the first of them."""
+
+from heliotrope.console import _secrets
+from heliotrope.control.authority import Person, Role
+from heliotrope.store.people import People
+
+ROLES = {"viewer": Role.VIEWER, "operator": Role.OPERATOR, "engineer": Role.ENGINEER}
+#: Name of the first account.
+FIRST = "engineer"
+
+
+def first_start(people: People, now: float) -> str | None:
+    """Make the first account if there is none.
+
+    Parameters
+    ----------
+    people
+        Of the store.
+    now
+        POSIX s.
+
+    Returns
+    -------
+    Its password, to be printed once; None if there are accounts already.
+    """
+    if not people.empty():
+        return None
+    password = _secrets.new_password()
+    people.add(FIRST, _secrets.hash_password(password), "engineer", now)
+    return password
+
+
+def person_of(name: str, role: str) -> Person:
+    """Return who commands."""
+    return Person(name, ROLES[role])

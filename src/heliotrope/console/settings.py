@@ -1,0 +1,94 @@
+"""Settings of the console."""
+
+import ipaddress
+from dataclasses import dataclass
+from pathlib import Path
+
+from heliotrope.errors import InputError
+
+
+@dataclass(frozen=True)
+class ConsoleSettings:
+    """Where the console listens and how strict it is.
+
+    Attributes
+    ----------
+    host, port
+        Address it binds to; port 0 takes a free one.
+    names
+        Further names that people may write into the browser for this machine. A request for any
+        other name is refused, since a page from elsewhere may resolve its own name to this one.
+    certificate, key
+        Files of a TLS certificate and its key, PEM; None: plain HTTP.
+    session_s
+        How long a person stays signed in, s.
+    failures, failures_s
+        Failed log-ins from one address or of one name that are let through within a span, s.
+    period
+        Between two messages of the live stream, s.
+    viewers
+        Live streams at once.
+    page
+        Whether the operator page is served; if not, only the API is.
+    plain
+        Whether it may be reached from other machines without TLS: behind a proxy that has it.
+
+    Raises
+    ------
+    InputError
+        A port that none is, a key without certificate, a time that is not above 0; an address
+        other than this machine's own without TLS.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    names: tuple[str, ...] = ()
+    certificate: Path | None = None
+    key: Path | None = None
+    session_s: float = 36_000.0
+    failures: int = 5
+    failures_s: float = 60.0
+    period: float = 1.0
+    viewers: int = 200
+    page: bool = True
+    plain: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.port <= 65_535:
+            raise InputError(f"console: port {self.port}; give 1 to 65535, or 0 for a free one")
+        if (self.certificate is None) != (self.key is None):
+            raise InputError("console: TLS needs both files, --certificate and --key")
+        for name in ("session_s", "failures_s", "period"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"console: {name} of {getattr(self, name)} s must be above 0")
+        if not self.local and not self.tls and not self.plain:
+            raise InputError(
+                f"console: {self.host} is reached from other machines, and without TLS passwords "
+                "can be read on the way; give --certificate and --key, or --plain behind a proxy "
+                "that has TLS"
+            )
+
+    @property
+    def tls(self) -> bool:
+        """Whether it speaks TLS itself."""
+        return self.certificate is not None
+
+    @property
+    def local(self) -> bool:
+        """Whether only this machine reaches it."""
+        if self.host == "localhost":
+            return True
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return False
+
+    @property
+    def hosts(self) -> frozenset[str]:
+        """Names that a request may be for."""
+        return frozenset({"127.0.0.1", "localhost", "[::1]", "::1", self.host, *self.names})
+
+    def address(self, port: int) -> str:
+        """Return the address to write into a browser."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'https' if self.tls else 'http'}://{host}:{port}/"

@@ -1,0 +1,86 @@
+// Puts the parts of the page into the frame.
+import { api, me, rowsWhere, store } from "./live.js";
+import { FieldMap } from "./map.js";
+import { VIEWS } from "./palette.js";
+import * as panels from "./panels.js";
+import { bar, say, whoCommands } from "./orders.js";
+import { count, degrees, h, span } from "./dom.js";
+
+const ready = store.start().catch((error) => say(`the plant cannot be read: ${error.message}`, true));
+
+function map(box) {
+  const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
+    Object.entries(VIEWS).map(([name, { title }]) => h("option", { value: name }, title)));
+  const lasso = h("button", { className: "hx-button", title: "Draw a lasso (L, or Shift and drag)", onclick: () => store.emit("mode", lasso.classList.contains("main") ? "pan" : "lasso") }, "Lasso");
+  const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
+  const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
+  const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
+    placeholder: "state = TRACKING and error > 1", title: "Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Signs: = != < > <= >= ~ (pattern with *). Press / to come here." });
+  const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(`${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
+  query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
+  const field = h("div", { className: "hx-map-field" });
+  box.append(h("div", { className: "hx-tools" }, view, lasso, all, none, query, h("button", { className: "hx-button", onclick: run }, "Select")), field);
+  const off = store.on("mode", (mode) => lasso.classList.toggle("main", mode === "lasso"));
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "/" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement?.tagName)) { event.preventDefault(); query.focus(); }
+  });
+  const drawn = new FieldMap(field);
+  return () => { off(); drawn.close(); };
+}
+
+function head(box) {
+  const time = h("b"), speed = h("span", { className: "hx-hint" }), sun = h("span"), live = h("span", { className: "hx-live" });
+  box.append(h("span", { className: "hx-plant" }, store.field.plant), live, time, speed, sun);
+  const show = () => {
+    const now = store.head;
+    if (!now) return;
+    time.textContent = `${now.at.slice(0, 10)} ${now.at.slice(11, 19)} UTC`;
+    speed.textContent = now.extra?.speed && now.extra.speed !== 1 ? `×${now.extra.speed}` : now.lag > 2 ? `${span(now.lag)} behind` : "";
+    sun.textContent = `☀ ${degrees(now.sun.azimuth, 0)}° ↑${degrees(now.sun.elevation, 0)}°`;
+  };
+  const mark = () => { live.textContent = store.live ? "● live" : "✕ NOT LIVE"; live.classList.toggle("bad", !store.live); document.body.classList.toggle("hx-dead", !store.live); };
+  const off = [store.on("frame", show), store.on("live", mark)];
+  mark(); show();
+  return () => off.forEach((end) => end());
+}
+
+function badge(box) {
+  const show = (now) => {
+    box.textContent = now.alarms ? String(now.alarms) : "";
+    document.body.classList.toggle("hx-emergency", now.emergency);
+  };
+  return store.on("frame", show);
+}
+
+function alert(box) {
+  const text = h("span"), back = h("button", { className: "hx-button", onclick: async () => {
+    try { await api("DELETE", "emergency"); say("emergency withdrawn; acknowledge the alarms that it left"); } catch (error) { say(error.message, true); }
+  } }, "Withdraw");
+  box.append(text, me.role === "viewer" ? "" : back);
+  new ResizeObserver(() => document.body.style.setProperty("--alert", `${box.offsetHeight}px`)).observe(box);
+  return store.on("frame", (now) => {
+    box.classList.toggle("on", now.emergency);
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)}` : "";
+  });
+}
+
+const PARTS = { map, head, bar, badge, alert, authority: whoCommands, ...panels };
+
+export function mount(kind, box) {
+  let end = null, over = false;
+  ready.then(() => { if (!over && store.field) end = PARTS[kind](box); });
+  return () => { over = true; end?.(); };
+}
+
+window.heliotrope = {
+  theme() {
+    const night = !document.body.classList.contains("body--dark");
+    Quasar.Dark.set(night);
+    localStorage.setItem("heliotrope-theme", night ? "dark" : "light");
+    setTimeout(() => store.emit("theme"), 50);
+  },
+  async leave() { await api("DELETE", "session"); location.assign("/login"); },
+  store,
+};
+const wanted = localStorage.getItem("heliotrope-theme");
+if (wanted) { Quasar.Dark.set(wanted === "dark"); setTimeout(() => store.emit("theme"), 50); }

@@ -1,0 +1,111 @@
+// Small things to build the page from. Text always goes in as text, never as markup.
+import { store } from "./live.js";
+
+export function h(tag, given = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(given)) {
+    if (value === undefined || value === false) continue;
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name in made && name !== "list") made[name] = value;
+    else made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
+  return made;
+}
+
+const known = (value) => value !== null && value !== undefined && Number.isFinite(value);
+export const number = (value, digits = 2) => (known(value) ? value.toFixed(digits) : "–");
+export const mrad = (value, digits = 2) => (known(value) ? (1e3 * value).toFixed(digits) : "–");
+export const degrees = (value, digits = 2) => (known(value) ? ((value * 180) / Math.PI).toFixed(digits) : "–");
+export const count = (value) => (known(value) ? value.toLocaleString("en") : "–");
+export const clock = (at) => (known(at) && at > 0 ? new Date(1e3 * at).toISOString().slice(11, 19) : "–");
+export function span(seconds) {
+  if (!known(seconds)) return "never";
+  if (seconds < 120) return `${Math.max(0, seconds).toFixed(0)} s`;
+  if (seconds < 7200) return `${(seconds / 60).toFixed(0)} min`;
+  return seconds < 172800 ? `${(seconds / 3600).toFixed(1)} h` : `${(seconds / 86400).toFixed(1)} d`;
+}
+
+export function table(columns, rows, act) {
+  const head = h("tr", {}, columns.map(([title, , kind]) => h("th", { className: kind ?? "" }, title)));
+  const body = rows.map((row) => h("tr", act ? { className: "can", tabIndex: 0, onclick: () => act(row),
+    onkeydown: (event) => { if (event.key === "Enter") act(row); } } : {},
+    columns.map(([, show, kind]) => { const cell = show(row); return h("td", { className: kind ?? "" }, cell ?? ""); })));
+  return h("div", { className: "hx-scroll" }, h("table", { className: "hx-table" }, h("thead", {}, head), h("tbody", {}, body)));
+}
+
+export function facts(pairs) {
+  return h("dl", { className: "hx-facts" }, pairs.filter(Boolean).map(([name, value, extra]) =>
+    h("div", { className: extra ?? "" }, h("dt", {}, name), h("dd", {}, value))));
+}
+
+// Calls `load` now and whenever `key()` changes, or every some seconds; never twice at once.
+export function refreshed(load, { key = () => "", every = Infinity } = {}) {
+  let busy = false, last = "", at = -Infinity, over = false;
+  const look = async () => {
+    const now = performance.now(), present = String(key());
+    if (busy || over || document.hidden || (present === last && now - at < 1e3 * every)) return;
+    busy = true; last = present; at = now;
+    try { await load(); } catch (error) { store.emit("said", { text: error.message, bad: true }); }
+    finally { busy = false; }
+  };
+  const off = store.on("frame", look);
+  look();
+  return () => { over = true; off(); };
+}
+
+export function ask(title, fields, confirm) {
+  return new Promise((resolve) => {
+    const inputs = fields.map((field) => {
+      if (field.options) return h("select", { name: field.name }, field.options.map((o) => h("option", { value: o }, o)));
+      return h("input", { name: field.name, type: field.type ?? "text", value: field.value ?? "", step: "any", required: field.required ?? true });
+    });
+    const dialog = h("dialog", { className: "hx-dialog" }, h("form", { method: "dialog" },
+      h("h2", {}, title), fields.map((field, i) => h("label", {}, field.label, inputs[i])),
+      h("div", { className: "hx-row" },
+        h("button", { type: "button", className: "hx-button", onclick: () => dialog.close("") }, "Cancel"),
+        h("button", { type: "submit", value: "yes", className: "hx-button main" }, confirm))));
+    dialog.addEventListener("close", () => {
+      const values = Object.fromEntries(fields.map((field, i) => [field.name, inputs[i].value]));
+      dialog.remove();
+      resolve(dialog.returnValue === "yes" ? values : null);
+    });
+    document.body.append(dialog);
+    dialog.showModal();
+  });
+}
+
+// A chart of lines over time with a logarithmic scale in mrad.
+export function chart(canvas, series, night) {
+  const ratio = Math.min(2, window.devicePixelRatio || 1), wide = canvas.clientWidth, high = canvas.clientHeight;
+  canvas.width = wide * ratio; canvas.height = high * ratio;
+  const c = canvas.getContext("2d");
+  c.setTransform(ratio, 0, 0, ratio, 0, 0);
+  c.clearRect(0, 0, wide, high);
+  const points = series.flatMap((line) => line.points).filter(([, v]) => v > 0);
+  c.font = "11px system-ui, sans-serif"; c.fillStyle = night ? "#aab4bf" : "#57606a";
+  if (!points.length) { c.fillText("no measurement has come to its end yet", 12, high / 2); return; }
+  const times = points.map(([t]) => t), values = points.map(([, v]) => v);
+  const first = Math.min(...times), last = Math.max(...times, first + 60);
+  const low = Math.log10(Math.min(...values, 0.1)) - 0.1, top = Math.log10(Math.max(...values, 20)) + 0.05;
+  const x = (t) => 40 + ((wide - 52) * (t - first)) / (last - first);
+  const y = (v) => high - 22 - ((high - 32) * (Math.log10(v) - low)) / (top - low);
+  c.strokeStyle = night ? "#2b333c" : "#dfe2e6"; c.lineWidth = 1; c.textAlign = "right";
+  for (const v of [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50]) {
+    if (Math.log10(v) < low || Math.log10(v) > top) continue;
+    c.beginPath(); c.moveTo(40, y(v)); c.lineTo(wide - 12, y(v)); c.stroke();
+    c.fillText(String(v), 34, y(v) + 4);
+  }
+  c.textAlign = "left"; c.fillText(clock(first), 40, high - 6);
+  c.textAlign = "right"; c.fillText(clock(last), wide - 12, high - 6);
+  for (const { points: line, colour, dash, dots } of series) {
+    c.strokeStyle = c.fillStyle = colour; c.lineWidth = 2; c.setLineDash(dash ?? []);
+    c.beginPath();
+    line.filter(([, v]) => v > 0).forEach(([t, v], i) => {
+      if (dots) c.fillRect(x(t) - 2, y(v) - 2, 4, 4);
+      else if (i) c.lineTo(x(t), y(v)); else c.moveTo(x(t), y(v));
+    });
+    if (!dots) c.stroke();
+  }
+  c.setLineDash([]);
+}

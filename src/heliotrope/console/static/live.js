@@ -1,0 +1,174 @@
+// What the page knows of the plant: the live stream, decoded into one table, and the way to the API.
+// Everything that is shown comes from here; nothing here shows anything.
+
+export const STATES = ["UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING",
+  "DEFOCUSED", "LOCKED", "SEARCHING", "FAULT"];
+export const STALE = 255;
+const ROW = 24; // bytes of a row; see docs/reference/api-http.md
+const LATE = 3000; // ms after which what was last heard is no longer shown as live
+
+const meta = (name) => document.querySelector(`meta[name="${name}"]`)?.content ?? "";
+export const me = { name: meta("heliotrope-person"), role: meta("heliotrope-role") };
+
+class Store extends EventTarget {
+  field = null; // names, positions, clusters: what does not change
+  head = null; // the last message's header
+  received = 0; // when it came, ms
+  selection = new Set(); // rows
+  focus = -1; // the row that is looked at
+  live = false;
+
+  emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
+
+  on(name, act) {
+    const hear = (event) => act(event.detail);
+    this.addEventListener(name, hear);
+    return () => this.removeEventListener(name, hear);
+  }
+
+  async start() {
+    this.field = await api("GET", "field");
+    const n = this.field.names.length;
+    this.index = new Map(this.field.names.map((name, row) => [name, row]));
+    this.state = new Uint8Array(n).fill(STALE);
+    this.fault = new Uint8Array(n);
+    this.flags = new Uint16Array(n);
+    this.aim = new Uint8Array(n).fill(STALE);
+    this.sightings = new Uint16Array(n);
+    this.calibrated = new Uint32Array(n);
+    this.error = new Float32Array(n).fill(NaN);
+    this.measured = new Float32Array(n).fill(NaN);
+    this.emit("field");
+    this.connect();
+    setInterval(() => this.watch(), 500);
+  }
+
+  connect() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/api/v1/live`);
+    socket.binaryType = "arraybuffer";
+    socket.onmessage = (event) => this.take(event.data);
+    socket.onclose = (event) => {
+      if (event.code === 4401) location.assign("/login");
+      else setTimeout(() => this.connect(), 1000);
+    };
+    this.socket = socket;
+  }
+
+  watch() {
+    const live = performance.now() - this.received < LATE && this.received > 0;
+    if (live !== this.live) { this.live = live; this.emit("live", live); }
+    // A socket may be dead without knowing it.
+    if (!live && this.received && performance.now() - this.received > 10000) {
+      this.received = performance.now() - LATE;
+      this.socket.close();
+    }
+  }
+
+  take(buffer) {
+    const view = new DataView(buffer);
+    const length = view.getUint32(4, true);
+    this.head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, length)));
+    this.received = performance.now();
+    for (let at = 8 + length; at + ROW <= buffer.byteLength; at += ROW) {
+      const row = view.getUint32(at, true);
+      this.error[row] = view.getFloat32(at + 4, true);
+      this.measured[row] = view.getFloat32(at + 8, true);
+      this.calibrated[row] = view.getUint32(at + 12, true);
+      this.sightings[row] = view.getUint16(at + 16, true);
+      this.flags[row] = view.getUint16(at + 18, true);
+      this.state[row] = view.getUint8(at + 20);
+      this.fault[row] = view.getUint8(at + 21);
+      this.aim[row] = view.getUint8(at + 22);
+    }
+    this.watch();
+    this.emit("frame", this.head);
+  }
+
+  stateOf(row) { return this.live ? this.state[row] : STALE; }
+  stateName(row) { const s = this.stateOf(row); return s === STALE ? "stale" : STATES[s]; }
+  ageOf(row) { // of the calibration, s; NaN: never
+    return this.calibrated[row] && this.head ? this.head.utc - this.calibrated[row] : NaN;
+  }
+
+  select(rows, focus) {
+    this.selection = new Set(rows);
+    if (focus !== undefined) this.focus = focus;
+    else if (this.selection.size === 1) this.focus = [...this.selection][0];
+    this.emit("selection");
+  }
+  selected() { return [...this.selection].map((row) => this.field.names[row]); }
+}
+
+export const store = new Store();
+
+export class ApiError extends Error {
+  constructor(status, text) { super(text); this.status = status; }
+}
+
+export async function api(method, path, body) {
+  const options = { method, headers: { "X-CSRF-Token": meta("heliotrope-csrf") }, credentials: "same-origin" };
+  if (body !== undefined) {
+    options.body = JSON.stringify(body);
+    options.headers["Content-Type"] = "application/json";
+  }
+  const answer = await fetch(`/api/v1/${path}`, options);
+  if (answer.status === 401) { location.assign("/login"); throw new ApiError(401, "signed out"); }
+  const data = answer.status === 204 ? null : await answer.json();
+  if (!answer.ok) {
+    const detail = typeof data.detail === "string" ? data.detail : JSON.stringify(data.detail);
+    throw new ApiError(answer.status, detail);
+  }
+  return data;
+}
+
+// The query language: FIELD OP VALUE [and|or ...]; "and" binds tighter.
+const FIELDS = {
+  state: (row) => store.stateName(row).toUpperCase(),
+  name: (row) => store.field.names[row].toUpperCase(),
+  cluster: (row) => store.field.clusters[store.field.cluster[row]].toUpperCase(),
+  error: (row) => 1e3 * store.error[row],
+  measured: (row) => 1e3 * store.measured[row],
+  age: (row) => store.ageOf(row) / 3600,
+  sightings: (row) => store.sightings[row],
+  fault: (row) => store.fault[row],
+  on: (row) => (store.head?.surfaces?.[store.aim[row]] ?? "").toUpperCase(),
+  east: (row) => store.field.positions[row][0],
+  north: (row) => store.field.positions[row][1],
+};
+const OPERATORS = {
+  "=": (a, b) => a === b, "!=": (a, b) => a !== b, "<": (a, b) => a < b, ">": (a, b) => a > b,
+  "<=": (a, b) => a <= b, ">=": (a, b) => a >= b,
+  "~": (a, b) => new RegExp(`^${String(b).replace(/[.+^${}()|[\]\\]/g, "\\$&").replace(/\*/g, ".*").replace(/\?/g, ".")}$`).test(a),
+};
+
+export function parseQuery(text) {
+  const term = /^\s*([a-z]+)\s*(<=|>=|!=|=|<|>|~)\s*("[^"]*"|[^\s"]+)\s*/i;
+  const either = [[]];
+  let rest = text;
+  for (;;) {
+    const match = term.exec(rest);
+    if (!match) throw new Error(`cannot read "${rest.trim() || text}"; write: state = TRACKING and error > 1`);
+    const [whole, field, sign, raw] = match;
+    const get = FIELDS[field.toLowerCase()];
+    if (!get) throw new Error(`no field "${field}"; there are ${Object.keys(FIELDS).join(", ")}`);
+    const word = raw.replace(/"/g, "").toUpperCase();
+    const number = typeof get(0) === "number";
+    const value = number && sign !== "~" ? (word === "NEVER" ? NaN : Number(word)) : word;
+    if (number && word !== "NEVER" && Number.isNaN(value)) throw new Error(`${field}: "${raw}" is no number`);
+    either.at(-1).push(Number.isNaN(value)
+      ? (row) => Number.isNaN(get(row)) === (sign === "=") : (row) => OPERATORS[sign](get(row), value));
+    rest = rest.slice(whole.length);
+    const joint = /^(and|or)\b/i.exec(rest);
+    if (!joint) break;
+    if (joint[1].toLowerCase() === "or") either.push([]);
+    rest = rest.slice(joint[0].length);
+  }
+  if (rest.trim()) throw new Error(`"${rest.trim()}" is too much; join with "and" or "or"`);
+  return (row) => either.some((all) => all.every((holds) => holds(row)));
+}
+
+export function rowsWhere(text) {
+  const holds = parseQuery(text);
+  return store.field.names.map((_, row) => row).filter(holds);
+}

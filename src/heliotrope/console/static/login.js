@@ -1,0 +1,15 @@
+document.getElementById("login").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const said = document.getElementById("said"), form = new FormData(event.target);
+  said.textContent = "";
+  try {
+    const answer = await fetch("/api/v1/session", {
+      method: "POST", headers: { "Content-Type": "application/json" }, credentials: "same-origin",
+      body: JSON.stringify({ name: form.get("name"), password: form.get("password") }),
+    });
+    if (answer.ok) location.assign("/");
+    else said.textContent = (await answer.json()).detail;
+  } catch {
+    said.textContent = "the console does not answer";
+  }
+});

@@ -1,0 +1,130 @@
+// The command bar: to whom, what, and what became of it. All of it goes through the API.
+import { api, me, store } from "./live.js";
+import { ask, count, h } from "./dom.js";
+
+export const say = (text, bad) => store.emit("said", { text, bad });
+
+// Does something and says what became of it.
+export async function act(what, name) {
+  try {
+    const done = await what();
+    if (done?.identity) follow(done); else say(`${name}: done`);
+    return done;
+  } catch (error) { say(`${name}: ${error.message}`, true); return null; }
+}
+
+async function follow(ticket) {
+  let seen = ticket;
+  say(seen.text);
+  for (let i = 0; i < 120 && !seen.finished; i++) {
+    await new Promise((wake) => setTimeout(wake, i < 10 ? 700 : 3000));
+    try { seen = await api("GET", `commands/${encodeURIComponent(ticket.identity)}`); } catch { return; }
+    say(seen.text, seen.finished && !seen.good);
+  }
+}
+
+let scope = "selection";
+
+function whom() {
+  if (scope === "field") return { names: [], text: `all ${count(store.field.names.length)} heliostats` };
+  let rows = [...store.selection];
+  if (scope === "cluster") {
+    const places = new Set(rows.map((row) => store.field.cluster[row]));
+    rows = store.field.cluster.flatMap((c, row) => (places.has(c) ? [row] : []));
+  }
+  if (!rows.length) throw new Error("nothing is selected; click a heliostat, draw a lasso or write a query");
+  const names = rows.map((row) => store.field.names[row]);
+  return { names, text: names.length === 1 ? names[0] : `${count(names.length)} heliostats` };
+}
+
+async function order(name, title, make, fields, sure) {
+  let to;
+  try { to = whom(); } catch (error) { say(`${title}: ${error.message}`, true); return; }
+  let values = {};
+  if (fields || (sure && to.names.length !== 1)) {
+    values = await ask(`${title}: ${to.text}`, fields ?? [], title);
+    if (!values) return;
+  }
+  await act(() => make(to.names, values), title);
+}
+
+const plainly = (name) => (heliostats) => api("POST", "commands", { command: name, heliostats });
+const ORDERS = [
+  ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats }), null, scope === "field"), "safe"],
+  ["Defocus", "D", () => order("DEFOCUS", "Defocus", (heliostats) => api("POST", "defocus", { heliostats }), null, scope === "field"), "safe"],
+  ["Approach", "", () => order("APPROACH", "Approach", plainly("APPROACH"), null, true)],
+  ["Track", "", () => order("TRACK", "Track", plainly("TRACK"), null, true)],
+  ["Standby", "", () => order("IDLE", "Standby", plainly("IDLE"))],
+  ["Refocus", "", () => order("REFOCUS", "Refocus", plainly("REFOCUS"), null, true)],
+  ["Aim…", "", () => order("AIM", "Aim", (heliostats, v) => api("POST", "aim", { heliostats, where: v.where }),
+    [{ name: "where", label: "At", options: [...store.field.receivers, ...store.field.targets] }])],
+  ["Jog…", "", () => order("JOG", "Jog", (heliostats, v) => api("POST", "commands", { command: "JOG", heliostats, values: [v.axis === "primary" ? 0 : 1, Number(v.steps)] }),
+    [{ name: "axis", label: "Axis", options: ["primary", "secondary"] }, { name: "steps", label: "Steps (up and east positive)", type: "number", value: "100" }]), "engineer"],
+  ["Lock", "", () => order("LOCK", "Lock", plainly("LOCK"))],
+  ["Unlock", "", () => order("UNLOCK", "Unlock", plainly("UNLOCK"))],
+  ["Search…", "", () => order("SEARCH", "Search", (heliostats, v) => api("POST", "commands", { command: "SEARCH", heliostats, values: [1e-3 * v.pitch, 1e-3 * v.radius] }),
+    [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
+  ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
+  ["Hold…", "", () => order("HOLD", "Hold back from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
+    [{ name: "reason", label: "Why" }]), "free"],
+  ["Automatic", "", () => order("AUTO", "Give to the automatic work", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],
+];
+
+export function bar(box) {
+  // The bar may need two lines; the rest of the page has what is left.
+  new ResizeObserver(() => document.body.style.setProperty("--foot", `${box.parentElement.offsetHeight}px`)).observe(box);
+  const said = h("div", { className: "hx-said", role: "status" });
+  if (me.role === "viewer") {
+    box.append(h("span", { className: "hx-hint" }, "You look only. EMERGENCY is open to everybody."), said);
+  } else {
+    const to = h("select", { title: "To whom (T)", onchange: () => { scope = to.value; mark(); } },
+      h("option", { value: "selection" }, "Selection"), h("option", { value: "cluster" }, "Their clusters"), h("option", { value: "field" }, "Whole field"));
+    const buttons = ORDERS.filter(([, , , kind]) => kind !== "engineer" || me.role === "engineer")
+      .map(([title, key, go, kind]) => [h("button", { className: `hx-button ${kind === "safe" ? "safe" : ""}`, title: key ? `Alt+${key}` : "", onclick: go }, title), kind]);
+    const mark = () => {
+      const n = store.selection.size;
+      to.options[0].textContent = `Selection (${count(n)})`;
+      for (const [button, kind] of buttons) {
+        const may = kind === "safe" || kind === "free" || store.mine;
+        button.disabled = !may || (scope !== "field" && !n);
+      }
+    };
+    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "To ", to), buttons.map(([button]) => button)), said);
+    store.on("selection", mark); store.on("authority", mark);
+    document.addEventListener("keydown", (event) => {
+      const found = event.altKey && ORDERS.find(([, key]) => key && event.code === `Key${key}`);
+      if (found) { event.preventDefault(); found[2](); }
+    });
+    mark();
+  }
+  return store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); });
+}
+
+// Who has the authority, and the button to take it and give it back.
+export function whoCommands(box) {
+  const text = h("span"), button = h("button", { className: "hx-button" });
+  box.append(text, me.role === "viewer" ? "" : button);
+  const take = async () => {
+    const head = store.head;
+    if (store.mine) return act(() => api("DELETE", "authority"), "authority");
+    const other = head.holder && head.holder !== me.name && head.holder !== "automat";
+    if (!other) return act(() => api("POST", "authority"), "authority");
+    const why = await ask(`${head.holder} has the command. Break it?`, [{ name: "reason", label: "Why" }], "Break and take");
+    return why ? act(() => api("POST", "authority/seize", { reason: why.reason }), "authority") : null;
+  };
+  button.addEventListener("click", async () => { await take(); kept = 0; });
+  let kept = 0;
+  const show = (head) => {
+    const mine = head.holder === me.name && head.role === me.role;
+    if (mine !== store.mine) { store.mine = mine; store.emit("authority", mine); }
+    text.textContent = mine ? "You command" : head.holder ? `${head.holder} commands` : "Nobody commands";
+    text.className = mine ? "good" : "";
+    button.textContent = mine ? "Give back" : "Take command";
+    // Kept up only while somebody has this page before them.
+    if (mine && !document.hidden && performance.now() - kept > 4000) {
+      kept = performance.now();
+      api("PUT", "authority").catch(() => {});
+    }
+  };
+  return store.on("frame", show);
+}

@@ -1,0 +1,234 @@
+// The tabs of the page.
+import { api, me, store } from "./live.js";
+import { cividis, colourOf, dark } from "./palette.js";
+import { chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
+import { act, say } from "./orders.js";
+
+const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
+const canCommand = () => me.role !== "viewer";
+const severe = { emergency: "bad", alarm: "bad", warning: "warn", fault: "bad" };
+
+export function plant(box) {
+  const states = h("div"), light = h("div"), proof = h("div"), flux = h("canvas", { className: "hx-flux" });
+  const name = store.field.receivers[0];
+  const figures = h("div");
+  box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light,
+    ...(name ? [h("h3", {}, `Predicted light on ${name}`), figures, flux] : []));
+  let seen = null;
+  const show = () => {
+    const head = store.head;
+    if (!head) return;
+    const most = head.heliostats;
+    states.replaceChildren(h("div", { className: "hx-bars" }, Object.entries(head.states).map(([state, n]) => {
+      const bar = h("i"); bar.style.width = `${Math.max(1, (100 * n) / most)}%`; bar.style.background = colourOf(state);
+      return h("div", {}, h("span", {}, state), h("b", {}, bar), h("em", {}, count(n)));
+    })), facts([["Clusters heard", `${count(head.clusters_alive)} of ${count(store.field.clusters.length)}`],
+      ["Wait to join the receiver", count(head.waiting)],
+      ["Calibrated", `${count(head.calibration.done)} of ${count(most)}`],
+      ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
+    light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
+      ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
+    proof.replaceChildren(...(head.order.act ? [h("p", { className: head.order.on ? "hx-said bad" : "hx-said" },
+      `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`)] : []));
+  };
+  const draw = () => { if (seen) drawFlux(flux, seen); };
+  const off = [store.on("frame", show), store.on("theme", () => { show(); draw(); })];
+  if (name) off.push(refreshed(async () => {
+    seen = await api("GET", `receivers/${encodeURIComponent(name)}/flux`);
+    const peak = Math.max(0, ...seen.flux.flat());
+    figures.replaceChildren(facts([["Power", `${number(seen.power / 1e6, 2)} MW`],
+      ["Intercept", seen.intercept === null ? "–" : `${number(100 * seen.intercept, 1)} %`],
+      ["Peak", `${number(peak / 1e3, 0)} kW/m²`], ["Heliostats on it", count(seen.heliostats)]]));
+    draw();
+  }, { every: 10 }));
+  show();
+  return () => off.forEach((end) => end());
+}
+
+function drawFlux(canvas, view) {
+  const rows = view.flux.length, columns = view.flux[0].length, peak = Math.max(1, ...view.flux.flat());
+  const c = canvas.getContext("2d"), high = 190, aspect = (view.right.at(-1) - view.right[0]) / Math.max(0.1, view.up.at(-1) - view.up[0]);
+  // While its tab is being opened the part has no width yet.
+  const room = (canvas.parentElement.clientWidth || 480) - 90, wide = Math.round(Math.max(120, Math.min(room, high * aspect)));
+  canvas.width = wide + 84; canvas.height = high + 22;
+  const image = new ImageData(columns, rows);
+  for (let y = 0; y < rows; y++) for (let x = 0; x < columns; x++) {
+    const [r, g, b] = cividis(view.flux[rows - 1 - y][x] / peak);
+    image.data.set([r, g, b, 255], 4 * (y * columns + x));
+  }
+  const small = h("canvas", { width: columns, height: rows });
+  small.getContext("2d").putImageData(image, 0, 0);
+  c.drawImage(small, 0, 0, wide, high);
+  const ink = dark() ? "#c9d1d9" : "#24292f";
+  for (let i = 0; i < high; i++) { c.fillStyle = `rgb(${cividis(1 - i / high).join(",")})`; c.fillRect(wide + 12, i, 12, 1); }
+  c.fillStyle = ink; c.font = "11px system-ui, sans-serif"; c.textAlign = "left";
+  c.fillText(`${(peak / 1e3).toFixed(0)}`, wide + 28, 10); c.fillText("kW/m²", wide + 28, 24); c.fillText("0", wide + 28, high);
+  const half = (a) => a.at(-1) + 0.5 * (a[1] - a[0]);
+  c.fillText(`${(2 * half(view.right)).toFixed(1)} × ${(2 * half(view.up)).toFixed(1)} m, seen from the field`, 0, high + 16);
+}
+
+export function heliostat(box) {
+  const off = [], body = h("div");
+  box.append(body);
+  const load = async () => {
+    if (store.focus < 0) {
+      body.replaceChildren(h("p", { className: "hx-hint" }, store.selection.size
+        ? `${count(store.selection.size)} heliostats are selected. Click one on the map to see it here.`
+        : "Click a heliostat on the map to see it here."));
+      return;
+    }
+    const one = await api("GET", `heliostats/${encodeURIComponent(store.field.names[store.focus])}`);
+    body.replaceChildren(...heliostatView(one));
+    const canvas = body.querySelector("canvas");
+    if (canvas && one.history.length) chart(canvas, [
+      { points: one.history.map((s) => [s.at, 1e3 * s.error]), colour: colourOf("APPROACHING"), dots: true },
+      { points: one.results.filter((r) => r.predicted !== null).map((r) => [r.at, 1e3 * r.predicted]), colour: colourOf("TRACKING") }], dark());
+  };
+  off.push(refreshed(load, { key: () => store.focus, every: 2 }));
+  off.push(store.on("selection", load));
+  return () => off.forEach((end) => end());
+}
+
+function heliostatView(one) {
+  const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none given" : p.map((v) => number(v, 1)).join(", "));
+  return [
+    h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
+    facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
+      ["Fault", one.live ? one.fault : "not known", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
+      ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
+      ["Stands at E, N, U (m)", one.position.map((v) => number(v, 1)).join(", ")], ["Mirror", `${number(one.width, 1)} × ${number(one.height, 1)} m`],
+      ["Predicted error", one.error === null ? "never calibrated" : `${mrad(one.error)} mrad`],
+      one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
+      ["Supply", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
+      ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
+      one.hold ? ["Held back", one.hold, "warn"] : null]),
+    h("h3", {}, "Drives"),
+    one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
+      ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
+      one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "not known while it is stale"),
+    h("h3", {}, "Parameters"),
+    table([["Name", (p) => p[0]], ["Value", (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
+      ["Nominal", (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
+    h("h3", {}, `Errors of its sightings (${one.history.length}), mrad`), h("canvas", { className: "hx-chart small" }),
+    one.flags.length ? h("p", { className: "hx-hint" }, one.flags.join(" · ")) : "",
+  ];
+}
+const parameter = (value, unit) => (value === null ? "–" : unit === "rad" ? (1e3 * value).toFixed(3) : value.toFixed(4));
+
+export function targets(box) {
+  const off = [], shown = new Map();
+  for (const name of store.field.targets) {
+    const image = h("img", { alt: `Photograph of ${name}` }), said = h("p", { className: "hx-reading" }), at = h("span", { className: "hx-chip" }, "no photograph yet");
+    box.append(h("h3", {}, name, at), h("div", { className: "hx-photo" }, image), said);
+    shown.set(name, { image, said, at });
+    off.push(refreshed(async () => {
+      if (!store.head?.cameras?.[name]) return;
+      const view = await api("GET", `targets/${encodeURIComponent(name)}`);
+      image.src = `/api/v1/targets/${encodeURIComponent(name)}/photograph?${view.version}`;
+      said.textContent = view.reading.join("\n");
+      at.textContent = `${clock(view.at)} · no. ${view.version}`;
+    }, { key: () => store.head?.cameras?.[name] }));
+  }
+  if (!shown.size) box.append(h("p", { className: "hx-hint" }, "This plant has no calibration target."));
+  return () => off.forEach((end) => end());
+}
+
+export function calibration(box) {
+  const body = h("div"), lines = h("canvas", { className: "hx-chart" });
+  box.append(body);
+  let view = null;
+  const draw = () => {
+    if (!view) return;
+    const truth = view.quality.some((p) => p.truth_median !== null);
+    const running = view.running.map((r) => h("li", {}, h("b", {}, r.heliostat), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
+    const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
+    body.replaceChildren(
+      h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "At work" : `Off: ${view.reason}`),
+        canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
+      facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Without success", count(view.failed)]]),
+      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement goes on now")),
+      h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
+      h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("nine of ten below", colourOf("APPROACHING"), true),
+        truth ? [key("true (twin), median", colourOf("SEARCHING")), key("nine of ten below", colourOf("SEARCHING"), true)] : ""),
+      h("h3", {}, "Last measurements"),
+      table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
+        ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
+        truth ? ["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"] : ["", () => ""],
+        ["", (r) => h("span", { className: r.good ? "good" : "warn", title: r.text }, r.good ? "✓ learnt" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
+    chart(lines, [["median", "APPROACHING"], ["ninety", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_ninety", "SEARCHING", [5, 4]]]
+      .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
+  };
+  const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },
+    { key: () => JSON.stringify([store.head?.calibration, store.head?.measuring]) });
+  const off = store.on("theme", draw);
+  return () => { end(); off(); };
+}
+
+export function clusters(box) {
+  const body = h("div");
+  box.append(body);
+  return refreshed(async () => {
+    const rows = await api("GET", "clusters");
+    const rank = (r) => (r.alive ? (r.live < r.heliostats ? 1 : 2) : 0);
+    rows.sort((a, b) => rank(a) - rank(b) || a.name.localeCompare(b.name));
+    body.replaceChildren(facts([["Heard", `${rows.filter((r) => r.alive).length} of ${rows.length}`]]),
+      table([["Cluster", (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? "● well" : "▲ missing") : "✕ silent")],
+        ["Heliostats", (r) => `${r.live}/${r.heliostats}`, "num"], ["Heard", (r) => (r.age === null ? "never" : `${number(r.age, 1)} s`), "num"],
+        ["Poll (ms)", (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], ["Answered", (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
+        ["Lease (s)", (r) => number(r.lease_left, 1), "num"], ["Clock", (r) => r.time_quality], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
+      rows, (r) => { const place = store.field.clusters.indexOf(r.name); store.select(store.field.cluster.flatMap((c, row) => (c === place ? [row] : [])), -1); }));
+  }, { every: 3 });
+}
+
+export function alarms(box) {
+  const body = h("div");
+  box.append(body);
+  return refreshed(async () => {
+    const rows = await api("GET", "alarms");
+    const open = rows.filter((r) => !r.acknowledged_by);
+    const all = async () => { for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => say(error.message, true)); };
+    body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, `${open.length} not acknowledged, ${rows.filter((r) => r.active).length} active`),
+      canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(all, "acknowledge all") }, "Acknowledge all") : ""),
+    rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
+      ["Time", (r) => clock(r.at)], ["What", (r) => h("div", {}, h("b", {}, r.condition, r.subject ? ` · ${r.subject}` : ""), h("div", { className: "hx-hint" }, r.text))],
+      ["", (r) => (r.active ? "active" : "over")],
+      ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }), "acknowledge") }, "Acknowledge") : "not acknowledged")],
+      ["×", (r) => r.count, "num"]], rows) : h("p", { className: "hx-hint" }, "No alarm so far."));
+  }, { key: () => store.head?.alarms, every: 4 });
+}
+
+export function logs(box) {
+  let which = "events", filter = "";
+  const body = h("div"), tabs = ["events", "packets", "commands"].map((name) => h("button", { className: "hx-button", onclick: () => { which = name; mark(); load(); } }, name));
+  const find = h("input", { type: "search", placeholder: "filter", oninput: () => { filter = find.value.toLowerCase(); load(); } });
+  const mark = () => tabs.forEach((tab) => tab.classList.toggle("main", tab.textContent === which));
+  const columns = {
+    events: [["Time", (r) => clock(r.at)], ["Kind", (r) => r.kind], ["Who", (r) => r.who], ["", (r) => r.text]],
+    packets: [["Time", (r) => clock(r.at)], ["Cluster", (r) => `${r.way === "to" ? "→" : "←"} ${r.cluster}`], ["Kind", (r) => r.kind], ["Bytes", (r) => r.size, "num"], ["", (r) => h("code", {}, r.text)]],
+    commands: [["Command", (r) => r.command], ["Heliostats", (r) => count(r.heliostats), "num"], ["", (r) => h("span", { className: r.finished ? (r.good ? "good" : "warn") : "" }, r.text)]],
+  };
+  const load = async () => {
+    const rows = await api("GET", which === "commands" ? which : `${which}?limit=300`);
+    const text = (r) => Object.values(r).join(" ").toLowerCase();
+    body.replaceChildren(table(columns[which], filter ? rows.filter((r) => text(r).includes(filter)) : rows));
+  };
+  box.append(h("div", { className: "hx-row" }, tabs, find), body);
+  mark();
+  return refreshed(load, { key: () => store.head?.events, every: 3 });
+}
+
+export function schedule(box) {
+  const body = h("div");
+  box.append(body);
+  return refreshed(async () => {
+    const [plan, holds] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "holds")]);
+    body.replaceChildren(h("h3", {}, "Next measurements"),
+      plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
+        : h("p", { className: "hx-hint" }, "Nothing is planned."),
+      h("h3", {}, "Held back from calibration"),
+      holds.length ? table([["Heliostat", (r) => r.heliostat], ["By", (r) => r.who], ["Since", (r) => clock(r.since)], ["Why", (r) => r.reason],
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "unhold") }, "Give back") : "")]], holds)
+        : h("p", { className: "hx-hint" }, "None."));
+  }, { every: 5 });
+}
+

@@ -1,0 +1,50 @@
+"""The last commands that came through the console, to be asked after."""
+
+from collections import OrderedDict
+
+from heliotrope.console.models import TicketState
+from heliotrope.control._tickets import Ticket
+from heliotrope.errors import UnknownNameError
+
+#: Tickets that are kept; those of whole fields are large.
+KEPT = 200
+
+
+class Tickets:
+    """Keeps the last tickets by their identity in the audit."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[str, Ticket] = OrderedDict()
+
+    def put(self, ticket: Ticket) -> TicketState:
+        """Keep a ticket; return how far it has come."""
+        self._kept[ticket.identity] = ticket
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return state_of(ticket)
+
+    def get(self, identity: str) -> TicketState:
+        """Return how far a command has come.
+
+        Raises
+        ------
+        UnknownNameError
+            If it is not among the last ones.
+        """
+        ticket = self._kept.get(identity)
+        if ticket is None:
+            raise UnknownNameError("command", identity, list(self._kept)[-5:])
+        return state_of(ticket)
+
+    def last(self, limit: int = 50) -> list[TicketState]:
+        """Return the last ones, newest first."""
+        return [state_of(ticket) for ticket in list(self._kept.values())[: -limit - 1 : -1]]
+
+
+def state_of(ticket: Ticket) -> TicketState:
+    """Return how far a command has come."""
+    return TicketState(
+        identity=ticket.identity, command=ticket.name, heliostats=len(ticket.heliostats),
+        counted=ticket.counted(), finished=ticket.finished, good=ticket.good, text=ticket.text,
+        refusals=dict(list(ticket.refusals.items())[:100]),
+    )  # fmt: skip

@@ -1,0 +1,216 @@
+"""A calibration cycle that finds beams which miss the target, and brings them to its middle.
+
+A mirror that was never calibrated may miss by more than the target is wide. If nothing is seen,
+the aim goes along a square spiral in the target's plane until light appears; the aim is then
+moved by as much as the beam was off. Only what is seen on the target is used.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.control._visit import Visit
+from heliotrope.control.authority import RefusedError
+from heliotrope.control.calibration_cycle import (
+    CalibrationCycle,
+    Camera,
+    CycleSettings,
+    Shot,
+)
+from heliotrope.control.plant import PlantController
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+
+
+@dataclass(frozen=True)
+class Centring:
+    """How a beam is looked for.
+
+    Attributes
+    ----------
+    pitch
+        Between neighbouring aims, as a share of the target's lesser side.
+    most
+        Aims that are tried beside the middle.
+    near
+        A beam this close to where it is wanted is left there, as a share of the lesser side.
+    spread
+        Photographs after the first are taken with the beam so far off the middle, as a share of
+        half of what the beam leaves free of the target: the further apart sightings are, the more
+        they tell. 0: all in the middle.
+    slope
+        Half the breadth of a beam, rad, beside that of its mirror.
+    """
+
+    pitch: float = 0.7
+    most: int = 24
+    near: float = 0.15
+    spread: float = 0.8
+    slope: float = 8e-3
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.pitch <= 2.0 and self.most >= 0 and 0.0 < self.near <= 0.5):
+            raise InputError(
+                f"centring: pitch {self.pitch}, {self.most} aims, near {self.near}; give above 0 "
+                "to 2, 0 or more, and above 0 to 0.5"
+            )
+
+
+#: Where the photographs after the first are taken: right and up, in turn.
+CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
+
+
+def spiral(count: int) -> Iterator[tuple[int, int]]:
+    """Yield the first places of a square spiral about (0, 0), which is left out."""
+    x = y = 0
+    step, turn, left = 1, 0, 1
+    ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    for _ in range(count):
+        x, y = x + ways[turn % 4][0], y + ways[turn % 4][1]
+        yield x, y
+        left -= 1
+        if left == 0:
+            turn += 1
+            step += turn % 2 == 0
+            left = step
+
+
+class CentringCycle(CalibrationCycle):
+    """A `CalibrationCycle` with a search and with its beam brought to the middle.
+
+    Parameters
+    ----------
+    plant, camera, settings
+        As of `CalibrationCycle`.
+    centring
+        How beams are looked for.
+    on_stage
+        Called with heliostat, target and what is done now.
+    """
+
+    def __init__(
+        self, plant: PlantController, camera: Camera, settings: CycleSettings | None = None,
+        centring: Centring | None = None,
+        on_stage: Callable[[str, str, str], None] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(plant, camera, settings)
+        self._centring = centring or Centring()
+        self.on_stage = on_stage
+
+    @property
+    def settings(self) -> CycleSettings:
+        """How it calibrates."""
+        return self._settings
+
+    @property
+    def model(self) -> str | tuple[str, ...]:
+        """Parameters that are fitted: a name of the table, or names."""
+        return self._settings.model
+
+    @property
+    def model_name(self) -> str:
+        """The same as one word."""
+        model = self._settings.model
+        return model if isinstance(model, str) else "+".join(model)
+
+    def _tell(self, visit: Visit, stage: str) -> None:
+        if self.on_stage is not None:
+            self.on_stage(visit.heliostat, visit.target.name, stage)
+
+    async def _shoot(self, visit: Visit) -> tuple[list[Sightings], list[str]]:
+        plant, settings = self._plant, self._settings
+        found: list[Sightings] = []
+        rejected: list[str] = []
+        aim = await self._find(visit)
+        if aim is None:
+            tries = self._centring.most + 1
+            return found, [f"no beam was seen on {visit.target.name} in {tries} photographs"]
+        middle, room = aim, self._room(visit)
+        # Two more than are wanted: one or the other may be cut at an edge.
+        for k in range(settings.shots + 2):
+            if len(found) >= settings.shots:
+                break
+            self._tell(visit, f"photograph {k + 1}")
+            due = plant.now() + settings.interval
+            shot = await self._photograph(visit)
+            if shot.reasons:
+                rejected.append(f"photograph {k + 1}: {'; '.join(shot.reasons)}")
+            else:
+                found.append(self._sighting(shot, await visit.counts_at(shot.at)))
+            if len(found) < settings.shots:
+                x, y = CORNERS[k % len(CORNERS)]
+                # What could not be used there may be better in the middle.
+                off = np.array([x, y]) * (0.0 if shot.reasons else room)
+                await self._go(visit, np.asarray(middle + off @ visit.target.axes), aim)
+                aim = np.asarray(middle + off @ visit.target.axes)
+            while plant.now() < due and len(found) < settings.shots:
+                await visit.look()
+        return found, rejected
+
+    def _room(self, visit: Visit) -> float:
+        """Return how far a beam may be off the middle on both sides, m."""
+        target, plant, row = visit.target, self._plant, visit.row
+        group, place = plant.design.find(visit.heliostat)
+        mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
+        slant = float(np.linalg.norm(plant.beams.armature.origin_1[row] - target.center))
+        free = 0.5 * min(target.width, target.height) - mirror - self._centring.slope * slant
+        return self._centring.spread * max(0.0, free)
+
+    async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:
+        if np.linalg.norm(aim - before) > 0.05:
+            await visit.aim(aim)
+            await visit.arrived(self._settings.arrival)
+
+    async def _photograph(self, visit: Visit) -> Shot:
+        shot = await self._camera.photograph(visit.target, visit.heliostat)
+        if visit.state != states.TRACKING:
+            raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")
+        return shot
+
+    async def _find(self, visit: Visit) -> FloatArray | None:
+        """Return an aim with which the beam is seen near the middle; None if it is nowhere."""
+        target, centring = visit.target, self._centring
+        middle = np.asarray(target.center)
+        pitch = centring.pitch * min(target.width, target.height)
+        places = [(0, 0), *spiral(centring.most)]
+        for k, (x, y) in enumerate(places):
+            aim = np.asarray(middle + pitch * (np.array([x, y]) @ target.axes))
+            if k > 0:
+                self._tell(visit, f"search {k}")
+                await visit.aim(aim)
+                await visit.arrived(self._settings.arrival)
+            else:
+                self._tell(visit, "first look")
+            shot = await self._photograph(visit)
+            if seen(target, shot) is not None:
+                return await self._centre(visit, aim, shot)
+        return None
+
+    async def _centre(self, visit: Visit, aim: FloatArray, shot: Shot) -> FloatArray:
+        """Move the aim by as much as the beam is off the middle; return it."""
+        target, place = visit.target, seen(visit.target, shot)
+        if place is None:
+            return aim
+        if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
+            return aim
+        self._tell(visit, "to the middle")
+        moved = np.asarray(aim - place @ target.axes)
+        await visit.aim(moved)
+        await visit.arrived(self._settings.arrival)
+        return moved
+
+
+def seen(target: Target, shot: Shot) -> FloatArray | None:
+    """Return where a shot shows light, right of and above the aim point, m, (2,); None: nowhere."""
+    if not np.isfinite(shot.point).all():
+        return None
+    place = target.plane_coordinates(shot.point)
+    corners = target.plane_coordinates(target.corners)
+    if (place < corners.min(axis=0)).any() or (place > corners.max(axis=0)).any():
+        return None
+    return np.asarray(place)

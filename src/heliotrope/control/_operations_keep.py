@@ -1,0 +1,145 @@
+"""What the automatic work keeps of calibrations and holds over a restart, and recalls."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliotrope.calibration.estimator import fit
+from heliotrope.control._operations_book import CalibrationBook
+from heliotrope.control._operations_cycle import CentringCycle
+from heliotrope.control._operations_views import CalibrationEntry, Hold
+from heliotrope.control.calibration_cycle import CycleResult
+from heliotrope.control.parameters import items_of
+from heliotrope.control.plant import PlantController
+from heliotrope.store.records import Records, StoreError, VisitEntry, version_of
+
+
+class Keeper:
+    """Keeps and recalls; without records it does nothing.
+
+    Parameters
+    ----------
+    plant, book, cycle
+        Whose calibration it is.
+    records
+        Where it is kept; None: nowhere.
+
+    Attributes
+    ----------
+    lost
+        The last error at keeping, "" if there was none.
+    """
+
+    def __init__(
+        self, plant: PlantController, records: Records | None, book: CalibrationBook,
+        cycle: CentringCycle | None,
+    ) -> None:  # fmt: skip
+        self._plant, self._records, self._book, self._cycle = plant, records, book, cycle
+        self._numbers: dict[str, list[int]] = {}
+        self.lost = ""
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be kept now, "" if it can."""
+        return self.lost or (self._records.problem if self._records is not None else "")
+
+    def holds(self) -> dict[str, Hold]:
+        """Return the holds that were kept."""
+        if self._records is None:
+            return {}
+        kept = self._records.holds(self._plant.clock.utc().timestamp())
+        return {
+            name: Hold(name, hold.person, hold.reason, hold.since)
+            for name, hold in kept.items()
+            if name in self._plant.field.index
+        }
+
+    def hold(self, heliostats: Sequence[str], reason: str, who: str, at: float) -> None:
+        """Keep holds."""
+        if self._records is not None:
+            self._records.hold(heliostats, reason, who, at)
+
+    def unhold(self, heliostats: Sequence[str], who: str, at: float) -> None:
+        """Keep that heliostats were given back."""
+        if self._records is not None:
+            self._records.unhold(heliostats, who, at)
+
+    def recall(self) -> None:
+        """Take up all calibrations that were kept; local controllers that differ are told."""
+        if self._records is None or self._cycle is None:
+            return
+        cycle, plant = self._cycle, self._plant
+        latest = self._records.latest_parameters(plant.field.names)
+        kept = self._records.sightings(plant.field.names)
+        for name, version in latest.items():
+            seen = kept.of(name)
+            if name not in plant.field.index or not len(seen):
+                continue
+            cycle.known[name] = seen
+            cycle.values[name] = version.parameters
+            mechanism = cycle.mechanism(name)[1]
+            row = plant.field.place(name)
+            plant.beams.replace(row, mechanism[0].armature.table, mechanism[0].drives.table)
+            plant.wanted.set(name, items_of(mechanism[0]))
+            self._book.learn(name, version.parameters, mechanism, seen, version.at)
+            self._book.sightings[row] = len(seen)
+            place = kept.names.index(name)
+            mine = kept.identities[kept.sightings.heliostat == place]
+            self._numbers[name] = [int(number) for number in mine]
+
+    def keep(
+        self, entry: CalibrationEntry, begun: float, sigma: float, result: CycleResult | None
+    ) -> None:
+        """Keep what a visit brought."""
+        if self._records is None:
+            return
+        try:
+            self._keep(self._records, entry, begun, sigma, result)
+            self.lost = ""
+        except StoreError as error:
+            self.lost = str(error)
+
+    def _keep(
+        self, records: Records, entry: CalibrationEntry, begun: float, sigma: float,
+        result: CycleResult | None,
+    ) -> None:  # fmt: skip
+        name, new, version = entry.heliostat, 0, 0
+        numbers = self._numbers.setdefault(name, [])
+        if result is not None and result.sightings is not None:
+            fresh = result.sightings.take(np.arange(len(numbers), len(result.sightings)))
+            new = len(fresh)
+            if new:
+                made = records.record_sightings((name,), fresh, target=entry.target)
+                numbers.extend(int(number) for number in made)
+            if entry.good and self._cycle is not None:
+                nominal = self._cycle.mechanism(name)[0]
+                fitted = fit(nominal, result.sightings, self._cycle.model)
+                version = records.record_parameters(
+                    version_of(
+                        name,
+                        entry.at,
+                        fitted,
+                        nominal,
+                        result.sightings,
+                        numbers,
+                        model=self._cycle.model_name,
+                        person="automat",
+                        pushed=result.pushed,
+                    )
+                )
+        records.record_visit(
+            VisitEntry(
+                name,
+                entry.target,
+                begun,
+                entry.at,
+                entry.good,
+                entry.text,
+                sigma_before=sigma,
+                sigma_after=entry.predicted,
+                error_before=entry.before,
+                error_after=entry.after,
+                sightings=new,
+                version=version,
+            )
+        )

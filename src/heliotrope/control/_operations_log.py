@@ -1,0 +1,264 @@
+"""Alarms, events and packets of a plant at work, as people look at them."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from heliotrope.control._operations_views import AlarmRow, ClusterRow, EventRow, PacketRow
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import Link, Outcome, Statistics
+from heliotrope.control.plant import PlantController
+from heliotrope.control.protocol import Alarm, ProtocolError, Status, decode
+from heliotrope.errors import HeliotropeError
+from heliotrope.store.records import Event, Records
+
+#: Come each second: only the last of each cluster is kept.
+_STEADY = ("lease", "status")
+#: Longest text of a packet, letters.
+_LONGEST = 240
+#: Alarms that nobody has to acknowledge for a row of the safety table: of this side.
+_PLAIN = ("records", "work")
+#: Is told once and mended by the plant itself.
+_PASSING = ("parameters_differ",)
+
+
+class Logbook:
+    """What has happened.
+
+    Parameters
+    ----------
+    clock
+        Of the plant.
+    records
+        Where alarms and events are kept besides; None: nowhere.
+    events, packets
+        How many are held here.
+
+    Attributes
+    ----------
+    refused
+        Messages of each cluster that were none.
+    """
+
+    def __init__(
+        self, clock: Clock, records: Records | None = None, *, events: int = 2000,
+        packets: int = 4000,
+    ) -> None:  # fmt: skip
+        self._clock, self._records = clock, records
+        self._alarms: dict[tuple[str, str], AlarmRow] = {}
+        self._events: deque[EventRow] = deque(maxlen=events)
+        self._packets: deque[tuple[float, str, str, bytes]] = deque(maxlen=packets)
+        self._steady: dict[tuple[str, str, str], tuple[float, bytes]] = {}
+        self._links: dict[str, Link] = {}
+        self._statuses: dict[str, Status] = {}
+        self.refused: dict[str, int] = {}
+
+    def _now(self) -> float:
+        return self._clock.utc().timestamp()
+
+    # -- taking ----------------------------------------------------------------------------
+
+    def tapped(self, links: Mapping[str, Link]) -> dict[str, Link]:
+        """Return links that tell this book what goes through them, to be given to the plant."""
+        self._links.update(links)
+        return {name: _Tapped(name, link, self) for name, link in links.items()}
+
+    def packet(self, cluster: str, way: str, data: bytes) -> None:
+        """Take a message at a link; ``way`` is "to" or "from"."""
+        kind = _kind(data)
+        if kind in _STEADY:
+            self._steady[cluster, way, kind] = self._now(), data
+        else:
+            self._packets.append((self._now(), cluster, way, data))
+
+    def take_alarm(self, alarm: Alarm) -> None:
+        """Take an alarm of the plant or of a cluster; what ends by itself becomes an event."""
+        if alarm.condition in _PASSING:
+            self.event("plant", alarm.subject, alarm.text)
+            return
+        key = (alarm.condition, alarm.subject)
+        known = self._alarms.get(key)
+        new = alarm.active and (known is None or not known.active)
+        count = (known.count if known is not None else 0) + new
+        by = known.acknowledged_by if known is not None and not new else ""
+        at = self._now() if new or known is None else known.at
+        self._alarms[key] = AlarmRow(
+            at, alarm.condition, alarm.subject, alarm.severity, alarm.text, alarm.active, by,
+            max(count, 1),
+        )  # fmt: skip
+        if new or (known is not None and known.active != alarm.active):
+            over = "" if alarm.active else " (over)"
+            self.event("alarm", alarm.subject, f"{alarm.condition}: {alarm.text}{over}")
+            if self._records is not None:
+                self._keep(
+                    self._records.record_alarm, alarm.condition, alarm.subject, alarm.severity,
+                    alarm.text, self._now(), active=alarm.active,
+                )  # fmt: skip
+
+    def event(self, kind: str, who: str, text: str) -> None:
+        """Take an event; see `EventRow`."""
+        self._events.append(EventRow(self._now(), kind, who, text))
+        if self._records is not None and kind != "alarm":
+            line = f"{who}: {text}" if who else text
+            self._keep(self._records.record_event, Event(self._now(), kind, line))
+
+    def _keep(self, keep: Any, *values: Any, **named: Any) -> None:
+        """Keep something; a store that is full or gone is an alarm, and stops nothing."""
+        try:
+            keep(*values, **named)
+        except HeliotropeError as error:
+            self._alarms["records", ""] = AlarmRow(
+                self._now(), "records", "", "alarm", f"not kept: {error}", active=True
+            )
+
+    def acknowledge(self, who: str, condition: str, subject: str) -> None:
+        """Note that a person acknowledged an alarm."""
+        known = self._alarms.get((condition, subject))
+        if known is not None:
+            self._alarms[condition, subject] = replace(known, acknowledged_by=who)
+        if self._records is not None:
+            self._keep(self._records.record_acknowledgement, condition, subject, who, self._now())
+
+    # -- looking ---------------------------------------------------------------------------
+
+    @staticmethod
+    def is_plain(condition: str) -> bool:
+        """Whether an alarm belongs to no row of the safety table."""
+        return condition in _PLAIN
+
+    @property
+    def open_alarms(self) -> int:
+        """How many alarms are active or not acknowledged."""
+        return sum(_open(row) for row in self._alarms.values())
+
+    def alarms(self) -> tuple[AlarmRow, ...]:
+        """Return the alarms: those that are open first, then the newest."""
+        rows = sorted(self._alarms.values(), key=lambda row: (not _open(row), -row.at))
+        return tuple(rows[:500])
+
+    def events(self, limit: int) -> tuple[EventRow, ...]:
+        """Return the last events, newest first."""
+        return tuple(list(self._events)[: -limit - 1 : -1])
+
+    def packets(self, limit: int, cluster: str = "") -> tuple[PacketRow, ...]:
+        """Return the last messages, newest first."""
+        found = [
+            (at, name, way, data)
+            for (name, way, _), (at, data) in self._steady.items()
+            if name == cluster
+        ]
+        for packet in reversed(self._packets):
+            if len(found) >= limit:
+                break
+            if not cluster or packet[1] == cluster:
+                found.append(packet)
+        found.sort(key=lambda packet: -packet[0])
+        return tuple(_shown(packet) for packet in found[:limit])
+
+    def cluster_rows(self, plant: PlantController) -> tuple[ClusterRow, ...]:
+        """Return the health of each cluster."""
+        field, now = plant.field, plant.now()
+        live, size = field.live(now), len(field.clusters)
+        counted = [
+            np.bincount(field.cluster, weights=weights, minlength=size)
+            for weights in (None, live, field.rows["asked"], field.rows["answered"])
+        ]
+        return tuple(
+            self._cluster_row(name, now - field.status_at[name], field.limit, *numbers)
+            for name, *numbers in zip(field.clusters, *counted, strict=True)
+        )
+
+    def _cluster_row(
+        self, name: str, age: float, limit: float, count: float, live: float, asked: float,
+        answered: float,
+    ) -> ClusterRow:  # fmt: skip
+        status, link = self._status(name), self._links.get(name)
+        nan = float("nan")
+        return ClusterRow(
+            name, age <= limit, age, link is not None and link.connected, int(count), int(live),
+            status.cycle_s if status else nan, answered / asked if asked else nan,
+            self.refused.get(name, 0), status.time_quality if status else "",
+            status.time_error_s if status else nan, status.lease_left if status else nan,
+            status.acts if status else (), link.problem if link is not None else "",
+        )  # fmt: skip
+
+    def _status(self, cluster: str) -> Status | None:
+        _, data = self._steady.get((cluster, "from", "status"), (0.0, b""))
+        try:
+            found = decode(data) if data else None
+        except ProtocolError:
+            self.refused[cluster] = self.refused.get(cluster, 0) + 1
+            self._steady.pop((cluster, "from", "status"))
+            found = None
+        if isinstance(found, Status):
+            self._statuses[cluster] = found
+        return self._statuses.get(cluster)
+
+
+class _Tapped:
+    """A link that shows what goes through it."""
+
+    def __init__(self, name: str, link: Link, book: Logbook) -> None:
+        self.name, self._link, self._book = name, link, book
+
+    @property
+    def connected(self) -> bool:
+        return self._link.connected
+
+    @property
+    def closed(self) -> bool:
+        return self._link.closed
+
+    @property
+    def silent_for(self) -> float:
+        return self._link.silent_for
+
+    @property
+    def problem(self) -> str:
+        return self._link.problem
+
+    @property
+    def statistics(self) -> Statistics:
+        return self._link.statistics
+
+    async def run(self) -> None:
+        await self._link.run()
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        outcome = await self._link.send(data, expires=expires, hold=hold)
+        if outcome is Outcome.SENT:
+            self._book.packet(self.name, "to", data)
+        return outcome
+
+    async def receive(self) -> bytes:
+        data = await self._link.receive()
+        self._book.packet(self.name, "from", data)
+        return data
+
+    async def close(self) -> None:
+        await self._link.close()
+
+
+def _open(row: AlarmRow) -> bool:
+    return row.active or not row.acknowledged_by
+
+
+def _kind(data: bytes) -> str:
+    """Return the kind that a message says it is, without reading the rest of it."""
+    head, _, rest = data.partition(b'"kind":"')
+    return rest.partition(b'"')[0].decode("ascii", "replace") if len(head) < 8 else ""
+
+
+def _shown(packet: tuple[float, str, str, bytes]) -> PacketRow:
+    at, cluster, way, data = packet
+    line, _, block = data.partition(b"\n")
+    text = line.decode("utf-8", "replace")
+    if len(text) > _LONGEST:
+        text = text[:_LONGEST] + "…"
+    more = f" + {len(block)} bytes" if block else ""
+    return PacketRow(at, cluster, way, _kind(data), len(data), text + more)

@@ -1,0 +1,120 @@
+"""Settings of the schedule, and the weather that keeps photographs from being taken."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from heliotrope.calibration.drift import DAY, START_DAYS, START_RAD
+from heliotrope.calibration.planning import Limits
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What keeps photographs from being taken: NaN where nobody measures it.
+
+    Attributes
+    ----------
+    dni
+        Direct normal irradiance, W/m².
+    wind
+        m/s.
+    """
+
+    dni: float = float("nan")
+    wind: float = float("nan")
+
+
+def _default_limits() -> Limits:
+    return Limits(min_elevation=float(np.radians(15.0)))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of the schedule.
+
+    Attributes
+    ----------
+    model, priors
+        Parameters that are learnt, and standard deviations that replace the table's.
+    limits
+        Of sun, incidence and obliquity.
+    shots, interval, sigma
+        Photographs of a visit, s between them, and the standard deviation of a beam, rad.
+    settle
+        Beside driving and photographs, s: until it stands still, answers, parameters.
+    look
+        A further look for a beam that is not on the target, s; None: nobody looks for it.
+    goal
+        Expected beam error, rad RMS, below which a heliostat is left alone until it is due.
+    worth
+        Least share of the expected squared error that a visit must take away.
+    most_age
+        A heliostat that was not calibrated for so long comes before all gains, s.
+    retry
+        After a visit that failed, s; doubled each time, a day at most.
+    creep
+        Of the drives' zeros, rad in a day: the error grows with the root of time.
+    glare
+        Least angle between the sun and a camera's line to its target, rad.
+    most_hidden
+        Share of a mirror that neighbours may hide from the sun or from the target.
+    least_dni, most_wind
+        W/m² and m/s.
+    """
+
+    model: str | tuple[str, ...] = "malan8"
+    priors: Mapping[str, float] = field(default_factory=dict)
+    limits: Limits = field(default_factory=_default_limits)
+    shots: int = 3
+    interval: float = 20.0
+    sigma: float = 5e-4
+    settle: float = 20.0
+    look: float | None = 20.0
+    goal: float = 7e-4
+    worth: float = 0.1
+    most_age: float = 30.0 * DAY
+    retry: float = 900.0
+    #: An Ornstein-Uhlenbeck process begins as a random walk of this step.
+    creep: float = START_RAD["slow"] * float(np.sqrt(2.0 / START_DAYS["slow"]))
+    glare: float = float(np.radians(10.0))
+    most_hidden: float = 0.35
+    least_dni: float = 300.0
+    most_wind: float = 12.0
+
+    def __post_init__(self) -> None:
+        if self.shots < 1 or not self.interval >= 0.0 or not self.settle >= 0.0:
+            raise InputError(
+                f"schedule: {self.shots} shots {self.interval} s apart and {self.settle} s beside; "
+                "give 1 or more, and 0 s or more"
+            )
+        for name in ("sigma", "goal", "most_age", "retry", "glare", "most_wind"):
+            if not 0.0 < getattr(self, name) < np.inf:
+                raise InputError(f"schedule: {name} {getattr(self, name)} must be above 0")
+        for name in ("worth", "most_hidden"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise InputError(f"schedule: {name} {getattr(self, name)} must be 0 to below 1")
+        if not self.creep >= 0.0 or (self.look is not None and not self.look > 0.0):
+            raise InputError(
+                f"schedule: creep {self.creep} rad and look {self.look} s; give 0 or more, and "
+                "above 0 or None"
+            )
+
+    @property
+    def visit(self) -> float:
+        """Time of a visit without driving and searching, s."""
+        return self.settle + self.shots * self.interval
+
+    def closed(self, sun: FloatArray, weather: Weather) -> str:
+        """Return why nothing can be photographed under a sun (3,) and weather; "" if it can."""
+        elevation = float(np.arcsin(np.clip(sun[2], -1.0, 1.0)))
+        if elevation < self.limits.min_elevation:
+            lowest = np.degrees(self.limits.min_elevation)
+            return f"the sun is at {np.degrees(elevation):.1f}°, below {lowest:.0f}°"
+        if weather.dni < self.least_dni:
+            return f"clouds: {weather.dni:.0f} W/m², below {self.least_dni:.0f} W/m²"
+        if weather.wind > self.most_wind:
+            return f"wind: {weather.wind:.1f} m/s, above {self.most_wind:.1f} m/s"
+        return ""

@@ -1,0 +1,144 @@
+r"""The light that a field is expected to bring to a receiver: a map, its power, the intercept.
+
+A beam is a Gaussian about its aim. Its width follows from sun, mirror, and how well the mirror
+is calibrated (:func:`heliotrope.field.intercept.beam_sigma`). Across the ray it is round; on the
+aperture, which the ray with components :math:`d_r, d_u` meets under the cosine c, its variances are
+
+.. math:: σ_r^2 = σ^2 (1 + (d_r / c)^2), \qquad σ_u^2 = σ^2 (1 + (d_u / c)^2),
+
+and the correlation of the two axes is left out: then each cell's share is a product, and a field
+of 10,000 beams is one product of two matrices. The power of a beam is
+
+.. math:: P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),
+
+with the loss l in clear air after Vittitoe and Biggs as in DELSOL3 (Kistler 1986):
+:math:`l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3`, d in km. Shading and blocking of
+neighbours are left out, and so is the shape of the sun's limb. A receiver that is no plane is
+shown by the plane of its aperture.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control._operations_views import FluxView
+from heliotrope.errors import InputError
+from heliotrope.field.intercept import beam_sigma
+from heliotrope.field.target import Receiver
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+
+#: Cells across and up.
+CELLS = (24, 24)
+#: The map is wider than the aperture by this factor: what misses it is to be seen.
+MARGIN = 1.5
+
+
+def air_loss(distance: npt.ArrayLike) -> FloatArray:
+    """Return the share of the light that clear air takes on a way in m; see the head."""
+    d = 1e-3 * as_float(distance)
+    return as_float(np.clip(0.006789 + 0.1046 * d - 0.017 * d**2 + 0.002845 * d**3, 0.0, 1.0))
+
+
+def predicted(
+    receiver: Receiver,
+    vertices: npt.ArrayLike,
+    aims: npt.ArrayLike,
+    areas: npt.ArrayLike,
+    error: npt.ArrayLike,
+    *,
+    sun: npt.ArrayLike,
+    dni: float = 900.0,
+    reflectivity: float = 0.9,
+    slope: float = 1e-3,
+    cells: tuple[int, int] = CELLS,
+) -> FluxView:
+    """Return the light of N beams that are on a receiver.
+
+    Parameters
+    ----------
+    receiver
+        Its aperture is taken as the rectangle of its width and height.
+    vertices, aims
+        Of the mirrors, and where their beams go, ENU, m, (N, 3).
+    areas
+        Of the mirrors, m², (N,).
+    error
+        Standard deviation of the normals, two-dimensional, rad, (N,).
+    sun
+        Unit vector, (3,).
+    dni
+        W/m².
+    reflectivity
+        A share.
+    slope
+        Standard deviation of the mirrors' surface per axis, rad.
+    cells
+        Across and up.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit, or numbers are out of their range.
+    """
+    places = as_vectors(np.reshape(as_float(vertices), (-1, 3)), "vertices")
+    points = as_vectors(np.reshape(as_float(aims), (-1, 3)), "aims")
+    area, sigma = as_float(areas).reshape(-1), as_float(error).reshape(-1)
+    if not len(places) == len(points) == len(area) == len(sigma):
+        raise InputError(
+            f"flux: {len(places)} vertices, {len(points)} aims, {len(area)} areas and "
+            f"{len(sigma)} errors; give as many of each"
+        )
+    if not (np.isfinite(dni) and dni >= 0.0 and 0.0 <= reflectivity <= 1.0):
+        raise InputError(
+            f"flux: {dni} W/m² and a reflectivity of {reflectivity}: 0 or more, 0 to 1"
+        )
+    light = as_vectors(sun, "sun")
+    right, up, normal = _axes(receiver)
+    size = np.array([receiver.width, receiver.height], dtype=np.float64)
+    edges = [
+        0.5 * MARGIN * s * np.linspace(-1.0, 1.0, n + 1) for s, n in zip(size, cells, strict=True)
+    ]
+    middle = [0.5 * (e[1:] + e[:-1]) for e in edges]
+    way = points - places
+    slant = np.linalg.norm(way, axis=-1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ray = way / slant[:, None]
+    cosine = -(ray @ normal)
+    # What comes from behind, or along the plane, is no light in it.
+    good = np.isfinite(cosine) & (cosine > 0.05) & (light[2] > 0.0)
+    ray, slant, cosine = ray[good], slant[good], cosine[good]
+    narrow = beam_sigma(np.maximum(slant, 1e-3), tracking=sigma[good] / np.sqrt(2.0), slope=slope)
+    power = area[good] * dni * reflectivity * np.sqrt(np.maximum(0.0, 0.5 * (1.0 + ray @ light)))
+    power = power * (1.0 - air_loss(slant))
+    off = points[good] - receiver.center
+    shares, inside = [], np.ones(len(power))
+    for axis, edge, side in zip((right, up), edges, size, strict=True):
+        wide = narrow * np.sqrt(1.0 + ((ray @ axis) / cosine) ** 2)
+        at = (off @ axis)[:, None]
+        shares.append(np.diff(_below((edge - at) / wide[:, None]), axis=-1))
+        half = 0.5 * side * np.array([-1.0, 1.0])
+        inside = inside * np.diff(_below((half - at) / wide[:, None]), axis=-1)[:, 0]
+    flux = (shares[1] * power[:, None]).T @ shares[0]
+    cell = (edges[0][1] - edges[0][0]) * (edges[1][1] - edges[1][0])
+    total, caught = float(power.sum()), float(power @ inside)
+    return FluxView(
+        receiver.name, middle[0], middle[1], flux / cell, caught,
+        caught / total if total > 0.0 else float("nan"), len(power),
+    )  # fmt: skip
+
+
+def _axes(receiver: Receiver) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return right (as seen from the front), up, and the normal of the aperture."""
+    normal = normalize(receiver.normal)
+    level = np.cross(np.array([0.0, 0.0, 1.0]), normal)
+    if np.linalg.norm(level) < 1e-6:
+        # An aperture that looks straight down or up has no right of its own: east.
+        level = np.array([1.0, 0.0, 0.0])
+    right = normalize(level)
+    return right, np.asarray(np.cross(normal, right)), normal
+
+
+def _below(z: FloatArray) -> FloatArray:
+    """Return the share of a normal distribution below z; single precision is plenty for a map."""
+    from scipy import special
+
+    return np.asarray(special.ndtr(z.astype(np.float32)), dtype=np.float64)

@@ -1,0 +1,510 @@
+"""The plant at work: the one object that a console, an API and the command line talk to.
+
+It reads the plant (`PlantController`) into plain values, made at most once a second and shared by
+all who look; passes on commands of persons; and runs the work that goes on by itself: raising the
+field, calibrating it with every target's camera, keeping alarms and events. A single failure of
+that work is told as an event or an alarm, and the work goes on.
+
+Commands of persons go through here so that the automatic work knows what people want: what a
+person has stowed, defocused or locked stays so until a person calls it back.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy.typing as npt
+
+from heliotrope import sun
+from heliotrope.control._operations_cycle import CentringCycle
+from heliotrope.control._operations_detail import detail, emergency_view
+from heliotrope.control._operations_field import FrameMaker
+from heliotrope.control._operations_log import Logbook
+from heliotrope.control._operations_views import (
+    AlarmRow,
+    CalibrationView,
+    CameraView,
+    ClusterRow,
+    EmergencyView,
+    EventRow,
+    FieldFrame,
+    FluxView,
+    HeliostatView,
+    Hold,
+    PacketRow,
+    Planned,
+    Summary,
+    SunView,
+)
+from heliotrope.control._operations_work import Automat, Photographer, Scheduling, WorkSettings
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.authority import Grant, Person, RefusedError
+from heliotrope.control.emergency import EmergencyOrder
+from heliotrope.control.flux import predicted
+from heliotrope.control.plant import PlantController
+from heliotrope.control.safety import Act
+from heliotrope.errors import UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.store.records import Records
+
+__all__ = ["Logbook", "Operations", "WorkSettings"]
+
+#: Orders of persons after which the automatic work leaves heliostats alone, and those after
+#: which it has them again.
+_AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
+_BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
+#: The predicted flux is made anew after so many seconds.
+_FLUX_EVERY = 5.0
+
+
+@dataclass(frozen=True)
+class _Cached:
+    at: float
+    value: FluxView
+
+
+class Operations:
+    """A plant at work.
+
+    Parameters
+    ----------
+    plant
+        The controller; its ``on_alarm`` is ``logbook.take_alarm`` and its links are
+        ``logbook.tapped(links)``. It is run by the owner.
+    logbook
+        Alarms, events and packets.
+    cycle
+        Calibrates; None: nothing is calibrated.
+    cameras
+        Photographs of the targets for people, by name of the target.
+    scheduler
+        Says which heliostat is next; None: the least known one that stands ready.
+    records
+        Keeps what happens over a restart; None: nothing is kept.
+    truth
+        Tracking error of each heliostat that a twin knows, rad, (N,); None: nobody knows.
+    settings
+        Of the automatic work.
+    extra
+        What the summary shows besides, such as the speed of a twin.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        logbook: Logbook,
+        cycle: CentringCycle | None = None,
+        *,
+        cameras: Mapping[str, Photographer] | None = None,
+        scheduler: Scheduling | None = None,
+        records: Records | None = None,
+        truth: Callable[[], FloatArray] | None = None,
+        settings: WorkSettings | None = None,
+        extra: Callable[[], Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.plant, self.logbook = plant, logbook
+        self._cameras, self._extra = dict(cameras or {}), extra
+        self.work = Automat(
+            plant, logbook, cycle, scheduler=scheduler, records=records, truth=truth,
+            settings=settings or WorkSettings(),
+        )  # fmt: skip
+        self._frames = FrameMaker(plant, self.work)
+        self._flux: dict[str, _Cached] = {}
+        self._closing = asyncio.Event()
+
+    # -- running ---------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Work until closed; the plant itself is run by the owner."""
+        self.logbook.event("plant", "", f"{self.design.name}: operations begin")
+        async with asyncio.TaskGroup() as group:
+            works = group.create_task(self.work.run())
+            await self._closing.wait()
+            self.work.stop()
+            works.cancel()
+        self.logbook.event("plant", "", f"{self.design.name}: operations end")
+
+    async def close(self) -> None:
+        """End the work; beams stay where they are: stow before, if they shall not."""
+        self._closing.set()
+
+    # -- what it is ------------------------------------------------------------------------
+
+    @property
+    def design(self) -> Plant:
+        """Site, heliostats, receivers, targets."""
+        return self.plant.design
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Heliostats, N, in the order of all arrays."""
+        return self.plant.field.names
+
+    @property
+    def clusters(self) -> tuple[str, ...]:
+        """Names of the clusters."""
+        return self.plant.field.clusters
+
+    @property
+    def positions(self) -> FloatArray:
+        """Where the heliostats stand, ENU, m, (N, 3)."""
+        return self._frames.positions
+
+    @property
+    def sizes(self) -> FloatArray:
+        """Width and height of the mirrors, m, (N, 2)."""
+        return self._frames.sizes
+
+    @property
+    def targets(self) -> tuple[str, ...]:
+        """Names of the calibration targets."""
+        return tuple(target.name for target in self.design.targets)
+
+    @property
+    def receivers(self) -> tuple[str, ...]:
+        """Names of the receivers."""
+        return tuple(receiver.name for receiver in self.design.receivers)
+
+    @property
+    def aim_names(self) -> tuple[str, ...]:
+        """What `FieldFrame.on` counts: "", the receivers, the targets, "elsewhere"."""
+        return self._frames.aim_names
+
+    # -- the field -------------------------------------------------------------------------
+
+    def frame(self) -> FieldFrame:
+        """Return the whole field; the same frame for a second."""
+        return self._frames.frame()
+
+    def summary(self) -> Summary:
+        """Return the plant in one look."""
+        now, grant = self.plant.now(), self.plant.authority.grant
+        field = self.plant.field
+        alive = sum(now - at <= field.limit for at in field.status_at.values())
+        extra = dict(self._extra()) if self._extra is not None else {}
+        return Summary(
+            self.design.name, self.plant.clock.utc(), len(field), len(field.clusters),
+            field.counted(now), alive,
+            grant.holder.name if grant else "", grant.holder.role.name.lower() if grant else "",
+            self.plant.waiting, self.logbook.open_alarms, self.plant.emergency_on,
+            float(extra.pop("lag", 0.0)), extra,
+        )  # fmt: skip
+
+    def heliostat(self, name: str) -> HeliostatView:
+        """Return one heliostat in detail.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is none of that name.
+        """
+        return detail(self.plant, self.work, self._frames, name)
+
+    def cluster_rows(self) -> tuple[ClusterRow, ...]:
+        """Return the health of each cluster."""
+        return self.logbook.cluster_rows(self.plant)
+
+    # -- light -----------------------------------------------------------------------------
+
+    def sun(self) -> SunView:
+        """Return where the sun is."""
+        at = self.plant.clock.utc()
+        found = sun.position(at, self.design.site)
+        return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
+
+    def receiver_flux(self, name: str = "") -> FluxView:
+        """Return the predicted light on a receiver ("": the first), made every five seconds.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such receiver.
+        """
+        if not name and not self.receivers:
+            raise UnknownNameError("receiver", name, self.receivers)
+        receiver = self.design.receiver(name or self.receivers[0])
+        now, known = self.plant.now(), self._flux.get(receiver.name)
+        if known is None or now - known.at >= _FLUX_EVERY:
+            view = predicted(
+                receiver, *self._frames.beams(receiver.name), sun=self.plant.sun_vector()
+            )
+            known = self._flux[receiver.name] = _Cached(now, view)
+        return known.value
+
+    # -- what happens ----------------------------------------------------------------------
+
+    def alarms(self) -> tuple[AlarmRow, ...]:
+        """Return the alarms, those that are active or not acknowledged first, then the newest."""
+        return self.logbook.alarms()
+
+    def events(self, limit: int = 200) -> tuple[EventRow, ...]:
+        """Return the last events, newest first."""
+        return self.logbook.events(limit)
+
+    def packets(self, limit: int = 200, cluster: str = "") -> tuple[PacketRow, ...]:
+        """Return the last messages at the links, newest first; of one cluster if it is named.
+
+        Leases and statuses, which come each second, are only kept as the last of each cluster.
+        """
+        return self.logbook.packets(limit, cluster)
+
+    # -- calibration -----------------------------------------------------------------------
+
+    def calibration(self) -> CalibrationView:
+        """Return how far calibration has come."""
+        return self.work.view()
+
+    def switch_calibration(self, person: Person, on: bool) -> None:
+        """Switch the automatic calibration on or off.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer.
+        """
+        _operator(person, "calibration")
+        self.work.switch(on)
+        self._tell(person, f"calibration switched {'on' if on else 'off'}")
+
+    def camera(self, target: str) -> CameraView:
+        """Return the last photograph of a target.
+
+        Raises
+        ------
+        UnknownNameError
+            If no camera looks at it.
+        """
+        if target not in self._cameras:
+            raise UnknownNameError("target with a camera", target, self._cameras)
+        return self._cameras[target].view(target)
+
+    def schedule(self, limit: int = 20) -> tuple[Planned, ...]:
+        """Return the plan of the next measurements."""
+        return self.work.plan(limit)
+
+    def holds(self) -> tuple[Hold, ...]:
+        """Return the heliostats that are kept out of calibration."""
+        return tuple(self.work.holds.values())
+
+    def hold(self, person: Person, heliostats: Sequence[str], reason: str) -> None:
+        """Keep heliostats out of calibration.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer; without a reason.
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        _operator(person, "hold")
+        if not reason.strip():
+            raise RefusedError("hold: a reason is needed; give one")
+        self.work.hold(person.name, heliostats, reason)
+        self._tell(person, f"{len(heliostats)} heliostats held: {reason}")
+
+    def unhold(self, person: Person, heliostats: Sequence[str]) -> None:
+        """Give heliostats back to calibration.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer.
+        UnknownNameError
+            If there is no such heliostat.
+        """
+        _operator(person, "unhold")
+        self.work.unhold(person.name, heliostats)
+        self._tell(person, f"{len(heliostats)} heliostats given back")
+
+    # -- the authority ---------------------------------------------------------------------
+
+    def take_authority(self, person: Person) -> Grant:
+        """Take the command authority; the automatic work gives way at once.
+
+        Raises
+        ------
+        RefusedError
+            If another person has it; to a viewer.
+        """
+        _operator(person, "authority")
+        self.work.give_way()
+        grant = self.plant.take_authority(person)
+        self._tell(person, "has the authority", "authority")
+        return grant
+
+    def seize_authority(self, person: Person, reason: str) -> Grant:
+        """Break another person's command authority and take it.
+
+        Raises
+        ------
+        RefusedError
+            See `PlantController.seize_authority`.
+        """
+        _operator(person, "authority")
+        self.work.give_way()
+        grant = self.plant.seize_authority(person, reason)
+        self._tell(person, f"has broken the authority: {reason}", "authority")
+        return grant
+
+    def keep_authority(self, person: Person, token: int) -> Grant:
+        """Keep the command authority up; to be called every few seconds.
+
+        Raises
+        ------
+        RefusedError
+            If it is not theirs any more.
+        """
+        return self.plant.authority.keep(person, token)
+
+    def release_authority(self, person: Person, token: int) -> None:
+        """Give the command authority back; the automatic work goes on.
+
+        Raises
+        ------
+        RefusedError
+            If it is not theirs.
+        """
+        self.plant.release_authority(person, token)
+        self._tell(person, "has given the authority back", "authority")
+
+    # -- commands --------------------------------------------------------------------------
+
+    def command(
+        self, person: Person, token: int, name: str, heliostats: Sequence[str] = (),
+        values: Sequence[float] = (),
+    ) -> Ticket:  # fmt: skip
+        """Give a command; see `PlantController.command`."""
+        ticket = self.plant.command(person, token, name, heliostats, values)
+        self._meant(name, ticket.heliostats)
+        self._told(person, ticket)
+        return ticket
+
+    def aim(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Aim heliostats at points; see `PlantController.aim`."""
+        ticket = self.plant.aim(person, token, points)
+        self._told(person, ticket)
+        return ticket
+
+    def aim_at(self, person: Person, token: int, heliostats: Sequence[str], where: str) -> Ticket:
+        """Aim heliostats at a receiver (as the design says) or at a target, by its name.
+
+        Raises
+        ------
+        UnknownNameError
+            If there is neither.
+        """
+        names = tuple(heliostats) or self.names
+        if where in self.receivers:
+            points = self.plant.default_aims(names)
+        elif where in self.targets:
+            center = self.design.target(where).center
+            points = dict.fromkeys(names, center)
+        else:
+            raise UnknownNameError("receiver or target", where, self.receivers + self.targets)
+        return self.aim(person, token, points)
+
+    def standby(self, person: Person, token: int, points: Mapping[str, npt.ArrayLike]) -> Ticket:
+        """Set standby points; see `PlantController.standby`."""
+        ticket = self.plant.standby(person, token, points)
+        self._told(person, ticket)
+        return ticket
+
+    def stow(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
+        """Send heliostats (() for all) to stow; anybody may."""
+        ticket = self.plant.stow(person.name, heliostats)
+        self._meant("STOW", ticket.heliostats)
+        self._told(person, ticket)
+        return ticket
+
+    def defocus(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
+        """Take beams off the receiver; anybody may."""
+        ticket = self.plant.defocus(person.name, heliostats)
+        self._meant("DEFOCUS", ticket.heliostats)
+        self._told(person, ticket)
+        return ticket
+
+    def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
+        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
+
+        Raises
+        ------
+        InputError
+            Another act.
+        """
+        order = self.plant.raise_emergency(person.name, _act(act), reason)
+        self._meant(act, self.names)
+        self.logbook.event("command", person.name, f"EMERGENCY {act}: {reason or 'no reason'}")
+        return order
+
+    def emergency_view(self) -> EmergencyView:
+        """Return the last emergency order with its proof."""
+        return emergency_view(self.plant)
+
+    def withdraw(self, person: Person) -> None:
+        """Take an emergency order back.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer.
+        """
+        self.plant.withdraw_emergency(person)
+        self._tell(person, "emergency withdrawn", "command")
+
+    def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
+        """Acknowledge an alarm, and the row of the safety table that it tells of.
+
+        Raises
+        ------
+        RefusedError
+            If the role is too low, or the cause of a latched row has not gone.
+        """
+        _operator(person, "acknowledge")
+        if not self.logbook.is_plain(condition):
+            self.plant.acknowledge(person, condition, subject)
+        self.logbook.acknowledge(person.name, condition, subject)
+        self._tell(person, f"acknowledged {condition} {subject}".strip(), "command")
+
+    def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> None:
+        """Give heliostats (() for all) to the automatic work: it raises and calibrates them.
+
+        Raises
+        ------
+        RefusedError
+            To a viewer.
+        """
+        _operator(person, "give back")
+        names = tuple(heliostats) or self.names
+        self.work.want(names, wanted=True)
+        self._tell(person, f"{len(names)} heliostats given to the automatic work", "command")
+
+    # -- notes -----------------------------------------------------------------------------
+
+    def _meant(self, name: str, heliostats: Sequence[str]) -> None:
+        if name in _AWAY:
+            self.work.want(heliostats, wanted=False)
+        elif name in _BACK:
+            self.work.want(heliostats, wanted=True)
+
+    def _told(self, person: Person, ticket: Ticket) -> None:
+        some = ", ".join(ticket.heliostats[:3])
+        more = f" and {len(ticket.heliostats) - 3} more" if len(ticket.heliostats) > 3 else ""
+        self.logbook.event("command", person.name, f"{ticket.name} {some}{more}")
+
+    def _tell(self, person: Person, text: str, kind: str = "calibration") -> None:
+        self.logbook.event(kind, person.name, text)
+
+
+def _act(name: str) -> Act:
+    if name not in Act.__members__:
+        raise UnknownNameError("act of an emergency", name, ("DEFOCUS", "STOW"))
+    return Act[name]
+
+
+def _operator(person: Person, what: str) -> None:
+    from heliotrope.control.authority import Role
+
+    if person.role < Role.OPERATOR:
+        raise RefusedError(f"{what}: {person.name} is viewer; it needs operator")

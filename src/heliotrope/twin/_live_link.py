@@ -1,0 +1,115 @@
+"""A line between plant and cluster in one process that takes no time and loses nothing.
+
+For whole fields: hundreds of clusters with the heartbeats of real links would cost more than
+all the rest. What a line may do to messages is shown by `control.memory`.
+"""
+
+import asyncio
+from collections import deque
+
+from heliotrope.control.clock import Clock
+from heliotrope.control.link import LinkClosedError, Outcome, Statistics
+
+#: Messages that may wait at an end; beyond it the oldest is dropped, as at any link.
+_CAPACITY = 256
+
+
+class NearLink:
+    """One end; a `control.link.Link`.
+
+    Attributes
+    ----------
+    name
+        Whom it leads to.
+    plugged
+        Whether the line holds; unplug one end to cut it.
+    other
+        The other end.
+    """
+
+    def __init__(self, name: str, clock: Clock) -> None:
+        self.name, self.statistics, self.plugged = name, Statistics(), True
+        self._clock = clock
+        self.other: NearLink | None = None
+        self._waiting: deque[tuple[bytes, float | None]] = deque(maxlen=_CAPACITY)
+        self._news, self._closing = asyncio.Event(), asyncio.Event()
+        self._was = False
+
+    @property
+    def connected(self) -> bool:
+        """Whether both ends are there."""
+        other = self.other
+        here = not self.closed and other is not None and not other.closed
+        now = here and self.plugged and other is not None and other.plugged
+        if now and not self._was:
+            self.statistics.opened += 1
+        self._was = now
+        return now
+
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed for good."""
+        return self._closing.is_set()
+
+    @property
+    def silent_for(self) -> float:
+        """0 s while the line holds."""
+        return 0.0 if self.connected else float("inf")
+
+    @property
+    def problem(self) -> str:
+        """Why it is not connected."""
+        return "" if self.connected else "the line is cut"
+
+    async def run(self) -> None:
+        """Wait for the end."""
+        await self._closing.wait()
+
+    async def send(
+        self, data: bytes, *, expires: float | None = None, hold: bool = False
+    ) -> Outcome:
+        """Put a message at the other end."""
+        del hold
+        if self.closed:
+            raise LinkClosedError(f"link to {self.name}: it is closed")
+        if expires is not None and self._clock.monotonic() >= expires:
+            self.statistics.expired += 1
+            return Outcome.EXPIRED
+        if not self.connected or self.other is None:
+            self.statistics.dropped += 1
+            return Outcome.DISCONNECTED
+        self.other.take(data, expires)
+        self.statistics.sent += 1
+        return Outcome.SENT
+
+    def take(self, data: bytes, expires: float | None) -> None:
+        """Take a message from the other end."""
+        self._waiting.append((data, expires))
+        self._news.set()
+
+    async def receive(self) -> bytes:
+        """Wait for the next message that has not expired."""
+        while True:
+            while self._waiting:
+                data, expires = self._waiting.popleft()
+                if expires is None or self._clock.monotonic() < expires:
+                    self.statistics.received += 1
+                    self.statistics.last_received = self._clock.monotonic()
+                    return data
+                self.statistics.late += 1
+            if self.closed:
+                raise LinkClosedError(f"link to {self.name}: it is closed")
+            self._news.clear()
+            await self._news.wait()
+
+    async def close(self) -> None:
+        """Close it for good."""
+        self._closing.set()
+        self._news.set()
+
+
+def near_pair(clock: Clock, names: tuple[str, str]) -> tuple[NearLink, NearLink]:
+    """Return two ends: the first leads to the second name, as the plant's to its cluster."""
+    first, second = NearLink(names[1], clock), NearLink(names[0], clock)
+    first.other, second.other = second, first
+    return first, second

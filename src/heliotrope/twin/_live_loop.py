@@ -1,0 +1,88 @@
+"""An event loop whose time goes at a speed, and waits for those who are late.
+
+Loop time advances with the wall's, times the speed, but never past a timer that has not had its
+turn. Where the machine is too slow for the speed, or stands still for a while, simulated time
+goes slower instead of jumping over leases and deadlines; `PacedLoop.lag` says by how much.
+"""
+
+import asyncio
+import selectors
+import time
+from collections.abc import Callable
+
+from heliotrope.errors import InputError
+
+#: Timers may be late by so much loop time before the loop's time is held back, s.
+LATE = 0.25
+#: Loop time that may pass while callbacks are ready without end, s.
+_BUSY = 0.005
+
+
+class _Pace(selectors.DefaultSelector):
+    """Waits for files and for wall time, and lets the loop's time run."""
+
+    def __init__(self, speed: float, start: float, wall: Callable[[], float]) -> None:
+        super().__init__()
+        self.speed, self.now, self.lag = speed, start, 0.0
+        self._wall, self._begin, self._start = wall, wall(), start
+
+    def _target(self) -> float:
+        return self._start + self.speed * (self._wall() - self._begin) - self.lag
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout is None:
+            found = super().select(None)
+            self.now = max(self.now, self._target())
+            return found
+        due = self.now + max(timeout, 0.0)
+        wait = max(0.0, due - self._target()) / self.speed if timeout > 0.0 else 0.0
+        found = super().select(wait)
+        most = due if timeout > 0.0 else self.now + _BUSY
+        target = self._target()
+        if target - most > LATE:
+            self.lag += target - most - LATE
+        self.now = max(self.now, min(target, most))
+        return list(found)
+
+
+class PacedLoop(asyncio.SelectorEventLoop):
+    """See the head of this module; sockets and threads work as in any loop.
+
+    Parameters
+    ----------
+    speed
+        Loop seconds in a second of the wall.
+    start
+        Of `time`, s.
+    wall
+        Gives seconds of the wall.
+
+    Raises
+    ------
+    InputError
+        A speed that none is.
+    """
+
+    def __init__(
+        self, speed: float = 1.0, start: float = 1000.0,
+        wall: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        if not 0.0 < speed <= 1000.0:
+            self._closed = True  # its end asks for it
+            raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds in a second")
+        self._pace = _Pace(speed, start, wall)
+        super().__init__(self._pace)
+
+    def time(self) -> float:
+        """Return the loop's time, s."""
+        return self._pace.now
+
+    @property
+    def speed(self) -> float:
+        """Loop seconds in a second of the wall, if the machine keeps up."""
+        return self._pace.speed
+
+    @property
+    def lag(self) -> float:
+        """By how much the loop's time is behind what the speed asks for, s."""
+        return self._pace.lag

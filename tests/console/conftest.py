@@ -1,0 +1,48 @@
+"""A plant at work with its console, for all tests of this folder."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from live_console import PASSWORD, ROLES, LiveConsole
+
+
+@pytest.fixture(scope="session")
+def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Two clusters of 32 heliostats, at eight times the speed of real time, without the page."""
+    made = LiveConsole(tmp_path_factory.mktemp("console"), 64, page=False, speed=8.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def tokens(console: LiveConsole) -> dict[str, str]:
+    """An API token of each role."""
+    import time
+
+    people, now = console.keeper.people, time.time()
+    return {role: people.add_token(role, "tests", role, now)[1] for role in ROLES}
+
+
+@pytest.fixture
+def ask(console: LiveConsole, tokens: dict[str, str]) -> Iterator[Callable[..., httpx.Response]]:
+    """Send a request as somebody of a role ("" for nobody)."""
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+
+        def send(role: str, method: str, path: str, body: Any = None) -> httpx.Response:
+            headers = {"Authorization": f"Bearer {tokens[role]}"} if role else {}
+            return client.request(method, path, json=body, headers=headers)
+
+        yield send
+
+
+@pytest.fixture
+def signed_in(console: LiveConsole) -> Iterator[httpx.Client]:
+    """A browser without a page: an operator with a session."""
+    with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
+        answer = client.post("session", json={"name": "operator", "password": PASSWORD})
+        assert answer.status_code == 200
+        client.headers["X-CSRF-Token"] = answer.json()["csrf"]
+        yield client

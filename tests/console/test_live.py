@@ -1,0 +1,204 @@
+"""The live stream, the command line on the API, and what the API does with anything at all."""
+
+import asyncio
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import schemathesis
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from heliotrope.cli._ctl import app
+from heliotrope.console.client import Client, Message, RemoteError, read_message
+from heliotrope.console.live import MARK, ROW, changed, message
+from heliotrope.console.models import plain
+from live_console import PASSWORD, LiveConsole
+
+Ask = Callable[..., httpx.Response]
+
+
+def _watch(
+    console: LiveConsole, token: str, enough: Callable[[np.ndarray[Any, Any], Message], bool]
+) -> list[Message]:
+    """Follow the stream until the field that it tells is as wanted."""
+
+    async def follow() -> list[Message]:
+        seen: list[Message] = []
+        field = np.zeros(len(console.live.names), ROW)
+        client = Client(token, console.address)
+        try:
+            async with asyncio.timeout(40.0):
+                async for one in client.live():
+                    seen.append(one)
+                    field[one.rows["row"]] = one.rows
+                    if enough(field, one):
+                        return seen
+        finally:
+            client.close()
+        return seen
+
+    return asyncio.run(follow())
+
+
+def test_the_whole_first_then_what_changed(console: LiveConsole, tokens: dict[str, str]) -> None:
+    frames: list[Any] = []
+
+    def same(field: np.ndarray[Any, Any], one: Message) -> bool:
+        frames.append((field.copy(), one))
+        return len(frames) >= 4
+
+    seen = _watch(console, tokens["viewer"], same)
+    assert seen[0].header["whole"]
+    assert len(seen[0].rows) == len(console.live.names)
+    assert not any(one.header["whole"] for one in seen[1:])
+    assert [one.header["tick"] for one in seen] == list(
+        range(seen[0].header["tick"], seen[0].header["tick"] + len(seen))
+    )
+    told = np.bincount(frames[-1][0]["state"], minlength=256)
+    counts = seen[-1].header["states"]
+    # The rows are of a frame that may be a second of the plant older than the header.
+    assert sum(counts.values()) == told.sum()
+
+
+def test_the_stream_needs_a_token(console: LiveConsole) -> None:
+    with pytest.raises(RemoteError, match="sign in"):
+        _watch(console, "not a token", lambda _, __: True)
+
+
+@given(
+    before=st.lists(st.floats(width=32), min_size=1, max_size=8), flips=st.sets(st.integers(0, 7))
+)
+def test_only_what_changed_is_told(before: list[float], flips: set[int]) -> None:
+    rows = np.zeros(len(before), ROW)
+    rows["row"], rows["error"] = np.arange(len(rows)), before
+    after = rows.copy()
+    for i in flips:
+        if i < len(rows):
+            after["state"][i] ^= 1
+    told = changed(rows, after)
+    assert set(told["row"].tolist()) == {i for i in flips if i < len(rows)}
+    read = read_message(message({"tick": 1}, told))
+    assert read.header == {"tick": 1}
+    assert read.rows.tobytes() == told.tobytes()
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"HLS0....", MARK + struct.pack("<I", 99), MARK + struct.pack("<I", 2) + b"{}x"]
+)
+def test_what_is_no_message(data: bytes) -> None:
+    with pytest.raises(RemoteError, match="live stream"):
+        read_message(data)
+
+
+def test_what_is_not_known_is_null() -> None:
+    found = plain({"a": math.nan, "b": (1, np.float32(math.inf)), "c": np.array([1.5, math.nan])})
+    assert found == {"a": None, "b": [1, None], "c": [1.5, None]}
+
+
+@pytest.fixture
+def ctl(
+    console: LiveConsole, tokens: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Any]:
+    """Run the command line as somebody."""
+
+    def run(role: str, *words: str, typed: str = "") -> Any:
+        monkeypatch.setenv("HELIOTROPE_URL", console.address)
+        monkeypatch.setenv("HELIOTROPE_TOKEN", tokens.get(role, role))
+        return CliRunner().invoke(app, list(words), input=typed)
+
+    return run
+
+
+def test_ctl_looks(ctl: Callable[..., Any], console: LiveConsole) -> None:
+    shown = ctl("viewer", "status")
+    assert shown.exit_code == 0, shown.output
+    assert "2 of 2 clusters are heard" in shown.stdout
+    shown = ctl("viewer", "show", console.live.names[0])
+    assert shown.exit_code == 0
+    assert '"cluster": "C' in shown.stdout
+
+
+def test_ctl_commands(ctl: Callable[..., Any], console: LiveConsole) -> None:
+    name = console.live.names[7]
+    given = ctl("operator", "command", "lock", name)
+    assert given.exit_code == 0, given.output
+    assert given.stdout == "LOCK: 1 done\n"
+    assert console.call(lambda: console.live.operations.heliostat(name).state) == "LOCKED"
+    assert ctl("operator", "command", "unlock", name).exit_code == 0
+    stowed = ctl("operator", "stow", name, "--wait", "60")
+    assert stowed.exit_code == 0, stowed.output
+    assert console.until(lambda: console.live.operations.heliostat(name).state == "STOWED")
+
+
+@pytest.mark.parametrize(
+    ("role", "words", "text"),
+    [
+        ("viewer", ("stow", "--all"), "needs operator"),
+        ("wrong", ("status",), "sign in"),
+        ("operator", ("stow",), "give --all"),
+        ("operator", ("aim", "receiver", "nobody"), "nobody"),
+        ("operator", ("show", "nobody"), "nobody"),
+    ],
+)
+def test_ctl_refusals(
+    ctl: Callable[..., Any], role: str, words: tuple[str, ...], text: str
+) -> None:
+    refused = ctl(role, *words)
+    assert text in str(refused.exception)
+
+
+def test_ctl_makes_a_token(ctl: Callable[..., Any], console: LiveConsole) -> None:
+    made = ctl("", "token", "cron", "--name", "operator", typed=f"{PASSWORD}\n")
+    assert made.exit_code == 0, made.output
+    secret = made.stdout.splitlines()[-1].split()[-1]
+    assert PASSWORD not in made.output
+    assert ctl(secret, "status").exit_code == 0
+
+
+def test_ctl_lets_a_person_in_and_keeps_them_out(
+    ctl: Callable[..., Any], console: LiveConsole
+) -> None:
+    new = "a long enough one"
+    made = ctl("", "account", "paula", "--role", "operator", typed=f"{PASSWORD}\n{new}\n{new}\n")
+    assert made.exit_code == 0, made.output
+    assert new not in made.output
+    assert console.keeper.people.account("paula").role == "operator"
+    out = ctl("", "account", "paula", "--disable", typed=f"{PASSWORD}\n")
+    assert out.exit_code == 0, out.output
+    assert console.keeper.people.account("paula").disabled
+
+
+def test_anything_at_all(console: LiveConsole, tokens: dict[str, str]) -> None:
+    """What the description allows is answered as it says; nothing makes the server fail."""
+    schema = schemathesis.openapi.from_url(f"{console.address}api/v1/openapi.json")
+    headers = {"Authorization": f"Bearer {tokens['viewer']}"}
+    few = settings(
+        max_examples=2, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+    )
+
+    for found in schema.get_all_operations():
+        operation = found.ok()
+        # These end what all tests share; they have tests of their own.
+        if operation.path.endswith(("/session", "/emergency")):
+            continue
+
+        @few
+        @given(case=operation.as_strategy())
+        def check(case: Any) -> None:
+            answer = case.call(headers=headers)
+            case.validate_response(
+                answer,
+                checks=[
+                    schemathesis.checks.not_a_server_error,
+                    schemathesis.specs.openapi.checks.status_code_conformance,
+                    schemathesis.specs.openapi.checks.response_schema_conformance,
+                ],
+            )
+
+        check()

@@ -1,0 +1,235 @@
+"""The operator page in a browser."""
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from heliotrope.twin._live_field import LiveBus
+from live_console import PASSWORD, LiveConsole
+
+CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
+ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+pytestmark = pytest.mark.skipif(
+    not os.path.exists(CHROMIUM) and not os.environ.get("CI"),  # noqa: PTH110 - a word of skipif
+    reason=f"{CHROMIUM} is not there: the page is not tested",
+)
+
+
+@pytest.fixture(scope="session")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Six hundred and forty heliostats with the page, at six times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("page"), 640, speed=6.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """A browser without a screen."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+        yield made
+        made.close()
+
+
+@pytest.fixture
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[[str], Any]]:
+    """Sign in as somebody of a role; what goes wrong in the page fails the test."""
+    opened, wrong = [], []
+
+    def go(role: str) -> Any:
+        context = browser.new_context(viewport={"width": 1600, "height": 900})
+        context.set_default_timeout(20_000)
+        opened.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.goto(field.address)
+        page.wait_for_url("**/login")
+        page.fill("[name=name]", role)
+        page.fill("[name=password]", PASSWORD)
+        page.click("button")
+        page.wait_for_selector(".hx-legend b")
+        page.wait_for_function("heliotrope.store.live")
+        return page
+
+    yield go
+    for context in opened:
+        context.close()
+    assert not wrong
+
+
+def _said(page: Any, text: str) -> None:
+    page.wait_for_function(
+        "text => document.querySelector('.hx-bar .hx-said').textContent.includes(text)", arg=text
+    )
+
+
+def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    assert page.inner_text(".hx-plant >> nth=0")
+    assert "You look only" in page.inner_text(".hx-bar")
+    assert page.locator(".hx-bar button").count() == 0
+    for title in ("Heliostat", "Targets", "Calibration", "Clusters", "Alarms", "Logs", "Schedule"):
+        page.click(f".hx-tabs >> text={title}")
+        page.wait_for_selector(f".hx-panels .hx-{title.lower()} >> css=*")
+    # A viewer who asks the API by hand is refused too.
+    status = page.evaluate(
+        """async () => (await fetch('/api/v1/stow', {method: 'POST', body: '{}', headers: {
+        'Content-Type': 'application/json', 'X-CSRF-Token':
+        document.querySelector('meta[name=heliotrope-csrf]').content}})).status"""
+    )
+    assert status == 403
+
+
+def test_wrong_password(field: LiveConsole, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(f"{field.address}login")
+    page.fill("[name=name]", "operator")
+    page.fill("[name=password]", "not the password")
+    page.click("button")
+    page.wait_for_selector("#said:has-text('wrong')")
+    page.close()
+
+
+def test_select_by_lasso_and_stow(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    field.until(lambda: field.live.operations.summary().states.get("STOWED", 0) < 320, 60.0)
+    page = enter("operator")
+    page.click(".hx-tools >> text=Lasso")
+    box = page.locator(".hx-map-field").bounding_box()
+    left, top = box["x"] + 4, box["y"] + 0.1 * box["height"]
+    right, bottom = box["x"] + 0.78 * box["width"], box["y"] + 0.97 * box["height"]
+    page.mouse.move(left, top)
+    page.mouse.down()
+    for x, y in ((right, top), (right, bottom), (left, bottom), (left, top + 5)):
+        page.mouse.move(x, y, steps=5)
+    page.mouse.up()
+    chosen = page.evaluate("heliotrope.store.selected()")
+    assert 400 <= len(chosen) < 640
+    page.click(".hx-orders >> text=Stow")
+    _said(page, "STOW")
+    kept = set(field.live.names) - set(chosen)
+
+    def stows() -> bool:
+        state = {name: field.live.operations.plant.field.of(name, now) for name in chosen}
+        return all(one.state in ("STOWED", "STOWING") for one in state.values())
+
+    def now_() -> float:
+        return field.live.operations.plant.now()
+
+    end = time.monotonic() + 30.0
+    while True:
+        now = field.call(now_)
+        if field.call(stows):
+            break
+        assert time.monotonic() < end
+        time.sleep(0.2)
+    others = field.call(
+        lambda: {field.live.operations.plant.field.of(name, now_()).state for name in kept}
+    )
+    assert others - {"STOWED", "STOWING"}
+    page.keyboard.press("Escape")
+
+
+def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    name = field.live.names[20]
+    page.keyboard.press("/")
+    page.keyboard.type(f"name = {name}")
+    page.keyboard.press("Enter")
+    page.click(".hx-tabs >> text=Heliostat")
+    page.wait_for_function(
+        "name => document.querySelector('.hx-heliostat h2')?.textContent.startsWith(name)", arg=name
+    )
+    page.fill(".hx-query", "speed > 3")
+    page.keyboard.press("Enter")
+    _said(page, 'no field "speed"')
+    page.fill(".hx-query", "cluster = C001 or cluster = C002 and east < 1e9")
+    page.keyboard.press("Enter")
+    page.wait_for_function("heliotrope.store.selection.size === 64")
+
+
+def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-calibration td:has-text('learnt')", timeout=60_000)
+    row = page.inner_text(".hx-calibration tbody tr:has-text('learnt') >> nth=0")
+    assert any(target in row for target in field.live.operations.targets)
+    page.select_option(".hx-tools select", "error")
+    assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")
+
+
+def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    buses = field.call(lambda: [x for x in field.live._parts if isinstance(x, LiveBus)])
+    page.click(".hx-tabs >> text=Clusters")
+    page.wait_for_selector(".hx-clusters tbody tr")
+    field.call(lambda: setattr(buses[3], "plugged", False))
+    try:
+        page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+        page.wait_for_selector(".hx-clusters tbody tr:has-text('missing')")
+        page.wait_for_function(
+            "document.querySelector('.hx-legend').textContent.includes('stale 32')"
+        )
+    finally:
+        field.call(lambda: setattr(buses[3], "plugged", True))
+    page.wait_for_function("heliotrope.store.state.every(s => s !== 255)")
+
+
+def test_dark_and_light(enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    ground = "getComputedStyle(document.body).backgroundColor"
+    night = page.evaluate(ground)
+    page.click("[aria-label='Dark or light']")
+    page.wait_for_function(f"{ground} !== '{night}'")
+    page.reload()
+    page.wait_for_selector(".hx-legend b")
+    assert page.evaluate(ground) != night
+
+
+def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("engineer")
+    page.click("#emergency")
+    order = field.until(lambda: field.live.operations.plant.emergency, 5.0)
+    assert order.who == "engineer"
+    page.wait_for_selector(".hx-alert.on")
+    page.wait_for_function(
+        "document.querySelector('.hx-alert').textContent.includes('acknowledged 640 of 640')"
+    )
+    page.click(".hx-alert >> text=Withdraw")
+    page.click(".hx-tabs >> text=Alarms")
+    # Each row can be acknowledged when its cause has gone: the order, then the light.
+    end = time.monotonic() + 30.0
+    while page.locator(".hx-alert.on").count():
+        assert time.monotonic() < end, page.inner_text(".hx-alarms")
+        button = page.locator(".hx-alarms >> text=Acknowledge all")
+        if button.count():
+            button.click(force=True)
+        page.wait_for_timeout(1000)
+    assert not field.call(lambda: field.live.operations.plant.emergency_on)
+
+
+def test_emergency_without_the_frame(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    """The plain page works with nothing but its own script."""
+    page = enter("viewer")
+    before = field.call(lambda: field.live.operations.plant.emergency)
+    page.route("**/_nicegui/**", lambda route: route.abort())
+    page.goto(f"{field.address}emergency")
+    page.click("#emergency")
+    page.wait_for_selector("#emergency-said:has-text('ordered')")
+    order = field.call(lambda: field.live.operations.plant.emergency)
+    assert order is not before
+    field.calm()
+
+
+def test_a_page_that_hears_nothing_says_so(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    page.evaluate("heliotrope.store.take = () => {}")
+    page.wait_for_function("document.body.classList.contains('hx-dead')")
+    assert "NOT LIVE" in page.inner_text(".hx-live")
+    assert page.evaluate("heliotrope.store.stateName(0)") == "stale"

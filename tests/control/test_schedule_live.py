@@ -1,0 +1,112 @@
+"""The schedule in a plant at work: simulated mirrors under real clusters."""
+
+import asyncio
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+
+from heliotrope.control._schedule_live import PlantSchedule, settings_for
+from heliotrope.control.calibration_cycle import CycleSettings
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.schedule import Scheduler, Settings
+from heliotrope.field.layouts import malan_plant
+from heliotrope.lcu import states
+from heliotrope.twin.live import LiveOptions, LivePlant
+
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+DESIGN = malan_plant(12)
+
+
+def test_the_settings_are_those_of_the_cycle() -> None:
+    cycle = CycleSettings(shots=5, interval=7.0, sigma=1e-4, model=("tilt_north", "tilt_east"))
+    made = settings_for(cycle, Settings(goal=1e-3))
+    assert (made.shots, made.interval, made.sigma) == (5, 7.0, 1e-4)
+    assert made.model == ("tilt_north", "tilt_east")
+    assert made.goal == 1e-3
+
+
+def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None:
+    async def main(clock: VirtualClock) -> None:
+        options = LiveOptions(rendered=False, threads=0)
+        async with LivePlant(DESIGN, clock, options).running() as live:
+            try:
+                schedule = live.operations.work._scheduler
+                assert isinstance(schedule, PlantSchedule)
+                await _visits(live, schedule)
+                _what_came_of_it(live, schedule)
+                _what_is_to_come(live, schedule)
+                _after_a_restart(live, schedule)
+            finally:
+                # As an exit does: what is on its way is given up first.
+                await live.operations.work.halt()
+                await live.end()
+
+    run_virtual(main, start=START)
+
+
+async def _visits(live: LivePlant, schedule: PlantSchedule) -> None:
+    until = live.clock.monotonic() + 300.0
+    while len(schedule.scheduler.finished) < 4 and live.clock.monotonic() < until:
+        await asyncio.sleep(1.0)
+
+
+def _what_came_of_it(live: LivePlant, schedule: PlantSchedule) -> None:
+    chosen, now = schedule.scheduler, live.clock.utc()
+    good = {f.visited.heliostat for f in chosen.finished if f.visited.calibrated}
+    assert len(good) >= 3
+    assert {f.planned.target for f in chosen.finished} == {"left", "right"}
+    # What is calibrated is expected to be better, and is.
+    rows = np.isin(chosen.names, sorted(good))
+    expected, true = chosen.expected(now), live.errors()
+    assert expected[rows].max() < 0.8 * expected[~rows].min()
+    assert np.median(true[rows]) < 1e-3 < np.median(true[~rows])
+    found = chosen.compared()
+    assert found.visits == len(chosen.finished)
+    assert 0.1 < found.ratio < 2.0
+
+
+def _what_is_to_come(live: LivePlant, schedule: PlantSchedule) -> None:
+    """The plan is made a little at each look, and names nobody who is under way."""
+    for _ in range(60):
+        coming = live.operations.schedule(6)
+        if len(coming) == 6:
+            break
+    assert len(coming) == 6
+    assert all(p.gain > 0.0 and p.reason for p in coming)
+    assert not {p.heliostat for p in coming} & set(schedule.scheduler.running)
+
+
+def _after_a_restart(live: LivePlant, before: PlantSchedule) -> None:
+    """A new schedule knows what the cycle knows, and forgets what ended without a result."""
+    names, now = live.plant.field.names, live.clock.utc()
+    cycle = before._cycle
+    fresh = Scheduler(DESIGN, before.scheduler.settings, now=now, names=names)
+    again = PlantSchedule(live.plant, cycle, fresh)
+    ready = np.full(12, fill_value=True)
+    book = live.operations.work.book
+    first = again.next("left", ready, book)
+    assert first is not None
+    np.testing.assert_allclose(fresh.expected(now), before.scheduler.expected(now), rtol=0.05)
+    assert list(fresh.running) == [first.heliostat]
+    second = again.next("left", ready, book)
+    assert second is not None
+    assert list(fresh.running) == [second.heliostat]
+    nobody = again.next("right", np.zeros(12, dtype=np.bool_), book)
+    assert nobody is None
+    assert fresh.reason == "nobody stands ready"
+
+
+@pytest.mark.parametrize("hour", [0, 22])
+def test_the_scheduler_is_quiet_at_night(hour: int) -> None:
+    chosen = Scheduler(DESIGN, now=START)
+    night = START.replace(hour=hour)
+
+    class Field:
+        state = np.full(12, states.IDLE, dtype=np.uint8)
+        counts = np.zeros((12, 2), dtype=np.int32)
+
+    from heliotrope.sun import vector
+
+    assert chosen.next(night, vector(night, DESIGN.site), Field(), ("left",)) is None
+    assert chosen.reason.startswith("the sun is at -")

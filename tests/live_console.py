@@ -1,0 +1,125 @@
+"""A small plant of the twin at work with its console, in a thread of its own, at some speed."""
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from heliotrope.console import _secrets
+from heliotrope.console.serve import ConsoleServer
+from heliotrope.console.settings import ConsoleSettings
+from heliotrope.control.audit import JsonLines
+from heliotrope.control.authority import Person, RefusedError, Role
+from heliotrope.control.clock import VirtualClock
+from heliotrope.control.link import running
+from heliotrope.field.layouts import malan_plant
+from heliotrope.store.keeper import Keeper
+from heliotrope.twin._live_loop import PacedLoop
+from heliotrope.twin.live import LiveOptions, LivePlant
+
+PASSWORD = "correct horse"
+ROLES = ("viewer", "operator", "engineer")
+T = TypeVar("T")
+
+
+class LiveConsole:
+    """Starts at once; `close` ends it and raises what went wrong.
+
+    Attributes
+    ----------
+    address
+        Of the console.
+    live, server
+        The plant and its console; touch them with `call` only.
+    """
+
+    def __init__(
+        self, folder: Path, heliostats: int, *, page: bool = True, speed: float = 1.0,
+        rendered: bool = False,
+    ) -> None:  # fmt: skip
+        self.folder, self.address = folder, ""
+        self._made = (heliostats, page, speed, rendered)
+        self._ready, self._over = threading.Event(), threading.Event()
+        self._problem: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, name="console")
+        self._thread.start()
+        self._ready.wait(60.0)
+        if not self.address:
+            self.close()
+
+    def _run(self) -> None:
+        speed = self._made[2]
+        try:
+            with asyncio.Runner(loop_factory=lambda: PacedLoop(speed)) as runner:
+                runner.run(self._main())
+        except BaseException as error:  # noqa: BLE001 - told by `close`, in the test's thread
+            self._problem = error
+        self._ready.set()
+
+    async def _main(self) -> None:
+        heliostats, page, speed, rendered = self._made
+        self._loop = asyncio.get_running_loop()
+        clock = VirtualClock(self._loop.time)
+        self.keeper = Keeper(self.folder / "store.sqlite")
+        now = time.time()
+        for role in ROLES:
+            self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
+        self.live = LivePlant(
+            malan_plant(heliostats), clock, LiveOptions(rendered=rendered),
+            audit=JsonLines(self.folder / "audit.jsonl", clock.utc()), records=self.keeper,
+            extra=lambda: {"speed": speed},
+        )  # fmt: skip
+        async with self.live.running():
+            settings = ConsoleSettings(port=0, page=page)
+            self.server = ConsoleServer(self.live.operations, self.keeper.people, settings)
+            async with running(self.server):
+                self.address = await self.server.address()
+                self._ready.set()
+                while not self._over.is_set():
+                    await asyncio.sleep(0.1)
+        self.keeper.close()
+
+    def call(self, work: Callable[[], T]) -> T:
+        """Do something in the plant's loop."""
+
+        async def inside() -> T:
+            return work()
+
+        return asyncio.run_coroutine_threadsafe(inside(), self._loop).result(30.0)
+
+    def until(self, holds: Callable[[], Any], within: float = 30.0) -> Any:
+        """Wait until something holds in the plant's loop; return it."""
+        end = time.monotonic() + within
+        while not (found := self.call(holds)):
+            assert time.monotonic() < end, f"not within {within} s"
+            time.sleep(0.1)
+        return found
+
+    def states(self) -> dict[str, int]:
+        """How many heliostats are in each state, as the plant knows them."""
+        return self.call(lambda: dict(self.live.operations.summary().states))
+
+    def calm(self) -> None:
+        """Withdraw an emergency, and acknowledge what it left as soon as its causes have gone."""
+        who = Person("Egon", Role.ENGINEER)
+        here = self.live.operations
+
+        def quiet() -> bool:
+            for alarm in here.alarms():
+                if not alarm.acknowledged_by:
+                    with contextlib.suppress(RefusedError):
+                        here.acknowledge(who, alarm.condition, alarm.subject)
+            return not here.plant._sentinel.refusal(here.plant.field.clusters)
+
+        self.call(lambda: here.withdraw(who))
+        self.until(quiet, 40.0)
+
+    def close(self) -> None:
+        """End it."""
+        self._over.set()
+        self._thread.join(60.0)
+        if self._problem is not None:
+            raise self._problem

@@ -1,0 +1,339 @@
+"""A plant that lives in the twin: its loop, links, buses, cameras, and that it learns."""
+
+import asyncio
+import hashlib
+import struct
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.control.authority import Person, Role
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.link import LinkClosedError, Outcome
+from heliotrope.control.operations import WorkSettings
+from heliotrope.control.parameters import items_of
+from heliotrope.errors import InputError
+from heliotrope.field.layouts import lay_out, malan_plant
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import bisector, normalize, reflect
+from heliotrope.imaging.scenes import Scene
+from heliotrope.lcu import journal, messages, states, wire
+from heliotrope.store.keeper import Keeper
+from heliotrope.twin._live_boards import BoardField
+from heliotrope.twin._live_camera import LiveCamera
+from heliotrope.twin._live_field import LiveField, near
+from heliotrope.twin._live_link import near_pair
+from heliotrope.twin._live_loop import LATE, PacedLoop
+from heliotrope.twin.cameras import Mirror, Sight
+from heliotrope.twin.live import (
+    LiveOptions,
+    LivePlant,
+    machine_of,
+    prototype_plant,
+    standby_of,
+)
+
+MRAD = 1e-3
+START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+EXACT = LiveOptions(rendered=False, threads=0, plain=True)
+
+
+def live(
+    work: Callable[[LivePlant], Awaitable[None]], design: Plant, options: LiveOptions = EXACT
+) -> None:
+    """Run a plant in virtual time beside some work."""
+
+    async def main(clock: VirtualClock) -> None:
+        async with LivePlant(design, clock, options).running() as plant:
+            await work(plant)
+            await plant.end()
+
+    run_virtual(main, start=START)
+
+
+class Wall:
+    """Wall time by hand."""
+
+    def __init__(self) -> None:
+        self.now = 50.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_paced_loop_goes_at_its_speed_and_waits_for_the_late() -> None:
+    wall = Wall()
+    with asyncio.Runner(loop_factory=lambda: PacedLoop(4.0, 100.0, wall)) as runner:
+        loop = runner.get_loop()
+        assert isinstance(loop, PacedLoop)
+        seen: list[float] = []
+
+        async def main() -> None:
+            for _ in range(3):
+                # The wall goes on by 0.5 s while it waits: two seconds of the loop.
+                asyncio.get_running_loop().call_soon(lambda: setattr(wall, "now", wall.now + 0.5))
+                await asyncio.sleep(2.0)
+                seen.append(loop.time())
+            assert loop.lag == 0.0
+            wall.now += 10.0
+            await asyncio.sleep(1.0)
+
+        runner.run(main())
+        assert np.allclose(np.diff([100.0, *seen]), 2.0, atol=0.05)
+        # Forty seconds have passed where one was asked for: no timer is jumped over.
+        assert loop.time() == pytest.approx(seen[-1] + 1.0, abs=0.3)
+        assert loop.lag == pytest.approx(39.0 - LATE, abs=0.3)
+    for bad in (0.0, -1.0, 2000.0):
+        with pytest.raises(InputError, match="simulated seconds in a second"):
+            PacedLoop(bad)
+
+
+def test_a_near_link_carries_what_is_fresh() -> None:
+    async def main(clock: VirtualClock) -> None:
+        plant, cluster = near_pair(clock, ("plant", "C1"))
+        assert plant.connected
+        assert plant.name == "C1"
+        assert cluster.name == "plant"
+        now = clock.monotonic()
+        assert await plant.send(b"late", expires=now) is Outcome.EXPIRED
+        assert await plant.send(b"stale", expires=now + 1.0) is Outcome.SENT
+        await asyncio.sleep(2.0)
+        assert await plant.send(b"fresh", expires=clock.monotonic() + 1.0) is Outcome.SENT
+        assert await cluster.receive() == b"fresh"
+        assert cluster.statistics.late == 1
+        cluster.plugged = False
+        assert await plant.send(b"lost") is Outcome.DISCONNECTED
+        assert plant.problem == "the line is cut"
+        cluster.plugged = True
+        assert plant.connected
+        assert plant.statistics.opened == 2
+        await plant.close()
+        with pytest.raises(LinkClosedError):
+            await plant.send(b"")
+        with pytest.raises(LinkClosedError):
+            await plant.receive()
+
+    run_virtual(main)
+
+
+def test_mirrors_near_a_target_are_those_whose_rays_meet_it() -> None:
+    rng = np.random.default_rng(3)
+    design = lay_out("radial", 60)
+    target = design.targets[0]
+    light = normalize(np.array([0.3, 0.5, 0.8]))
+    vertex = design.position + [0.0, 0.0, 2.0]
+    aims = target.center + rng.normal(0.0, 6.0, (60, 3))
+    facing = bisector(light, normalize(aims - vertex))
+    sizes = np.ones((60, 2))
+    middle = np.asarray(target.corners).mean(axis=0)
+    found = near((facing, vertex), light, middle, target.normal, 5.0, design.names, sizes)
+    expected = set()
+    for name, v, n in zip(design.names, vertex, facing, strict=True):
+        ray = reflect(light, n)
+        point = target.intersect(v, ray)
+        if np.isfinite(point).all() and (point - v) @ ray > 0 and n @ light > 0.05:
+            expected |= {name} if np.linalg.norm(point - middle) <= 5.0 else set()
+    assert 5 < len(expected) < 55
+    assert {mirror.heliostat for mirror in found} == expected
+
+
+def _field(count: int = 3) -> LiveField:
+    design = lay_out("radial", count)
+    (group,) = design.groups.values()
+    return LiveField(group.mechanism, group.mechanism, machine_of(design))
+
+
+def _ask(field: LiveField, name: str, *values: object, key: bytes = b"") -> wire.Frame:
+    sender = wire.Sender(wire.CLUSTER_ADDRESS, 1, lambda d: hashlib.sha256(d).digest())
+    bus = field.bus(range(3))
+    data = asyncio.run(bus.transact(sender.frame(2, name, *values, key=key), 0.1))
+    (frame,) = wire.Reader().feed(data)
+    return frame
+
+
+def test_a_live_bus_tells_and_takes_what_is_stored() -> None:
+    field = _field()
+    wanted = items_of(field.mechanism[1].with_parameters({"tilt_north": 8 * MRAD}))
+    number = [row[0] for row in journal.ITEMS]
+    place = number.index("armature") + 1
+    before = _ask(field, "QUERY_STORED", place).values()
+    assert before is not None
+    assert before[1] == items_of(field.mechanism[1])["armature"]
+    numbers = struct.unpack("<18d", wanted["armature"])
+    answer = _ask(field, "SET_ARMATURE", 9, 9, 1, *numbers, key=b"k" * 32).values()
+    assert answer is not None
+    assert answer[2] == messages.DONE
+    after = _ask(field, "QUERY_STORED", place).values()
+    assert after is not None
+    assert after[1] == wanted["armature"]
+    status = _ask(field, "QUERY_STATUS").values()
+    assert status is not None
+    assert status[7] == field.checksums[1]
+    # Nothing is stored in a mirror that tracks; the neighbours have not changed.
+    field.state[1] = states.TRACKING
+    refused = _ask(field, "SET_ARMATURE", 9, 9, 2, *numbers, key=b"k" * 32).values()
+    assert refused is not None
+    assert refused[2] == messages.REFUSED_STATE
+    assert set(field.stored) == {1}
+
+
+def test_what_is_stored_is_what_the_mirror_then_does() -> None:
+    design = lay_out("radial", 12)
+    (group,) = design.groups.values()
+    truth = group.mechanism.with_parameters(
+        {"tilt_north": np.full(12, 9 * MRAD), "azimuth_bias": np.full(12, -4 * MRAD)}
+    )
+    field = LiveField(truth, group.mechanism, machine_of(design))
+    light = normalize(np.array([0.2, 0.6, 0.7]))
+    aims = np.broadcast_to(design.receivers[0].center, (12, 3))
+    assert np.median(field.errors(light, aims)) > 3 * MRAD
+    for row in range(6):
+        field.store(row, items_of(truth[row]))
+    errors = field.errors(light, aims)
+    # What is left is half a step of each axis, 8 µrad.
+    assert errors[:6].max() < 0.02 * MRAD
+    assert errors[6:].min() > 1 * MRAD
+
+
+def test_a_small_plant_raises_itself_learns_and_is_stowed() -> None:
+    async def work(plant: LivePlant) -> None:
+        before = plant.errors()
+        await asyncio.sleep(210.0)
+        view = plant.operations.calibration()
+        seen = {(entry.heliostat, entry.target) for entry in view.results if entry.good}
+        assert seen == {(name, target) for name in plant.names for target in ("left", "right")}
+        assert plant.operations.summary().states == {"TRACKING": 3}
+        assert before.max() > 5 * MRAD
+        assert plant.errors().max() < 0.2 * before.max()
+        assert view.quality[-1].calibrated == 3
+        assert await plant.stowed()
+        assert plant.operations.summary().states == {"STOWED": 3}
+
+    live(work, lay_out("radial", 3))
+
+
+@pytest.mark.slow
+def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None:
+    # Sixty of the ten thousand, near and far ones alike.
+    design = malan_plant()
+    (group,) = design.groups.values()
+    some = group.take(np.linspace(0, len(group) - 1, 60).astype(np.intp))
+    some = replace(some, cluster=tuple(f"C{1 + i // 20}" for i in range(60)))
+
+    async def work(plant: LivePlant) -> None:
+        before = plant.errors()
+        assert 10 * MRAD < np.sqrt(np.mean(before**2)) < 20 * MRAD
+        await asyncio.sleep(600.0)
+        results = plant.operations.calibration().results
+        seen = {(entry.heliostat, entry.target) for entry in results if entry.good}
+        both = {name for name, _ in seen if {(name, "left"), (name, "right")} <= seen}
+        assert len(both) >= 8
+        rows = [plant.plant.field.place(name) for name in both]
+        assert np.median(plant.errors()[rows]) < 0.5 * MRAD
+
+    live(work, replace(design, groups={"azel": some}))
+
+
+def test_boards_learn_as_a_vectorised_field_does() -> None:
+    design = prototype_plant()
+    (group,) = design.groups.values()
+    few = replace(design, groups={"azel": group.take([0, 1, 2])})
+
+    async def work(plant: LivePlant) -> None:
+        await asyncio.sleep(110.0)
+        view = plant.operations.calibration()
+        assert view.done >= 1, plant.operations.events(20)
+        assert view.results[-1].text.startswith("calibrated: ")
+        assert await plant.stowed()
+
+    live(work, few, replace(EXACT, boards=True))
+
+
+def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
+    design = lay_out("radial", 3)
+    errors: list[float] = []
+
+    async def main(clock: VirtualClock) -> None:
+        keeper = Keeper(tmp_path, inline=True)
+        first = LivePlant(design, clock, EXACT, records=keeper)
+        async with first.running():
+            await asyncio.sleep(100.0)
+            known = {entry.heliostat for entry in first.operations.calibration().results}
+            first.operations.hold(Person("Olga", Role.OPERATOR), ["R001-002"], "painted")
+            errors.append(float(np.nanmax(first.operations.frame().error)))
+            await first.end()
+        assert known
+        # The next program, and boards that know nothing.
+        idle = replace(EXACT, work=WorkSettings(calibrate=True))
+        second = LivePlant(design, clock, idle, records=keeper)
+        assert [hold.heliostat for hold in second.operations.holds()] == ["R001-002"]
+        assert second.operations.calibration().done == len(known)
+        rows = [second.plant.field.place(name) for name in known]
+        async with second.running():
+            before = second.errors()[rows]
+            await asyncio.sleep(40.0)
+            # The plant has pushed what it remembers.
+            assert second.errors()[rows].max() < 0.5 * before.max()
+            await second.end()
+        assert len(keeper.visits(100)) >= len(known)
+        keeper.close()
+
+    run_virtual(main, start=START)
+    assert 0.0 < errors[0] < 6 * MRAD
+
+
+def test_a_live_camera_shows_what_it_saw() -> None:
+    design = lay_out("radial", 6)
+    target, camera = design.targets[0], design.cameras[0]
+    light = normalize(np.array([0.2, 0.6, 0.7]))
+    vertex = design.position[0] + [0.0, 0.0, 2.0]
+    point = target.point(np.array([0.5, -0.3]))
+    mirror = Mirror("A", vertex, bisector(light, normalize(point - vertex)), 2.5, 2.0)
+    there: list[Mirror] = []
+
+    async def main(clock: VirtualClock) -> None:
+        sight = Sight(clock, lambda: tuple(there), lambda: light)
+        eye = LiveCamera(sight, [Scene(camera, (target,))], threads=0)
+        assert eye.view(target.name).version == 0
+        await eye.take_empty(target)
+        there.append(mirror)
+        shot = await eye.photograph(target, "A")
+        assert shot.reasons == ()
+        assert np.linalg.norm(shot.point - point) < 0.05
+        view = eye.view(target.name)
+        assert view.version == 2
+        assert view.jpeg[:2] == b"\xff\xd8"
+        assert view.centroid == pytest.approx((0.5, -0.3), abs=0.05)
+        with pytest.raises(InputError, match="a beam is on it"):
+            await eye.take_empty(target)
+        eye.close()
+
+    run_virtual(main)
+
+
+def test_what_a_live_plant_refuses() -> None:
+    design = lay_out("radial", 6)
+    (group,) = design.groups.values()
+
+    async def main(clock: VirtualClock) -> None:
+        halves = {"a": group.take([0, 1, 2]), "b": group.take([3, 4, 5])}
+        with pytest.raises(InputError, match="2 groups of heliostats; the twin takes one"):
+            LivePlant(replace(design, groups=halves), clock, EXACT)
+        mixed = replace(group, cluster=("A", "B", "A", "B", "A", "B"))
+        with pytest.raises(InputError, match="cluster A do not stand together"):
+            LivePlant(replace(design, groups={"a": mixed}), clock, EXACT)
+        with pytest.raises(InputError, match="no camera with a known position"):
+            LivePlant(replace(design, cameras=()), clock, LiveOptions(threads=0))
+        machine = replace(machine_of(design), stow=(1, 2))
+        with pytest.raises(InputError, match="stow at"):
+            BoardField(clock, group.names, group.mechanism, group.mechanism, machine)
+        with pytest.raises(InputError, match="-1 threads"):
+            LiveOptions(threads=-1)
+
+    run_virtual(main)
+    with pytest.raises(InputError, match="no receiver"):
+        standby_of(replace(design, receivers=()))
