@@ -112,10 +112,14 @@ class LiveConsole:
                 if not alarm.acknowledged_by:
                     with contextlib.suppress(RefusedError):
                         here.acknowledge(who, alarm.condition, alarm.subject)
-            return not here.plant._sentinel.refusal(here.plant.field.clusters)
+            self._why = here.plant._sentinel.refusal(here.plant.field.clusters)
+            return not self._why
 
         self.call(lambda: here.withdraw(who))
-        self.until(quiet, 40.0)
+        try:
+            self.until(quiet, 40.0)
+        except AssertionError:
+            raise AssertionError(f"not calm within 40 s: {self._why}") from None
 
     def close(self) -> None:
         """End it."""

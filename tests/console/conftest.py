@@ -9,7 +9,7 @@ import pytest
 from live_console import PASSWORD, ROLES, LiveConsole
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     """Two clusters of 32 heliostats, at eight times the speed of real time, without the page."""
     made = LiveConsole(tmp_path_factory.mktemp("console"), 64, page=False, speed=8.0)
@@ -17,7 +17,7 @@ def console(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     made.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def tokens(console: LiveConsole) -> dict[str, str]:
     """An API token of each role."""
     import time

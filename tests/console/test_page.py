@@ -19,7 +19,7 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     """Six hundred and forty heliostats with the page, at six times the speed of real time."""
     made = LiveConsole(tmp_path_factory.mktemp("page"), 640, speed=6.0)
@@ -27,9 +27,9 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
     made.close()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser without a screen."""
+    """A browser without a screen, for this module alone: its loop would stand in others' way."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -164,23 +164,6 @@ def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) ->
     assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")
 
 
-def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[str], Any]) -> None:
-    page = enter("viewer")
-    buses = field.call(lambda: [x for x in field.live._parts if isinstance(x, LiveBus)])
-    page.click(".hx-tabs >> text=Clusters")
-    page.wait_for_selector(".hx-clusters tbody tr")
-    field.call(lambda: setattr(buses[3], "plugged", False))
-    try:
-        page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
-        page.wait_for_selector(".hx-clusters tbody tr:has-text('missing')")
-        page.wait_for_function(
-            "document.querySelector('.hx-legend').textContent.includes('stale 32')"
-        )
-    finally:
-        field.call(lambda: setattr(buses[3], "plugged", True))
-    page.wait_for_function("heliotrope.store.state.every(s => s !== 255)")
-
-
 def test_dark_and_light(enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     ground = "getComputedStyle(document.body).backgroundColor"
@@ -233,3 +216,21 @@ def test_a_page_that_hears_nothing_says_so(field: LiveConsole, enter: Callable[[
     page.wait_for_function("document.body.classList.contains('hx-dead')")
     assert "NOT LIVE" in page.inner_text(".hx-live")
     assert page.evaluate("heliotrope.store.stateName(0)") == "stale"
+
+
+# The last one: nodes that failed are counted for ten minutes, and commands refused meanwhile.
+def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    buses = field.call(lambda: [x for x in field.live._parts if isinstance(x, LiveBus)])
+    page.click(".hx-tabs >> text=Clusters")
+    page.wait_for_selector(".hx-clusters tbody tr")
+    field.call(lambda: setattr(buses[3], "plugged", False))
+    try:
+        page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+        page.wait_for_selector(".hx-clusters tbody tr:has-text('missing')")
+        page.wait_for_function(
+            "document.querySelector('.hx-legend').textContent.includes('stale 32')"
+        )
+    finally:
+        field.call(lambda: setattr(buses[3], "plugged", True))
+    page.wait_for_function("heliotrope.store.state.every(s => s !== 255)")

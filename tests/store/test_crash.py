@@ -154,8 +154,8 @@ def check_load(promises: Promises, place: Path, kills: int) -> None:
     assert rows.to_pylist()[0]["h"] == 50
 
 
-def test_thirty_kills_lose_nothing(loads: Loads, tmp_path: Path) -> None:
-    check_load(kill_many(loads, tmp_path / "data", 30), tmp_path / "data", 30)
+def test_kills_lose_nothing(loads: Loads, tmp_path: Path) -> None:
+    check_load(kill_many(loads, tmp_path / "data", 12), tmp_path / "data", 12)
 
 
 @pytest.mark.slow
