@@ -24,5 +24,6 @@ fi
 
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
 echo "setup: installing into $VENV"
-"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input \
+# Compiled is what is used, when it is used.
+"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input --no-compile \
   --constraint constraints.txt --editable ".[dev]"

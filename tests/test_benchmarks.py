@@ -21,6 +21,7 @@ COLUMNS = {
         "ratio_to_first", "growth_exponent", "peak_bytes_per_heliostat", "apart_rad",
     },
     "calibration": {"heliostats", "ms_per_heliostat", "scipy_ratio", "differs_sigma"},
+    "airborne": {"work", "ratio_to_decoding", "per_second"} | TIMES,
     "imaging": {"photograph", "work", "ratio_to_decoding", "per_second"} | TIMES,
     "sun": {"times", "contender", "processor_ms", "ratio_to_first", "apart_rad"} | TIMES,
     "field": {"heliostats", "table", "work", "ratio_to_pandas"} | TIMES,

@@ -13,6 +13,7 @@ import pytest
 
 from data import juelich
 from heliotrope import __version__, sun
+from heliotrope.calibration import report
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import join, sightings
 from heliotrope.cli import main
@@ -30,6 +31,12 @@ def _call(arguments: list[str], capsys: Any, monkeypatch: pytest.MonkeyPatch) ->
     captured = capsys.readouterr()
     assert leaving.value.code in (0, None), captured.err
     return str(captured.out)
+
+
+@pytest.fixture(autouse=True)
+def few_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a report's heliostats only the worst two are drawn."""
+    monkeypatch.setattr(report, "MOST_SECTIONS", 2)
 
 
 @pytest.fixture

@@ -2,8 +2,11 @@
 
 import asyncio
 import math
+import re
+import shlex
 import struct
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -151,6 +154,33 @@ def test_ctl_refusals(
 ) -> None:
     refused = ctl(role, *words)
     assert text in str(refused.exception)
+
+
+def _lines() -> list[str]:
+    pages = (
+        Path(__file__).parents[2] / "docs" / "how-to" / name for name in ("api.md", "console.md")
+    )
+    return [
+        line
+        for page in pages
+        for block in re.findall(r"```sh\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        for line in block.splitlines()
+        if line.startswith("heliotrope ctl ")
+    ]
+
+
+@pytest.mark.parametrize("line", _lines())
+def test_commands_of_the_pages_are_understood(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With no plant there, each ends where it would ask one."""
+    monkeypatch.setenv("HELIOTROPE_URL", "http://127.0.0.1:1/")
+    monkeypatch.setenv("HELIOTROPE_TOKEN", "none")
+    ended = CliRunner().invoke(app, shlex.split(line)[2:], input="word\nlong enough\nlong enough\n")
+    assert isinstance(ended.exception, RemoteError), ended.output
+    assert ended.exception.status == 0
+
+
+def test_the_pages_have_commands() -> None:
+    assert len(_lines()) > 8
 
 
 def test_ctl_makes_a_token(ctl: Callable[..., Any], console: LiveConsole) -> None:

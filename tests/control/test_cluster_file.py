@@ -16,7 +16,7 @@ from heliotrope.cli.cluster import _line, _link, _time
 from heliotrope.control import timekeeping
 from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
-from heliotrope.control._sun_line import HORIZON, sun_at, sun_values
+from heliotrope.control._sun_line import HORIZON, sun_at, sun_now, sun_values
 from heliotrope.control.clock import SystemClock, VirtualClock
 from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
 from heliotrope.control.cluster_file import TABLES, read_cluster
@@ -212,6 +212,9 @@ def test_the_sun_between_its_knots_is_that_of_spa(begin: float) -> None:
         assert np.linalg.norm(np.subtract(here, vector)) < 0.01 * URAD
         assert abs(math.hypot(*here) - 1.0) < 1e-9
         assert np.linalg.norm(np.add(here, rate) - there) < 0.1 * URAD
+        assert sun_now(float(time), SITE) == pytest.approx(vector, abs=1e-8)
+    night = float(times[np.argmin(exact[:, 2])])
+    assert (sun_now(night, SITE) == sun.vector(night, SITE)).all()
 
 
 def test_sun_on_the_wire_is_within_a_nanoradian_and_none_is_sent_at_night() -> None:

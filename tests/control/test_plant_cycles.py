@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.control._visit import Visit
 from heliotrope.control.authority import RefusedError
 from heliotrope.control.calibration_cycle import (
     CalibrationCycle,
@@ -298,3 +299,34 @@ def test_a_search_that_finds_nothing_says_so(tmp_path: Path) -> None:
     assert results[0].text.endswith("the spiral is at its end")
     assert results[1].text.endswith("5 s are over")
     assert np.isnan(results[0].counts).all()
+
+
+class _Stuck(Visit):
+    """Of a heliostat that cannot be brought home."""
+
+    def __init__(self) -> None:
+        pass
+
+    async def home(self) -> None:
+        raise RefusedError("nobody has the authority")
+
+
+def test_who_is_cancelled_ends_as_cancelled_whatever_happens_on_the_way_home() -> None:
+    async def main(_: VirtualClock) -> None:
+        with pytest.raises(RefusedError, match="authority"):
+            async with _Stuck():
+                pass
+        started = asyncio.Event()
+
+        async def visit() -> None:
+            async with _Stuck():
+                started.set()
+                await asyncio.Event().wait()
+
+        task = asyncio.create_task(visit())
+        await started.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_virtual(main)
