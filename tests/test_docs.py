@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from data import juelich
+from heliotrope.calibration import report
 from heliotrope.cli import main
 
 ROOT = Path(__file__).parents[1]
@@ -80,6 +81,8 @@ def _console(body: str, where: str) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=[str(p.relative_to(ROOT)) for p in PAGES])
 def test_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    # A report of two heliostats is as true as one of eighteen.
+    monkeypatch.setattr(report, "MOST_SECTIONS", 2)
     if "<!-- needs: juelich -->" in page.read_text(encoding="utf-8"):
         (tmp_path / "juelich").symlink_to(juelich())
     names: dict[str, object] = {"__name__": "__page__"}

@@ -155,7 +155,7 @@ def check_load(promises: Promises, place: Path, kills: int) -> None:
 
 
 def test_kills_lose_nothing(loads: Loads, tmp_path: Path) -> None:
-    check_load(kill_many(loads, tmp_path / "data", 12), tmp_path / "data", 12)
+    check_load(kill_many(loads, tmp_path / "data", 6), tmp_path / "data", 6)
 
 
 @pytest.mark.slow
