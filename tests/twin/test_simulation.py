@@ -56,6 +56,13 @@ def test_no_invariant_is_broken(seed: int) -> None:
     assert outcome.counts["accepted"] > 10
 
 
+@pytest.mark.parametrize(("seed", "seconds"), [(30085, 60.0), (30054, 240.0)])
+def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
+    """An order told by the answer to an older one; a sun sent by a time that was seconds old."""
+    outcome = run(Plan(seed, seconds, 4, pause=12.0))
+    assert outcome.good, f"{outcome.text}; {outcome.command}"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(10))
 def test_no_invariant_is_broken_for_long(block: int) -> None:

@@ -124,9 +124,8 @@ class Urgent:
                     await self._ask(order, node)
 
     async def _ask(self, order: _Order, node: Node) -> None:
-        answer = await self._exchange.ask(
-            node, order.name, expires=self._clock() + 1.0, urgent=True
-        )
+        begin = self._clock()
+        answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
         self._sent(order)
         if answer is None:
             node.counts.retries += 1
@@ -135,7 +134,8 @@ class Urgent:
         self._reports.clear("order_unacknowledged", node.name, f"{node.name} has acknowledged")
         self._acknowledged(order, node)
         for other in self._orders:
-            if other.name == order.name and node in other.waiting:
+            # An order that came when this was on its way already is asked for itself.
+            if other.name == order.name and other.began <= begin and node in other.waiting:
                 other.waiting.remove(node)
                 self._acknowledged(other, node)
 

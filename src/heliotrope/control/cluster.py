@@ -245,7 +245,8 @@ class Cluster:
         if self._urgent.pressing and self._exchange.connected:
             await self._urgent.serve()
         if self._exchange.connected:
-            await self._broadcast(present, begin)
+            # An emergency on a bus that is silent takes seconds: what counts is the time now.
+            await self._broadcast(self._time.time(), self._clock.monotonic())
             self._orders.second()
             await self._round(begin + _ROUND)
         self._goals.second(self.nodes, begin)
