@@ -494,3 +494,22 @@ def test_what_was_at_work_when_an_emergency_came_is_not_sent_again() -> None:
         assert "DEFOCUS came before it" in field.plant.text("track")
 
     run(main, "IDLE", bus=interrupted)
+
+
+def test_many_emergencies_on_a_silent_bus_keep_nobody_from_the_sun() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        for board in field.boards[1:]:
+            board.on = False
+        await asyncio.sleep(4.0)
+        dead = [f"A{n}" for n in range(2, 9)]
+        for number in range(30):
+            await field.emergency(f"stop {number}", "DEFOCUS" if number % 2 else "STOW", *dead)
+        for _ in range(200):
+            await asyncio.sleep(0.05)
+            ages.append(field.boards[0].node.controller.sun.age_ms())
+        assert all(field.plant.stages(f"stop {n}", "A8") != [] for n in range(30))
+
+    ages: list[int] = []
+    run(main, count=8)
+    assert max(ages) < 4000

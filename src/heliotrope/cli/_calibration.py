@@ -11,6 +11,8 @@ import typer
 from heliotrope.cli._common import open_plant
 
 if TYPE_CHECKING:
+    from distributed import Client
+
     from heliotrope.calibration.learning import Learned, Progress
     from heliotrope.calibration.models import Candidate
     from heliotrope.calibration.sightings import Sightings
@@ -146,6 +148,21 @@ def progress(label: str, quiet: bool) -> "Iterator[Progress]":
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+@contextmanager
+def connected(scheduler: str | None) -> "Iterator[Client | None]":
+    """Give a client of a dask cluster beside a block; None if there is no scheduler."""
+    if scheduler is None:
+        yield None
+        return
+    from heliotrope.calibration import cluster
+
+    client = cluster.connect(scheduler)
+    try:
+        yield client
+    finally:
+        cluster.disconnect(client)
+
+
 def parse_model(text: str) -> str | tuple[str, ...]:
     """Return a model's name, or the parameters of a list "tilt_north,canting,…"."""
     return tuple(p.strip() for p in text.split(",") if p.strip()) if "," in text else text
@@ -195,16 +212,10 @@ def describe(scored: "tuple[Candidate, ...]") -> tuple[str, ...]:
 @contextmanager
 def workers(scheduler: str | None) -> "Iterator[Callable[..., object] | None]":
     """Give a runner on a dask scheduler, or None for this process."""
-    if scheduler is None:
-        yield None
-        return
     from heliotrope.calibration import cluster
 
-    client = cluster.connect(scheduler)
-    try:
-        yield cluster.runner(client)
-    finally:
-        cluster.disconnect(client)
+    with connected(scheduler) as client:
+        yield None if client is None else cluster.runner(client)
 
 
 def learn(

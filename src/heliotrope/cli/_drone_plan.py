@@ -1,12 +1,11 @@
 """``heliotrope drone plan``: a campaign of a drone over a field, as waypoint files."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import open_plant, parse_duration, parse_point, print_json, print_table
 
 if TYPE_CHECKING:
@@ -109,9 +108,9 @@ def plan(
         photo_minutes=target_minutes,
     )  # fmt: skip
     _check_aircraft(aircraft)
-    with _bar(as_json, "choosing directions") as step:
+    with progress("choosing directions", as_json) as step:
         made = plan_flight(plant, wishes, step)
-    with _bar(as_json, "writing sorties") as step:
+    with progress("writing sorties", as_json) as step:
         written = write_plan(made, into, formats=wanted, aircraft=aircraft, progress=step)
     write_picture(into / "map.png", flight_map(made))
     summary = made.summary()
@@ -168,20 +167,6 @@ def _airspace(
 
     base = Airspace(keep_from_tower(plant) if tower else (), None, *heights, ground=plant.position)
     return (base, None) if path is None else read_airspace(path, base)
-
-
-@contextmanager
-def _bar(quiet: bool, text: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on the terminal, fed with (done, all)."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(
-        console=console, transient=True, disable=quiet or not console.is_terminal
-    ) as shown:
-        task = shown.add_task(text, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
 
 
 def _print(s: dict[str, Any]) -> None:

@@ -1,7 +1,6 @@
 """What the commands of a drone's flight share: a folder of photographs beside its field."""
 
 import os
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +11,6 @@ from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import open_plant
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from distributed import Client
-
     from heliotrope.airborne.mirror import MirrorShape
     from heliotrope.airborne.photo import LedCamera, Photo
     from heliotrope.airborne.reading import Seen
@@ -127,23 +122,9 @@ def read_flight(
     """Read all photographs behind a progress bar; what was read before is not read again."""
     from heliotrope.airborne.evaluation import read_many
 
-    with _cluster(scheduler) as client, shared.progress("reading", quiet) as advance:
+    with shared.connected(scheduler) as client, shared.progress("reading", quiet) as advance:
         return read_many(
             flight.photos, flight.camera, flight.stand,
             processes=processes or len(os.sched_getaffinity(0)), client=client, keep=keep,
             progress=advance,
         )  # fmt: skip
-
-
-@contextmanager
-def _cluster(scheduler: str | None) -> "Iterator[Client | None]":
-    if scheduler is None:
-        yield None
-        return
-    from heliotrope.calibration import cluster
-
-    client = cluster.connect(scheduler)
-    try:
-        yield client
-    finally:
-        cluster.disconnect(client)

@@ -4,7 +4,6 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -15,10 +14,6 @@ from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import open_plant, print_json
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from distributed import Client
-
     from heliotrope.field.camera import Camera
     from heliotrope.field.target import Target
     from heliotrope.imaging.campaign import Job, Outcome
@@ -87,7 +82,7 @@ def image(
     table: Log | None = None if log is None else read_log(log)
     entries = campaign.known_of(files, table, heliostat)
     job = _job(place, target, crop, camera, empty, memory, annotated if pictures else None)
-    with _cluster(scheduler) as client, shared.progress("reading", as_json) as advance:
+    with shared.connected(scheduler) as client, shared.progress("reading", as_json) as advance:
         outcomes = campaign.process_many(
             files, job, entries,
             processes=processes or len(os.sched_getaffinity(0)), client=client, progress=advance,
@@ -221,20 +216,6 @@ def _job(
         annotated=annotated,
         without=None if empty is None else read_image(empty),
     )
-
-
-@contextmanager
-def _cluster(scheduler: str | None) -> "Iterator[Client | None]":
-    if scheduler is None:
-        yield None
-        return
-    from heliotrope.calibration import cluster
-
-    client = cluster.connect(scheduler)
-    try:
-        yield client
-    finally:
-        cluster.disconnect(client)
 
 
 def _write(

@@ -1,8 +1,7 @@
 """``heliotrope plan``: what to measure next, of a heliostat or of a whole field."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import (
     open_plant,
     parse_duration,
@@ -96,7 +96,7 @@ def plan(
         as_json=as_json,
     )
     made = _made(plant, sightings)
-    with _bar(as_json, "looking at the year") as step:
+    with progress("looking at the year", as_json) as step:
         parts = _parts(plant, heliostat, model, made, order.span[0], step)
     (_campaign if campaign else _plans)(plant, parts, order)
 
@@ -269,20 +269,6 @@ def _aims(plant: "Plant", group: "Heliostats") -> "FloatArray":
     return np.where(np.isfinite(group.aim).all(axis=-1, keepdims=True), group.aim, common)
 
 
-@contextmanager
-def _bar(quiet: bool, text: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on the terminal, fed with (done, all)."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(
-        console=console, transient=True, disable=quiet or not console.is_terminal
-    ) as shown:
-        task = shown.add_task(text, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
-
-
 def _plans(plant: "Plant", parts: list[_Part], order: _Order) -> None:
     from heliotrope.calibration.planning_report import (
         plan_picture,
@@ -291,7 +277,7 @@ def _plans(plant: "Plant", parts: list[_Part], order: _Order) -> None:
         write_table,
     )
 
-    with _bar(order.as_json, "planning") as step:
+    with progress("planning", order.as_json) as step:
         plans, possible = _all_plans(plant, parts, order, step)
     tables = {name: plan_rows(name, one) for name, one in plans.items()}
     if order.csv is not None:
@@ -414,7 +400,7 @@ def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
         for p in parts
     ]
     start, stop = (t.timestamp() for t in order.span)
-    with _bar(order.as_json, "scheduling") as step:
+    with progress("scheduling", order.as_json) as step:
         found = planner.campaign(
             fleets, plant.site, order.targets, start, stop, timing=order.timing,
             every=order.every, ahead=order.ahead, worth=order.worth, count=order.count,

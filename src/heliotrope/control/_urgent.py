@@ -52,6 +52,7 @@ class Urgent:
         self._nodes, self._exchange = nodes, exchange
         self._goals, self._reports, self._clock = goals, reports, clock
         self._orders: list[_Order] = []
+        self._serving = 0.0
         self.pressing = False
 
     def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
@@ -69,7 +70,12 @@ class Urgent:
         self.pressing = True
 
     async def serve(self) -> None:
-        """Call and ask until every order has had its round; a new one goes first."""
+        """Call and ask until every order has had its round; a new one goes first.
+
+        Once this has gone on for the budget of an order, who is silent waits for the next second,
+        so that many orders on a dead bus take no longer than a few.
+        """
+        self._serving = self._clock()
         while self.pressing:
             self.pressing = False
             for order in self._orders:
@@ -118,7 +124,8 @@ class Urgent:
                 if rounds == 1 and self._clock() - begin > _SHARE:
                     return
                 node = order.waiting.popleft()
-                if order.given_up and node.missed > 0:
+                late = self._clock() - self._serving > ORDER_BUDGET
+                if (order.given_up and node.missed > 0) or (late and node.missed >= _SILENT):
                     order.waiting.append(node)  # polling finds it when it comes back
                 else:
                     await self._ask(order, node)

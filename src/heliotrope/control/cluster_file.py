@@ -210,7 +210,7 @@ def read_cluster(path: str | Path) -> Installation:
         If something cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
-    raw = _toml(path, "a cluster file")
+    raw = read_toml(path, "a cluster file")
     if raw.get("format") != "heliotrope-cluster":
         raise FormatError(
             path, f"format is {raw.get('format')!r}; a cluster file says "
@@ -221,7 +221,7 @@ def read_cluster(path: str | Path) -> Installation:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
-        raise FormatError(path, _explain(first), where) from None
+        raise FormatError(path, explained(first, TABLES), where) from None
     secrets = _Secrets(path.parent / document.keys if document.keys else None)
     try:
         return _install(path, document, secrets)
@@ -257,7 +257,7 @@ def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Inst
             "system_tolerance_s", "time.ntp",
         )  # fmt: skip
     line = document.safety.emergency_line
-    scheme, host, port, prefix = _place(path, document.plant.url)
+    scheme, host, port, prefix = url_parts(path, document.plant.url, "plant.url")
     return Installation(
         config=config, bus_url=bus.url, bus=BusSettings(baud_rate=bus.baud_rate, echo=bus.echo),
         plant=document.plant, scheme=scheme, host=host, port=port, prefix=prefix,
@@ -267,23 +267,29 @@ def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Inst
     )  # fmt: skip
 
 
-def _place(path: Path, url: str) -> tuple[str, str, int, str]:
-    """Return scheme, host, port and prefix of the plant's URL."""
+def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
+    """Return scheme, host, port and prefix of a link's URL, which stands in a file at a place.
+
+    Raises
+    ------
+    FormatError
+        If it is none, or lacks a part.
+    """
     try:
         parts = urlsplit(url)
         port = parts.port
     except ValueError:
-        raise FormatError(path, f"{url!r} is no URL; give tcp://host:port", "plant.url") from None
+        raise FormatError(path, f"{url!r} is no URL; give tcp://host:port", where) from None
     if parts.scheme not in _PORTS or not parts.hostname:
         raise FormatError(
             path, f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
-            "plant.url",
+            where,
         )  # fmt: skip
     port = port or _PORTS[parts.scheme]
     prefix = parts.path.strip("/")
     if port is None or (parts.scheme != "tcp" and not prefix):
         missing = "port: tcp://host:port" if port is None else "prefix: mqtt://host/prefix"
-        raise FormatError(path, f"{url!r} has no {missing}", "plant.url")
+        raise FormatError(path, f"{url!r} has no {missing}", where)
     return parts.scheme, parts.hostname, port, prefix
 
 

@@ -23,7 +23,6 @@ export class FieldMap {
     this.mode = "pan";
     this.dirty = true;
     this.fitted = false;
-    this.frames = [];
     box.tabIndex = 0;
     box.setAttribute("role", "application");
     box.setAttribute("aria-label", "Map of the field. Arrows move, plus and minus zoom, 0 shows all, " +
@@ -46,11 +45,16 @@ export class FieldMap {
     if (store.field) this.fit();
     const turn = (now) => {
       if (!this.box.isConnected) return;
-      if (this.dirty) { this.dirty = false; this.draw(); this.frames.push(now); if (this.frames.length > 240) this.frames.shift(); }
+      if (this.dirty) { this.dirty = false; this.draw(); this.drawn(); }
       requestAnimationFrame(turn);
     };
     requestAnimationFrame(turn);
     window.heliotropeMap = this; // for measurements of its rate
+  }
+
+  // Tells measurements when the field was first seen live.
+  drawn() {
+    if (!this.seen && store.live && this.x) { this.seen = true; performance.mark("heliotrope-ready"); }
   }
 
   close() { this.off.forEach((end) => end()); this.sizes.disconnect(); }
