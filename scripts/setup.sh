@@ -24,6 +24,10 @@ fi
 
 [ -x "$VENV/bin/python" ] || "$PYTHON" -m venv "$VENV"
 echo "setup: installing into $VENV"
-# Compiled is what is used, when it is used.
+# uv does in seconds what takes pip minutes; where its index is not to be had, pip does it.
 "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input --no-compile \
-  --constraint constraints.txt --editable ".[dev]"
+  --constraint constraints.txt uv || echo "setup: no uv; pip takes some minutes"
+"$VENV/bin/uv" pip install --quiet --python "$VENV/bin/python" \
+  --constraint constraints.txt --editable ".[dev]" ||
+  "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check --no-input --no-compile \
+    --constraint constraints.txt --editable ".[dev]"
