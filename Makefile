@@ -25,9 +25,8 @@ run: $(STAMP)  ## make an example plant, measure, calibrate and track it, and wr
 	@$(BIN)/heliotrope demo --into out/demo
 
 test: $(STAMP)  ## run the tests in parallel
-	@bash scripts/packages.sh
-	@$(BIN)/python -m heliotrope.warm
-	@HELIOTROPE_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) -m "not slow" -q
+	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm; warm=$$?; wait; exit $$warm
+	@HELIOTROPE_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" -q
 
 soak: $(STAMP)  ## run the slow tests too
 	@$(BIN)/python -m pytest -n $(JOBS) -q

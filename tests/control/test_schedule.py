@@ -25,7 +25,7 @@ from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
 from heliotrope.sun import vector
-from schedule_case import Field, World
+from heliotrope.twin.days import Days, Standing
 
 PLANT = malan_plant(24)
 SMALL = malan_plant(10)
@@ -40,7 +40,7 @@ def scheduler(**settings: object) -> Scheduler:
 
 def ask(one: Scheduler, now: datetime = MORNING, **more: object) -> Assignment | None:
     """One decision with all heliostats ready."""
-    fields = {"states": Field.ready(24), "free_targets": BOTH, **more}
+    fields = {"states": Standing.ready(24), "free_targets": BOTH, **more}
     return one.next(now, vector(now, PLANT.site), **fields)  # type: ignore[arg-type]
 
 
@@ -98,7 +98,7 @@ def test_holds_and_states_are_kept_to() -> None:
     told = ask(scheduler(), holds=tuple(n for n in PLANT.names if n != allowed))
     assert told is not None
     assert told.heliostat == allowed
-    seen = Field.ready(24)
+    seen = Standing.ready(24)
     seen.state[:] = states.STOWED
     seen.state[7] = states.TRACKING
     told = ask(scheduler(), states=seen)
@@ -133,7 +133,7 @@ def test_no_photograph_against_the_sun() -> None:
     sun = behind / np.linalg.norm(behind)
     sun = direction(np.arctan2(sun[0], sun[1]), np.radians(20.0))
     one = scheduler(glare=np.radians(15.0))
-    found = one.next(MORNING, sun, Field.ready(24), ("left",))
+    found = one.next(MORNING, sun, Standing.ready(24), ("left",))
     assert found is None
     assert one.reason == "the sun dazzles the cameras of left"
 
@@ -143,13 +143,13 @@ def test_a_low_sun_hides_mirrors_behind_others() -> None:
     strict, mild = scheduler(most_hidden=0.0), scheduler(most_hidden=0.9)
     count = {"strict": 0, "mild": 0}
     for name, one in (("strict", strict), ("mild", mild)):
-        while one.next(MORNING, low, Field.ready(24), BOTH) is not None:
+        while one.next(MORNING, low, Standing.ready(24), BOTH) is not None:
             count[name] += 1
     assert count["mild"] > count["strict"]
 
 
 def test_far_drives_are_a_cost() -> None:
-    near, far = Field.ready(24), Field.ready(24)
+    near, far = Standing.ready(24), Standing.ready(24)
     far.counts[:] = [150_000.0, 100_000.0]
     told = [ask(scheduler(), states=seen) for seen in (near, far)]
     assert told[0] is not None
@@ -194,7 +194,7 @@ def test_what_failed_is_left_for_longer_each_time() -> None:
 
 
 def test_old_ones_come_first_whatever_the_gain() -> None:
-    world = World(PLANT, scheduler(most_age=3600.0 * 2), MORNING)
+    world = Days(PLANT, scheduler(most_age=3600.0 * 2), MORNING)
     world.live(timedelta(minutes=5))
     assert world.values
     done = next(iter(world.values))
@@ -212,7 +212,7 @@ def test_old_ones_come_first_whatever_the_gain() -> None:
 
 
 def test_the_expected_error_fades_with_time_but_never_beyond_the_prior() -> None:
-    world = World(PLANT, scheduler(), MORNING)
+    world = Days(PLANT, scheduler(), MORNING)
     before = world.scheduler.expected(MORNING)
     world.live(timedelta(minutes=10))
     rows = [PLANT.names.index(name) for name in world.values]
@@ -228,7 +228,7 @@ def test_growth_of_the_expected_error_brings_a_heliostat_back() -> None:
     # Known perfectly but for its zeros, which creep: no age limit, only growth.
     settings = {"goal": 2 * MRAD, "most_age": 1e9}
     still, creeps = scheduler(creep=0.0, **settings), scheduler(creep=1 * MRAD, **settings)
-    world = World(PLANT, still, MORNING)
+    world = Days(PLANT, still, MORNING)
     only = PLANT.names[0]
     world.holds = PLANT.names[1:]
     world.live(timedelta(hours=8), timedelta(minutes=20))
@@ -244,7 +244,7 @@ def test_growth_of_the_expected_error_brings_a_heliostat_back() -> None:
 
 
 def test_a_mirror_that_is_found_elsewhere_is_known_less() -> None:
-    world = World(PLANT, scheduler(), MORNING)
+    world = Days(PLANT, scheduler(), MORNING)
     world.live(timedelta(minutes=10))
     one, name = world.scheduler, next(iter(world.values))
     row = PLANT.names.index(name)
@@ -257,7 +257,7 @@ def test_a_mirror_that_is_found_elsewhere_is_known_less() -> None:
 
 
 def test_a_surprise_at_a_visit_is_told_and_doubted() -> None:
-    world = World(PLANT, scheduler(), MORNING)
+    world = Days(PLANT, scheduler(), MORNING)
     world.live(timedelta(minutes=30))
     one = world.scheduler
     again = [a for a in world.made if a.heliostat in world.values]
@@ -275,7 +275,7 @@ def test_a_surprise_at_a_visit_is_told_and_doubted() -> None:
 
 
 def test_a_result_of_the_cycle_becomes_a_visit() -> None:
-    world = World(PLANT, scheduler(), MORNING)
+    world = Days(PLANT, scheduler(), MORNING)
     seen = world.photographs(PLANT.names[0], "left", MORNING.timestamp() + np.arange(3.0))
     good = CycleResult(PLANT.names[0], seen, (), 2e-3, 1e-4, {}, ("armature",), "calibrated: …")
     now = MORNING.timestamp()
@@ -294,7 +294,7 @@ def test_a_result_of_the_cycle_becomes_a_visit() -> None:
 
 def test_the_plan_is_what_then_happens() -> None:
     # Told with the same sky, the first visits are those of the plan.
-    world = World(PLANT, scheduler(), MORNING)
+    world = Days(PLANT, scheduler(), MORNING)
     coming = world.scheduler.plan(MORNING, timedelta(hours=1), world.field, most=8)
     assert not world.scheduler.running
     assert len(coming) == 8
@@ -362,10 +362,10 @@ def test_finished_visits_are_compared_with_their_prediction() -> None:
 
 
 @pytest.fixture(scope="module")
-def days() -> World:
+def days() -> Days:
     """Four days unattended, one mirror blind, one held, clouds on the second day."""
     settings = Settings(most_age=2.0 * DAY, retry=1800.0, goal=1.5 * MRAD, worth=0.2)
-    world = World(SMALL, Scheduler(SMALL, settings, now=MORNING), MORNING, seed=3)
+    world = Days(SMALL, Scheduler(SMALL, settings, now=MORNING), MORNING, seed=3)
     world.blind, world.holds = frozenset({SMALL.names[2]}), (SMALL.names[3],)
     for day in range(4):
         world.weather = Weather(dni=100.0 if day == 1 else 850.0, wind=3.0)
@@ -373,20 +373,23 @@ def days() -> World:
     return world
 
 
-def test_days_unattended_calibrate_the_field(days: World) -> None:
+def test_days_unattended_calibrate_the_field(days: Days) -> None:
     free = [n for n in SMALL.names if n not in (SMALL.names[2], SMALL.names[3])]
     assert set(days.values) == set(free)
     assert SMALL.names[3] not in {a.heliostat for a in days.made}
     rows = [SMALL.names.index(n) for n in free]
-    noon = vector(datetime(2026, 6, 22, 10, 30, tzinfo=UTC), SMALL.site)
-    after = days.beam_error(noon)[rows]
-    # Rough installation: 15 mrad of the normal, 30 mrad of the beam.
-    untouched = World(SMALL, Scheduler(SMALL, now=MORNING), MORNING, seed=3).beam_error(noon)[rows]
-    assert np.sqrt(np.mean(untouched**2)) > 15 * MRAD
-    assert np.sqrt(np.mean(after**2)) < 1.0 * MRAD
+    times = MORNING.timestamp() + DAY + np.array([0.0, 9e3, 2e4])
+    after = days.look(times, tuple(SMALL.names[k] for k in rows))
+    untouched = Days(SMALL, Scheduler(SMALL, now=MORNING), MORNING, seed=3)
+    before = untouched.look(times, after.names)
+    # As roughly installed, and without a prediction; after, as well as predicted.
+    assert np.sqrt(np.mean(before.error**2)) > 7.5 * MRAD
+    assert np.isnan(before.predicted).all()
+    assert np.sqrt(np.mean(after.error**2)) < 0.5 * MRAD
+    assert 0.6 < after.within <= 1.0
 
 
-def test_days_are_dark_at_night_and_under_clouds(days: World) -> None:
+def test_days_are_dark_at_night_and_under_clouds(days: Days) -> None:
     assert any(reason.startswith("the sun is at") for reason in days.reasons)
     assert any(reason.startswith("clouds") for reason in days.reasons)
     for told in days.made:
@@ -395,7 +398,7 @@ def test_days_are_dark_at_night_and_under_clouds(days: World) -> None:
         assert not DAY <= told.at - MORNING.timestamp() < 2.0 * DAY
 
 
-def test_no_one_waits_for_ever(days: World) -> None:
+def test_no_one_waits_for_ever(days: Days) -> None:
     # Overdue after two days; a day of clouds and the nights come on top.
     ages = days.scheduler.age(days.now)
     for row, name in enumerate(SMALL.names):
@@ -407,13 +410,13 @@ def test_no_one_waits_for_ever(days: World) -> None:
         assert gaps.max() < 4.0 * DAY
 
 
-def test_a_blind_mirror_does_not_hold_up_the_others(days: World) -> None:
+def test_a_blind_mirror_does_not_hold_up_the_others(days: Days) -> None:
     tries = sum(a.heliostat == SMALL.names[2] for a in days.made)
     # Half an hour, an hour, two, … a day.
     assert 2 <= tries <= 9
 
 
-def test_predictions_of_days_can_be_believed(days: World) -> None:
+def test_predictions_of_days_can_be_believed(days: Days) -> None:
     found = days.scheduler.compared()
     assert found.visits == len(days.scheduler.finished) > 40
     # The priors are wider than this installation by a third or so.
@@ -435,7 +438,7 @@ def test_only_who_may_is_ever_chosen(
 ) -> None:
     one = _SHARED
     one.running.clear()
-    seen = Field.ready(24)
+    seen = Standing.ready(24)
     seen.state[list(dead)] = states.FAULT
     told = one.next(
         MORNING, direction(azimuth, elevation), seen, BOTH, [PLANT.names[i] for i in held]
@@ -462,7 +465,7 @@ def test_what_cannot_be_used_is_refused() -> None:
     with pytest.raises(InputError, match="23 names for 24 heliostats"):
         Scheduler(PLANT, now=MORNING, names=PLANT.names[1:])
     with pytest.raises(InputError, match="states of shape"):
-        ask(scheduler(), states=Field.ready(23))
+        ask(scheduler(), states=Standing.ready(23))
     with pytest.raises(UnknownNameError, match="there is no target 'up'"):
         ask(scheduler(), free_targets=("up",))
     with pytest.raises(UnknownNameError, match="there is no heliostat 'X'"):
@@ -489,7 +492,7 @@ def test_the_order_of_the_states_may_be_another() -> None:
     names = tuple(reversed(PLANT.names))
     one, other = scheduler(), Scheduler(PLANT, Settings(), now=MORNING, names=names)
     np.testing.assert_allclose(one.expected(MORNING), other.expected(MORNING)[::-1])
-    seen = Field.ready(24)
+    seen = Standing.ready(24)
     seen.state[:] = states.STOWED
     seen.state[-1] = states.IDLE
     told = other.next(MORNING, vector(MORNING, PLANT.site), seen, BOTH)

@@ -1,0 +1,122 @@
+"""A day unattended: what 10,000 heliostats learn from sun to sun, and eight hours of a plant.
+
+Part one: the real schedule and the real fit of the default plant over a day, mirrors as a quick
+installation leaves them; what the calibrations predict stands beside the twin's truth. Part two:
+the whole program (plant, clusters, cameras with exact centroids, automatic work) in virtual time;
+its memory and processor time hour by hour.
+"""
+
+import asyncio
+import os
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks._run import BenchmarkError, Result, Row
+from heliotrope.control._schedule_live import settings_for
+from heliotrope.control.clock import VirtualClock, VirtualLoop
+from heliotrope.control.schedule import Scheduler, Weather
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import MRAD
+from heliotrope.sun import vector
+from heliotrope.twin.days import Days
+from heliotrope.twin.live import CYCLE, LiveOptions, LivePlant
+
+#: Midsummer, an hour after midnight, UTC.
+BEGIN = datetime(2026, 6, 21, 1, 0, tzinfo=UTC)
+MORNING = datetime(2026, 6, 21, 8, 0, tzinfo=UTC)
+#: Heliostats that are compared with the truth, at most.
+SAMPLE = 400
+#: From one hour to the last, memory may grow by so much.
+GROWTH = 0.02
+
+
+def _memory() -> float:
+    """Return the resident memory of this process, MiB."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def _row(work: str, heliostats: int, **figures: float | int | None) -> Row:
+    columns = (
+        "simulated_h", "calibrated", "visits", "median_mrad", "rms_mrad", "predicted_mrad",
+        "within_90", "cpu_s_per_h", "memory_mib",
+    )  # fmt: skip
+    return {"work": work, "heliostats": heliostats, **{c: figures.get(c) for c in columns}}
+
+
+def _day(count: int, hours: float) -> tuple[list[Row], str]:
+    plant = malan_plant(count)
+    begin = BEGIN if hours >= 24.0 else MORNING
+    scheduler = Scheduler(plant, settings_for(CYCLE), now=begin)
+    days = Days(plant, scheduler, begin, noise=CYCLE.sigma, weather=Weather(dni=850.0, wind=3.0))
+    work = time.process_time()
+    days.live(timedelta(hours=hours), timedelta(minutes=5))
+    work = time.process_time() - work
+    if not days.values:
+        raise BenchmarkError("a day without a calibrated heliostat")
+    times = begin.timestamp() + 86400.0 + 3600.0 * np.arange(24)
+    times = times[vector(times, plant.site)[:, 2] > np.sin(np.radians(10.0))]
+    chosen = tuple(list(days.values)[:: max(1, len(days.values) // SAMPLE)])
+    after = days.look(times, chosen)
+    untouched = Days(plant, scheduler, begin).look(times, chosen)
+    share = {"simulated_h": hours, "calibrated": len(days.values), "visits": len(days.made)}
+    rows = [
+        _row("as installed", count, median_mrad=float(np.median(untouched.error)) / MRAD,
+             rms_mrad=_rms(untouched.error), **share),
+        _row("calibrated", count, median_mrad=float(np.median(after.error)) / MRAD,
+             rms_mrad=_rms(after.error), predicted_mrad=_rms(after.predicted),
+             within_90=after.within, cpu_s_per_h=work / hours, memory_mib=_memory(), **share),
+    ]  # fmt: skip
+    text = (
+        f"{count:,} heliostats, {hours:g} h: {len(days.values):,} calibrated, "
+        f"{rows[0]['median_mrad']:.1f} to {rows[1]['median_mrad']:.2f} mrad, "
+        f"{100 * after.within:.0f} % in their 90 % ellipses"
+    )
+    return rows, text
+
+
+def _rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(error**2))) / MRAD
+
+
+async def _live(count: int, minutes: float, looks: int) -> list[Row]:
+    clock = VirtualClock(asyncio.get_running_loop().time, MORNING)
+    options = LiveOptions(rendered=False, threads=0, plain=True)
+    rows: list[Row] = []
+    live = LivePlant(malan_plant(count), clock, options)
+    async with live.running():
+        before = time.process_time()
+        for look in range(1, looks + 1):
+            await asyncio.sleep(60.0 * minutes / looks)
+            now, summary = time.process_time(), live.operations.calibration()
+            hours = minutes / looks / 60.0
+            last = summary.quality[-1].truth_median if summary.quality else float("nan")
+            rows.append(_row(
+                "whole program", count, simulated_h=look * hours, calibrated=summary.done,
+                cpu_s_per_h=(now - before) / hours, memory_mib=_memory(),
+                median_mrad=last / MRAD if np.isfinite(last) else None,
+            ))  # fmt: skip
+            before = now
+        await live.end()
+    return rows
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    rows, text = _day(24, 2.0) if quick else _day(10_000, 24.0)
+    with asyncio.Runner(loop_factory=VirtualLoop) as runner:
+        whole = runner.run(_live(8, 4.0, 2) if quick else _live(320, 480.0, 8))
+    # The first hour loads modules, fills caches and calibrates everybody once.
+    first, last = whole[len(whole) // 4], whole[-1]
+    growth = float(last["memory_mib"] or 0.0) / float(first["memory_mib"] or 1.0) - 1.0
+    figures: dict[str, float | int | str] = {"memory_growth": growth}
+    return Result(
+        rows + whole,
+        f"{text}; whole program, {whole[0]['heliostats']} heliostats, "
+        f"{whole[-1]['simulated_h']:.3g} h: memory {100 * growth:+.1f} %",
+        figures,
+        None if quick else growth < GROWTH,
+    )  # fmt: skip

@@ -1,0 +1,247 @@
+"""Days of calibration without controllers: mirrors are measured as a schedule says, and learnt.
+
+Visits begin when the real schedule says so and take as long as it expects; sightings come from
+the true mechanisms with noise, parameters from the real fit. So a month of 10,000 heliostats takes
+minutes, where the plant with all its controllers (`twin.live`) takes the month.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.drift import NINETY
+from heliotrope.calibration.estimator import fit
+from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.planning import Limits, aim_at
+from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
+from heliotrope.calibration.uncertainty import expected
+from heliotrope.control.schedule import Assignment, Scheduler, Visited, Weather
+from heliotrope.field.example import roughly_installed
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, reflect
+from heliotrope.lcu import states
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.tracking import track
+from heliotrope.sun import vector
+
+#: Before the end of a visit, its photographs are so far apart, s.
+_APART = 20.0
+
+
+@dataclass
+class Standing:
+    """States of heliostats that all stand at their standby points."""
+
+    state: npt.NDArray[np.uint8]
+    counts: npt.NDArray[np.int32]
+
+    @classmethod
+    def ready(cls, count: int) -> "Standing":
+        """All of them can be sent."""
+        stand = np.full((count, 2), [0, 50_000], dtype=np.int32)
+        return cls(np.full(count, states.IDLE, dtype=np.uint8), stand)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """How N heliostats would really point at some suns; NaN where they cannot.
+
+    Attributes
+    ----------
+    names
+        N of them.
+    error
+        True error of the mirror's normal, RMS over the suns, rad, (N,).
+    predicted
+        The same as the calibration predicts it, rad, (N,).
+    within
+        Share of all pairs of heliostat and sun whose beam lies in the predicted 90 % ellipse.
+    """
+
+    names: tuple[str, ...]
+    error: FloatArray
+    predicted: FloatArray
+    within: float
+
+
+@dataclass
+class Days:
+    """A plant whose true mirrors stand as a quick installation leaves them.
+
+    Attributes
+    ----------
+    plant, scheduler
+        The plant as it knows itself, with heliostats of one group.
+    now
+        Time; `live` moves it.
+    noise
+        Of a photograph's beam direction, rad, in each direction.
+    weather, holds, blind
+        What the schedule is told; whose beams no photograph shows.
+    truth
+        The true mechanisms.
+    known, values, covariances
+        By heliostat: sightings, calibrated mechanism (1,), covariance of its parameters (P, P).
+    made
+        Assignments in the order of their beginnings.
+    reasons
+        Why the schedule had nothing to do.
+    """
+
+    plant: Plant
+    scheduler: Scheduler
+    now: datetime
+    noise: float = 5e-4
+    seed: int = 0
+    weather: Weather = field(default_factory=Weather)
+    holds: tuple[str, ...] = ()
+    blind: frozenset[str] = frozenset()
+    known: dict[str, Sightings] = field(default_factory=dict)
+    values: dict[str, Mechanism] = field(default_factory=dict)
+    covariances: dict[str, FloatArray] = field(default_factory=dict)
+    made: list[Assignment] = field(default_factory=list)
+    reasons: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        (self.group,) = self.plant.groups.values()
+        self.truth = roughly_installed(self.group.mechanism, self.seed)
+        self.field = Standing.ready(len(self.plant))
+        self.chance = np.random.default_rng(self.seed)
+        self._ends: list[tuple[datetime, Assignment]] = []
+        self._learnt: tuple[str, ...] = ()
+
+    def live(
+        self, span: timedelta, look: timedelta = timedelta(seconds=60),
+        progress: Callable[[datetime], None] | None = None,
+    ) -> None:  # fmt: skip
+        """Let time pass.
+
+        Parameters
+        ----------
+        span
+            For so long.
+        look
+            While there is nothing to do, the schedule is asked so often.
+        progress
+            Told the time after each decision.
+        """
+        until = self.now + span
+        while self.now < until:
+            for end, told in [e for e in self._ends if e[0] <= self.now]:
+                self._ends.remove((end, told))
+                self.scheduler.done(self._visit(told))
+            if progress is not None:
+                progress(self.now)
+            told_next = self._next()
+            if told_next is not None:
+                self.made.append(told_next)
+                self._ends.append((datetime.fromtimestamp(told_next.until, UTC), told_next))
+                continue
+            self.reasons.add(self.scheduler.reason.split(":")[0])
+            self.now = min([self.now + look, *(end for end, _ in self._ends)])
+
+    def _next(self) -> Assignment | None:
+        busy = {told.target for _, told in self._ends}
+        free = [t.name for t in self.plant.targets if t.name not in busy]
+        if not free:
+            return None
+        return self.scheduler.next(
+            self.now, vector(self.now, self.plant.site), self.field, free, self.holds,
+            self.weather,
+        )  # fmt: skip
+
+    def mechanism(self, name: str) -> Mechanism:
+        """Return a heliostat as it is believed to be, (1,)."""
+        row = np.array([self.group.index(name)])
+        return self.values.get(name, self.group.mechanism[row])
+
+    def photographs(self, name: str, target: str, times: FloatArray) -> Sightings:
+        """Return sightings of a heliostat that tracks a target as it is believed to be.
+
+        Parameters
+        ----------
+        name, target
+            Who and where.
+        times
+            POSIX s, (M,).
+        """
+        row, believed = self.group.index(name), self.mechanism(name)
+        surface = self.plant.target(target)
+        suns = vector(times, self.plant.site)
+        many = believed[np.zeros(len(times), dtype=np.intp)]
+        counts = aim_at(many, suns, surface, Limits()).counts
+        pose = self.truth[np.full(len(times), row)].pose(counts)
+        # The plane goes on beyond the target: a search would have found the beam.
+        seen = surface.intersect(pose.vertex, reflect(suns, pose.normal))
+        away = np.linalg.norm(seen - pose.vertex, axis=1)[:, None]
+        shift = self.noise * away * self.chance.standard_normal((len(times), 2))
+        return camera_target(
+            np.zeros(len(times), dtype=np.intp), counts, suns, seen + shift @ surface.axes,
+            time=times, sigma=self.noise,
+        )  # fmt: skip
+
+    def _visit(self, told: Assignment) -> Visited:
+        name, settings = told.heliostat, self.scheduler.settings
+        if name in self.blind:
+            return Visited(name, told.target, told.until, False, text="no beam")
+        times = told.until - _APART * np.arange(settings.shots, 0.0, -1.0)
+        seen = self.photographs(name, told.target, times)
+        measured = float(np.sqrt(np.mean(errors(self.mechanism(name), seen).beam ** 2)))
+        before = [self.known[name]] if name in self.known else []
+        self.known[name] = join([*before, seen])
+        row = np.array([self.group.index(name)])
+        found = fit(self.group.mechanism[row], self.known[name], settings.model)
+        self.values[name] = self.group.mechanism[row].with_parameters(found.parameters)
+        self.covariances[name] = found.covariance[0]
+        self._learnt = tuple(found.parameters)
+        return Visited(name, told.target, told.until, True, self.known[name], measured)
+
+    def look(self, times: FloatArray, names: tuple[str, ...] | None = None) -> Truth:
+        """Compare with the truth what heliostats would do at the receiver.
+
+        Parameters
+        ----------
+        times
+            POSIX s, (K,), with the sun up.
+        names
+            Whose; default: all that were calibrated. With who was not, nothing is predicted.
+        """
+        chosen = tuple(self.values) if names is None else names
+        suns = vector(times, self.plant.site)
+        aim = self.plant.receivers[0].center
+        off, wide = [], []
+        for name in chosen:
+            error, uncertain = self._compare(name, suns, aim)
+            off.append(error)
+            wide.append(uncertain)
+        beam, covariance = np.stack(off), np.stack(wide)
+        sure = np.isfinite(beam).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
+        whitened = np.linalg.solve(covariance[sure], beam[sure][:, :, None])[..., 0]
+        near = np.sum(beam[sure] * whitened, axis=-1)
+        within = float(np.mean(near <= NINETY)) if sure.any() else float("nan")
+        spread = np.trace(covariance, axis1=-2, axis2=-1)
+        return Truth(chosen, _half(np.sum(beam**2, axis=-1)), _half(spread), within)
+
+    def _compare(self, name: str, suns: FloatArray, aim: FloatArray) -> tuple[FloatArray, ...]:
+        """Return beam errors (K, 2) and their predicted covariance (K, 2, 2), rad and rad²."""
+        believed, count = self.mechanism(name), len(suns)
+        solved = track(believed[np.zeros(count, dtype=np.intp)], suns, aim)
+        counts = solved.chosen(solved.counts)
+        row = np.full(count, self.group.index(name))
+        seen = sightings(np.arange(count), counts, suns, np.broadcast_to(aim, (count, 3)))
+        off = errors(self.truth[row], seen).offset
+        if name not in self.covariances:
+            return off, np.full((count, 2, 2), np.nan)
+        found = expected(believed, self._learnt, self.covariances[name], suns, aim)
+        return off, found.covariance
+
+
+def _half(squares: FloatArray) -> FloatArray:
+    """Return half of the root mean square over what is finite: normals turn half as much."""
+    good = np.isfinite(squares)
+    total = np.where(good, squares, 0.0).sum(axis=1)
+    mean = total / np.where(good.any(axis=1), good.sum(axis=1), np.nan)
+    return np.asarray(0.5 * np.sqrt(mean))
