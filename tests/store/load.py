@@ -1,8 +1,8 @@
 """A plant's memory under load, in processes that are killed: run by test_crash.py.
 
-It imports everything once, then forks a child for each line it is told: ``write PLACE SEED`` or
-``limit PLACE``. A child tells what is confirmed, line by line, into a file that is its own: what
-was told before the kill is what must be found afterwards.
+It imports everything once, then forks a child for each line it is told: ``write PLACE SEED``,
+``plant PLACE SEED`` or ``limit PLACE``. A child tells what is confirmed, line by line, into a file
+that is its own: what was told before the kill is what must be found afterwards.
 """
 
 import asyncio
@@ -15,6 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import plant_load
 
 from heliotrope.calibration.sightings import sightings
 from heliotrope.control.audit import Record
@@ -63,7 +64,9 @@ async def _write(
         telemetry.take(1.8e9 + 1000.0 * seed + k, _look(k))
         if chance.random() < 0.3:
             identity = f"{seed}-{k}"
-            audit.begin(Record(identity, "anna", "operator", "AIM", START.isoformat(), (1.0, 2.0)))
+            audit.begin(
+                Record(identity, "operator", "operator", "AIM", START.isoformat(), (1.0, 2.0))
+            )
             tell(f"begun {identity}")
             if chance.random() < 0.7:
                 audit.finish(identity, "done", START.isoformat())
@@ -141,6 +144,8 @@ def main() -> None:
                 told = os.open(f"{place}.told", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
                 if what == "write":
                     write(Path(place), int(rest[0]), told)
+                elif what == "plant":
+                    plant_load.plant(Path(place), int(rest[0]), told)
                 else:
                     limit(Path(place), told)
                 status = 0

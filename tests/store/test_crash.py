@@ -62,15 +62,18 @@ def loads() -> Iterator[Loads]:
     made.close()
 
 
-def kill_at_random(loads: Loads, place: Path, seed: int, chance: random.Random) -> list[str]:
+def kill_at_random(
+    loads: Loads, place: Path, seed: int, chance: random.Random, what: str = "write"
+) -> list[str]:
     """Let a child write, kill it at a random moment; return what it told."""
     told = Path(f"{place}.told")
     told.unlink(missing_ok=True)
-    child = loads.start(f"write {place} {seed}")
+    child = loads.start(f"{what} {place} {seed}")
     if chance.random() < 0.8:
         # Most are killed while they write, some while they open the store.
-        wanted = chance.randint(1, 40)
+        wanted, until = chance.randint(1, 40), time.monotonic() + 120.0
         while not told.exists() or told.read_bytes().count(b"\n") < wanted:
+            assert time.monotonic() < until, "the child does nothing"
             time.sleep(0.005)
     time.sleep(chance.uniform(0.0, 0.05))
     os.kill(child, signal.SIGKILL)
@@ -161,6 +164,51 @@ def test_kills_lose_nothing(loads: Loads, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_two_hundred_kills_lose_nothing(loads: Loads, tmp_path: Path) -> None:
     check_load(kill_many(loads, tmp_path / "data", 200), tmp_path / "data", 200)
+
+
+def kill_plants(loads: Loads, place: Path, kills: int) -> dict[str, int]:
+    """Kill a whole plant at random moments; return how much was promised of each kind."""
+    chance, counts = random.Random(11), dict.fromkeys(("accepted", "event", "version", "point"), 0)
+    accepted, events = set[str](), set[str]()
+    versions, points = dict[str, int](), dict[str, float]()
+    for seed in range(1, kills + 1):
+        for line in kill_at_random(loads, place, seed, chance, "plant"):
+            what, *values = line.split()
+            counts[what] = counts.get(what, 0) + 1
+            if what == "accepted":
+                accepted.add(values[0])
+            elif what == "event":
+                events.add(values[0])
+            elif what == "version":
+                versions[values[0]] = int(values[1])
+            elif what == "point":
+                points[values[0]] = float(values[1])
+        if seed % 10 and seed != kills:
+            continue
+        with closing(Keeper(place)) as keeper:
+            with keeper.database.reading() as connection:
+                records = {r.identity for r in audit.entries(connection, 10**6)}
+                kept = audit.points(connection).get("STANDBY", {})
+            assert accepted <= records
+            assert events <= {e.text for e in keeper.events(10**6)}
+            latest = keeper.latest_parameters()
+            assert all(latest[name].version >= v for name, v in versions.items())
+            # What was told last, or one that came after it and was not told any more.
+            assert points.keys() <= kept.keys()
+            assert all(25.0 <= kept[name][0] <= 26.0 for name in points)
+    return counts
+
+
+def test_a_plant_that_is_killed_starts_again(loads: Loads, tmp_path: Path) -> None:
+    counts = kill_plants(loads, tmp_path / "data", 2)
+    assert counts["accepted"] > 0
+    assert counts["open"] > 0
+
+
+@pytest.mark.slow
+def test_two_hundred_kills_of_a_plant_lose_nothing(loads: Loads, tmp_path: Path) -> None:
+    counts = kill_plants(loads, tmp_path / "data", 200)
+    assert min(counts.values()) > 50, counts
 
 
 def test_a_full_disk_is_told_and_outlived(loads: Loads, tmp_path: Path) -> None:
