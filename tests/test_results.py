@@ -189,9 +189,13 @@ def real() -> tuple[Plant, Sightings]:
 
 @pytest.mark.parametrize(
     ("kind", "limit", "low", "high"),
-    [("random", 0.65e-3, 0.85, 0.95), ("chronological", 1.05e-3, 0.85, 0.95),
-     ("neighbour", 0.75e-3, 0.80, 0.95)],
-)  # fmt: skip
+    [
+        # The hardest of the three is enough where minutes count.
+        ("chronological", 1.05e-3, 0.85, 0.95),
+        pytest.param("random", 0.65e-3, 0.85, 0.95, marks=pytest.mark.slow),
+        pytest.param("neighbour", 0.75e-3, 0.80, 0.95, marks=pytest.mark.slow),
+    ],
+)
 def test_juelich_is_predicted(
     real: tuple[Plant, Sightings], kind: evaluation.Split, limit: float, low: float, high: float
 ) -> None:
@@ -207,10 +211,24 @@ def test_juelich_is_predicted(
     assert medians["BG14"] <= 3e-3
 
 
-def test_juelich_changes_and_mistakes(real: tuple[Plant, Sightings]) -> None:
+def _of(seen: Sightings, rows: list[int]) -> Sightings:
+    """Sightings of some heliostats, whose rows are then 0, 1, …"""
+    kept = seen.take(np.flatnonzero(np.isin(seen.heliostat, rows)))
+    place = {row: k for k, row in enumerate(rows)}
+    return dataclasses.replace(kept, heliostat=np.array([place[int(h)] for h in kept.heliostat]))
+
+
+@pytest.mark.parametrize("others", [2, pytest.param(0, marks=pytest.mark.slow)])
+def test_juelich_changes_and_mistakes(real: tuple[Plant, Sightings], others: int) -> None:
     """BF41 lost its elevation in February 2023; BG14 has beams that are not its own."""
-    plant, seen = real
-    (group,) = plant.groups.values()
+    plant, every = real
+    (whole,) = plant.groups.values()
+    bad = [whole.index("BF41"), whole.index("BG14")]
+    # Those with the most measurements, or all.
+    count = np.bincount(every.heliostat, minlength=len(whole))
+    order = [int(row) for row in np.argsort(-count) if row not in bad]
+    chosen = [*order[: others or len(order)], *bad]
+    group, seen = whole.take(chosen), _of(every, chosen)
     found = learning.learn(group.mechanism, seen, "jacks")
     lost = group.index("BF41")
     rows = np.flatnonzero((seen.heliostat == lost) & (found.regime > 0))
@@ -220,7 +238,10 @@ def test_juelich_changes_and_mistakes(real: tuple[Plant, Sightings]) -> None:
     during = mine & (seen.time / 86400.0 >= 19395) & (seen.time / 86400.0 < 19404)
     assert february.sum() + found.outlier[during].sum() >= 0.9 * during.sum()
     assert found.outlier[seen.heliostat == group.index("BG14")].sum() >= 3
-    assert found.outlier.sum() < 0.05 * len(seen)
+    good = ~np.isin(seen.heliostat, [lost, group.index("BG14")])
+    assert found.outlier[good].sum() < 0.05 * good.sum()
+    if not others:
+        assert found.outlier.sum() < 0.05 * len(seen)
 
 
 def test_an47_has_regimes() -> None:
