@@ -7,6 +7,8 @@ STAMP := $(VENV)/.installed
 JOBS ?= auto
 # Of `make soak`: simulated runs of six minutes with some thirty faults each.
 RUNS ?= 2000
+# Of `make run`; see heliotrope run --help.
+OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
@@ -21,8 +23,8 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
 	@PYTHON="$(PYTHON)" VENV="$(VENV)" bash scripts/setup.sh
 	@touch $@
 
-run: $(STAMP)  ## make an example plant, measure, calibrate and track it, and write a report
-	@$(BIN)/heliotrope demo --into out/demo
+run: $(STAMP)  ## run a plant of 10,000 heliostats in simulation until Ctrl-C: OPTIONS="--speed 2"
+	@$(BIN)/heliotrope run $(OPTIONS)
 
 test: $(STAMP)  ## run the tests in parallel
 	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm; warm=$$?; wait; exit $$warm

@@ -12,7 +12,7 @@ import pytest
 
 from clusters import SITE, config_of
 from heliotrope import sun
-from heliotrope.cli.cluster import _line, _link, _time
+from heliotrope.cli.cluster import _link
 from heliotrope.control import timekeeping
 from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
@@ -21,6 +21,7 @@ from heliotrope.control.clock import SystemClock, VirtualClock
 from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
 from heliotrope.control.cluster_file import TABLES, read_cluster
 from heliotrope.control.gps import GpsTime
+from heliotrope.control.real_cluster import line_of, time_of
 from heliotrope.control.timekeeping import Time
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
@@ -304,13 +305,13 @@ def test_links_and_times_are_made_as_the_file_says(folder: Path) -> None:
     clock = SystemClock()
     installation = read_cluster(folder / "C1.toml")
     assert _link(installation, clock).name == "plant at 10.0.0.2:4840"
-    assert isinstance(_time(installation, clock), GpsTime)
+    assert isinstance(time_of(installation, clock), GpsTime)
     changed(folder, "tcp://10.0.0.2:4840", "mqtt://broker/heliotrope/example")
     changed(folder, 'source = "gps"', 'source = "system"')
     installation = read_cluster(folder / "C1.toml")
     assert (installation.port, installation.prefix) == (1883, "heliotrope/example")
     assert "broker" in _link(installation, clock).name
-    keeper = _time(installation, clock)
+    keeper = time_of(installation, clock)
     assert keeper.time().error == 0.5
     changed(folder, 'example"', 'example"\nauthority = "no.pem"')
     changed(folder, "mqtt://", "mqtts://")
@@ -343,7 +344,7 @@ def test_a_receiver_is_believed_as_the_file_says(
     changed(folder, "[time]", f"[time]\n{lines}")
     clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
     clock.jump(off)
-    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
     assert isinstance(keeper, GpsTime)
     found = spoken(keeper, clock)
     assert found.quality == quality
@@ -353,7 +354,7 @@ def test_a_receiver_is_believed_as_the_file_says(
 def test_an_oscillator_drifts_as_the_file_says(folder: Path) -> None:
     changed(folder, "[time]", "[time]\ndrift_ppm = 200")
     clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
-    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
     assert isinstance(keeper, GpsTime)
     before = spoken(keeper, clock).error
     clock.advance(1000.0)
@@ -369,7 +370,7 @@ def test_with_ntp_the_kernel_is_asked(folder: Path, monkeypatch: pytest.MonkeyPa
         folder, 'source = "gps"', 'source = "system"\nntp = true\ndrift_ppm = 400\nerror_s = 0.1'
     )
     clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
-    keeper = _time(read_cluster(folder / "C1.toml"), clock)
+    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
     assert (keeper.time().quality, keeper.time().error) == ("system", 0.1)
     kept[0] = False
     clock.advance(1000.0)
@@ -384,7 +385,7 @@ def test_where_the_kernel_cannot_be_asked_that_is_said_at_the_start(
     changed(folder, 'source = "gps"', 'source = "system"\nntp = true')
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
     with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
-        _time(read_cluster(folder / "C1.toml"), SystemClock())
+        time_of(read_cluster(folder / "C1.toml"), SystemClock())
 
 
 def test_many_clusters_begin_their_seconds_apart() -> None:
@@ -400,8 +401,10 @@ def test_many_clusters_begin_their_seconds_apart() -> None:
 
 def test_an_emergency_line_that_cannot_be_read_is_open(tmp_path: Path) -> None:
     file = tmp_path / "value"
-    assert not _line(file)
+    flows = line_of(file)
+    assert flows is not None
+    assert not flows()
     file.write_text("1\n")
-    assert _line(file)
+    assert flows()
     file.write_text("0\n")
-    assert not _line(file)
+    assert not flows()

@@ -22,7 +22,7 @@ from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
 from heliotrope.cli.image import image
 from heliotrope.cli.plan import plan
-from heliotrope.cli.run import run
+from heliotrope.cli.run import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track
@@ -65,7 +65,7 @@ app.command()(calibrate)
 app.command()(plan)
 app.command()(evaluate)
 app.add_typer(drone_app, name="drone")
-app.command()(run)
+app.command(cls=GroupedCommand)(run)
 app.add_typer(ctl_app, name="ctl")
 app.add_typer(store_app, name="store")
 app.command()(cluster)

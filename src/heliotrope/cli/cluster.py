@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from heliotrope.control.cluster import Cluster
     from heliotrope.control.cluster_file import Installation
     from heliotrope.control.link import Link
-    from heliotrope.control.timekeeping import TimeKeeper
 
 
 def cluster(
@@ -50,15 +49,15 @@ async def _run(installation: "Installation", every: float) -> None:
     from heliotrope.control.clock import SystemClock
     from heliotrope.control.cluster import Cluster
     from heliotrope.control.link import running
+    from heliotrope.control.real_cluster import line_of, time_of
     from heliotrope.control.serial_bus import SerialBus
 
     clock = SystemClock()
     bus = SerialBus(installation.bus_url, clock, installation.bus)
-    link, time = _link(installation, clock), _time(installation, clock)
-    file = installation.emergency_line
+    link, time = _link(installation, clock), time_of(installation, clock)
     cluster = Cluster(
         installation.config, bus, link, clock, time, Kept(installation.state),
-        None if file is None else lambda: _line(file),
+        line_of(installation.emergency_line),
     )  # fmt: skip
     ending = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -78,14 +77,6 @@ async def _log(cluster: "Cluster", ending: "asyncio.Event", every: float) -> Non
                 await ending.wait()
         except TimeoutError:
             print(cluster.line(), flush=True)
-
-
-def _line(file: Path) -> bool:
-    """Whether current flows in the emergency line; what cannot be read is an open line."""
-    try:
-        return file.read_bytes()[:1] == b"1"
-    except OSError:
-        return False
 
 
 def _link(installation: "Installation", clock: "Clock") -> "Link":
@@ -110,22 +101,3 @@ def _link(installation: "Installation", clock: "Clock") -> "Link":
         installation.password or None, tls,
     )  # fmt: skip
     return mqtt_link(broker, installation.prefix, name, key, clock, plant=False)
-
-
-def _time(installation: "Installation", clock: "Clock") -> "TimeKeeper":
-    time = installation.time
-    if time.source == "system":
-        from heliotrope.control.timekeeping import SystemTime, kernel_synchronised
-
-        if time.ntp:
-            kernel_synchronised()  # where the kernel cannot be asked, that is said at the start
-        asked = kernel_synchronised if time.ntp else None
-        return SystemTime(clock, time.error_s, synchronised=asked, drift_ppm=time.drift_ppm)
-    from heliotrope.control.discipline import DisciplineSettings
-    from heliotrope.control.gps import GpsSettings, GpsTime
-
-    discipline = DisciplineSettings(
-        latency=time.latency_s, drift_ppm=time.drift_ppm,
-        system_tolerance=time.system_tolerance_s or None,
-    )  # fmt: skip
-    return GpsTime(time.url, clock, GpsSettings(time.baud_rate, discipline=discipline))

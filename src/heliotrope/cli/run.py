@@ -1,9 +1,11 @@
-"""``heliotrope run``: a plant that lives in the twin, with its console, at work until Ctrl-C."""
+"""``heliotrope run``: a plant at work with its console until Ctrl-C, in the twin or for real."""
 
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from heliotrope.cli._common import open_plant, parse_time
 
@@ -12,6 +14,27 @@ if TYPE_CHECKING:
 
     from heliotrope.field.plant import Plant
 
+_TWIN, _REAL, _WORK = "Simulation", "A real plant", "Work"
+_CONSOLE, _KEPT = "Console", "Records"
+
+
+class GroupedCommand(TyperCommand):
+    """A command whose help shows its options under headings."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments, then the options of each heading."""
+        for heading, params in groupby(self.get_params(ctx), _heading):
+            rows = [row for row in (param.get_help_record(ctx) for param in params) if row]
+            if rows:
+                with formatter.section(heading):
+                    formatter.write_dl(rows)
+
+
+def _heading(param: Any) -> str:
+    if param.param_type_name == "argument":
+        return "Arguments"
+    return getattr(param, "rich_help_panel", None) or "Options"
+
 
 def run(
     field: Annotated[
@@ -19,77 +42,172 @@ def run(
         typer.Argument(help="Plant file or folder; default: 10,000 heliostats, 313 clusters."),
     ] = None,
     heliostats: Annotated[
-        int | None, typer.Option(help="Of the default plant, instead of 10,000.")
+        int | None,
+        typer.Option(help="Of the default plant, instead of 10,000.", rich_help_panel=_TWIN),
     ] = None,
     prototype: Annotated[
-        bool, typer.Option("--prototype", help="18 heliostats on simulated boards.")
-    ] = False,
-    speed: Annotated[float, typer.Option(help="Simulated seconds in a second.")] = 1.0,
-    start: Annotated[
-        str, typer.Option(help='Simulated start: ISO 8601, "now", or "morning" at the site.')
-    ] = "morning",
-    seed: Annotated[int, typer.Option(help="Of how the mirrors really stand.")] = 0,
-    exact: Annotated[
-        bool, typer.Option("--exact", help="Centroids with noise instead of photographs.")
-    ] = False,
-    gain: Annotated[
         bool,
-        typer.Option("--gain", help="Measure by expected gain over the year, not pair by pair."),
+        typer.Option(
+            "--prototype", help="18 heliostats on simulated boards.", rich_help_panel=_TWIN
+        ),
+    ] = False,
+    speed: Annotated[
+        float, typer.Option(help="Simulated seconds in a second.", rich_help_panel=_TWIN)
+    ] = 1.0,
+    start: Annotated[
+        str,
+        typer.Option(
+            help='Simulated start: ISO 8601, "now", or "morning" at the site.',
+            rich_help_panel=_TWIN,
+        ),
+    ] = "morning",
+    seed: Annotated[
+        int, typer.Option(help="Of how the mirrors really stand.", rich_help_panel=_TWIN)
+    ] = 0,
+    exact: Annotated[
+        bool,
+        typer.Option(
+            "--exact", help="Centroids with noise instead of photographs.", rich_help_panel=_TWIN
+        ),
+    ] = False,
+    clusters: Annotated[
+        Path | None,
+        typer.Option(
+            help="Links file: how each cluster is reached; the plant is then real.",
+            rich_help_panel=_REAL,
+        ),
+    ] = None,
+    configure: Annotated[
+        bool,
+        typer.Option(
+            "--configure",
+            help="Store axes, limits, stow and standby in local controllers that hold others.",
+            rich_help_panel=_REAL,
+        ),
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Only read the files.", rich_help_panel=_REAL)
     ] = False,
     idle: Annotated[
-        bool, typer.Option("--idle", help="Move nothing until a person says so.")
-    ] = False,
-    port: Annotated[int, typer.Option(help="Of the console, on this machine; 0: a free one.")] = (
-        8080
-    ),
-    no_console: Annotated[bool, typer.Option("--no-console", help="Only print lines.")] = False,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
-    minutes: Annotated[
-        float | None, typer.Option(help="End after this time; default: at Ctrl-C.")
+        bool | None,
+        typer.Option(
+            "--idle/--automatic",
+            help="Move nothing until a person says so, or begin to work at once; default: --idle "
+            "for a real plant, --automatic in simulation.",
+            rich_help_panel=_WORK,
+        ),
     ] = None,
+    gain: Annotated[
+        bool,
+        typer.Option(
+            "--gain",
+            help="Measure by expected gain over the year, not pair by pair.",
+            rich_help_panel=_WORK,
+        ),
+    ] = False,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="End after this time; default: at Ctrl-C.", rich_help_panel=_WORK),
+    ] = None,
+    every: Annotated[
+        float, typer.Option(help="Seconds between lines that are printed.", rich_help_panel=_WORK)
+    ] = 10.0,
+    host: Annotated[
+        str,
+        typer.Option(
+            help="Address to listen at; other than this machine's own it needs TLS.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="0: a free one.", rich_help_panel=_CONSOLE)] = 8080,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Name that people write for this machine; may be given again.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="PEM file: TLS.", rich_help_panel=_CONSOLE)
+    ] = None,
+    key: Annotated[
+        Path | None,
+        typer.Option(help="PEM file of the certificate's key.", rich_help_panel=_CONSOLE),
+    ] = None,
+    plain: Annotated[
+        bool,
+        typer.Option(
+            "--plain",
+            help="Without TLS all the same: behind a proxy that has it.",
+            rich_help_panel=_CONSOLE,
+        ),
+    ] = False,
+    no_console: Annotated[
+        bool, typer.Option("--no-console", help="Only print lines.", rich_help_panel=_CONSOLE)
+    ] = False,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="Open no browser.", rich_help_panel=_CONSOLE)
+    ] = False,
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder in which all is kept; default: nothing outlasts the run."),
+        typer.Option(
+            help="Folder for all that is kept; default: nothing outlasts the run.",
+            rich_help_panel=_KEPT,
+        ),
     ] = None,
-    every: Annotated[float, typer.Option(help="Seconds between lines that are printed.")] = 10.0,
+    database: Annotated[
+        str | None,
+        typer.Option(
+            help="postgresql://user@host/name for the records; telemetry stays in --data.",
+            rich_help_panel=_KEPT,
+        ),
+    ] = None,
 ) -> None:
-    """Run a plant in simulation: it tracks, photographs, learns and corrects by itself.
+    """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
 
     The field leaves stow some heliostats at a time, every target's camera calibrates one
     heliostat after the other, and what was learnt is pushed to its controller. The console shows
-    it all. Ctrl-C stows the field and ends.
+    it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
     """
-    from heliotrope.cli._run_plant import Choice, run_plant
+    from heliotrope.cli._run_shared import Shown
     from heliotrope.errors import InputError
 
+    if not 0.0 < speed <= 1000.0:
+        raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
     if prototype and (field is not None or heliostats is not None):
         raise InputError("run: --prototype is a plant of its own; give no field and no number")
     if field is not None and heliostats is not None:
         raise InputError("run: --heliostats is for the default plant; leave it out with a field")
-    for name, value in (("minutes", minutes), ("every", every)):
-        if value is not None and not 0.0 < value < 1e6:
-            raise InputError(f"run: --{name} {value:g}; give above 0")
-    if not 0.0 < speed <= 1000.0:
-        raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
-    design = _design(field, heliostats, prototype=prototype)
-    run_plant(
-        design,
-        Choice(
-            speed=speed,
-            start=_start(start, design),
-            seed=seed,
-            exact=exact,
-            idle=idle,
-            gain=gain,
-            boards=prototype,
-            port=port,
-            console=not no_console,
-            browser=not no_browser,
-            minutes=minutes,
-            data=data,
-            every=every,
-        ),
-    )
+    shown = Shown(
+        host=host, port=port, names=tuple(name or ()), certificate=certificate, key=key,
+        plain=plain, console=not no_console, browser=not no_browser, data=data,
+        database=database, minutes=minutes, every=every,
+    )  # fmt: skip
+    if clusters is None:
+        if configure or check:
+            raise InputError("run: --configure and --check need a real plant; give --clusters")
+        design = _design(field, heliostats, prototype=prototype)
+        from heliotrope.cli._run_plant import Choice, run_plant
+
+        choice = Choice(
+            speed=speed, start=_start(start, design), seed=seed, exact=exact, idle=bool(idle),
+            gain=gain, boards=prototype,
+        )  # fmt: skip
+        run_plant(design, choice, shown)
+        return
+    if field is None:
+        raise InputError("run: --clusters needs the plant file; give it before")
+    if speed != 1.0 or start != "morning" or seed or exact:
+        raise InputError(
+            "run: --speed, --start, --seed and --exact are of the simulation; leave them out with "
+            "--clusters"
+        )
+    design = open_plant(field)
+    from heliotrope.cli._run_real import RealChoice, run_real
+
+    folder = field if field.is_dir() else field.parent
+    real = RealChoice(folder, clusters, idle is not False, gain, configure, check)
+    run_real(design, real, shown)
 
 
 def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "Plant":

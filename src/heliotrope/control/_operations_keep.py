@@ -1,6 +1,7 @@
 """What the automatic work keeps of calibrations and holds over a restart, and recalls."""
 
 from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -12,6 +13,18 @@ from heliotrope.control.calibration_cycle import CycleResult
 from heliotrope.control.parameters import items_of
 from heliotrope.control.plant import PlantController
 from heliotrope.store.records import Records, StoreError, VisitEntry, version_of
+
+#: Old events are looked for so often, s.
+_DAY = 86_400.0
+
+
+@runtime_checkable
+class Forgetting(Protocol):
+    """Records that can let go of what is old."""
+
+    def forget_events(self, before: float) -> None:
+        """Let go of events before a time, and of alarms that were over and acknowledged."""
+        ...
 
 
 class Keeper:
@@ -37,6 +50,7 @@ class Keeper:
         self._plant, self._records, self._book, self._cycle = plant, records, book, cycle
         self._numbers: dict[str, list[int]] = {}
         self.lost = ""
+        self._forgot_at = -np.inf
 
     @property
     def problem(self) -> str:
@@ -63,6 +77,17 @@ class Keeper:
         """Keep that heliostats were given back."""
         if self._records is not None:
             self._records.unhold(heliostats, who, at)
+
+    def forget(self, now: float, days: float) -> None:
+        """Let go of events older than some days, once a day; ``now`` in POSIX s."""
+        kept: object = self._records
+        if now - self._forgot_at < _DAY or not isinstance(kept, Forgetting):
+            return
+        self._forgot_at = now
+        try:
+            kept.forget_events(now - days * _DAY)
+        except StoreError as error:
+            self.lost = str(error)
 
     def recall(self) -> None:
         """Take up all calibrations that were kept; local controllers that differ are told."""

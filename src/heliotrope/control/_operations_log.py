@@ -19,8 +19,12 @@ from heliotrope.store.records import Event, Records
 _STEADY = ("lease", "status")
 #: Longest text of a packet, letters.
 _LONGEST = 240
-#: Alarms that nobody has to acknowledge for a row of the safety table: of this side.
-_PLAIN = ("records", "work")
+#: Alarms of no row of the safety table, of the plant and of clusters: noted when acknowledged.
+_PLAIN = frozenset(
+    {"records", "work", "camera", "sensor", "order_unacknowledged", "node_silent", "node_fault",
+     "node_unintelligible", "plant_unintelligible", "lease_refused", "autonomy_limited",
+     "state_unwritable"}
+)  # fmt: skip
 #: Is told once and mended by the plant itself.
 _PASSING = ("parameters_differ",)
 

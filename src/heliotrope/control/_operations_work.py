@@ -99,6 +99,8 @@ class WorkSettings:
         What was commanded is not commanded again within this time, s.
     margin
         Beams that were never calibrated must miss targets by so many standard deviations.
+    events
+        Events, and alarms that are over and acknowledged, are kept so long, days.
     """
 
     wanted: bool = False
@@ -110,6 +112,7 @@ class WorkSettings:
     pause: float = 1200.0
     patience: float = 60.0
     margin: float = 3.0
+    events: float = 400.0
 
     def __post_init__(self) -> None:
         if not (0.0 < self.rate <= 100.0 and 0.0 < self.beat <= 60.0 and self.margin >= 0.0):
@@ -117,6 +120,8 @@ class WorkSettings:
                 f"work: {self.rate} heliostats a second, a beat of {self.beat} s, a margin of "
                 f"{self.margin}; give above 0 to 100, above 0 to 60 s, 0 or more"
             )
+        if not self.events > 0.0:
+            raise InputError(f"work: events of {self.events} days are kept; give above 0")
 
 
 class Automat:
@@ -390,6 +395,7 @@ class Automat:
         """Predict errors anew, and note how good the field is."""
         self.book.refresh()
         self.book.point(self._utc(), self.truth_errors())
+        self._keeper.forget(self._utc(), self._settings.events)
         problem = self._keeper.problem
         if problem or self._troubled:
             text = problem or "records are kept again"

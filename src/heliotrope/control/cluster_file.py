@@ -6,6 +6,7 @@ in a file of their own that nobody else may read.
 
 import string
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -21,6 +22,9 @@ from heliotrope.sun import Site
 
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
 _OTHERS = 0o077
+_MISSING = {
+    "heliostats": "the cluster has no such heliostat", "clusters": "the plant has no such cluster",
+}  # fmt: skip
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
@@ -222,7 +226,7 @@ def read_cluster(path: str | Path) -> Installation:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise FormatError(path, explained(first, TABLES), where) from None
-    secrets = _Secrets(path.parent / document.keys if document.keys else None)
+    secrets = Keys(path.parent / document.keys if document.keys else None, "heliostats")
     try:
         return _install(path, document, secrets)
     except FormatError:
@@ -231,7 +235,7 @@ def read_cluster(path: str | Path) -> Installation:
         raise FormatError(path, str(error)) from None
 
 
-def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Installation:
+def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installation:
     site, bus, polling = document.site, document.bus, document.polling
     names = [each.name for each in document.heliostats]
     secrets.check(names)
@@ -242,7 +246,7 @@ def _install(path: Path, document: ClusterDocument, secrets: "_Secrets") -> Inst
             site.temperature_c, document.name, site.delta_t_s,
         ),
         heliostats=tuple(
-            Member(each.name, each.address, each.serial, secrets.heliostats.get(each.name, b""))
+            Member(each.name, each.address, each.serial, secrets.members.get(each.name, b""))
             for each in document.heliostats
         ),
         answer=bus.answer_s, stored_answer=bus.stored_answer_s,
@@ -293,29 +297,49 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
     return parts.scheme, parts.hostname, port, prefix
 
 
-class _Secrets:
-    """The keys' file: ``plant``, ``password`` and a table ``heliostats``, keys in hexadecimal."""
+class Keys:
+    """A keys' file: ``plant``, ``password`` and a table of keys, all in hexadecimal.
 
-    def __init__(self, path: Path | None) -> None:
-        self._path = path
+    Parameters
+    ----------
+    path
+        None: there is none, and no key.
+    table
+        Name of the table: "heliostats" of a cluster, "clusters" of a plant.
+
+    Attributes
+    ----------
+    plant, password
+        b"" and "" if they are not given.
+    members
+        Keys of the table by name.
+
+    Raises
+    ------
+    FormatError
+        A file that others may read, or that holds what is no key.
+    """
+
+    def __init__(self, path: Path | None, table: str) -> None:
+        self._path, self._table = path, table
         self.plant, self.password = b"", ""
-        self.heliostats: dict[str, bytes] = {}
+        self.members: dict[str, bytes] = {}
         if path is None:
             return
-        raw = _toml(path, "a file of keys")
+        raw = read_toml(path, "a file of keys")
         if path.stat().st_mode & _OTHERS:
             mode = path.stat().st_mode & 0o777
             raise FormatError(path, f"others may read it (mode {mode:o}); say chmod 600")
         for key in raw:
-            if key not in ("plant", "password", "heliostats"):
-                raise FormatError(path, f"{key!r} is not known; give plant, password, heliostats")
+            if key not in ("plant", "password", table):
+                raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
         if "plant" in raw:
             self.plant = self._key("plant", raw["plant"])
-        password, table = raw.get("password", ""), raw.get("heliostats", {})
-        if not isinstance(password, str) or not isinstance(table, dict):
-            raise FormatError(path, "password must be a text, and heliostats a table of keys")
+        password, keys = raw.get("password", ""), raw.get(table, {})
+        if not isinstance(password, str) or not isinstance(keys, dict):
+            raise FormatError(path, f"password must be a text, and {table} a table of keys")
         self.password = password
-        self.heliostats = {name: self._key(name, value) for name, value in table.items()}
+        self.members = {name: self._key(name, value) for name, value in keys.items()}
 
     def _key(self, name: str, value: object) -> bytes:
         text = value if isinstance(value, str) else ""
@@ -329,17 +353,24 @@ class _Secrets:
         return bytes.fromhex(text)
 
     def check(self, names: list[str]) -> None:
-        """Refuse keys of heliostats that are not in the cluster."""
-        for name in self.heliostats:
+        """Refuse keys of those that are not there."""
+        for name in self.members:
             if name not in names:
                 close = get_close_matches(name, names, n=1)
                 hint = f"; did you mean {close[0]!r}?" if close else "; remove it"
                 raise FormatError(
-                    self._path, f"the cluster has no such heliostat{hint}", f"heliostats.{name}"
+                    self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
                 )
 
 
-def _toml(path: Path, what: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Return what a TOML file holds; ``what`` it should be, as an error calls it.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read or is no TOML.
+    """
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -352,13 +383,13 @@ def _toml(path: Path, what: str) -> dict[str, Any]:
         raise FormatError(path, f"no TOML: {error}") from None
 
 
-def _explain(error: Any) -> str:
-    """One line from pydantic's description of an error."""
+def explained(error: Any, tables: Iterable[type[BaseModel]]) -> str:
+    """Return one line from pydantic's description of an error in a file of some tables."""
     key = str(error["loc"][-1]) if error["loc"] else ""
     if error["type"] == "missing":
         return f"{key!r} is missing; add it"
     if error["type"] == "extra_forbidden":
-        known = sorted({name for table in TABLES for name in table.model_fields})
+        known = sorted({name for table in tables for name in table.model_fields})
         close = get_close_matches(key, known, n=1)
         return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
     message = error["msg"][0].lower() + error["msg"][1:]

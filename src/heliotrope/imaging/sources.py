@@ -30,7 +30,6 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.motion import find_shift
 from heliotrope.imaging.reading import IMAGE_SUFFIXES, find_images, read_image, write_image
 
-#: What :func:`open_source` takes for a video.
 VIDEO_SUFFIXES = (".avi", ".mp4", ".m4v", ".mkv", ".mov", ".mpg", ".mpeg", ".ts", ".webm", ".mjpeg")
 _PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}
 
@@ -91,8 +90,7 @@ def open_source(
     Parameters
     ----------
     text
-        A folder of images, an image, a video file; rtsp://…, http://… (MJPEG); usb:0 or
-        /dev/video0.
+        Folder, image or video file; rtsp://…, http://… (MJPEG, or …/now.jpg); usb:0, /dev/video0.
     folder
         Relative paths start here: the plant file's folder.
     start, size, watch
@@ -103,7 +101,7 @@ def open_source(
     Raises
     ------
     InputError
-        If the text names nothing that can be a source.
+        The text names nothing that can be a source.
     """
     text, stop = text.strip(), stop or threading.Event()
     scheme, _, rest = text.partition(":")
@@ -111,7 +109,9 @@ def open_source(
     if not text:
         raise InputError("no source is given; name a folder, a video, rtsp://…, http://… or usb:0")
     if scheme in _PORTS and rest.startswith("//"):
-        return StreamSource(text, limit=limit, stop=stop)
+        from heliotrope.imaging.snapshot import SnapshotSource, is_snapshot
+
+        return (SnapshotSource if is_snapshot(text) else StreamSource)(text, limit=limit, stop=stop)
     if scheme == "usb" or re.fullmatch(r"/dev/video\d+", text):
         device = rest if scheme == "usb" else text
         return UsbSource(device, width=size[0], height=size[1], limit=limit, stop=stop)

@@ -10,25 +10,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from heliotrope.control._operations_views import CameraView
 from heliotrope.control.calibration_cycle import Shot
+from heliotrope.control.real_views import Views, picture_of, shot_of
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Photograph, read_photograph
 from heliotrope.imaging.rendering import render
 from heliotrope.imaging.scenes import Scene, Thrown, exposed
 from heliotrope.twin.cameras import PEAK, ExactCamera, Mirror, Optics, RenderedCamera, Sight
-
-#: Quality of the pictures for people, 0 to 100.
-_JPEG = 80
-#: Of the pictures for people.
-_GAMMA = 0.45
 
 
 class LiveCamera(RenderedCamera):
@@ -48,7 +40,7 @@ class LiveCamera(RenderedCamera):
     ) -> None:  # fmt: skip
         super().__init__(sight, scenes, optics=optics, seed=seed)
         self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
-        self._views: dict[str, CameraView] = {}
+        self._views = Views()
         self._known: dict[str, tuple[Any, ...]] = {}
 
     def close(self) -> None:
@@ -58,7 +50,7 @@ class LiveCamera(RenderedCamera):
 
     def view(self, target: str) -> CameraView:
         """Return the last photograph of a target for people."""
-        return self._views.get(target, CameraView(target, 0, 0.0, b""))
+        return self._views.view(target)
 
     async def take_empty(self, target: Target) -> None:
         """Photograph a target before a beam comes; see `RenderedCamera.take_empty`."""
@@ -74,12 +66,7 @@ class LiveCamera(RenderedCamera):
         """Return the beam that is seen on a target; see `RenderedCamera.photograph`."""
         del heliostat
         seen, _, at = await self._look(target)
-        reading = seen.reading(target.name)
-        reasons = tuple(f"{reason.name}: {reason.text}" for reason in reading.reasons)
-        if not reading.spots:
-            return Shot(np.full(3, np.nan), at, 0.0, reasons)
-        spot = reading.spots[0]
-        return Shot(spot.point, at, spot.covariance_enu, reasons)
+        return shot_of(seen, target.name, at)
 
     async def _look(self, target: Target) -> tuple[Photograph, Frame, float]:
         name = target.name
@@ -100,13 +87,13 @@ class LiveCamera(RenderedCamera):
                 frame, scene.targets, scene.camera, settings=self._settings,
                 previous=self._known.get(name, ()), without=self._empty.get(name),
             )  # fmt: skip
-            return seen, frame, _jpeg(annotate(_brightened(seen)))
+            return seen, frame, picture_of(seen)
 
         if self._pool is None:
             seen, frame, jpeg = work()
         else:
             seen, frame, jpeg = await asyncio.get_running_loop().run_in_executor(self._pool, work)
-        self._keep(name, utc.timestamp(), seen, jpeg)
+        self._views.keep(name, utc.timestamp(), seen, jpeg)
         return seen, frame, at
 
     def _thrown(
@@ -115,33 +102,6 @@ class LiveCamera(RenderedCamera):
         """Return what some mirrors throw on a target, as `RenderedCamera.beams` does."""
         still = replace(self._sight, mirrors=lambda: mirrors, sun=lambda: sun)
         return RenderedCamera(still, (), optics=self._optics).beams(target)
-
-    def _keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
-        reading = seen.reading(name)
-        lines = [f"{reason.name}: {reason.text}" for reason in reading.reasons]
-        centroid = None
-        if reading.spots:
-            x, y = reading.spots[0].plane
-            centroid = float(x), float(y)
-            lines.insert(0, f"{len(reading.spots)} spot(s), {x:+.3f} m right, {y:+.3f} m up")
-        version = self.view(name).version + 1
-        self._views[name] = CameraView(name, version, at, jpeg, tuple(lines), centroid)
-
-
-def _brightened(seen: Photograph) -> Photograph:
-    """Return a photograph for people: beside a beam the target would look black."""
-    frame = seen.frame
-    top = 255.0 if frame.pixels.dtype == np.uint8 else 65535.0
-    table = np.round(255.0 * np.linspace(0.0, 1.0, int(top) + 1) ** _GAMMA).astype(np.uint8)
-    pixels = table[frame.pixels]
-    return replace(seen, frame=replace(frame, pixels=pixels))
-
-
-def _jpeg(picture: npt.NDArray[np.uint8]) -> bytes:
-    import cv2
-
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
-    return data.tobytes()
 
 
 class SeenExactly(ExactCamera):

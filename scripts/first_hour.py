@@ -1,0 +1,118 @@
+"""Makes the pictures of the tutorial of the first hour, from `heliotrope run` itself.
+
+python scripts/first_hour.py [--heliostats 320] [--speed 2] [--learnt 6] [--into docs/images]
+
+It prints how long each step took, and the lines of the plant.
+"""
+
+import argparse
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from screenshots import ARGS, CHROMIUM, WIDE
+
+COMMAND = [sys.executable, "-c", "from heliotrope.cli import main; main()", "run"]
+
+
+class Plant:
+    """`heliotrope run` as a process; its lines are kept and printed."""
+
+    def __init__(self, *options: str) -> None:
+        self.begun, self.lines = time.monotonic(), list[str]()
+        self._process = subprocess.Popen(  # noqa: S603 - this program itself
+            [*COMMAND, *options, "--port", "0", "--no-browser", "--every", "20"],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self.lines.append(line)
+            self.say(re.sub(r"password \S+", "password …", line.rstrip()))
+
+    def say(self, text: str) -> None:
+        """Print a line with the seconds since the start."""
+        print(f"{time.monotonic() - self.begun:6.1f} s  {text}", flush=True)
+
+    def told(self, pattern: str, within: float = 120.0) -> str:
+        """Wait for a line, and return the group of its match."""
+        until = time.monotonic() + within
+        while time.monotonic() < until:
+            for line in self.lines:
+                if found := re.search(pattern, line):
+                    return found[1]
+            time.sleep(0.1)
+        raise SystemExit(f"no line with {pattern!r} within {within:g} s")
+
+    def end(self) -> None:
+        """Ctrl-C."""
+        self._process.terminate()
+        self._process.wait(400.0)
+
+
+def take(page: Any, plant: Plant, learnt: int, into: Path) -> None:
+    """Walk through the hour."""
+
+    def shot(name: str) -> None:
+        page.wait_for_timeout(1000)
+        page.screenshot(path=into / f"first-hour-{name}.png")
+        plant.say(f"picture {name}")
+
+    def done(count: int) -> None:
+        holds = f"heliotrope.store.head?.calibration.done >= {count}"
+        page.wait_for_function(holds, timeout=900_000)
+        plant.say(f"{count} calibrated")
+
+    page.wait_for_selector(".hx-legend b")
+    page.wait_for_timeout(5000)
+    shot("raising")
+    done(1)
+    page.click(".hx-tabs >> text=Targets")
+    shot("target")
+    done(learnt)
+    page.click(".hx-tabs >> text=Calibration")
+    page.select_option(".hx-tools select", "error")
+    shot("calibration")
+    page.fill(".hx-query", "sightings > 0")
+    page.keyboard.press("Enter")
+    page.evaluate("heliotrope.store.select([...heliotrope.store.selection].slice(0, 1))")
+    page.click(".hx-tabs >> text=Heliostat")
+    shot("heliostat")
+
+
+def main() -> None:
+    """Make the pictures."""
+    from playwright.sync_api import sync_playwright
+
+    parser = argparse.ArgumentParser(description="Pictures of the first hour.")
+    parser.add_argument("--heliostats", type=int, default=320)
+    parser.add_argument("--speed", type=float, default=2.0)
+    parser.add_argument("--learnt", type=int, default=6, help="heliostats to wait for")
+    parser.add_argument("--into", type=Path, default=Path("docs/images"))
+    given = parser.parse_args()
+    plant = Plant("--heliostats", str(given.heliostats), "--speed", str(given.speed))
+    try:
+        address = plant.told(r"console: (\S+)")
+        password = plant.told(r"password (\S+)")
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+            page = browser.new_page(viewport=WIDE)
+            page.set_default_timeout(60_000)
+            page.goto(f"{address}login")
+            page.fill("[name=name]", "engineer")
+            page.fill("[name=password]", password)
+            page.click("button")
+            take(page, plant, given.learnt, given.into)
+            browser.close()
+    finally:
+        plant.end()
+
+
+if __name__ == "__main__":
+    main()

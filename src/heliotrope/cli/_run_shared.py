@@ -1,0 +1,301 @@
+"""What every plant at work shares, simulated or real: store, archive, console, lines, its end."""
+
+import asyncio
+import contextlib
+import shutil
+import signal
+import socket
+import sys
+import tempfile
+import webbrowser
+from collections.abc import AsyncIterator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from heliotrope.control.clock import Clock
+from heliotrope.control.operations import Operations
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.geometry import as_float
+from heliotrope.lcu import states
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.telemetry import Look, Telemetry
+
+if TYPE_CHECKING:
+    from heliotrope.console.serve import ConsoleServer
+
+#: A console prints lines more seldom: people look at it.
+_SELDOM = 6.0
+#: Seconds between lines by default.
+EVERY = 10.0
+
+
+class AtWork(Protocol):
+    """A plant with all that runs beside it."""
+
+    operations: Operations
+
+    @property
+    def clock(self) -> Clock:
+        """Of the plant."""
+        ...
+
+    async def stowed(self, limit: float = 300.0) -> bool:
+        """Stow the field; return whether all of it is."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shown:
+    """Console, store and lines, as they were asked for; see `cli.run`."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    names: tuple[str, ...] = ()
+    certificate: Path | None = None
+    key: Path | None = None
+    plain: bool = False
+    console: bool = True
+    browser: bool = True
+    data: Path | None = None
+    database: str | None = None
+    minutes: float | None = None
+    every: float = EVERY
+
+    def __post_init__(self) -> None:
+        for name, value in (("minutes", self.minutes), ("every", self.every)):
+            if value is not None and not 0.0 < value < 1e6:
+                raise InputError(f"run: --{name} {value:g}; give above 0")
+        if self.database is not None and not self.database.startswith("postgresql://"):
+            raise InputError(
+                "run: --database is no postgresql://user@host/name; SQLite needs --data alone"
+            )
+        if self.certificate is not None and self.key is not None:
+            from heliotrope.control.tcp import server_tls
+
+            server_tls(self.certificate, self.key)
+        if self.console:
+            self.settings()
+
+    def settings(self) -> Any:
+        """Return the settings of the console.
+
+        Raises
+        ------
+        InputError
+            If they do not hold together, or the console is not installed.
+        """
+        try:
+            from heliotrope.console.settings import ConsoleSettings
+        except ImportError as error:
+            raise _missing(error) from None
+        return ConsoleSettings(
+            host=self.host, port=self.port, names=self.names, certificate=self.certificate,
+            key=self.key, plain=self.plain,
+        )  # fmt: skip
+
+
+def load_console(shown: Shown) -> None:
+    """Import the console before the plant begins: that takes longer than a lease lasts.
+
+    Raises
+    ------
+    InputError
+        If it is not installed, or its address is taken.
+    """
+    if not shown.console:
+        return
+    family = socket.AF_INET6 if ":" in shown.host else socket.AF_INET
+    try:
+        socket.create_server((shown.host, shown.port), family=family).close()
+    except OSError as error:
+        why = error.strerror or str(error)
+        raise InputError(
+            f"console: {shown.host} port {shown.port} cannot be had ({why}); another program may "
+            "use it, choose another with --port"
+        ) from None
+    try:
+        import heliotrope.console.serve  # noqa: F401 - only loaded
+    except ImportError as error:
+        raise _missing(error) from None
+
+
+def _missing(error: ImportError) -> InputError:
+    return InputError(
+        f"run: {error.name} is not installed; say pip install 'heliotrope[console]', or give "
+        "--no-console"
+    )
+
+
+@contextlib.contextmanager
+def one_error() -> Iterator[None]:
+    """Raise the first error that Heliotrope raised on purpose in place of a group that holds it."""
+    try:
+        yield
+    except BaseExceptionGroup as group:
+        found = _leaves(group)
+        known = [error for error in found if isinstance(error, HeliotropeError | OSError)]
+        if not known:
+            raise
+        raise known[0] from None
+
+
+def _leaves(error: BaseException) -> list[BaseException]:
+    if isinstance(error, BaseExceptionGroup):
+        return [leaf for inner in error.exceptions for leaf in _leaves(inner)]
+    return [error]
+
+
+def ending_at_signals() -> asyncio.Event:
+    """Return an event that Ctrl-C and SIGTERM set."""
+    ending, loop = asyncio.Event(), asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ending.set)
+    return ending
+
+
+@contextlib.contextmanager
+def store(shown: Shown) -> Iterator[Keeper]:
+    """Open the store: a database, or in its folder, or in one that is gone afterwards."""
+    kept = shown.data is not None or shown.database is not None
+    folder = shown.data if kept else Path(tempfile.mkdtemp(prefix="heliotrope-"))
+    try:
+        place = shown.database or folder
+        assert place is not None
+        keeper = Keeper(place)
+        try:
+            yield keeper
+        finally:
+            keeper.close()
+    finally:
+        if not kept and folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.asynccontextmanager
+async def archive(live: AtWork, shown: Shown) -> AsyncIterator[None]:
+    """Archive the field's telemetry beside a block, if there is a folder."""
+    if shown.data is None:
+        yield
+        return
+    kept = Telemetry(shown.data / "telemetry", live.operations.names, states.STATES)
+
+    async def look() -> None:
+        while True:
+            frame = live.operations.frame()
+            flags = frame.flags.astype(np.uint16)
+            kept.take(
+                frame.at, Look(frame.state, frame.fault, flags, frame.counts, as_float(frame.age))
+            )  # fmt: skip
+            await asyncio.sleep(5.0)
+
+    try:
+        async with asyncio.TaskGroup() as group:
+            looking = group.create_task(look())
+            yield
+            looking.cancel()
+    finally:
+        kept.close()
+
+
+def console_of(live: AtWork, keeper: Keeper, shown: Shown) -> "ConsoleServer | None":
+    """Return the console of a plant that does not run yet; None if none is wanted.
+
+    It takes longer to make than a lease lasts, so it is made before.
+    """
+    if not shown.console:
+        return None
+    from heliotrope.console.serve import ConsoleServer
+
+    return ConsoleServer(live.operations, keeper.people, shown.settings())
+
+
+@contextlib.asynccontextmanager
+async def console(
+    server: "ConsoleServer | None", live: AtWork, keeper: Keeper, shown: Shown, speed: float = 1.0
+) -> AsyncIterator[bool]:
+    """Serve the console beside a block; say where it is."""
+    if server is None:
+        yield False
+        return
+    from heliotrope.console.people import FIRST, first_start
+
+    password = first_start(keeper.people, live.clock.utc().timestamp())
+    async with asyncio.TaskGroup() as group:
+        serving = group.create_task(server.run())
+        address = await server.address(60.0 * speed)
+        print(f"console: {address}", flush=True)
+        if password is not None:
+            print(f"first account: {FIRST}, password {password} (shown only now)", flush=True)
+        if shown.browser and sys.stdout.isatty():
+            webbrowser.open(address)
+        yield True
+        await server.close()
+        await serving
+
+
+async def watch(
+    live: AtWork, shown: Shown, ending: asyncio.Event, *, seen: bool, speed: float = 1.0
+) -> None:
+    """Print a line now and then until the end; ``seen``: people look at a console."""
+    loop = asyncio.get_running_loop()
+    pause = speed * shown.every * (_SELDOM if seen and shown.every == EVERY else 1.0)
+    until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
+    while not ending.is_set() and (until is None or loop.time() < until):
+        left = pause if until is None else min(pause, until - loop.time())
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(max(left, 0.01)):
+                await ending.wait()
+        print(line(live), flush=True)
+
+
+async def stow(live: AtWork, ending: asyncio.Event) -> bool:
+    """Stow the field, or give up at a second signal; return whether all of it is."""
+    print("stowing; Ctrl-C again ends at once", flush=True)
+    ending.clear()
+    stowing = asyncio.ensure_future(live.stowed())
+    waiting = asyncio.ensure_future(ending.wait())
+    await asyncio.wait({stowing, waiting}, return_when=asyncio.FIRST_COMPLETED)
+    waiting.cancel()
+    stowing.cancel()
+    done = await asyncio.gather(stowing, return_exceptions=True)
+    for error in done:
+        if isinstance(error, Exception):
+            raise error
+    good = list(done) == [True]
+    print("the field is stowed" if good else "not all is stowed", flush=True)
+    return good
+
+
+def line(live: AtWork) -> str:
+    """Return one line on a plant."""
+    summary, work = live.operations.summary(), live.operations.calibration()
+    counts = ", ".join(f"{count:,} {name.lower()}" for name, count in summary.states.items())
+    parts = [f"{summary.at:%H:%M:%S} UTC", counts, f"{work.done} calibrated"]
+    if summary.clusters_alive < summary.clusters:
+        parts.append(_silent(live))
+    if work.quality:
+        last = work.quality[-1]
+        true = np.isfinite(last.truth_median)
+        said = f"{1e3 * (last.truth_median if true else last.median):.2f} mrad"
+        parts.append(f"median error {said}" if true else f"predicted error {said}")
+    if work.running:
+        parts.append("; ".join(f"{r.heliostat} at {r.target}: {r.stage}" for r in work.running))
+    elif work.reason:
+        parts.append(work.reason)
+    if summary.alarms:
+        parts.append(f"{summary.alarms} alarms")
+    if summary.lag > 1.0:
+        parts.append(f"{summary.lag:.0f} s behind")
+    return " | ".join(parts)
+
+
+def _silent(live: AtWork) -> str:
+    """Return which clusters are silent, and why the first of them is."""
+    rows = live.operations.cluster_rows()
+    away = [row for row in rows if not row.alive]
+    names = ", ".join(row.name for row in away[:3]) + (", …" if len(away) > 3 else "")
+    why = f" ({away[0].problem})" if away and away[0].problem else ""
+    return f"{len(away)} of {len(rows)} clusters silent: {names}{why}"

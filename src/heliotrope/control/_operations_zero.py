@@ -1,0 +1,49 @@
+"""ZERO: where the axes of one heliostat stand, as a person declares it."""
+
+from collections.abc import Sequence
+
+from heliotrope.control._plant_orders import whole
+from heliotrope.control._tickets import Ticket
+from heliotrope.control.authority import Person, RefusedError
+from heliotrope.control.plant import PlantController
+from heliotrope.lcu import messages
+
+
+def zero(
+    plant: PlantController, person: Person, token: int, heliostats: Sequence[str],
+    values: Sequence[float],
+) -> Ticket:  # fmt: skip
+    """Declare the step counts of the two axes of one heliostat that is locked or has a fault.
+
+    Nothing moves; its controller stores the counts. It needs an engineer, and the heliostat's key
+    in its cluster.
+
+    Parameters
+    ----------
+    plant
+        The controller.
+    person, token
+        Who, with the token of the authority.
+    heliostats
+        The name of one.
+    values
+        Counts of the primary and the secondary axis, steps.
+
+    Raises
+    ------
+    RefusedError
+        If it is not accepted; nothing is sent then.
+    InputError
+        Values that do not fit.
+    UnknownNameError
+        If there is no such heliostat.
+    """
+    if len(heliostats) != 1:
+        raise RefusedError(
+            f"ZERO: {len(heliostats) or 'all'} heliostats; the counts of one are not those of "
+            "another, give one heliostat"
+        )
+    numbers = whole(values, messages.ROW_OF[messages.NUMBER_OF["ZERO"]][3], "ZERO")
+    ticket = plant._accept(person, token, "ZERO", numbers, heliostats)  # noqa: SLF001 - a part of the plant
+    plant._orders.command(ticket, "ZERO", numbers, heliostats, token)  # noqa: SLF001 - as above
+    return ticket

@@ -1,0 +1,304 @@
+"""Cameras of a real plant: their newest frames, read as every photograph is read.
+
+A thread for each camera keeps the newest frame of its source (`imaging.sources`): a watched
+folder, a stream, a device, an address of one image. A photograph of a beam is the first frame that
+was exposed after it was asked for; where none comes within some seconds that is an alarm, and the
+camera's targets are left alone until one comes.
+
+The picture of the empty target is learnt from every frame (`imaging.memory`), so that light that
+changes over the day is no beam.
+"""
+
+import asyncio
+import math
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from heliotrope.control._operations_views import CameraView
+from heliotrope.control.calibration_cycle import Shot
+from heliotrope.control.clock import Clock
+from heliotrope.control.protocol import Alarm
+from heliotrope.control.real_views import Views, picture_of, shot_of
+from heliotrope.errors import FetchError, HeliotropeError, InputError, UnknownNameError
+from heliotrope.field.camera import Camera
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.memory import Memory
+from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
+from heliotrope.imaging.teaching import read_pictures
+
+#: A photograph is awaited for so long, and its frame looked for so often, s.
+PATIENCE, _LOOK = 15.0, 0.05
+#: A source that failed is opened again after so long, s.
+_AGAIN = 5.0
+#: A frame's time may be unsure by so much, s: in 1 s the sun moves a normal by 36 µrad.
+_UNSURE = 1.0
+#: A stream whose delay nobody has stated is late by so much at most, s.
+_LATE = 2.0
+#: What was learnt of empty targets is kept after so many photographs.
+_OFTEN = 20
+
+
+def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
+    """Return the live source of a camera.
+
+    Parameters
+    ----------
+    camera
+        With its ``source``; see docs/how-to/camera-sources.md.
+    folder
+        Of the plant file.
+    stop
+        Ends it.
+
+    Raises
+    ------
+    InputError
+        If it names none, or a recording.
+    """
+    who = f"camera {camera.name}"
+    if not camera.source:
+        raise InputError(
+            f"{who}: the plant file names no source of its frames; add source, as rtsp://…, "
+            "http://…/now.jpg, usb:0, or a folder that the camera writes into"
+        )  # fmt: skip
+    found = open_source(camera.source, folder=folder, size=camera.size, watch=True, stop=stop)
+    if isinstance(found, VideoSource):
+        raise InputError(f"{who}: {camera.source} is a recording; give a source of live frames")
+    if isinstance(found, FolderSource) and not Path(found.path).exists():
+        raise InputError(f"{who}: there is no folder {found.path}; make it, or correct source")
+    return found
+
+
+class Feed:
+    """The newest frame of one source, kept by a thread.
+
+    Parameters
+    ----------
+    source
+        Of frames; its ``stop`` ends the thread.
+
+    Attributes
+    ----------
+    newest
+        The last frame, None before the first.
+    problem
+        Why there is none now, "" if nothing is wrong.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.newest: Frame | None = None
+        self.problem = ""
+        self._source = source
+        self._thread = threading.Thread(target=self._run, name=source.name, daemon=True)
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread; one that hangs in a driver is left behind."""
+        self._source.stop.set()
+        if self._thread.is_alive():
+            self._thread.join(2.0)
+
+    def _run(self) -> None:
+        stop = self._source.stop
+        while not stop.is_set():
+            try:
+                with self._source as source:
+                    for frame in source:
+                        self.newest, self.problem = frame, ""
+            except HeliotropeError as error:
+                self.problem = str(error)
+            except Exception as error:  # noqa: BLE001 - a driver's; the plant goes on without it
+                self.problem = f"{type(error).__name__}: {error}"
+            stop.wait(_AGAIN)
+
+
+@dataclass(frozen=True)
+class _Eye:
+    """A camera with its feed and the targets that it is asked for."""
+
+    camera: Camera
+    targets: tuple[Target, ...]
+    feed: Feed
+
+
+class RealCameras:
+    """All cameras of a plant; a `calibration_cycle.Camera` and an `operations.Photographer`.
+
+    Parameters
+    ----------
+    design
+        Of its cameras those are used that name a target; the first of each target.
+    folder
+        Of the plant file.
+    clock
+        Of the plant.
+    memory
+        Folder in which pictures of empty targets are kept; None: they are learnt anew.
+    patience
+        For a frame, s.
+    sources
+        Makes the source of a camera.
+
+    Attributes
+    ----------
+    on_alarm
+        Called when a camera has fallen silent, and when it is back.
+    silent
+        Targets whose camera gave no frame when it was last asked.
+    unseen
+        Targets that no camera looks at.
+
+    Raises
+    ------
+    InputError
+        A camera without a live source.
+    """
+
+    def __init__(
+        self, design: Plant, folder: Path, clock: Clock, *, memory: Path | None = None,
+        patience: float = PATIENCE,
+        sources: Callable[[Camera, Path, threading.Event], Source] = source_of,
+    ) -> None:  # fmt: skip
+        self._clock, self._patience = clock, patience
+        self.on_alarm: Callable[[Alarm], None] = lambda _: None
+        self._stop = threading.Event()
+        self._pool = ThreadPoolExecutor(1, "camera")
+        self._memory = Memory() if memory is None else Memory.load(memory)
+        self._folder, self._views, self._taken = memory, Views(), 0
+        self.silent: set[str] = set()
+        self._eyes: dict[str, _Eye] = {}
+        for camera, targets in _watching(design.cameras, design.targets):
+            eye = _Eye(camera, targets, Feed(sources(camera, folder, self._stop)))
+            self._eyes |= {target.name: eye for target in targets}
+        self.unseen = tuple(t.name for t in design.targets if t.name not in self._eyes)
+        self._settings = Settings(pictures=read_pictures(folder, design.targets))
+
+    def start(self) -> None:
+        """Begin to take frames."""
+        for feed in {id(eye.feed): eye.feed for eye in self._eyes.values()}.values():
+            feed.start()
+
+    def close(self) -> None:
+        """End all threads, and keep what was learnt.
+
+        Raises
+        ------
+        InputError
+            If that cannot be written.
+        """
+        self._stop.set()
+        for eye in self._eyes.values():
+            eye.feed.close()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._folder is not None:
+            self._memory.save(self._folder)
+
+    def view(self, target: str) -> CameraView:
+        """Return the last photograph of a target for people."""
+        return self._views.view(target)
+
+    def awake(self, target: str) -> bool:
+        """Return whether a target has a camera that is not silent, or has spoken since."""
+        eye = self._eyes.get(target)
+        if eye is None:
+            return False
+        if target in self.silent:
+            frame, limit = eye.feed.newest, timedelta(seconds=self._patience)
+            known = None if frame is None else frame.time
+            if known is not None and self._clock.utc() - known < limit:
+                self._tell(target, "frames come again", active=False)
+        return target not in self.silent
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return the beam that is seen on a target; the camera does not know whose it is.
+
+        Raises
+        ------
+        FetchError
+            If no frame comes.
+        UnknownNameError
+            If no camera looks at the target.
+        """
+        del heliostat
+        return await self.look(target.name)
+
+    async def look(self, target: str) -> Shot:
+        """Photograph a target; see `photograph`."""
+        if target not in self._eyes:
+            raise UnknownNameError("target with a camera", target, list(self._eyes))
+        eye = self._eyes[target]
+        frame = await self._frame(eye, target)
+        loop = asyncio.get_running_loop()
+        seen, jpeg = await loop.run_in_executor(self._pool, self._read, eye, frame)
+        assert frame.time is not None
+        self._views.keep(target, frame.time.timestamp(), seen, jpeg)
+        age = (self._clock.utc() - frame.time).total_seconds()
+        shot = shot_of(seen, target, self._clock.monotonic() - age)
+        if frame.time_deviation > _UNSURE:
+            known = f"{frame.time_deviation:.2g} s only, the limit is {_UNSURE:g} s"
+            text = f"time: known within {known}; let the camera write its time with a zone"
+            shot = replace(shot, reasons=(*shot.reasons, text))
+        return shot
+
+    async def _frame(self, eye: _Eye, target: str) -> Frame:
+        """Wait for a frame that was exposed from now on."""
+        asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
+        while self._clock.monotonic() < until:
+            frame = eye.feed.newest
+            if frame is not None and _dated(frame, eye.camera) >= asked:
+                if target in self.silent:
+                    self._tell(target, "frames come again", active=False)
+                return frame
+            await asyncio.sleep(_LOOK)
+        why = eye.feed.problem or "look at the camera, its network and its clock"
+        text = f"camera {eye.camera.name}: no frame for {self._patience:g} s; {why}"
+        self._tell(target, text, active=True)
+        raise FetchError(text)
+
+    def _tell(self, target: str, text: str, *, active: bool) -> None:
+        (self.silent.add if active else self.silent.discard)(target)
+        self.on_alarm(Alarm("camera", target, "warning", text, active))
+
+    def _read(self, eye: _Eye, frame: Frame) -> tuple[Photograph, bytes]:
+        settings = replace(self._settings, empty=self._memory.models)
+        seen = read_photograph(frame, eye.targets, eye.camera, settings=settings)
+        self._memory.learn(seen.faces)
+        self._taken += 1
+        if self._folder is not None and self._taken % _OFTEN == 0:
+            self._memory.save(self._folder)
+        return seen, picture_of(seen)
+
+
+def _watching(
+    cameras: Sequence[Camera], targets: Sequence[Target]
+) -> list[tuple[Camera, tuple[Target, ...]]]:
+    """Return the cameras that are used, each with its targets; a target has one camera."""
+    left = {target.name: target for target in targets}
+    found = []
+    for camera in cameras:
+        names = camera.targets or tuple(left)
+        mine = tuple(left.pop(name) for name in names if name in left)
+        if mine:
+            found.append((camera, mine))
+    return found
+
+
+def _dated(frame: Frame, camera: Camera) -> datetime:
+    """Return the instant after which a frame was exposed, for all that is known."""
+    if frame.time is None:
+        raise InputError(
+            f"camera {camera.name}: {frame.name} says no time with a zone; let the camera write "
+            "one, as its name (2026-06-21T10-00-00Z) or in EXIF"
+        )
+    unsure = _LATE if math.isnan(frame.time_deviation) else frame.time_deviation
+    return frame.time - timedelta(seconds=unsure)

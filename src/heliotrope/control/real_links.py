@@ -1,0 +1,267 @@
+"""The file that tells a plant how it reaches its clusters, and the links that follow from it.
+
+A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
+at an MQTT broker, or its bus is at this machine and its cluster file is given: then the cluster's
+own program runs in this process. Keys stand in a file of their own that nobody else may read.
+"""
+
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+from urllib.parse import urlsplit
+
+from pydantic import Field, ValidationError
+
+from heliotrope.control.clock import Clock
+from heliotrope.control.cluster_file import Keys, Table, explained, read_toml, url_parts
+from heliotrope.control.link import Link
+from heliotrope.control.mqtt import Broker, mqtt_link
+from heliotrope.control.real_cluster import LocalCluster
+from heliotrope.control.real_sensors import FED, SensorFiles
+from heliotrope.control.tcp import TcpServer, client_tls, server_tls
+from heliotrope.errors import FormatError
+
+
+class TcpTable(Table):
+    """``[tcp]``: where clusters connect to this plant."""
+
+    listen: str = Field(min_length=3, description="`address:port` of this machine.")
+    certificate: str | None = Field(None, description="PEM file, with its key: TLS.")
+    key: str | None = Field(None, description="PEM file of the certificate's key.")
+    authority: str | None = Field(
+        None, description="PEM file of who signs clusters' certificates; without: they need none."
+    )
+
+
+class MqttTable(Table):
+    """``[mqtt]``: the broker at which clusters are met."""
+
+    url: str = Field(min_length=1, description="`mqtt://host:port/prefix`, or `mqtts://…` (TLS).")
+    username: str | None = Field(None, description="At the broker; password: the keys' file.")
+    authority: str | None = Field(
+        None, description="PEM file of who signs the broker's certificate; default: the system's."
+    )
+
+
+class LinksDocument(Table):
+    """The whole file."""
+
+    format: Literal["heliotrope-links"]
+    version: Literal[1]
+    keys: str = Field("", description="File of the keys, beside this one.")
+    tcp: TcpTable | None = None
+    mqtt: MqttTable | None = None
+    sensors: dict[str, str] = Field(
+        default_factory=dict, description="By reading of the safety table: a file with one number."
+    )
+    clusters: dict[str, str] = Field(
+        min_length=1, description='By name: `"tcp"`, `"mqtt"`, or the cluster file of a local bus.'
+    )
+
+
+#: The tables, for the reference and for hints.
+TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable)
+
+
+@dataclass(frozen=True)
+class LinksFile:
+    """A links file as it was read.
+
+    Attributes
+    ----------
+    path
+        Of the file; other files are beside it.
+    document
+        Its tables.
+    keys
+        By cluster.
+    password
+        At the broker.
+    """
+
+    path: Path
+    document: LinksDocument
+    keys: Mapping[str, bytes] = field(repr=False)
+    password: str = field(repr=False)
+
+    def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
+        """See that it names every cluster of a plant and no other.
+
+        Parameters
+        ----------
+        homes
+            Heliostats of each cluster, as `plant_settings.clusters_of` gives them.
+
+        Raises
+        ------
+        FormatError
+            If a cluster has no link, or a link no cluster.
+        """
+        for name in homes:
+            if name not in self.document.clusters:
+                raise FormatError(
+                    self.path, f"the plant has a cluster {name} of {len(homes[name])} heliostats, "
+                    "and no line says how it is reached; add one", "clusters",
+                )  # fmt: skip
+        for name in self.document.clusters:
+            if name not in homes:
+                raise FormatError(
+                    self.path, f"the plant has no cluster {name}; it has {', '.join(homes)}",
+                    "clusters",
+                )  # fmt: skip
+
+    def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
+        """Return the plant's ends of the links, and what has to run beside them.
+
+        Raises
+        ------
+        FormatError
+            See `check`; a local cluster whose heliostats are not the plant's.
+        InputError
+            Certificates that cannot be used.
+        """
+        self.check(homes)
+        made = PlantLinks()
+        folder = self.path.parent
+        made.sensors = SensorFiles({n: folder / f for n, f in self.document.sensors.items()})
+        served = {n: self.keys[n] for n, how in self.document.clusters.items() if how == "tcp"}
+        if served:
+            self._serve(made, served, clock)
+        for name, how in self.document.clusters.items():
+            if how == "mqtt":
+                made.links[name] = self._meet(name, clock)
+                made.parts.append(made.links[name])
+            elif how != "tcp":
+                local = LocalCluster(self.path.parent / how, name, homes[name], clock)
+                made.local.append(local)
+                made.links[name] = local.link
+        return made
+
+    def _serve(self, made: "PlantLinks", keys: Mapping[str, bytes], clock: Clock) -> None:
+        table = self.document.tcp
+        assert table is not None
+        tls = None
+        if table.certificate and table.key:
+            folder = self.path.parent
+            authority = folder / table.authority if table.authority else None
+            tls = server_tls(folder / table.certificate, folder / table.key, authority)
+        host, port = _listen(self.path, table.listen)
+        made.server = TcpServer(host, port, keys, clock, tls=tls)
+        made.links.update(made.server.links)
+        made.parts.append(made.server)
+
+    def _meet(self, name: str, clock: Clock) -> Link:
+        table = self.document.mqtt
+        assert table is not None
+        scheme, host, port, prefix = url_parts(self.path, table.url, "mqtt.url")
+        tls = None
+        if scheme == "mqtts":
+            tls = ssl.create_default_context()
+            if table.authority is not None:
+                tls = client_tls(self.path.parent / table.authority)
+        broker = Broker(host, port, table.username, self.password or None, tls)
+        return mqtt_link(broker, prefix, name, self.keys.get(name, b""), clock, plant=True)
+
+
+@dataclass
+class PlantLinks:
+    """The plant's ends of its links.
+
+    Attributes
+    ----------
+    links
+        By cluster.
+    parts
+        To be run beside the plant, with what `local` has.
+    local
+        Clusters whose bus is at this machine.
+    server
+        That clusters connect to; None if none does.
+    sensors
+        Readings of the safety table from files.
+    """
+
+    links: dict[str, Link] = field(default_factory=dict)
+    parts: list[Any] = field(default_factory=list)
+    local: list[LocalCluster] = field(default_factory=list)
+    server: TcpServer | None = None
+    sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
+
+    def refusal(self) -> str:
+        """Return why the last that connected was not let in, "" if all were."""
+        return self.server.last_refusal if self.server is not None else ""
+
+
+def read_links(path: str | Path) -> LinksFile:
+    """Return a links file with its keys.
+
+    Raises
+    ------
+    FormatError
+        If something cannot be used; the text names file, place, value and limit.
+    """
+    path = Path(path)
+    raw = read_toml(path, "a links file")
+    if raw.get("format") != "heliotrope-links":
+        raise FormatError(
+            path, f"format is {raw.get('format')!r}; a links file says "
+            'format = "heliotrope-links" and version = 1'
+        )  # fmt: skip
+    try:
+        document = LinksDocument.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise FormatError(path, explained(first, TABLES), where) from None
+    keys = Keys(path.parent / document.keys if document.keys else None, "clusters")
+    keys.check(list(document.clusters))
+    found = LinksFile(path, document, keys.members, keys.password)
+    _check(found)
+    return found
+
+
+def _check(found: LinksFile) -> None:
+    path, document = found.path, found.document
+    for name in document.sensors:
+        if name not in FED:
+            raise FormatError(
+                path, f"no row of the safety table needs it; give one of {', '.join(sorted(FED))}",
+                f"sensors.{name}",
+            )  # fmt: skip
+    ways = set(document.clusters.values())
+    for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
+        if way in ways and table is None:
+            raise FormatError(path, f"clusters are reached by {way}; add a table [{way}]", way)
+    for name, how in document.clusters.items():
+        if not name.strip() or not how.strip():
+            raise FormatError(path, "a cluster without a name or a way; give both", "clusters")
+        if how == "tcp" and name not in found.keys:
+            raise FormatError(
+                path, "a cluster that connects over TCP proves itself by its key; put one into the "
+                "keys' file, table [clusters]", f"clusters.{name}",
+            )  # fmt: skip
+        if how not in ("tcp", "mqtt") and not (path.parent / how).is_file():
+            raise FormatError(
+                path, f'{how!r}: give "tcp", "mqtt", or the cluster file of a bus at this machine '
+                "(no such file)", f"clusters.{name}",
+            )  # fmt: skip
+    if document.tcp is not None:
+        _listen(path, document.tcp.listen)
+        if (document.tcp.certificate is None) != (document.tcp.key is None):
+            raise FormatError(path, "TLS needs both, certificate and key", "tcp")
+    if document.mqtt is not None and url_parts(path, document.mqtt.url, "mqtt.url")[0] == "tcp":
+        raise FormatError(path, "give mqtt://host/prefix or mqtts://host/prefix", "mqtt.url")
+
+
+def _listen(path: Path, text: str) -> tuple[str, int]:
+    """Return address and port."""
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or port is None:
+        raise FormatError(path, f"{text!r}: give address:port, as 0.0.0.0:4840", "tcp.listen")
+    return host, port

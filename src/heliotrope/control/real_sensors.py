@@ -1,0 +1,82 @@
+"""Readings of the safety table from files, as whatever reads the sensors writes them.
+
+A file holds one number, in the unit of its row, and is written anew with each reading (beside, then
+renamed). A file that is not written anew is no new reading: after some seconds the worst case of
+its row counts, as if the sensor were gone. See `control.safety`.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from heliotrope.control._plant_watch import OWN_READINGS
+from heliotrope.control.safety import CONDITIONS, Watcher, watched_by
+
+#: Readings that have to come from outside.
+FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS
+#: A file with more is none of a number, bytes.
+_LONGEST = 64
+
+
+@dataclass(frozen=True)
+class Readings:
+    """What has changed since the last look.
+
+    Attributes
+    ----------
+    values
+        New ones, by reading.
+    problems
+        Why one cannot be read, by reading; "" where it can be again.
+    """
+
+    values: dict[str, float] = field(default_factory=dict)
+    problems: dict[str, str] = field(default_factory=dict)
+
+
+class SensorFiles:
+    """Files of sensors.
+
+    Parameters
+    ----------
+    files
+        By reading of the safety table, one of `FED`.
+
+    Attributes
+    ----------
+    names
+        Of the readings.
+    """
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        self._files = dict(files)
+        self.names = frozenset(files)
+        self._written: dict[str, int] = {}
+        self._problems: dict[str, str] = {}
+
+    def read(self) -> Readings:
+        """Look at all files; return what is new."""
+        found = Readings()
+        for name, path in self._files.items():
+            problem = ""
+            try:
+                written = path.stat().st_mtime_ns
+                if written == self._written.get(name):
+                    continue
+                value = float(path.read_text(encoding="ascii")[:_LONGEST])
+                if math.isfinite(value):
+                    # The file of the start may be of long ago.
+                    if name in self._written:
+                        found.values[name] = value
+                    self._written[name] = written
+                else:
+                    problem = f"{path}: {value} is no reading; write one finite number"
+            except OSError as error:
+                problem = f"{path}: cannot be read ({error.strerror})"
+            except ValueError:
+                problem = f"{path}: holds no number; write one, in the unit of the safety table"
+            if problem != self._problems.get(name, ""):
+                found.problems[name] = problem
+            self._problems[name] = problem
+        return found

@@ -1,0 +1,66 @@
+"""What a plant's cameras saw last, for people to look at."""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.control._operations_views import CameraView
+from heliotrope.control.calibration_cycle import Shot
+from heliotrope.imaging.annotate import annotate
+from heliotrope.imaging.photograph import Photograph
+
+#: Quality of the pictures for people, 0 to 100.
+_JPEG = 80
+#: Of the pictures for people.
+_GAMMA = 0.45
+
+
+class Views:
+    """The last photograph of each target."""
+
+    def __init__(self) -> None:
+        self._views: dict[str, CameraView] = {}
+
+    def view(self, target: str) -> CameraView:
+        """Return the last photograph of a target for people."""
+        return self._views.get(target, CameraView(target, 0, 0.0, b""))
+
+    def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
+        """Keep what was seen of a target at a time (POSIX s), and its picture."""
+        reading = seen.reading(name)
+        lines = [f"{reason.name}: {reason.text}" for reason in reading.reasons]
+        centroid = None
+        if reading.spots:
+            x, y = reading.spots[0].plane
+            centroid = float(x), float(y)
+            lines.insert(0, f"{len(reading.spots)} spot(s), {x:+.3f} m right, {y:+.3f} m up")
+        version = self.view(name).version + 1
+        self._views[name] = CameraView(name, version, at, jpeg, tuple(lines), centroid)
+
+
+def shot_of(seen: Photograph, target: str, at: float) -> Shot:
+    """Return what a photograph, taken at ``at`` (monotonic s), shows of a beam on a target."""
+    reading = seen.reading(target)
+    reasons = tuple(f"{reason.name}: {reason.text}" for reason in reading.reasons)
+    if not reading.spots:
+        return Shot(np.full(3, np.nan), at, 0.0, reasons)
+    spot = reading.spots[0]
+    return Shot(spot.point, at, spot.covariance_enu, reasons)
+
+
+def picture_of(seen: Photograph) -> bytes:
+    """Return a photograph with what was seen in it drawn in, as a JPEG."""
+    import cv2
+
+    _, data = cv2.imencode(".jpg", annotate(_brightened(seen)), [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
+    return data.tobytes()
+
+
+def _brightened(seen: Photograph) -> Photograph:
+    """Return a photograph for people: beside a beam the target would look black."""
+    frame = seen.frame
+    top = 255.0 if frame.pixels.dtype == np.uint8 else 65535.0
+    table = np.round(255.0 * np.linspace(0.0, 1.0, int(top) + 1) ** _GAMMA).astype(np.uint8)
+    pixels: npt.NDArray[np.uint8] = table[frame.pixels]
+    return replace(seen, frame=replace(frame, pixels=pixels))

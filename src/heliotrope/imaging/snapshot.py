@@ -1,0 +1,106 @@
+"""A network camera that gives one photograph for each question over HTTP."""
+
+import re
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from heliotrope.errors import FetchError, InputError
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.reading import IMAGE_SUFFIXES, read_image
+from heliotrope.imaging.sources import Source
+
+if TYPE_CHECKING:
+    import httpx
+
+#: A photograph that is larger is none, bytes.
+_LARGEST = 64 * 2**20
+
+
+def is_snapshot(text: str) -> bool:
+    """Return whether a camera's source is the address of one image: ``http://…/now.jpg``."""
+    parts = urlsplit(text.strip())
+    return parts.scheme.lower() in ("http", "https") and parts.path.lower().endswith(IMAGE_SUFFIXES)
+
+
+@dataclass
+class SnapshotSource(Source):
+    """Photographs that a camera takes when it is asked.
+
+    A frame's time is that of the file if it says one; else the middle of question and answer, with
+    half of the time between them as its deviation. A user and a password in the address are sent
+    as such, and stand in no message.
+
+    Attributes
+    ----------
+    url
+        Of the image.
+    interval
+        Between questions, s.
+    timeout
+        For an answer, s.
+
+    Raises
+    ------
+    InputError
+        An address that is none of an image.
+    """
+
+    url: str
+    interval: float = 1.0
+    timeout: float = 10.0
+
+    def __post_init__(self) -> None:
+        self.name = self.name or re.sub(r"(?<=://)[^/?#]*@", "", self.url)
+        if not is_snapshot(self.url):
+            raise InputError(
+                f"source {self.name}: no address of an image; give http://host/…, ending in "
+                f"{', '.join(IMAGE_SUFFIXES)}"
+            )
+
+    def _frames(self) -> Iterator[Frame]:
+        """Give photographs until it is stopped.
+
+        Raises
+        ------
+        FetchError
+            If the camera does not answer, or with something else.
+        FormatError
+            If what it gives is broken.
+        """
+        import httpx
+
+        with (
+            httpx.Client(timeout=self.timeout, trust_env=False) as client,
+            tempfile.TemporaryDirectory(prefix="heliotrope-") as folder,
+        ):
+            file = Path(folder) / f"snapshot{Path(urlsplit(self.url).path).suffix.lower()}"
+            while not self.stop.is_set():
+                yield self._ask(client, file)
+                self.stop.wait(self.interval)
+
+    def _ask(self, client: "httpx.Client", file: Path) -> Frame:
+        import httpx
+
+        begun = datetime.now(UTC)
+        try:
+            answer = client.get(self.url)
+        except (httpx.HTTPError, httpx.InvalidURL) as error:
+            why = type(error).__name__
+            raise FetchError(f"source {self.name}: no answer ({why}); check the address") from None
+        span = datetime.now(UTC) - begun
+        if answer.status_code != 200 or not 0 < len(answer.content) <= _LARGEST:
+            raise FetchError(
+                f"source {self.name}: answer {answer.status_code} of {len(answer.content)} bytes; "
+                "check address, user and password"
+            )
+        file.write_bytes(answer.content)
+        frame = read_image(file)
+        if frame.time is None:
+            half = span / 2
+            frame = replace(frame, time=begun + half, time_deviation=half.total_seconds())
+        return replace(frame, name=self.name)

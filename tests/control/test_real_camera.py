@@ -1,0 +1,227 @@
+"""Cameras of a real plant: their newest frames read, one that falls silent, one asked over HTTP."""
+
+import asyncio
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.control.clock import SystemClock
+from heliotrope.control.protocol import Alarm
+from heliotrope.control.real_camera import RealCameras, source_of
+from heliotrope.errors import FetchError, InputError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import normalize
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.reading import read_image, write_image
+from heliotrope.imaging.scenes import Scene
+from heliotrope.imaging.snapshot import SnapshotSource, is_snapshot
+from heliotrope.imaging.sources import SimulatedSource, Source, open_source
+from heliotrope.twin.cameras import Mirror, Optics, RenderedCamera, Sight
+from heliotrope.twin.live import prototype_plant
+
+SUN = normalize(np.array([0.2, -0.7, 0.7]), "sun")
+OFF = 0.4
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    """The prototype's, with half as many pixels each way: quicker to draw and to read."""
+    found = prototype_plant()
+    (camera,) = found.cameras
+    matrix = camera.matrix * [[0.5], [0.5], [1.0]]
+    width, height = camera.size
+    return replace(found, cameras=(replace(camera, size=(width // 2, height // 2), matrix=matrix),))
+
+
+@pytest.fixture(scope="module")
+def frame(plant: Plant) -> Frame:
+    """A photograph of a beam, 0.4 m right of the middle."""
+    target = plant.targets[0]
+    vertex = np.asarray(target.center) + 60.0 * np.asarray(target.normal) * [1.0, 1.0, 0.0]
+    point = np.asarray(target.center) + OFF * target.axes[0]
+    normal = normalize(SUN + normalize(point - vertex, "beam"), "normal")
+    mirror = Mirror("H", vertex, normal, 1.8, 1.2)
+    sight = Sight(SystemClock(), lambda: [mirror], lambda: SUN, latency=0.0)
+    camera = RenderedCamera(
+        sight, [Scene(plant.cameras[0], (target,))], optics=Optics(facets=(1, 1))
+    )
+    asyncio.run(camera.photograph(target, "H"))
+    assert camera.last is not None
+    return camera.last
+
+
+class Scripted:
+    """A source of the same picture, as of now, while it is told to give it."""
+
+    def __init__(self, frame: Frame, *, late: float = 0.0) -> None:
+        self.frame, self.late, self.alive = frame, late, True
+        self.deviation = 0.01
+
+    def __call__(self, camera: Any, folder: Path, stop: threading.Event) -> Source:
+        def made(at: datetime) -> Frame:
+            while not self.alive and not stop.is_set():
+                time.sleep(0.02)
+            time.sleep(0.05)
+            when = at - timedelta(seconds=self.late)
+            return replace(self.frame, time=when, time_deviation=self.deviation)
+
+        return SimulatedSource(made, lambda: datetime.now(UTC), stop=stop)
+
+
+def looked(cameras: RealCameras, name: str) -> Any:
+    return asyncio.run(cameras.look(name))
+
+
+def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) -> None:
+    target = plant.targets[0]
+    cameras = RealCameras(plant, tmp_path, SystemClock(), memory=tmp_path / "m",
+                          sources=Scripted(frame))  # fmt: skip
+    cameras.start()
+    try:
+        before = SystemClock().monotonic()
+        shot = looked(cameras, target.name)
+        assert shot.reasons == ()
+        assert shot.at >= before - 0.02
+        right, up = target.plane_coordinates(shot.point)
+        assert right == pytest.approx(OFF, abs=0.03)
+        assert up == pytest.approx(0.0, abs=0.03)
+        view = cameras.view(target.name)
+        assert view.version == 1
+        assert view.jpeg.startswith(b"\xff\xd8")
+        assert view.reading[0].startswith("1 spot(s), +")
+    finally:
+        cameras.close()
+    assert list((tmp_path / "m").glob("*.npz"))
+
+
+def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: Frame) -> None:
+    script, told = Scripted(frame), list[Alarm]()
+    cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)
+    cameras.on_alarm = told.append
+    script.alive = False
+    name = plant.targets[0].name
+    cameras.start()
+    try:
+        with pytest.raises(FetchError, match=r"camera camera: no frame for 0\.3 s; look at the"):
+            looked(cameras, name)
+        assert (told[0].condition, told[0].subject, told[0].active) == ("camera", name, True)
+        assert not cameras.awake(name)
+        script.alive = True
+        until = time.monotonic() + 20.0
+        while not cameras.awake(name):
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        assert [alarm.active for alarm in told] == [True, False]
+    finally:
+        cameras.close()
+
+
+def test_a_frame_from_before_is_no_photograph(plant: Plant, frame: Frame) -> None:
+    script = Scripted(frame, late=60.0)
+    cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)
+    cameras.start()
+    try:
+        with pytest.raises(FetchError, match="its clock"):
+            looked(cameras, plant.targets[0].name)
+    finally:
+        cameras.close()
+
+
+def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> None:
+    script = Scripted(frame, late=-3.0)
+    script.deviation = 2.0
+    cameras = RealCameras(plant, Path(), SystemClock(), sources=script)
+    cameras.start()
+    try:
+        reasons = looked(cameras, plant.targets[0].name).reasons
+    finally:
+        cameras.close()
+    assert any("known within 2 s only" in reason for reason in reasons)
+
+
+@pytest.mark.parametrize(
+    ("source", "text"),
+    [
+        ("", "names no source of its frames; add source"),
+        ("night.avi", "is a recording; give a source of live frames"),
+        ("nowhere", "there is no such file"),
+        ("ftp://a/b", "not by ftp"),
+    ],
+)
+def test_a_source_that_none_is(plant: Plant, tmp_path: Path, source: str, text: str) -> None:
+    (tmp_path / "night.avi").write_bytes(b"RIFF")
+    camera = replace(plant.cameras[0], source=source)
+    with pytest.raises(InputError, match=text):
+        source_of(camera, tmp_path, threading.Event())
+
+
+# -- snapshots -----------------------------------------------------------------------------
+
+
+class Answers(BaseHTTPRequestHandler):
+    """A network camera."""
+
+    image = b""
+
+    def do_GET(self) -> None:
+        good = self.path == "/now.png"
+        self.send_response(200 if good else 404)
+        self.end_headers()
+        self.wfile.write(self.image if good else b"no")
+
+    def log_message(self, *_: Any) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture
+def camera_server(tmp_path: Path) -> Iterator[str]:
+    pixels = np.random.default_rng(1).integers(0, 255, (40, 60), dtype=np.uint8)
+    write_image(pixels, tmp_path / "now.png")
+    Answers.image = (tmp_path / "now.png").read_bytes()
+    server = HTTPServer(("127.0.0.1", 0), Answers)
+    thread = threading.Thread(target=server.serve_forever, args=(0.05,))
+    thread.start()
+    yield f"http://user:secret@127.0.0.1:{server.server_port}"
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+def test_snapshots_over_http(camera_server: str, tmp_path: Path) -> None:
+    begun = datetime.now(UTC)
+    with SnapshotSource(f"{camera_server}/now.png", limit=2, interval=0.01) as source:
+        frames = list(source)
+    assert len(frames) == 2
+    assert (frames[0].pixels == read_image(tmp_path / "now.png").pixels).all()
+    assert frames[0].time is not None
+    assert begun <= frames[0].time <= datetime.now(UTC)
+    assert 0.0 < frames[0].time_deviation < 5.0
+    assert "secret" not in frames[0].name
+
+
+def test_a_snapshot_that_none_is(camera_server: str) -> None:
+    source = SnapshotSource(f"{camera_server}/other.png")
+    with pytest.raises(FetchError, match="answer 404 of 2 bytes") as refused:
+        next(iter(source))
+    assert "secret" not in str(refused.value)
+    source = SnapshotSource("http://user:secret@127.0.0.1:1/now.jpg", timeout=2.0)
+    with pytest.raises(FetchError, match=r"no answer \(ConnectError\)") as refused:
+        next(iter(source))
+    assert "secret" not in str(refused.value)
+    with pytest.raises(InputError, match="no address of an image"):
+        SnapshotSource("http://camera/video")
+
+
+def test_what_is_a_snapshot() -> None:
+    assert is_snapshot("http://10.0.0.5/axis/now.jpg?size=2")
+    assert not is_snapshot("http://10.0.0.5/video")
+    assert not is_snapshot("frames/now.jpg")
+    assert isinstance(open_source("http://10.0.0.5/now.jpg"), SnapshotSource)

@@ -1,0 +1,496 @@
+"""``heliotrope run --clusters`` for real: clusters over TCP, a broker and a bus, and one missing.
+
+The plant is a process, and so are two of its clusters. Their buses are pseudo-terminals with real
+local controllers at them, in threads of the test. One cluster never comes.
+"""
+
+import asyncio
+import contextlib
+import io
+import os
+import queue
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from broker import Mosquitto, mosquitto_for
+from cluster_process import Line
+from clusters import Board, key_of
+from heliotrope.cli import main
+from heliotrope.console.client import Client
+from heliotrope.control.audit import JsonLines
+from heliotrope.control.clock import SystemClock
+from heliotrope.control.parameters import Axis, Machine, items_of
+from heliotrope.control.plant_settings import clusters_of
+from heliotrope.control.real_links import LinksFile, read_links
+from heliotrope.control.real_plant import RealPlant
+from heliotrope.control.real_sensors import FED, SensorFiles
+from heliotrope.errors import FormatError
+from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
+from heliotrope.lcu.journal import Journal
+from heliotrope.mechanism import kinds
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import rotary
+from heliotrope.sun import Site
+
+MAIN = [sys.executable, "-c", "from heliotrope.cli import main; main()"]
+PREFIX = "heliotrope/test"
+#: By which way each cluster of two heliostats is reached.
+WAYS = {"K1": "tcp", "K2": "mqtt", "K3": "K3.toml", "K4": "tcp"}
+KEYS = {name: bytes([40 + i]) * 32 for i, name in enumerate(WAYS)}
+#: Coarse gears, so that a mirror turns by 90° in two seconds.
+TURN = 16_000
+STOW = (TURN // 4, 3_916)
+MACHINE = Machine(
+    (Axis(-800, 16_240, 8000, 16_000, 2), Axis(-160, 4_160, 8000, 16_000, 2)),
+    STOW, (12.0, 0.0, 40.0), (0.1, 0.05),
+)  # fmt: skip
+#: The machine may be busy, s.
+PATIENCE = 60.0
+
+
+def noon() -> Site:
+    """Return a place where the sun stands high now, whenever this is run."""
+    now = datetime.now(UTC)
+    hours = now.hour + now.minute / 60.0
+    return Site(-20.0 if 3 < now.month < 10 else 20.0, (12.0 - hours) * 15.0, 0.0, name="noon")
+
+
+def mechanisms(count: int) -> Mechanism:
+    bearing = np.radians(np.linspace(-25.0, 25.0, count))
+    place = 80.0 * np.stack([np.sin(bearing), np.cos(bearing), 0.0 * bearing], axis=-1)
+    gear = {"steps_per_turn": 200, "gear_ratio": TURN / 800, "microsteps": 4}
+    return kinds.azimuth_elevation(
+        place, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
+    )
+
+
+def design() -> Plant:
+    count = 2 * len(WAYS)
+    homes = tuple(name for name in WAYS for _ in range(2))
+    mirrors = Heliostats(
+        tuple(f"H{i + 1}" for i in range(count)), mechanisms(count), np.full(count, 3.0),
+        np.full(count, 2.0), cluster=homes,
+    )  # fmt: skip
+    receiver = Receiver(
+        "receiver", "planar", np.array([0.0, 0.0, 50.0]), np.array([0.0, 1.0, 0.0]), 4.0, 4.0
+    )
+    return Plant("four ways", noon(), {"all": mirrors}, receivers=(receiver,))
+
+
+def boards(cluster: int) -> list[Board]:
+    """Local controllers of a cluster, in stow."""
+    found = []
+    for address in (1, 2):
+        mechanism = mechanisms(2 * len(WAYS))[2 * cluster + address - 1]
+        board = Board(address, configured=False)
+        items = {**items_of(mechanism, MACHINE), "address": struct.pack("<H", address)}
+        board.timer.made = list(STOW)
+        journal = Journal(board.flash)
+        journal.load()
+        journal.store(items)
+        journal.zero(*STOW)
+        found.append(board)
+    return found
+
+
+def private(path: Path, text: str) -> None:
+    path.touch(0o600)
+    path.write_text(text)
+
+
+def cluster_file(folder: Path, name: str, url: str) -> None:
+    site, first = noon(), 2 * list(WAYS).index(name)
+    members = "".join(f'[[heliostats]]\nname = "H{first + k}"\naddress = {k}\n' for k in (1, 2))
+    (folder / f"{name}.toml").write_text(
+        f'format = "heliotrope-cluster"\nversion = 1\nname = "{name}"\nkeys = "{name}.keys"\n'
+        f"site = {{latitude_deg = {site.latitude_deg}, longitude_deg = {site.longitude_deg}}}\n"
+        f'bus = {{url = "{folder}/{name}.bus", answer_s = 0.5}}\nplant = {{url = "{url}"}}\n'
+        f"{members}"
+    )
+    keys = "".join(f'H{first + k} = "{key_of(k).hex()}"\n' for k in (1, 2))
+    private(folder / f"{name}.keys", f'plant = "{KEYS[name].hex()}"\n[heliostats]\n{keys}')
+
+
+def links_file(folder: Path, port: int, broker: int) -> Path:
+    (folder / "links.toml").write_text(
+        'format = "heliotrope-links"\nversion = 1\nkeys = "links.keys"\n'
+        f'[tcp]\nlisten = "127.0.0.1:{port}"\n'
+        f'[mqtt]\nurl = "mqtt://127.0.0.1:{broker}/{PREFIX}"\n[clusters]\n'
+        + "".join(f'{name} = "{way}"\n' for name, way in WAYS.items())
+    )
+    remote = [name for name, way in WAYS.items() if way in ("tcp", "mqtt")]
+    keys = "".join(f'{name} = "{KEYS[name].hex()}"\n' for name in remote)
+    private(folder / "links.keys", f"[clusters]\n{keys}")
+    return folder / "links.toml"
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return int(free.getsockname()[1])
+
+
+class Process:
+    """A program whose lines are read as they come."""
+
+    def __init__(self, *words: str) -> None:
+        self.text = ""
+        self._lines: queue.Queue[str] = queue.Queue()
+        self._popen = subprocess.Popen(
+            [*MAIN, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        )
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            self._lines.put(line)
+
+    def says(self, pattern: str) -> re.Match[str]:
+        """Wait until a line matches."""
+        until = time.monotonic() + PATIENCE
+        while True:
+            try:
+                line = self._lines.get(timeout=max(0.01, until - time.monotonic()))
+            except queue.Empty:
+                raise AssertionError(f"no {pattern!r} in\n{self.text}") from None
+            self.text += line
+            if found := re.search(pattern, line):
+                return found
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Send a signal; return exit code and all that was printed."""
+        if self._popen.poll() is None:
+            self._popen.send_signal(number)
+        try:
+            self._popen.wait(PATIENCE)
+        finally:
+            self._popen.kill()
+            self._popen.wait()
+            self._reader.join()
+            if self._popen.stdout is not None:
+                self._popen.stdout.close()
+        while not self._lines.empty():
+            self.text += self._lines.get()
+        return self._popen.returncode, self.text
+
+
+@pytest.fixture
+def mosquitto(tmp_path: Path) -> Iterator[Mosquitto]:
+    yield from mosquitto_for(tmp_path)
+
+
+@pytest.fixture
+def lines(tmp_path: Path) -> Iterator[dict[str, Line]]:
+    """Buses of the clusters that are there."""
+    made = {
+        name: Line(tmp_path / f"{name}.bus", boards(k)) for k, name in enumerate(("K1", "K2", "K3"))
+    }
+    yield made
+    for line in made.values():
+        line.end()
+
+
+def until(holds: Callable[[], Any], told: Callable[[], Any]) -> Any:
+    end = time.monotonic() + PATIENCE
+    while not (found := holds()):
+        assert time.monotonic() < end, f"it did not come to that: {told()}"
+        time.sleep(0.1)
+    return found
+
+
+def states(lines: dict[str, Line]) -> dict[str, str]:
+    """Of the local controllers, in truth."""
+    return {
+        f"H{2 * k + i + 1}": board.state
+        for k, line in enumerate(lines.values())
+        for i, board in enumerate(line.boards)
+    }
+
+
+def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
+    mosquitto: Mosquitto, lines: dict[str, Line], tmp_path: Path
+) -> None:
+    port = free_port()
+    write_plant(design(), tmp_path / "plant.toml")
+    cluster_file(tmp_path, "K1", f"tcp://127.0.0.1:{port}")
+    cluster_file(tmp_path, "K2", f"mqtt://127.0.0.1:{mosquitto.port}/{PREFIX}")
+    cluster_file(tmp_path, "K3", "tcp://127.0.0.1:1")
+    links = links_file(tmp_path, port, mosquitto.port)
+    with contextlib.ExitStack() as stack:
+        plant = Process(
+            "run", str(tmp_path / "plant.toml"), "--clusters", str(links), "--port", "0",
+            "--data", str(tmp_path / "data"), "--no-browser", "--every", "1",
+        )  # fmt: skip
+        stack.callback(plant.end)
+        for name in ("K1", "K2"):
+            stack.callback(Process("cluster", str(tmp_path / f"{name}.toml")).end)
+        address = plant.says(r"console: (\S+)")[1]
+        password = plant.says(r"password (\S+)")[1]
+        with Client(url=address) as client:
+            client.sign_in("engineer", password)
+            _tracked_and_stowed(client, lines)
+        plant.says("4 tracking")
+        code, text = plant.end(signal.SIGINT)
+    assert code == 0, text
+    # Ctrl-C stows whom it can, and names the others.
+    assert set(states(lines).values()) == {"STOWED"}
+    assert "not in stow: H7 silent, H8 silent" in text
+    assert "1 of 4 clusters silent: K4 (" in text
+    assert text.endswith("ended\n")
+
+
+def _tracked_and_stowed(client: Client, lines: dict[str, Line]) -> None:
+    def alive() -> list[str]:
+        return [row["name"] for row in client.get("clusters") if row["alive"]]
+
+    def told() -> Any:
+        events = [(event["who"], event["text"]) for event in client.get("events")]
+        return states(lines), client.get("clusters"), events
+
+    def calm() -> bool:
+        """What was silent at the start has cleared, but for the cluster that is missing."""
+        wrong = {alarm["subject"] for alarm in client.get("alarms") if alarm["active"]}
+        return not wrong & {"K1", "K2", "K3"}
+
+    until(lambda: alive() == ["K1", "K2", "K3"] and calm(), told)
+    # Nothing moves before a person says so.
+    assert set(states(lines).values()) == {"STOWED"}
+    names = [f"H{i}" for i in range(1, 7)]
+    client.ask("POST", "automatic", {"heliostats": names})
+    until(lambda: set(states(lines).values()) == {"TRACKING"}, told)
+    client.ask("POST", "stow", {"heliostats": names[:2]})
+    until(lambda: {states(lines)[name] for name in names[:2]} <= {"STOWING", "STOWED"}, told)
+    assert {states(lines)[name] for name in names[2:]} == {"TRACKING"}
+    missing = [a for a in client.get("alarms") if a["subject"] == "K4" and a["active"]]
+    assert missing
+
+
+# -- the links file ------------------------------------------------------------------------
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Files of a plant, none of whose clusters is there."""
+    write_plant(design(), tmp_path / "plant.toml")
+    links_file(tmp_path, 4840, 1883)
+    cluster_file(tmp_path, "K3", "tcp://127.0.0.1:1")
+    return tmp_path
+
+
+def read(folder: Path) -> LinksFile:
+    found = read_links(folder / "links.toml")
+    found.build(clusters_of(design()), SystemClock())
+    return found
+
+
+def test_each_cluster_gets_its_way(folder: Path) -> None:
+    made = read_links(folder / "links.toml").build(clusters_of(design()), SystemClock())
+    assert set(made.links) == set(WAYS)
+    assert made.server is not None
+    assert set(made.server.links) == {"K1", "K4"}
+    assert [one.cluster.config.name for one in made.local] == ["K3"]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "text"),
+    [
+        ("links.toml", 'format = "heliotrope-links"', "", "format is None; a links file says"),
+        ("links.toml", 'K3 = "K3.toml"\n', "", "a cluster K3 of 2 heliostats, and no line"),
+        ("links.toml", "[clusters]", '[clusters]\nK9 = "mqtt"', "the plant has no cluster K9"),
+        ("links.toml", 'K2 = "mqtt"', 'K2 = "mqqt"', 'K2: \'mqqt\': give "tcp", "mqtt", or the'),
+        ("links.toml", "K3.toml", "K5.toml", 'give "tcp", "mqtt", or the cluster file'),
+        ("links.toml", '[tcp]\nlisten = "127.0.0.1:4840"\n', "", "add a table \\[tcp\\]"),
+        ("links.toml", "127.0.0.1:4840", "4840", "'4840': give address:port"),
+        ("links.toml", "[mqtt]", "[mqtt]\nusernme = 'a'", "not known; did you mean 'username'"),
+        ("links.toml", f"mqtt://127.0.0.1:1883/{PREFIX}", "tcp://a:1", "mqtt.url: give mqtt://"),
+        ("links.toml", '"127.0.0.1:4840"', '"127.0.0.1:4840"\nkey = "a"', "needs both, certif"),
+        ("links.toml", "links.keys", "other.keys", "other.keys: there is no such file"),
+        ("links.keys", "K1 =", "K8 =", "clusters.K8: the plant has no such cluster; remove"),
+        ("links.keys", "[clusters]", "[cluster]", "'cluster' is not known; give plant, passw"),
+        ("links.keys", "28282828", "2", "links.keys: K1: a key of 57 characters"),
+        ("K3.toml", 'name = "K3"', 'name = "K5"', "it is of cluster K5, not of K3"),
+    ],
+)  # fmt: skip
+def test_what_a_links_file_may_not_say(
+    folder: Path, file: str, old: str, new: str, text: str
+) -> None:
+    path = folder / file
+    content = path.read_text()
+    assert old in content
+    path.write_text(content.replace(old, new, 1))
+    with pytest.raises(FormatError, match=text) as refused:
+        read(folder)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_bus_with_other_heliostats_is_refused(folder: Path) -> None:
+    homes = {**clusters_of(design()), "K3": ("H5", "H9")}
+    with pytest.raises(FormatError, match="H6 is a heliostat of K3 in this file only"):
+        read_links(folder / "links.toml").build(homes, SystemClock())
+
+
+def test_keys_that_others_may_read_are_refused(folder: Path) -> None:
+    (folder / "links.keys").chmod(0o644)
+    with pytest.raises(FormatError, match="others may read it"):
+        read(folder)
+
+
+# -- the command ---------------------------------------------------------------------------
+
+
+def call(*words: object) -> tuple[int, str, str]:
+    """Run the command here; return exit code, output, errors."""
+    out, err = io.StringIO(), io.StringIO()
+    before = sys.argv
+    sys.argv = ["heliotrope", "run", *map(str, words)]
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            main()
+    except SystemExit as leaving:
+        code = leaving.code
+    else:
+        code = 0
+    finally:
+        sys.argv = before
+    return int(code or 0), out.getvalue(), err.getvalue()
+
+
+def test_files_are_checked_without_a_plant(folder: Path) -> None:
+    done = call(folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
+    assert done == (
+        0, "four ways: 8 heliostats on 4 clusters, 0 of 0 targets with a camera\n", ""
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--clusters", "links.toml"), "--clusters needs the plant file"),
+        (("plant.toml", "--clusters", "links.toml"), "a real plant keeps its records; give --data"),
+        (("plant.toml", "--clusters", "no.toml"), "no.toml: there is no such file"),
+        (("plant.toml", "--clusters", "links.toml", "--speed", 2), "--speed, --start, --seed"),
+        (("--check",), "need a real plant; give --clusters"),
+        (("--configure",), "need a real plant; give --clusters"),
+        (("--prototype", "--heliostats", 5), "--prototype is a plant of its own"),
+        (("plant.toml", "--heliostats", 5), "--heliostats is for the default plant"),
+        (("--speed", 0), "--speed 0; give above 0 to 1000"),
+        (("--minutes", 0), "--minutes 0; give above 0"),
+        (("--every", "nan"), "--every nan; give above 0"),
+        (("--host", "0.0.0.0"), "without TLS passwords can be read on the way"),
+        (("--port", 70_000), "port 70000; give 1 to 65535"),
+        (("--certificate", "a.pem"), "TLS needs both files, --certificate and --key"),
+        (("--certificate", "a.pem", "--key", "b.pem"), "a.pem and key b.pem cannot be used"),
+        (("--database", "mysql://x/y"), "no postgresql://user@host/name"),
+        (("--heliostats", 32, "--no-console", "--database", "postgresql://x@127.0.0.1:1/y"),
+         "Connection refused"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_run_is_one_line(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...], text: str
+) -> None:
+    monkeypatch.chdir(folder)
+    code, out, err = call(*words)
+    assert code == 2
+    assert text in err
+    assert err.count("\n") == 1
+    assert out.count("\n") <= 1
+
+
+def test_an_address_that_is_taken_is_one_line(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        (folder / "links.toml").write_text(
+            (folder / "links.toml").read_text().replace("127.0.0.1:4840", f"127.0.0.1:{port}")
+        )
+        links = ("--clusters", folder / "links.toml", "--data", folder / "data", "--no-console")
+        code, _, err = call(folder / "plant.toml", *links, "--minutes", 1)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "another plant running there?" in err
+
+
+def test_a_port_of_the_console_that_is_taken_is_one_line() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        code, _, err = call("--heliostats", 32, "--exact", "--port", taken.getsockname()[1])
+    assert (code, err.count("\n")) == (2, 1)
+    assert "choose another with --port" in err
+
+
+def test_options_stand_under_headings() -> None:
+    _, text, _ = call("--help")
+    headings = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
+    assert headings == [
+        "Arguments", "Simulation", "A real plant", "Work", "Console", "Records", "Options"
+    ]  # fmt: skip
+
+
+# -- the plant -----------------------------------------------------------------------------
+
+
+def test_what_is_wanted_and_who_is_left(folder: Path) -> None:
+    """Of a plant none of whose clusters is there."""
+
+    async def main() -> tuple[bool, str]:
+        clock = SystemClock()
+        links = read_links(folder / "links.toml").build(clusters_of(design()), clock)
+        audit = JsonLines(folder / "audit.jsonl", clock.utc())
+        plant = RealPlant(design(), links, clock, audit, machine=MACHINE)
+        wanted = plant.plant.wanted.items
+        assert set(wanted) == set(design().names)
+        assert wanted["H3"] == items_of(mechanisms(8)[2], MACHINE)
+        assert {"wind_gust_stow", "receiver_flow_low"} <= set(plant.plant.unwatched)
+        stowed = await plant.stowed(0.5)
+        audit.close()
+        return stowed, plant.left()
+
+    stowed, left = asyncio.run(main())
+    assert not stowed
+    assert left.startswith("not in stow: H1 silent, H2 silent,")
+    assert left.endswith("and 3 more")
+
+
+# -- sensors -------------------------------------------------------------------------------
+
+
+def test_a_sensor_is_read_when_its_file_is_written_anew(tmp_path: Path) -> None:
+    file = tmp_path / "wind_gust"
+    sensors = SensorFiles({"wind_gust": file})
+    assert "cannot be read" in sensors.read().problems["wind_gust"]
+    assert not sensors.read().problems
+
+    def write(text: str, second: int) -> dict[str, float]:
+        file.write_text(text)
+        os.utime(file, (second, second))
+        return sensors.read().values
+
+    # What lay there at the start may be of long ago.
+    assert write("12.5\n", 1) == {}
+    assert sensors.read().values == {}
+    assert write("13", 2) == {"wind_gust": 13.0}
+    assert write("nan", 3) == {}
+    assert write("calm", 4) == {}
+    assert write("9.0", 5) == {"wind_gust": 9.0}
+    assert sensors.names <= FED
+
+
+def test_a_sensor_that_no_row_needs_is_refused(folder: Path) -> None:
+    links = folder / "links.toml"
+    links.write_text(links.read_text().replace("[clusters]", "[sensors]\nrain = 'x'\n[clusters]"))
+    with pytest.raises(FormatError, match=r"sensors.rain: no row .* give one of .*wind_gust"):
+        read_links(links)

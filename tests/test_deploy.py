@@ -1,0 +1,280 @@
+"""What a plant is deployed with, and what its people read: true to the code."""
+
+import ast
+import functools
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from heliotrope.control.real_links import TABLES, read_links
+from heliotrope.control.safety import CONDITIONS, Watcher
+from heliotrope.errors import FormatError
+from heliotrope.lcu import messages, names, states
+
+ROOT = Path(__file__).parents[1]
+DEPLOY = ROOT / "deploy"
+HANDBOOK = (ROOT / "docs" / "how-to" / "handbook.md").read_text(encoding="utf-8")
+UNITS = ("heliotrope-plant.service", "heliotrope-cluster@.service", "heliotrope-backup.service",
+         "heliotrope-backup.timer")  # fmt: skip
+
+
+# -- the handbook --------------------------------------------------------------------------
+
+
+def section(title: str) -> str:
+    """Return a section of the handbook, with those below it."""
+    level, _, _ = title.partition(" ")
+    found = re.search(rf"^{title}$(.*?)(?=^#{{1,{len(level)}}} |\Z)", HANDBOOK, re.M | re.S)
+    assert found, f"no section {title!r}"
+    return found[1]
+
+
+def rows(title: str) -> set[str]:
+    """Return the names in the first column of a section's tables; each has its other columns."""
+    lines = [line for line in section(title).splitlines() if line.startswith("| `")]
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    assert all(row[1] or row[2] for row in cells)
+    found = [row[0].strip("`") for row in cells]
+    assert len(found) == len(set(found))
+    return set(found)
+
+
+@functools.cache
+def raised() -> frozenset[str]:
+    """Return the conditions of all alarms that the code raises beside the safety table."""
+    found = set()
+    for path in (ROOT / "src" / "heliotrope").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if not re.search(r"Alarm\(|AlarmRow\(|Action\(|_reports\.", text):
+            continue
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Call) and (place := _told(node)) is not None:
+                value = node.args[place] if len(node.args) > place else None
+                if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                    found.add(value.value)
+    return frozenset(found)
+
+
+def _told(call: ast.Call) -> int | None:
+    """Return which argument of a call is the condition of an alarm; None if it raises none."""
+    called = call.func
+    if isinstance(called, ast.Name):
+        return {"Alarm": 0, "AlarmRow": 1, "Action": 3}.get(called.id)
+    if isinstance(called, ast.Attribute) and called.attr in ("alarm", "event"):
+        owner = called.value
+        return 0 if isinstance(owner, ast.Attribute) and owner.attr == "_reports" else None
+    return None
+
+
+def test_the_code_raises_what_is_looked_for() -> None:
+    """The search finds alarms of each kind of call."""
+    assert {
+        "camera",
+        "records",
+        "node_silent",
+        "plant_unintelligible",
+        "time_went_back",
+    } <= raised()
+
+
+def test_every_alarm_is_in_the_handbook() -> None:
+    listed = rows("## Alarms")
+    table = {row.name for row in CONDITIONS}
+    assert listed == table | raised()
+
+
+@pytest.mark.parametrize(
+    ("title", "watcher"),
+    [("### Of the plant", Watcher.PLANT), ("### Of a cluster", Watcher.CLUSTER),
+     ("### Of a local controller", Watcher.NODE)],
+)  # fmt: skip
+def test_alarms_stand_where_they_come_from(title: str, watcher: Watcher) -> None:
+    assert {row.name for row in CONDITIONS if row.watcher is watcher} <= rows(title)
+
+
+def test_every_state_command_and_fault_is_in_the_handbook() -> None:
+    assert rows("## States") == set(states.STATES)
+    assert rows("## Faults of a heliostat") == set(names.FAULTS[1:])
+    people = {
+        row[1] for row in messages.MESSAGES if row[2] in (messages.ANYONE, messages.AUTHORITY)
+    }
+    assert rows("## Commands") == people | {"ZERO", "SET_ADDRESS"}
+
+
+def test_the_emergency_comes_first() -> None:
+    assert re.findall(r"^## (.*)$", HANDBOOK, re.M)[0] == "Emergency"
+
+
+# -- commands of the pages -----------------------------------------------------------------
+
+PAGES = ("tutorial/first-hour.md", "how-to/handbook.md", "how-to/integrate.md", "how-to/deploy.md")
+GROUPS = ("ctl", "store", "field", "camera", "drone")
+
+
+def commands() -> list[str]:
+    """Return every call of the program in the pages, from the word after its name."""
+    found = []
+    for page in PAGES:
+        text = (ROOT / "docs" / page).read_text(encoding="utf-8").replace("\\\n", " ")
+        lines = [
+            line
+            for block in re.findall(r"```sh\n(.*?)^```", text, re.S | re.M)
+            for line in block.splitlines()
+        ]
+        lines += re.findall(r"`(heliotrope [a-z][^`]*)`", text)
+        start = re.compile(r"(?:sudo -u heliotrope )?(?:[./\w]*/)?heliotrope (.*)")
+        found += [call[1] for line in lines if (call := start.match(line))]
+    return [call for call in dict.fromkeys(found) if not call.startswith("--version")]
+
+
+@functools.cache
+def helped(*words: str) -> str:
+    """Return the help of a command."""
+    from heliotrope.cli import app
+
+    done = CliRunner().invoke(app, [*words, "--help"])
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+def test_the_pages_have_commands() -> None:
+    assert len(commands()) > 20
+
+
+@pytest.mark.parametrize("call", commands())
+def test_commands_of_the_pages_exist(call: str) -> None:
+    words = shlex.split(call)
+    path = words[: 2 if words[0] in GROUPS and len(words) > 1 else 1]
+    text = helped(*path)
+    for option in (word for word in words if word.startswith("--")):
+        assert re.search(rf"{option}\b", text), f"{' '.join(path)} has no {option}"
+
+
+# -- units ---------------------------------------------------------------------------------
+
+
+def test_systemd_takes_the_units(tmp_path: Path) -> None:
+    tool = shutil.which("systemd-analyze")
+    if tool is None:
+        pytest.skip("no systemd-analyze here: the units are not verified")
+    program = tmp_path / "heliotrope"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    for name in UNITS:
+        text = (DEPLOY / name).read_text(encoding="utf-8")
+        text = text.replace("/opt/heliotrope/bin/heliotrope", str(program))
+        (tmp_path / name.replace("@", "@C1")).write_text(
+            text.replace("User=heliotrope", "User=root")
+        )
+    given = [str(tmp_path / name.replace("@", "@C1")) for name in UNITS]
+    done = subprocess.run(
+        [tool, "verify", "--man=no", *given], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", [name for name in UNITS if name.endswith(".service")])
+def test_the_units_give_options_that_exist(name: str, capsys: Any, monkeypatch: Any) -> None:
+    from heliotrope.cli import main
+
+    text = (DEPLOY / name).read_text(encoding="utf-8") + (DEPLOY / "plant.env").read_text()
+    command = re.search(r"bin/heliotrope (store backup|\w+)", text)
+    assert command
+    options = set(re.findall(r"(?<=\s)--[\w-]+", text))
+    if "plant" not in name:
+        options &= {"--every", "--to"}
+    monkeypatch.setattr(sys, "argv", ["heliotrope", *command[1].split(), "--help"])
+    with pytest.raises(SystemExit):
+        main()
+    helped = capsys.readouterr().out
+    asked = {word for word in options if word not in ("--now", "--help")}
+    assert asked
+    assert all(re.search(rf"{word}\b", helped) for word in asked), helped
+
+
+def test_the_plant_has_time_to_stow() -> None:
+    limit = re.search(r"^TimeoutStopSec=(\d+)$", (DEPLOY / UNITS[0]).read_text(), re.M)
+    assert limit
+    assert int(limit[1]) > 300
+
+
+# -- broker, links -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "name"), [("conf", "mosquitto.conf"), ("acl", "mosquitto.acl")])
+def test_the_brokers_files_are_those_that_are_tried(kind: str, name: str) -> None:
+    """tests/control/test_mqtt.py starts a real Mosquitto with the blocks of the page."""
+    page = (ROOT / "docs" / "how-to" / "mqtt.md").read_text(encoding="utf-8")
+    block = re.search(rf"```{kind}\n(.*?)^```", page, re.S | re.M)
+    assert block
+    assert (DEPLOY / name).read_text(encoding="utf-8") == block[1]
+
+
+def test_the_links_file_is_read(tmp_path: Path) -> None:
+    shutil.copy(DEPLOY / "links.toml", tmp_path)
+    (tmp_path / "C3.toml").touch()
+    keys = tmp_path / "links.keys.toml"
+    keys.touch(0o600)
+    with pytest.raises(FormatError, match=r"clusters\.C1: a cluster that connects over TCP"):
+        read_links(tmp_path / "links.toml")
+    keys.write_text(f'password = "x"\n[clusters]\nC1 = "{"2a" * 32}"\n')
+    found = read_links(tmp_path / "links.toml")
+    assert found.document.clusters == {"C1": "tcp", "C2": "mqtt", "C3": "C3.toml"}
+    assert found.keys["C1"] == b"*" * 32
+    assert "2a2a" not in repr(found)
+
+
+def test_the_guide_names_every_setting_of_the_links_file() -> None:
+    page = (ROOT / "docs" / "how-to" / "integrate.md").read_text(encoding="utf-8")
+    part = page.partition("<!-- links -->")[2].partition("<!-- end of links -->")[0]
+    for table in TABLES:
+        for name, setting in table.model_fields.items():
+            assert f"| `{name}` " in part, name
+            assert (setting.description or "") in part, name
+
+
+# -- the packages --------------------------------------------------------------------------
+
+
+def test_the_packages_are_pinned_and_have_a_licence() -> None:
+    done = subprocess.run(
+        [sys.executable, "scripts/audit.py"], cwd=ROOT, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "known vulnerabilities were not looked up" in done.stdout
+
+
+def test_the_audit_can_fail() -> None:
+    audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
+    judge, pins = (
+        audit["judge"],
+        audit["constraints"]("a==1.0  # why\nB_c==2.0; python_version>'3'\n"),
+    )
+    assert pins == {"a": "1.0", "b-c": "2.0"}
+    assert judge("a", "1.0", "MIT", pins).problem == ""
+    assert "installed is 1.1, pinned is 1.0" in judge("a", "1.1", "MIT", pins).problem
+    assert "not pinned" in judge("x", "1.1", "MIT", pins).problem
+    assert "name no licence" in judge("a", "1.0", "", pins).problem
+    assert "none of the allowed" in judge("a", "1.0", "GPL-3.0-only", pins).problem
+    assert "none of the allowed" in judge("a", "1.0", "Proprietary", pins).problem
+
+
+@pytest.mark.parametrize(
+    ("licence", "good"),
+    [("GNU Lesser General Public License v3 (LGPLv3)", True), ("GPL-2.0 OR MIT", True),
+     ("GNU Affero General Public License v3", False), ("AGPL-3.0", False), ("Permit", False),
+     ("MPL-2.0 AND (Apache-2.0 OR MIT)", True)],
+)  # fmt: skip
+def test_licences(licence: str, good: bool) -> None:
+    audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
+    assert audit["allowed"](licence) is good
