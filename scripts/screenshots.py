@@ -1,6 +1,8 @@
 """Makes the pictures of the console for the documentation, from a plant of the twin at work.
 
-python scripts/screenshots.py [--heliostats 10000] [--learnt 20] [--speed 4] [--into docs/images]
+python scripts/screenshots.py [--heliostats 320] [--learnt 8] [--speed 4] [--into docs/images]
+
+console-field.png is the console-light.png of ``--heliostats 10000 --learnt 0 --speed 1``.
 """
 
 import argparse
@@ -21,7 +23,7 @@ from heliotrope.store.keeper import Keeper
 from heliotrope.twin._live_loop import PacedLoop
 from heliotrope.twin.live import LiveOptions, LivePlant
 
-NAME = "olga"
+NAME = "engineer"
 CHROMIUM = "/usr/bin/chromium"
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
 WIDE, TABLET = {"width": 1600, "height": 900}, {"width": 1024, "height": 768}
@@ -50,7 +52,10 @@ class Shown:
         clock = VirtualClock(asyncio.get_running_loop().time)
         keeper = Keeper(folder / "store.sqlite")
         kept = _secrets.hash_password(self.password)
-        keeper.people.add(NAME, kept, "engineer", time.time())
+        now = time.time()
+        keeper.people.add(NAME, kept, "engineer", now)
+        for name, role in (("desk-1", "operator"), ("desk-2", "operator"), ("visitors", "viewer")):
+            keeper.people.add(name, kept, role, now)
         live = LivePlant(
             malan_plant(heliostats), clock, LiveOptions(), records=keeper,
             extra=lambda: {"speed": speed},
@@ -94,7 +99,14 @@ def take(page: Any, into: Path) -> None:
     tab("Heliostat")
     page.select_option(".hx-tools select", "state")
     shot("heliostat")
+    page.click(f"header >> text={NAME} ·")
+    page.click(".q-menu >> text=People")
+    page.wait_for_selector("dialog.wide tr")
+    shot("people")
+    page.click("dialog >> text=Close")
     page.set_viewport_size(TABLET)
+    tab("Plant")
+    shot("tablet-dark")
     page.click("[aria-label='Dark or light']")
     tab("Clusters")
     shot("tablet")
@@ -110,8 +122,8 @@ def main() -> None:
     from playwright.sync_api import sync_playwright
 
     parser = argparse.ArgumentParser(description="Pictures of the console.")
-    parser.add_argument("--heliostats", type=int, default=10_000)
-    parser.add_argument("--learnt", type=int, default=20, help="heliostats to wait for")
+    parser.add_argument("--heliostats", type=int, default=320)
+    parser.add_argument("--learnt", type=int, default=8, help="heliostats to wait for")
     parser.add_argument("--speed", type=float, default=4.0)
     parser.add_argument("--into", type=Path, default=Path("docs/images"))
     given = parser.parse_args()

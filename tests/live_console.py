@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -90,6 +90,10 @@ class LiveConsole:
 
         return asyncio.run_coroutine_threadsafe(inside(), self._loop).result(30.0)
 
+    def wait(self, work: Coroutine[Any, Any, T]) -> T:
+        """Do something in the plant's loop that takes its time."""
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(30.0)
+
     def until(self, holds: Callable[[], Any], within: float = 30.0) -> Any:
         """Wait until something holds in the plant's loop; return it."""
         end = time.monotonic() + within
@@ -104,7 +108,7 @@ class LiveConsole:
 
     def calm(self) -> None:
         """Withdraw an emergency, and acknowledge what it left as soon as its causes have gone."""
-        who = Person("Egon", Role.ENGINEER)
+        who = Person("engineer", Role.ENGINEER)
         here = self.live.operations
 
         def quiet() -> bool:

@@ -3,10 +3,22 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import argon2
 import httpx
 import pytest
 
+from heliotrope.console import _secrets
 from live_console import PASSWORD, ROLES, LiveConsole
+
+
+@pytest.fixture(scope="session", autouse=True)
+def cheap_hashes() -> Iterator[None]:
+    """Hashes of passwords that take no time: a real one takes 50 ms of a core."""
+    with pytest.MonkeyPatch.context() as patch:
+        hasher = argon2.PasswordHasher(time_cost=1, memory_cost=64, parallelism=1)
+        patch.setattr(_secrets, "_HASHER", hasher)
+        patch.setattr(_secrets, "_NOBODY", hasher.hash("nobody"))
+        yield
 
 
 @pytest.fixture(scope="module")

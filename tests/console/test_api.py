@@ -1,18 +1,30 @@
 """The HTTP API against a plant at work: roles, sessions, commands, emergency."""
 
+import asyncio
+import contextlib
+import logging
+import re
+import ssl
+import subprocess
+import threading
 import time
 from collections.abc import Callable
 from http.client import HTTPConnection
+from pathlib import Path
 
 import httpx
 import pytest
 
 from heliotrope.console._attempts import Attempts
+from heliotrope.console._files import KEPT
+from heliotrope.console.client import Client, RemoteError
 from heliotrope.console.people import FIRST, first_start
+from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.control import audit
 from heliotrope.errors import InputError
 from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import StoreError
 from live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
@@ -37,6 +49,8 @@ NEEDED = {
     ("DELETE", "authority"): "operator",
     ("PUT", "calibration"): "operator",
     ("DELETE", "emergency"): "operator",
+    ("PUT", "session/password"): "viewer",
+    ("POST", "accounts/{name}/password"): "engineer",
     ("GET", "accounts"): "engineer",
     ("POST", "accounts"): "engineer",
     ("PATCH", "accounts/{name}"): "engineer",
@@ -67,6 +81,15 @@ def test_every_route_has_its_role(console: LiveConsole, ask: Ask) -> None:
                 assert status not in (401, 403, 500), (method, path, role)
             else:
                 assert status in expected, (method, path, role, status)
+
+
+def test_the_page_of_the_api_has_every_route() -> None:
+    page = Path(__file__).parents[2] / "docs" / "reference" / "api-http.md"
+    rows = re.findall(r"^\| `([A-Z]+) (\S+)` \| (\w+) \| \S", page.read_text("utf-8"), re.MULTILINE)
+    assert {(method, path): role for method, path, role in rows} == {
+        route: role or "none" for route, role in NEEDED.items()
+    }
+    assert len(rows) == len(NEEDED)
 
 
 def test_what_a_session_needs(console: LiveConsole, signed_in: httpx.Client) -> None:
@@ -144,16 +167,108 @@ def test_guessing_is_slowed(console: LiveConsole) -> None:
 
 
 def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask) -> None:
-    given = {"name": "gast", "role": "viewer", "password": "a long password"}
+    given = {"name": "guest", "role": "viewer", "password": "a long password"}
     assert ask("engineer", "POST", "accounts", given).status_code == 201
     with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
-        client.post("session", json={"name": "gast", "password": "a long password"})
+        client.post("session", json={"name": "guest", "password": "a long password"})
         assert client.get("session").status_code == 200
-        changed = ask("engineer", "PATCH", "accounts/gast", {"disabled": True})
+        changed = ask("engineer", "PATCH", "accounts/guest", {"disabled": True})
         assert changed.json()["disabled"]
         assert client.get("session").status_code == 401
-        again = client.post("session", json={"name": "gast", "password": "a long password"})
+        again = client.post("session", json={"name": "guest", "password": "a long password"})
         assert again.status_code == 401
+
+
+def test_no_secret_is_in_logs_or_files(
+    console: LiveConsole, ask: Ask, tokens: dict[str, str], caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    """Log-ins, good and bad, tokens, new passwords: what is logged and kept holds none of it."""
+    caplog.set_level(logging.DEBUG)
+    given = {"name": "desk-5", "role": "operator", "password": "a very own password"}
+    ask("engineer", "POST", "accounts", given)
+    with _client(console) as client:
+        wrong = {"name": "desk-5", "password": "not quite the password"}
+        assert client.post("session", json=wrong).status_code == 401
+        answer = client.post("session", json={"name": "desk-5", "password": given["password"]})
+        session, csrf = client.cookies["heliotrope_session"], answer.json()["csrf"]
+        client.headers["X-CSRF-Token"] = csrf
+        label = {"label": "nightly", "role": "viewer"}
+        token = client.post("tokens", json=label).json()["secret"]
+        with Client(token, console.address) as program:
+            program.get("summary")
+            with pytest.raises(RemoteError):
+                program.ask("POST", "stow", {"heliostats": ["nobody"]})
+    made = ask("engineer", "POST", "accounts/desk-5/password").json()["password"]
+    ask("engineer", "GET", "events")
+    # What the clients of this test log of their own requests is not the console's.
+    ours = [r.getMessage() for r in caplog.records if not r.name.startswith("http")]
+    assert ours
+    told = "\n".join(ours) + "".join(capfd.readouterr())
+    files = [file.read_bytes() for file in console.folder.iterdir() if file.is_file()]
+    assert any(b"desk-5" in data for data in files)
+    secrets = (given["password"], wrong["password"], session, csrf, token, made, PASSWORD,
+               *tokens.values())  # fmt: skip
+    for secret in secrets:
+        assert secret not in told
+        assert not any(secret.encode() in data for data in files)
+
+
+def _client(console: LiveConsole) -> httpx.Client:
+    return httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False)
+
+
+def test_a_new_password_is_told_once_and_ends_sessions(console: LiveConsole, ask: Ask) -> None:
+    given = {"name": "desk-2", "role": "viewer", "password": "a long password"}
+    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    with _client(console) as client:
+        client.post("session", json={"name": "desk-2", "password": "a long password"})
+        assert client.get("session").status_code == 200
+        made = ask("engineer", "POST", "accounts/desk-2/password").json()
+        assert client.get("session").status_code == 401
+        old = client.post("session", json={"name": "desk-2", "password": "a long password"})
+        assert old.status_code == 401
+        again = client.post("session", json=made)
+        assert again.status_code == 200
+    events = ask("viewer", "GET", "events").text
+    assert "new password for desk-2" in events
+    assert made["password"] not in events + ask("engineer", "GET", "accounts").text
+    assert ask("engineer", "POST", "accounts/engineer/password").status_code == 409
+    assert ask("engineer", "POST", "accounts/nobody/password").status_code == 404
+
+
+def test_the_own_password(console: LiveConsole, ask: Ask) -> None:
+    given = {"name": "desk-3", "role": "viewer", "password": "a long password"}
+    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    change = {"old": "not this one", "new": "another password"}
+    with _client(console) as client, _client(console) as elsewhere:
+        for one in (client, elsewhere):
+            answer = one.post("session", json={"name": "desk-3", "password": "a long password"})
+            one.headers["X-CSRF-Token"] = answer.json()["csrf"]
+        refused = client.put("session/password", json=change)
+        assert refused.status_code == 403
+        assert "present password" in refused.json()["detail"]
+        change["old"] = "a long password"
+        assert client.put("session/password", json={**change, "new": "short"}).status_code == 422
+        assert client.put("session/password", json=change).status_code == 204
+        assert client.get("session").status_code == 401
+        assert elsewhere.get("session").status_code == 401
+        signed = client.post("session", json={"name": "desk-3", "password": "another password"})
+        assert signed.status_code == 200
+    # Programs have no business with passwords.
+    assert ask("viewer", "PUT", "session/password", change).status_code == 403
+
+
+def test_guessing_the_own_password_is_slowed(console: LiveConsole, ask: Ask) -> None:
+    given = {"name": "desk-4", "role": "viewer", "password": "a long password"}
+    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    with _client(console) as client:
+        answer = client.post("session", json={"name": "desk-4", "password": "a long password"})
+        client.headers["X-CSRF-Token"] = answer.json()["csrf"]
+        guess = {"old": "x" * 12, "new": "another password"}
+        seen = [client.put("session/password", json=guess).status_code for _ in range(6)]
+    assert seen == [403] * 5 + [429]
+    console.call(lambda: console.server.app.state.console.attempts.good("address 127.0.0.1"))
 
 
 def test_nobody_takes_away_their_own_role(ask: Ask) -> None:
@@ -176,6 +291,41 @@ def test_sessions_and_tokens_end(console: LiveConsole, ask: Ask) -> None:
         assert client.get(url, headers=bearer).status_code == 200
         assert ask("operator", "DELETE", f"tokens/{kept.key}").status_code == 204
         assert client.get(url, headers=bearer).status_code == 401
+
+
+def test_what_has_expired_leaves_the_store(console: LiveConsole) -> None:
+    people, now = console.keeper.people, time.time()
+    old, _ = people.add_token("operator", "old", "operator", now - 100.0, 50.0)
+    new, _ = people.add_token("operator", "new", "operator", now, 50.0)
+
+    async def begin() -> None:
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(1.0):
+                await console.server.app.state.console.forget_expired()
+
+    console.wait(begin())
+    console.until(lambda: old.key not in {one.key for one in people.tokens()}, 5.0)
+    assert new.key in {one.key for one in people.tokens()}
+    people.revoke_token(new.key)
+
+
+def test_a_server_is_asked_beside_the_loop(
+    console: LiveConsole, ask: Ask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    people, threads = console.keeper.people, []
+    look = people.token
+    monkeypatch.setattr("heliotrope.console.auth.TRUSTED", -1.0)
+
+    def noted(secret: str, now: float) -> object:
+        threads.append(threading.current_thread().name)
+        return look(secret, now)
+
+    monkeypatch.setattr(people, "token", noted)
+    assert ask("viewer", "GET", "sun").status_code == 200
+    monkeypatch.setattr(type(people), "near", property(lambda _: False))
+    assert ask("viewer", "GET", "sun").status_code == 200
+    assert threads[0] == "console"
+    assert threads[1] != "console"
 
 
 def test_a_token_is_made_in_a_session_only(signed_in: httpx.Client, ask: Ask) -> None:
@@ -225,11 +375,112 @@ def test_a_command_has_one_record(console: LiveConsole, ask: Ask) -> None:
     assert ask("operator", "DELETE", "authority").json()["holder"] != "operator"
 
 
-def test_what_only_an_engineer_may(ask: Ask, console: LiveConsole) -> None:
-    order = {"command": "JOG", "heliostats": [console.live.names[0]], "values": [0, 10]}
+@pytest.mark.parametrize("name", ["JOG", "ZERO"])
+def test_what_only_an_engineer_may(ask: Ask, console: LiveConsole, name: str) -> None:
+    order = {"command": name, "heliostats": [console.live.names[0]], "values": [0, 10]}
     answer = ask("operator", "POST", "commands", order)
     assert answer.status_code == 403
     assert "needs engineer" in answer.json()["detail"]
+
+
+def test_zero_goes_to_one_heliostat(ask: Ask, console: LiveConsole) -> None:
+    _take(ask, "engineer")
+    order = {"command": "ZERO", "heliostats": [], "values": [0, 10]}
+    refused = ask("engineer", "POST", "commands", order)
+    assert refused.status_code == 409
+    assert "give one heliostat" in refused.json()["detail"]
+    order["heliostats"] = [console.live.names[0]]
+    given = ask("engineer", "POST", "commands", order)
+    assert given.status_code == 200, given.text
+    assert (given.json()["command"], given.json()["heliostats"]) == ("ZERO", 1)
+    ask("engineer", "DELETE", "authority")
+
+
+def test_answers_that_all_share_are_packed(console: LiveConsole, tokens: dict[str, str]) -> None:
+    headers = {"Authorization": f"Bearer {tokens['viewer']}"}
+    with _client(console) as client:
+        for path in ("field", "clusters"):
+            packed = client.get(path, headers={**headers, "Accept-Encoding": "gzip"})
+            plain = client.get(path, headers={**headers, "Accept-Encoding": "identity"})
+            assert "content-encoding" not in plain.headers
+            assert packed.headers.get("content-encoding") == (
+                "gzip" if len(plain.content) > 1024 else None
+            )
+            assert len(packed.json()) == len(plain.json())
+        assert packed.headers["cache-control"] == "no-store"
+
+
+def test_files_of_the_page_are_kept_by_browsers(console: LiveConsole) -> None:
+    with httpx.Client(base_url=console.address, trust_env=False) as client:
+        plain = client.get("console/static/live.js")
+        kept = client.get(f"{KEPT[1:]}/live.js")
+        assert kept.content == plain.content
+        assert "immutable" in kept.headers["cache-control"]
+        assert plain.headers["cache-control"] == "no-cache"
+        tag = {"If-None-Match": plain.headers["etag"]}
+        assert client.get("console/static/live.js", headers=tag).status_code == 304
+        packed = client.get("console/static/live.js", headers={"Accept-Encoding": "gzip"})
+        assert packed.headers["content-encoding"] == "gzip"
+        assert packed.content == plain.content
+        for path in ("console/static/nothing.js", f"{KEPT[1:]}/../app.py", "console/0/live.js"):
+            assert client.get(path).status_code == 404
+        assert client.get("console/static/live.js", headers={"Host": "x"}).status_code == 421
+
+
+def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
+    """A certificate and a key in files, really served."""
+    certificate, key = tmp_path / "console.pem", tmp_path / "console.key"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
+         "-nodes", "-days", "2", "-subj", "/CN=localhost", "-addext",
+         "subjectAltName=IP:127.0.0.1,DNS:localhost", "-keyout", key, "-out", certificate],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    settings = ConsoleSettings(port=0, page=False, certificate=certificate, key=key)
+
+    async def begin() -> tuple[ConsoleServer, asyncio.Task[None], str]:
+        server = ConsoleServer(console.live.operations, console.keeper.people, settings)
+        task = asyncio.get_running_loop().create_task(server.run())
+        return server, task, await server.address()
+
+    async def end() -> None:
+        await server.close()
+        await serving
+
+    server, serving, address = console.wait(begin())
+    try:
+        assert address.startswith("https://")
+        known = ssl.create_default_context(cafile=certificate)
+        with httpx.Client(base_url=address, verify=known, trust_env=False) as client:
+            given = {"name": "viewer", "password": PASSWORD}
+            answer = client.post("api/v1/session", json=given)
+            assert answer.status_code == 200
+            assert "; Secure" in answer.headers["set-cookie"]
+            assert "max-age" in answer.headers["strict-transport-security"]
+        with pytest.raises(httpx.HTTPError):
+            httpx.get(f"http{address[5:]}api/v1/health", trust_env=False)
+    finally:
+        console.wait(end())
+
+
+def test_emergency_does_not_wait_for_the_store(
+    console: LiveConsole, ask: Ask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who was known lately may call it, also when the store cannot be read any more."""
+
+    def gone(*_: object) -> None:
+        raise StoreError("store: cannot be read (gone)")
+
+    assert ask("viewer", "GET", "summary").status_code == 200
+    monkeypatch.setattr("heliotrope.console.auth.TRUSTED", -1.0)
+    monkeypatch.setattr(console.keeper.people, "token", gone)
+    assert ask("viewer", "GET", "summary").status_code == 503
+    try:
+        assert ask("viewer", "POST", "emergency").json()["on"]
+    finally:
+        monkeypatch.undo()
+        assert ask("operator", "DELETE", "emergency").status_code == 200
+        console.calm()
 
 
 def test_the_authority_of_another(ask: Ask) -> None:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from heliotrope.cli._ctl import app
+from heliotrope.console._secrets import verify_password
 from heliotrope.console.client import Client, Message, RemoteError, read_message
 from heliotrope.console.live import MARK, ROW, changed, message
 from heliotrope.console.models import plain
@@ -195,21 +196,28 @@ def test_ctl_lets_a_person_in_and_keeps_them_out(
     ctl: Callable[..., Any], console: LiveConsole
 ) -> None:
     new = "a long enough one"
-    made = ctl("", "account", "paula", "--role", "operator", typed=f"{PASSWORD}\n{new}\n{new}\n")
+    made = ctl("", "account", "desk-7", "--role", "operator", typed=f"{PASSWORD}\n{new}\n{new}\n")
     assert made.exit_code == 0, made.output
     assert new not in made.output
-    assert console.keeper.people.account("paula").role == "operator"
-    out = ctl("", "account", "paula", "--disable", typed=f"{PASSWORD}\n")
+    assert console.keeper.people.account("desk-7").role == "operator"
+    told = ctl("", "account", "desk-7", "--reset", typed=f"{PASSWORD}\n")
+    assert told.exit_code == 0, told.output
+    word = told.stdout.splitlines()[-1].split()[-1]
+    assert verify_password(console.keeper.people.account("desk-7").password_hash, word)
+    both = ctl("", "account", "desk-7", "--reset", "--disable", typed=f"{PASSWORD}\n")
+    assert "not both" in str(both.exception)
+    out = ctl("", "account", "desk-7", "--disable", typed=f"{PASSWORD}\n")
     assert out.exit_code == 0, out.output
-    assert console.keeper.people.account("paula").disabled
+    assert console.keeper.people.account("desk-7").disabled
 
 
-def test_anything_at_all(console: LiveConsole, tokens: dict[str, str]) -> None:
+@pytest.mark.parametrize("cases", [1, pytest.param(10, marks=pytest.mark.slow)])
+def test_anything_at_all(console: LiveConsole, tokens: dict[str, str], cases: int) -> None:
     """What the description allows is answered as it says; nothing makes the server fail."""
     schema = schemathesis.openapi.from_url(f"{console.address}api/v1/openapi.json")
     headers = {"Authorization": f"Bearer {tokens['viewer']}"}
     few = settings(
-        max_examples=2, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+        max_examples=cases, deadline=None, database=None, suppress_health_check=list(HealthCheck)
     )
 
     for found in schema.get_all_operations():

@@ -4,10 +4,14 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from heliotrope.console._secrets import verify_password
+from heliotrope.console.people import FIRST, first_start
+from heliotrope.store.keeper import Keeper
 from heliotrope.twin._live_field import LiveBus
 from live_console import PASSWORD, LiveConsole
 
@@ -21,8 +25,8 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
-    """Six hundred and forty heliostats with the page, at six times the speed of real time."""
-    made = LiveConsole(tmp_path_factory.mktemp("page"), 640, speed=6.0)
+    """Six hundred and forty heliostats with the page, at four times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("page"), 640, speed=4.0)
     yield made
     made.close()
 
@@ -85,6 +89,27 @@ def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> Non
         document.querySelector('meta[name=heliotrope-csrf]').content}})).status"""
     )
     assert status == 403
+
+
+def test_first_start(field: LiveConsole, browser: Any, tmp_path: Path) -> None:
+    """What the first start prints signs in; it is not printed again."""
+    keeper = Keeper(tmp_path / "store.sqlite", inline=True)
+    password = first_start(keeper.people, time.time())
+    console = field.server.app.state.console
+    before = field.call(lambda: console.people)
+    field.call(lambda: setattr(console, "people", keeper.people))
+    page = browser.new_page()
+    try:
+        page.goto(f"{field.address}login")
+        page.fill("[name=name]", FIRST)
+        page.fill("[name=password]", password)
+        page.click("button")
+        page.wait_for_selector(".hx-legend b")
+        assert first_start(keeper.people, time.time()) is None
+    finally:
+        page.close()
+        field.call(lambda: setattr(console, "people", before))
+        keeper.close()
 
 
 def test_wrong_password(field: LiveConsole, browser: Any) -> None:
@@ -154,14 +179,81 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     page.wait_for_function("heliotrope.store.selection.size === 64")
 
 
-def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
-    page = enter("viewer")
-    page.click(".hx-tabs >> text=Calibration")
-    page.wait_for_selector(".hx-calibration td:has-text('learnt')", timeout=60_000)
-    row = page.inner_text(".hx-calibration tbody tr:has-text('learnt') >> nth=0")
-    assert any(target in row for target in field.live.operations.targets)
-    page.select_option(".hx-tools select", "error")
-    assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")
+def test_a_tablet_has_all_of_it(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("engineer")
+    page.set_viewport_size({"width": 1024, "height": 768})
+    page.wait_for_timeout(300)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 1024
+    for what in ("#emergency", ".hx-map-field", ".hx-side", ".hx-orders >> text=Stow",
+                 ".hx-orders >> text=Zero", ".hx-authority button"):  # fmt: skip
+        box = page.locator(what).first.bounding_box()
+        assert 0 <= box["x"] <= 1024 - box["width"], what
+        assert 0 <= box["y"] <= 768 - box["height"], what
+    map_, foot = (page.locator(x).bounding_box() for x in (".hx-map", ".hx-footer"))
+    assert map_["y"] + map_["height"] <= foot["y"] + 1
+
+
+def _menu(page: Any, title: str) -> None:
+    page.click("header >> text=/engineer|viewer/")
+    page.click(f".q-menu >> text={title}")
+
+
+def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page, people = enter("engineer"), field.keeper.people
+    _menu(page, "People")
+    dialog = page.locator("dialog.wide")
+    dialog.locator("tr:has-text('operator')").first.wait_for()
+    dialog.locator("text=Add…").click()
+    page.fill("dialog:last-of-type [name=name]", "desk-1")
+    page.fill("dialog:last-of-type [name=password]", "long enough for it")
+    page.click("dialog:last-of-type >> text='Let in'")
+    row = dialog.locator("tr:has-text('desk-1')")
+    row.wait_for()
+    row.locator("select").select_option("operator")
+    dialog.locator(".hx-told:has-text('desk-1: operator')").wait_for()
+    assert people.account("desk-1").role == "operator"
+    row.locator("text=New password").click()
+    page.click("dialog:last-of-type >> text='Make'")
+    word = dialog.locator(".hx-secret").inner_text()
+    assert verify_password(people.account("desk-1").password_hash, word)
+    row.locator("text=Keep out").click()
+    row.locator("text=kept out").wait_for()
+    assert people.account("desk-1").disabled
+    # Told once: it is gone with whatever is done next.
+    assert word not in page.content()
+    assert dialog.locator("tr:has-text('engineer') >> text=you").count() == 1
+
+
+def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page, people = enter("viewer"), field.keeper.people
+    _menu(page, "API tokens")
+    assert page.locator(".q-menu >> text=People").count() == 0
+    dialog = page.locator("dialog.wide")
+    dialog.locator("text=Make…").click()
+    page.fill("dialog:last-of-type [name=label]", "nightly")
+    assert page.locator("dialog:last-of-type [name=role] option").all_inner_texts() == ["viewer"]
+    page.click("dialog:last-of-type >> text='Make'")
+    secret = dialog.locator(".hx-secret").inner_text()
+    assert people.token(secret, time.time()).label == "nightly"
+    dialog.locator("tr:has-text('nightly') >> text=Revoke").click()
+    page.click("dialog:last-of-type >> text='Revoke'")
+    dialog.locator("text=There is none").wait_for()
+    assert people.token(secret, time.time()) is None
+
+
+def test_the_own_password_is_changed(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page, people = enter("viewer"), field.keeper.people
+    kept = people.account("viewer").password_hash
+    for again, text in (("a different one", "differ"), ("one long enough", "")):
+        _menu(page, "Change password")
+        for name, value in (("old", PASSWORD), ("new", "one long enough"), ("again", again)):
+            page.fill(f"dialog [name={name}]", value)
+        page.click("dialog >> text='Change'")
+        if text:
+            _said(page, text)
+    page.wait_for_url("**/login")
+    assert verify_password(people.account("viewer").password_hash, "one long enough")
+    people.change("viewer", time.time(), password_hash=kept)
 
 
 def test_dark_and_light(enter: Callable[[str], Any]) -> None:
@@ -173,6 +265,16 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
     page.reload()
     page.wait_for_selector(".hx-legend b")
     assert page.evaluate(ground) != night
+
+
+def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
+    page = enter("viewer")
+    page.click(".hx-tabs >> text=Calibration")
+    page.wait_for_selector(".hx-calibration td:has-text('learnt')", timeout=60_000)
+    row = page.inner_text(".hx-calibration tbody tr:has-text('learnt') >> nth=0")
+    assert any(target in row for target in field.live.operations.targets)
+    page.select_option(".hx-tools select", "error")
+    assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")
 
 
 def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any]) -> None:

@@ -72,8 +72,9 @@ class Budget:
         return as_float(np.sqrt(sum(p**2 for p in self.parts(distance).values())))
 
     def covariance(
-        self, point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike, axes: npt.ArrayLike
-    ) -> FloatArray:
+        self, point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike,
+        axes: npt.ArrayLike, place: npt.ArrayLike | None = None,
+    ) -> FloatArray:  # fmt: skip
         """Return the covariance along two axes of what N points of a mirror share, (2, 2), rad².
 
         Parameters
@@ -82,11 +83,15 @@ class Budget:
             ENU metres, (N, 3).
         axes
             Two unit axes across the mirror's normal, (2, 3).
+        place
+            Covariance of the mirror's place as seen from the drone, m², (3, 3), if a bundle
+            adjustment found it: it stands for ``position``, ``kinematics`` and ``rtk``.
         """
         both, lamp = lever(point, camera, led, axes)
-        common = self.position**2 + self.kinematics**2 + self.rtk**2
+        known = (self.position**2 + self.kinematics**2 + self.rtk**2) * np.eye(3)
+        common = known if place is None else as_float(place)
         mean, half = both.mean(axis=0), lamp.mean(axis=0)
-        return as_float(common * mean @ mean.T + self.lamp**2 * half @ half.T)
+        return as_float(mean @ common @ mean.T + self.lamp**2 * half @ half.T)
 
 
 @dataclass(frozen=True)

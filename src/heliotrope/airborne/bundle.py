@@ -2,26 +2,32 @@ r"""Where the photographs of a flight were taken and how, from all of them toget
 
 The corners of the mirrors are marks whose places are nearly known. Unknown are, for each
 photograph, a rotation φ of the camera and the error t of its RTK position; the offset b that all
-positions share; and for each mirror the error δ of its position, a rotation ψ, and by how much
-its outline looks wider and higher than it is, g. A corner c of a mirror (vertex v, rotation M)
+positions share; for each mirror in each pose the error δ of its vertex, a rotation ψ, and by how
+much its outline looks wider and higher than it is, g; and for each heliostat that was flown in
+several poses the error d of its surveyed position. A corner c of a mirror (vertex v, rotation M)
 is seen from the told position p at
 
-.. math:: X = (R e^{[φ]})^T (v + δ + M e^{[ψ]} (c + g c) - (p - b + t))
+.. math:: X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t))
 
 in camera axes, at (X/Z, Y/Z) without distortion. Without g a shadow beside the edges of all
 mirrors, which shifts them by a tenth of a pixel, would move the camera by a decimetre: mirrors
 that look smaller would be taken to be farther away.
 
-All unknowns have priors: RTK's own deviation, the survey's, the commands'; those of φ and b are
+From one place the camera's attitude takes the shift of all mirrors for its own: what the survey
+errors leave of b is several times their mean. From several sides they are told apart, so the
+flights over the same heliostats go into one adjustment.
+
+All unknowns have priors: RTK's own deviation, the survey's, the commands'; that of φ is
 wide. The normal equations (Gauss-Newton, with weights that fall for residuals beyond 2.5
 standard deviations, after Huber) are sparse and are solved as such by SuperLU, which also gives
-the covariance of b; a least-squares driver without the normal matrix would not.
+the covariances; a least-squares driver without the normal matrix would not.
 
 Derivatives, with [X]_× for the matrix of the cross product:
-:math:`∂X/∂φ = [X]_×`, :math:`∂X/∂t = -R^T = -∂X/∂b`, :math:`∂X/∂δ = R^T`,
+:math:`∂X/∂φ = [X]_×`, :math:`∂X/∂t = -R^T = -∂X/∂b`, :math:`∂X/∂δ = ∂X/∂d = R^T`,
 :math:`∂X/∂ψ = -R^T M [c]_×`, :math:`∂X/∂g = R^T M diag(c)`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -43,6 +49,8 @@ _MOST_ROUNDS = 25
 MOST_POSITIONS = 400
 #: Steps below this (m, rad) change nothing that matters.
 _STILL = 2e-6
+#: No prior of a place is taken as narrower than this, m.
+_FIRM = 1e-6
 #: Unknowns of a mirror: δ, ψ, g.
 _OF_MIRROR = 8
 
@@ -80,7 +88,9 @@ class Priors:
     offset
         Of RTK's common offset, m.
     position
-        Of a mirror's vertex, each axis, m.
+        Of a heliostat's surveyed position, each axis, m: the same in all poses.
+    kinematics
+        Of a mirror's vertex in one pose about that, m.
     turn
         Of a mirror's rotation about each of its axes, rad.
     growth
@@ -89,6 +99,7 @@ class Priors:
 
     offset: float = 1.0
     position: float = 0.01
+    kinematics: float = 0.0
     turn: float = 0.005
     growth: float = 0.02
 
@@ -109,6 +120,8 @@ class State:
         b, told less true, m, (3,).
     stand
         The mirrors as they stand.
+    survey
+        d of each heliostat's position, m, (H, 3); zeros if it was flown in one pose.
     """
 
     told: FloatArray
@@ -116,11 +129,54 @@ class State:
     error: FloatArray
     offset: FloatArray
     stand: Standing
+    survey: FloatArray
 
     @property
     def position(self) -> FloatArray:
         """Where the photographs were taken, ENU m, (P, 3)."""
         return self.told - self.offset + self.error
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where which unknowns stand: φ and t of each photograph, b, δ, ψ and g of each mirror, d.
+
+    Attributes
+    ----------
+    photos, mirrors, heliostats
+        How many; no heliostats if each was flown in one pose.
+    owner
+        Row of the heliostat of each mirror, (N,).
+    """
+
+    photos: int
+    mirrors: int
+    heliostats: int
+    owner: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, photos: int, mirrors: int, owner: npt.ArrayLike | None) -> "_Layout":
+        rows = np.arange(mirrors) if owner is None else np.asarray(owner, dtype=np.intp)
+        if rows.shape != (mirrors,):
+            raise InputError(f"bundle: owners of shape {rows.shape} for {mirrors} mirrors")
+        shared = int(rows.max()) + 1 if len(np.unique(rows)) < mirrors else 0
+        return cls(photos, mirrors, shared, rows)
+
+    @property
+    def offset(self) -> int:
+        return 6 * self.photos
+
+    @property
+    def mirror(self) -> int:
+        return 6 * self.photos + 3
+
+    @property
+    def survey(self) -> int:
+        return self.mirror + _OF_MIRROR * self.mirrors
+
+    @property
+    def size(self) -> int:
+        return self.survey + 3 * self.heliostats
 
 
 @dataclass(frozen=True)
@@ -135,6 +191,9 @@ class Adjusted:
         Of b, m², (3, 3).
     position_sigma
         Standard deviations of the positions, m, (P, 3); NaN beyond :data:`MOST_POSITIONS`.
+    place_covariance
+        Of where each mirror stands as seen from the mean position of the photographs that show
+        it, m², (N, 3, 3): what all its reflections share.
     residual
         Of the corners in standard deviations, (K, 2).
     deviation
@@ -150,6 +209,7 @@ class Adjusted:
     state: State
     offset_covariance: FloatArray
     position_sigma: FloatArray
+    place_covariance: FloatArray
     residual: FloatArray
     deviation: float
     outlier: npt.NDArray[np.bool_]
@@ -194,6 +254,8 @@ def adjust(
     stand: Standing,
     corners: Corners,
     priors: Priors | None = None,
+    *,
+    owner: npt.ArrayLike | None = None,
 ) -> Adjusted:
     """Return the exterior orientation of all photographs, and the mirrors' places.
 
@@ -204,11 +266,13 @@ def adjust(
     rotations
         To start from, right to a few mrad, (P, 3, 3).
     stand
-        Mirrors as surveyed and commanded.
+        Mirrors as surveyed and commanded, once for each pose.
     corners
         What was seen.
     priors
         By default those of :class:`Priors`.
+    owner
+        Row of the heliostat that each mirror is of, (N,); by default each is one of its own.
 
     Raises
     ------
@@ -219,116 +283,154 @@ def adjust(
     places, spreads = as_float(told), as_float(sigma)
     if not len(corners):
         raise InputError("bundle: no corner of a mirror was seen in any photograph")
-    state = State(places, as_float(rotations), np.zeros_like(places), np.zeros(3), stand)
+    layout = _Layout.of(len(places), len(stand), owner)
+    state = State(
+        places, as_float(rotations), np.zeros_like(places), np.zeros(3), stand,
+        np.zeros((int(layout.owner.max()) + 1, 3)),
+    )  # fmt: skip
     start, moved, converged, rounds = stand, np.zeros((len(stand), _OF_MIRROR)), False, 0
     solver: SuperLU | None = None
-    right = np.empty(0)
     for rounds in range(1, _MOST_ROUNDS + 1):
         gap, parts = residuals(state, corners)
         scaled = np.linalg.norm(gap, axis=-1) / corners.sigma
         # The first round may stand far off for want of a good start: nothing is an outlier yet.
         limit = HUBER if rounds > 1 else max(HUBER, 3.0 * float(np.median(scaled)))
-        weight = np.minimum(1.0, limit / np.maximum(scaled, 1e-9))
-        solver, right = _normal_equations(state, corners, gap, parts, weight, spreads, known, moved)
+        scale = np.sqrt(np.minimum(1.0, limit / np.maximum(scaled, 1e-9))) / corners.sigma
+        prior, pull = _priors(layout, state, spreads, known, moved)
+        solver, right = _normal_equations(layout, corners, gap, parts, scale, prior, pull)
         step = solver.solve(right)
-        state, moved = _step(state, start, moved, step)
+        state, moved = _step(layout, state, start, moved, step)
         if np.abs(step).max() < _STILL:
             converged = True
             break
     assert solver is not None  # there is at least one round
-    return _told(state, corners, solver, len(right), rounds, converged)
+    return _told(layout, state, corners, solver, rounds, converged)
 
 
 def _told(
-    state: State, corners: Corners, solver: "SuperLU", size: int, rounds: int, converged: bool
-) -> Adjusted:
+    layout: _Layout, state: State, corners: Corners, solver: "SuperLU", rounds: int,
+    converged: bool,
+) -> Adjusted:  # fmt: skip
     gap, _ = residuals(state, corners, derivative=False)
     scaled = gap / corners.sigma[:, None]
     outlier = np.linalg.norm(scaled, axis=-1) > 4.0
     kept = scaled[~outlier]
-    photos = len(state.told)
-    at = 6 * photos
-    freedom = max(kept.size - at - 3, 1)
+    freedom = max(kept.size - layout.mirror, 1)
     deviation = float(np.sqrt(np.sum(kept**2) / freedom)) if kept.size else float("nan")
-    covariance = _block(solver, at, size)
-    positions = np.full((photos, 3), np.nan)
-    if photos <= MOST_POSITIONS:
-        for k in range(photos):
-            positions[k] = np.sqrt(np.diag(_block_of_position(solver, k, at, size)))
-    return Adjusted(state, covariance, positions, scaled, deviation, outlier, rounds, converged)
+    unit = np.eye(3)
+    covariance = _covariance(solver, layout.size, [(layout.offset, unit)])
+    positions = np.full((layout.photos, 3), np.nan)
+    if layout.photos <= MOST_POSITIONS:
+        for k in range(layout.photos):
+            parts = [(6 * k + 3, unit), (layout.offset, -unit)]
+            positions[k] = np.sqrt(np.diag(_covariance(solver, layout.size, parts)))
+    places = _place_covariances(layout, corners, solver)
+    return Adjusted(
+        state, covariance, positions, places, scaled, deviation, outlier, rounds, converged
+    )
+
+
+def _place_covariances(layout: _Layout, corners: Corners, solver: "SuperLU") -> FloatArray:
+    """Return the covariance of d + δ + b less the mean t of a mirror's photographs, (N, 3, 3)."""
+    unit = np.eye(3)
+    found = np.empty((layout.mirrors, 3, 3))
+    pairs = np.unique(np.stack([corners.mirror, corners.photo]), axis=1)
+    for n in range(layout.mirrors):
+        mine = pairs[1, pairs[0] == n]
+        parts = [(6 * int(k) + 3, -unit / len(mine)) for k in mine]
+        parts += [(layout.offset, unit), (layout.mirror + _OF_MIRROR * n, unit)]
+        if layout.heliostats:
+            parts.append((layout.survey + 3 * int(layout.owner[n]), unit))
+        found[n] = _covariance(solver, layout.size, parts)
+    return found
+
+
+def _priors(
+    layout: _Layout, state: State, spreads: FloatArray, known: Priors, moved: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the weights of all unknowns' priors, and how they pull."""
+    prior, pull = np.zeros(layout.size), np.zeros(layout.size)
+    photo = slice(0, layout.offset)
+    own, drawn = (a[photo].reshape(-1, 6) for a in (prior, pull))
+    own[:, :3], own[:, 3:] = 1e-2, 1.0 / spreads**2
+    drawn[:, 3:] = -state.error / spreads**2
+    common = slice(layout.offset, layout.mirror)
+    prior[common], pull[common] = 1.0 / known.offset**2, -state.offset / known.offset**2
+    mirror = slice(layout.mirror, layout.survey)
+    rest = prior[mirror].reshape(-1, _OF_MIRROR)
+    alone = known.kinematics if layout.heliostats else np.hypot(known.kinematics, known.position)
+    rest[:, :3] = 1.0 / max(alone, _FIRM) ** 2
+    rest[:, 3:6], rest[:, 6:] = 1.0 / known.turn**2, 1.0 / known.growth**2
+    pull[mirror] = -(rest * moved).reshape(-1)
+    if layout.heliostats:
+        prior[layout.survey :] = 1.0 / max(known.position, _FIRM) ** 2
+        pull[layout.survey :] = -state.survey.reshape(-1) * prior[layout.survey :]
+    return prior, pull
 
 
 def _normal_equations(
-    state: State, corners: Corners, gap: FloatArray, parts: tuple[FloatArray, ...],
-    weight: FloatArray, spreads: FloatArray, known: Priors, moved: FloatArray,
+    layout: _Layout, corners: Corners, gap: FloatArray, parts: tuple[FloatArray, ...],
+    scale: FloatArray, prior: FloatArray, pull: FloatArray,
 ) -> "tuple[SuperLU, FloatArray]":  # fmt: skip
-    """Return the factorised normal matrix and the right-hand side.
-
-    Unknowns in turn: φ and t of each photograph, b, δ, ψ and g of each mirror.
-    """
+    """Return the factorised normal matrix and the right-hand side."""
     from scipy.sparse.linalg import splu
 
-    jacobian = jacobian_matrix(corners, parts, len(state.told), len(state.stand))
-    scale = np.repeat(np.sqrt(weight) / corners.sigma, 2)
-    weighted = jacobian.multiply(scale[:, None]).tocsc()
-    photos, mirrors = len(state.told), len(state.stand)
-    size = 6 * photos + 3 + _OF_MIRROR * mirrors
-    prior, pull = np.zeros(size), np.zeros(size)
-    own = prior[: 6 * photos].reshape(photos, 6)
-    own[:, :3], own[:, 3:] = 1e-2, 1.0 / spreads**2
-    pull[: 6 * photos].reshape(photos, 6)[:, 3:] = -state.error / spreads**2
-    at = 6 * photos
-    prior[at : at + 3] = 1.0 / known.offset**2
-    pull[at : at + 3] = -state.offset / known.offset**2
-    rest = prior[at + 3 :].reshape(mirrors, _OF_MIRROR)
-    rest[:, :3], rest[:, 3:6] = 1.0 / known.position**2, 1.0 / known.turn**2
-    rest[:, 6:] = 1.0 / known.growth**2
-    pull[at + 3 :] = -(rest * moved).reshape(-1)
+    jacobian = jacobian_matrix(corners, parts, layout)
+    rows = np.repeat(scale, 2)
+    weighted = jacobian.multiply(rows[:, None]).tocsc()
     normal: csc_array = (weighted.T @ weighted).tocsc()
     normal.setdiag(normal.diagonal() + prior)
-    return splu(normal), weighted.T @ (gap.reshape(-1) * scale) + pull
+    solver = splu(
+        normal, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+    )
+    return solver, weighted.T @ (gap.reshape(-1) * rows) + pull
 
 
 def jacobian_matrix(
-    corners: Corners, parts: tuple[FloatArray, ...], photos: int, mirrors: int
+    corners: Corners, parts: tuple[FloatArray, ...], layout: _Layout
 ) -> "csc_array":
     """Return the sparse derivative (2K, U) of all places by all U unknowns, per unit."""
     from scipy.sparse import csc_array
 
     count = len(corners)
-    at = 6 * photos
-    mirror = at + 3 + _OF_MIRROR * corners.mirror
-    starts = (
-        6 * corners.photo, 6 * corners.photo + 3, np.full(count, at), mirror, mirror + 3,
-        mirror + 6,
-    )  # fmt: skip
+    mirror = layout.mirror + _OF_MIRROR * corners.mirror
+    starts = [
+        6 * corners.photo, 6 * corners.photo + 3, np.full(count, layout.offset), mirror,
+        mirror + 3, mirror + 6,
+    ]  # fmt: skip
+    blocks = list(parts)
+    if layout.heliostats:
+        # d moves a mirror as δ does.
+        starts.append(layout.survey + 3 * layout.owner[corners.mirror])
+        blocks.append(parts[3])
     values, rows, columns = [], [], []
-    for start, part in zip(starts, parts, strict=True):
+    for start, part in zip(starts, blocks, strict=True):
         line = np.arange(2 * count).reshape(count, 2, 1)
         column = start[:, None, None] + np.arange(part.shape[2])
         values.append(part.ravel())
         rows.append(np.broadcast_to(line, part.shape).ravel())
         columns.append(np.broadcast_to(column, part.shape).ravel())
     place = (np.concatenate(rows), np.concatenate(columns))
-    shape = (2 * count, at + 3 + _OF_MIRROR * mirrors)
-    return csc_array((np.concatenate(values), place), shape=shape)
+    return csc_array((np.concatenate(values), place), shape=(2 * count, layout.size))
 
 
 def _step(
-    state: State, start: Standing, moved: FloatArray, step: FloatArray
+    layout: _Layout, state: State, start: Standing, moved: FloatArray, step: FloatArray
 ) -> tuple[State, FloatArray]:
-    photos = len(state.told)
-    own = step[: 6 * photos].reshape(photos, 6)
-    at = 6 * photos
-    total = moved + step[at + 3 :].reshape(-1, _OF_MIRROR)
+    own = step[: layout.offset].reshape(-1, 6)
+    total = moved + step[layout.mirror : layout.survey].reshape(-1, _OF_MIRROR)
+    survey = state.survey
+    if layout.heliostats:
+        survey = survey + step[layout.survey :].reshape(-1, 3)
     return replace(
         state,
         rotation=state.rotation @ _turns(own[:, :3]),
         error=state.error + own[:, 3:],
-        offset=state.offset + step[at : at + 3],
+        offset=state.offset + step[layout.offset : layout.mirror],
+        survey=survey,
         stand=replace(
             start,
-            vertex=start.vertex + total[:, :3],
+            vertex=start.vertex + total[:, :3] + survey[layout.owner],
             # Small: the prior of ψ refers to where it started.
             rotation=start.rotation @ _turns(total[:, 3:6]),
             outline=start.outline * (1.0 + np.pad(total[:, None, 6:], ((0, 0), (0, 0), (0, 1)))),
@@ -340,18 +442,11 @@ def _turns(small: FloatArray) -> FloatArray:
     return rotation(small, np.linalg.norm(small, axis=-1))
 
 
-def _block(solver: "SuperLU", at: int, size: int) -> FloatArray:
-    """Return the inverse's block of three unknowns from ``at`` on, (3, 3)."""
+def _covariance(
+    solver: "SuperLU", size: int, parts: Sequence[tuple[int, FloatArray]]
+) -> FloatArray:
+    """Return the covariance of a sum of three unknowns each, times matrices, (3, 3)."""
     unit = np.zeros((size, 3))
-    unit[at : at + 3] = np.eye(3)
-    return as_float(solver.solve(unit)[at : at + 3])
-
-
-def _block_of_position(solver: "SuperLU", photo: int, offset: int, size: int) -> FloatArray:
-    """Return the covariance of a photograph's position, t less b, (3, 3)."""
-    unit = np.zeros((size, 3))
-    at = 6 * photo + 3
-    unit[at : at + 3] = np.eye(3)
-    unit[offset : offset + 3] = -np.eye(3)
-    found = solver.solve(unit)
-    return as_float(found[at : at + 3] - found[offset : offset + 3])
+    for at, factor in parts:
+        unit[at : at + 3] += factor.T
+    return as_float(unit.T @ solver.solve(unit))

@@ -6,6 +6,8 @@
 2. All together give the exterior orientation of each and RTK's common offset
    (:mod:`heliotrope.airborne.bundle`).
 3. The ray of each spot is cut with its mirror's surface: the rows of the reflections.
+
+In a night without moon no corner is seen: :mod:`heliotrope.airborne._dark` takes the place of 2.
 """
 
 import hashlib
@@ -20,7 +22,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.bundle import Adjusted, Corners, Priors, adjust, residuals
+from heliotrope.airborne._dark import BESIDE, turn_together
+from heliotrope.airborne.bundle import Adjusted, Corners, Priors, State, adjust, residuals
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.reading import Seen, read_photo
@@ -39,8 +42,10 @@ ShapeOf = Callable[[int], MirrorShape]
 FEWEST_FOR_PROCESSES = 4
 #: A spot's place on the mirror is not known better than this share of a pixel.
 SPOT_FLOOR = 0.15
-#: What lies beside a mirror moves its edges alike in all photographs, px.
-EDGE_BIAS = 0.03
+#: What lies beside a mirror moves its edges alike in all photographs, px. Where shadows touch the
+#: lower edges, rendered mirrors stand 0.03 px off, alike in a row of eight: as much as 0.06 px
+#: would make of mirrors that are independent.
+EDGE_BIAS = 0.06
 #: Deviations of the corners are taken as stated if the residuals agree within this factor.
 _AGREE = 1.15
 
@@ -61,6 +66,9 @@ class Evaluation:
         The bundle adjustment.
     stand
         The mirrors as their corners show them.
+    place_covariance
+        Of where each mirror stands as seen from the drone, m², (N, 3, 3): what all its
+        reflections share.
     reflections
         One row for each spot on a mirror; ``photo`` counts those that were used.
     problems
@@ -72,6 +80,7 @@ class Evaluation:
     seen: tuple[Seen, ...]
     adjusted: Adjusted
     stand: Standing
+    place_covariance: FloatArray
     reflections: Reflections
     problems: tuple[str, ...]
 
@@ -200,6 +209,7 @@ def evaluate(
     shape: ShapeOf,
     *,
     priors: Priors | None = None,
+    owner: npt.ArrayLike | None = None,
 ) -> Evaluation:
     """Return the reflections of a flight, with what the photographs say of themselves.
 
@@ -215,6 +225,9 @@ def evaluate(
         Gives the surface of a mirror's row; slopes do not matter here.
     priors
         Of the bundle adjustment.
+    owner
+        Row of the heliostat that each mirror is of, if some stand in several poses
+        (:func:`heliotrope.airborne.bundle.adjust`).
 
     Raises
     ------
@@ -229,12 +242,17 @@ def evaluate(
         if not s.problem and not np.isfinite(s.corners).any()
     ]
     if not good:
+        dark = [k for k, s in enumerate(seen) if not s.problem and len(s.spot)]
+        if dark and owner is None:
+            own = [photos[k] for k in dark], [seen[k] for k in dark]
+            lines = tuple(f"{s.name}: {s.problem}" for s in seen if s.problem)
+            return _evaluate_dark(*own, camera, stand, shape, priors or Priors(), lines)
         first = f"; the first: {problems[0]}" if problems else ""
         raise InputError(f"no photograph of {len(seen)} can be used{first}")
     told, used = [photos[k] for k in good], [seen[k] for k in good]
     corners = corners_of(used)
     known = _with_edges(priors or Priors(), told, stand, camera)
-    adjusted = _adjusted(told, used, stand, corners, known)
+    adjusted = _adjusted(told, used, stand, corners, known, owner)
     state = adjusted.state
     places = [
         photo.moved(place, turned)
@@ -248,7 +266,38 @@ def evaluate(
             "mirrors look at the drone (commands.csv)?"
         )
     return Evaluation(
-        tuple(places), tuple(told), tuple(used), adjusted, state.stand, found, tuple(problems)
+        tuple(places), tuple(told), tuple(used), adjusted, state.stand, adjusted.place_covariance,
+        found, tuple(problems),
+    )  # fmt: skip
+
+
+def _evaluate_dark(
+    told: Sequence[Photo], seen: Sequence[Seen], camera: LedCamera, stand: Standing,
+    shape: ShapeOf, priors: Priors, problems: tuple[str, ...],
+) -> Evaluation:  # fmt: skip
+    """Evaluate a flight at night: attitudes from the lights alone, positions as RTK has them."""
+    shifts = np.zeros((len(told), len(stand), 2))
+
+    def cut(photos: Sequence[Photo], mirrors: Standing) -> Reflections:
+        # The turn that all share moves lights beside the mirrors that they are on.
+        return _reflections(photos, seen, camera, mirrors, shape, shifts, BESIDE)
+
+    start = [p.moved(p.position, s.rotation) for p, s in zip(told, seen, strict=True)]
+    found = turn_together(start, stand, shape, cut)
+    position = as_float([p.position for p in told])
+    state = State(
+        position, as_float([p.rotation for p in found.photos]), np.zeros_like(position),
+        np.zeros(3), found.stand, np.zeros((len(stand), 3)),
+    )  # fmt: skip
+    place = float(np.linalg.norm([priors.offset, priors.position, priors.kinematics]))
+    places = found.place_covariance(place)
+    adjusted = Adjusted(
+        state, priors.offset**2 * np.eye(3), np.full(position.shape, np.nan), places,
+        np.empty((0, 2)), float("nan"), np.empty(0, np.bool_), 0, True,
+    )  # fmt: skip
+    rows = cut(found.photos, found.stand)
+    return Evaluation(
+        found.photos, tuple(told), tuple(seen), adjusted, found.stand, places, rows, problems
     )
 
 
@@ -271,28 +320,28 @@ def corners_of(seen: Sequence[Seen]) -> Corners:
 def _with_edges(
     priors: Priors, told: Sequence[Photo], stand: Standing, camera: LedCamera
 ) -> Priors:
-    """Return the priors with what the edges of mirrors add to their surveyed positions."""
+    """Return the priors with what the edges of mirrors add to where they seem to stand."""
     middle = as_float([p.position for p in told]).mean(axis=0)
     distance = float(np.median(np.linalg.norm(stand.vertex - middle, axis=-1)))
     bias = EDGE_BIAS * distance / camera.focal
-    return replace(priors, position=float(np.hypot(priors.position, bias)))
+    return replace(priors, kinematics=float(np.hypot(priors.kinematics, bias)))
 
 
 def _adjusted(
     told: Sequence[Photo], seen: Sequence[Seen], stand: Standing, corners: Corners,
-    priors: Priors | None,
+    priors: Priors | None, owner: npt.ArrayLike | None = None,
 ) -> Adjusted:  # fmt: skip
     """Adjust; once more if the corners scatter more or less than they say."""
     places = as_float([p.position for p in told])
     spreads = as_float([p.sigma_position for p in told])
     turns = as_float([s.rotation for s in seen])
-    found = adjust(places, spreads, turns, stand, corners, priors)
+    found = adjust(places, spreads, turns, stand, corners, priors, owner=owner)
     factor = found.deviation
     if np.isfinite(factor) and not 1.0 / _AGREE < factor < _AGREE:
         scaled = Corners(
             corners.photo, corners.mirror, corners.corner, corners.place, corners.sigma * factor
         )
-        found = adjust(places, spreads, found.state.rotation, stand, scaled, priors)
+        found = adjust(places, spreads, found.state.rotation, stand, scaled, priors, owner=owner)
     return found
 
 
@@ -314,9 +363,12 @@ def _local_shifts(adjusted: Adjusted, corners: Corners, photos: int, mirrors: in
 
 def _reflections(
     photos: Sequence[Photo], seen: Sequence[Seen], camera: LedCamera, stand: Standing,
-    shape: ShapeOf, shifts: FloatArray,
+    shape: ShapeOf, shifts: FloatArray, beside: float = 0.0,
 ) -> Reflections:  # fmt: skip
-    """Return the reflections of all spots, by the ray of each and its mirror."""
+    """Return the reflections of all spots, by the ray of each and its mirror.
+
+    Rays that pass ``beside`` m and a little beside all facets are left out.
+    """
     number = np.concatenate([np.full(len(s.spot_mirror), k) for k, s in enumerate(seen)])
     mirror = np.concatenate([s.spot_mirror for s in seen])
     place = np.concatenate([s.spot for s in seen]) - shifts[number, mirror]
@@ -331,7 +383,7 @@ def _reflections(
         mine = np.flatnonzero(mirror == row)
         turned = stand.rotation[row]
         start = (position[number[mine]] - stand.vertex[row]) @ turned
-        facet, xy = _cut(shape(int(row)), start, ways[mine] @ turned)
+        facet, xy = _cut(shape(int(row)), start, ways[mine] @ turned, beside)
         kept = facet >= 0
         distance = np.linalg.norm(start, axis=-1)
         # Seen from aside, a spot's place along the mirror is less sharp.
@@ -346,7 +398,7 @@ def _reflections(
 
 
 def _cut(
-    shape: MirrorShape, start: FloatArray, ways: FloatArray
+    shape: MirrorShape, start: FloatArray, ways: FloatArray, beside: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Return facet (-1 beside the mirror) and place (S, 2) where rays meet the surface."""
     height = np.zeros(len(ways))
@@ -355,23 +407,25 @@ def _cut(
     for _ in range(3):
         length = (height - start[:, 2]) / ways[:, 2]
         xy = start[:, :2] + length[:, None] * ways[:, :2]
-        facet = _nearest_facet(shape, xy)
+        facet = _nearest_facet(shape, xy, beside)
         kept = facet >= 0
         height[kept] = shape.point_at(facet[kept], xy[kept])[:, 2]
     return facet, xy
 
 
-def _nearest_facet(shape: MirrorShape, xy: FloatArray) -> npt.NDArray[np.intp]:
+def _nearest_facet(shape: MirrorShape, xy: FloatArray, beside: float) -> npt.NDArray[np.intp]:
     """Return the facet at each place; between two, the one that is nearer; -1 beside them."""
     facet = shape.facet_at(xy)
-    for i in np.flatnonzero(facet < 0):
-        every = np.arange(len(shape))
-        uv = shape.along_facet(every, np.broadcast_to(xy[i], (len(shape), 2)))
-        beyond = np.maximum(np.abs(uv) - shape.half_size, 0.0)
-        off = np.hypot(beyond[:, 0], beyond[:, 1])
-        k = int(np.argmin(off))
-        if off[k] < 0.05 * float(shape.half_size[k].max()) + 0.02:
-            facet[i] = k
+    left = np.flatnonzero(facet < 0)
+    if len(left):
+        every = np.tile(np.arange(len(shape)), len(left))
+        uv = shape.along_facet(every, np.repeat(xy[left], len(shape), axis=0))
+        beyond = np.maximum(np.abs(uv) - shape.half_size[every], 0.0)
+        off = np.hypot(beyond[:, 0], beyond[:, 1]).reshape(len(left), len(shape))
+        nearest = np.argmin(off, axis=1)
+        limit = 0.05 * shape.half_size.max(axis=1) + 0.02 + beside
+        near = off[np.arange(len(left)), nearest] < limit[nearest]
+        facet[left[near]] = nearest[near]
     return facet
 
 

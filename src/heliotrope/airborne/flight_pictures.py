@@ -3,10 +3,12 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
+from heliotrope.airborne._report_drawing import Panel, around, drawing, round_below
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.orientation import Orientation, Orientations
-from heliotrope.calibration.pictures import AFTER, BEFORE, OUTLIER, figure_of
+from heliotrope.calibration.pictures import AFTER, OUTLIER, TESTED, figure_of
 from heliotrope.geometry import FloatArray, as_float
 
 if TYPE_CHECKING:
@@ -14,40 +16,29 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _NAMES = ("rotX", "rotY")
-# Left, bottom, width and height of the axes of a heliostat's picture. They are given, because to
-# let the layout be found takes as long as the drawing.
-_PLACES = (
-    (0.045, 0.11, 0.36, 0.74), (0.455, 0.60, 0.24, 0.28), (0.455, 0.11, 0.24, 0.28),
-    (0.755, 0.60, 0.235, 0.28), (0.755, 0.11, 0.235, 0.28),
-)  # fmt: skip
-_SIZE = (13.0, 5.6)
-# Half widths of the mirror that the RMS of the differences is drawn as.
-_ARROW = 0.12
+_COLOURS = (AFTER, TESTED)
+_BAR = "#bbccdd"
+_ENDS = np.array([-1.0, 1.0])
+# Of a heliostat's picture, px.
+_SIZE = (1180.0, 500.0)
+# Length that the RMS of the differences is drawn with, in widths of the mirror.
+_ARROW = 0.06
+# Texts of facets that have room side by side.
+_MOST_LABELS = 6
+#: More heliostats than these get no arrows, and no names, in the map.
+MOST_ARROWS, MOST_NAMES = 300, 40
 
 
-def heliostat_figure(name: str, o: Orientation, shape: MirrorShape) -> "Figure":
-    """Return the picture of one heliostat.
+def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
+    """Return the picture of one heliostat, as SVG.
 
     Sampling points on the mirror with an arrow each (where the normal leans to, from the one
     expected), the differences about both axes with their distribution, by facet, and in the
     order of the photographs.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=_SIZE)
-    FigureCanvasAgg(figure)
-    axes = [figure.add_axes(place) for place in _PLACES]
-    figure.suptitle(
-        f"{name}: {o.count} reflections, {int(o.outlier.sum())} rejected, {o.distance:.0f} m",
-        fontsize=11,
-    )
-    _points(axes[0], o, shape)
-    for k, ax in enumerate(axes[1:3]):
-        _distribution(ax, o, k)
-    _facets(axes[3], o)
-    _order(axes[4], o)
-    return figure
+    panels = [_points(o, shape), _distribution(o, 0), _distribution(o, 1), _facets(o), _order(o)]
+    title = f"{name}: {o.count} reflections, {int(o.outlier.sum())} rejected, {o.distance:.0f} m"
+    return drawing(panels, *_SIZE, title)
 
 
 def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Figure":
@@ -71,7 +62,7 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
         ("σ_tot (RMS of both), mrad", [1e3 * rms(o.sigma_total) for o in found.found]),
     )
     for ax, (label, shown) in zip(axes[0], values, strict=True):
-        ax.plot(places[:, 0], places[:, 1], ".", color="#cccccc", ms=4)
+        ax.plot(places[:, 0], places[:, 1], ".", color="#cccccc", ms=4, zorder=0)
         if len(rows):
             size = 40.0 if len(rows) < 200 else 8.0
             dots = ax.scatter(places[rows, 0], places[rows, 1], c=shown, s=size, cmap="cividis")
@@ -84,9 +75,9 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
         ax.grid(alpha=0.3)
     axes[0, 0].set_title("deviation of the orientation", fontsize=10)
     axes[0, 1].set_title("how well it is known", fontsize=10)
-    if 0 < len(rows) <= 300:
+    if 0 < len(rows) <= MOST_ARROWS:
         _leans(axes[0, 0], found, places[rows])
-    if 0 < len(rows) <= 40:
+    if 0 < len(rows) <= MOST_NAMES:
         for row in rows:
             where = (float(places[row, 0]), float(places[row, 1]))
             axes[0, 1].annotate(
@@ -110,14 +101,8 @@ def _leans(ax: "Axes", found: Orientations, places: FloatArray) -> None:
         places[:, 0], places[:, 1], lean[:, 0], lean[:, 1], angles="xy", scale_units="xy",
         scale=size / (0.08 * span), width=3e-3, color=OUTLIER,
     )  # fmt: skip
-    key = _round(size)
+    key = round_below(size)
     ax.quiverkey(arrows, 0.8, 1.03, key, f"{key:g} mrad", labelpos="E", coordinates="axes")
-
-
-def _round(value: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten that is not above ``value``."""
-    power = 10.0 ** np.floor(np.log10(value))
-    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= 1.000001 * value))
 
 
 def _lean(o: Orientation) -> FloatArray:
@@ -125,94 +110,100 @@ def _lean(o: Orientation) -> FloatArray:
     return as_float(y * o.rotation[:, 0] - x * o.rotation[:, 1])
 
 
-def _points(ax: "Axes", o: Orientation, shape: MirrorShape) -> None:
-    for k, corners in enumerate(shape.corners):
-        closed = np.concatenate([corners, corners[:1]])
-        ax.plot(closed[:, 0], closed[:, 1], color="k", lw=0.8)
-        if len(shape) > 1:
-            left, low = corners[:, :2].min(axis=0)
-            ax.annotate(
-                str(k), (left, low), xytext=(4, 4), textcoords="offset points", color=BEFORE
-            )
-    good = ~o.outlier
+def _tips(o: Orientation, rows: npt.NDArray[np.bool_]) -> list[str]:
+    """Return what is known of each reflection."""
+    seen, d = o.reflections, 1e3 * o.difference
+    return [
+        f"photograph {seen.photo[i]}, facet {seen.facet[i]}: rotX {d[i, 0]:+.2f}, "
+        f"rotY {d[i, 1]:+.2f} mrad"
+        for i in np.flatnonzero(rows)
+    ]
+
+
+def _points(o: Orientation, shape: MirrorShape) -> Panel:
+    seen, good = o.reflections, ~o.outlier
+    corners = shape.corners[..., :2]
+    x = around(np.concatenate([corners[..., 0].ravel(), seen.x]))
+    y = around(np.concatenate([corners[..., 1].ravel(), seen.y]))
+    panel = Panel(
+        56.0, 60.0, 440.0, 390.0, x, y, "points, and where normals lean to",
+        "x, m (right, seen from the front)", "y, m",
+    ).equal()  # fmt: skip
+    for k, outline in enumerate(corners):
+        panel.line(outline[:, 0], outline[:, 1], "#444", closed=True)
+        left, low = outline.min(axis=0).tolist()
+        panel.text(left, low, str(k) if len(shape) > 1 else "")
     # A turn about x moves the normal towards −y, one about y towards x.
     lean = 1e3 * np.stack([o.difference[:, 1], -o.difference[:, 0]], axis=-1)
     size = rms(np.linalg.norm(lean[good], axis=-1))
-    if np.isfinite(size) and size > 0.0:
-        length = _ARROW * 0.5 * float(np.ptp(shape.corners[..., 0]))
+    if size > 0.0:
+        scale = _ARROW * panel.width / size
         for rows, colour in ((good, AFTER), (~good, OUTLIER)):
-            arrows = ax.quiver(
-                o.reflections.x[rows], o.reflections.y[rows], lean[rows, 0], lean[rows, 1],
-                angles="xy", scale_units="xy", scale=size / length, width=3e-3, color=colour,
-            )  # fmt: skip
-            if rows is good:
-                key = _round(size)
-                ax.quiverkey(
-                    arrows, 0.82, 1.04, key, f"{key:g} mrad", labelpos="E", coordinates="axes"
-                )
-    ax.plot(o.reflections.x[good], o.reflections.y[good], ".", color=AFTER, ms=4)
-    ax.plot(o.reflections.x[~good], o.reflections.y[~good], "x", color=OUTLIER, ms=6)
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title("points, and where normals lean to", fontsize=10, loc="left")
-    ax.set_xlabel("x, m (right, seen from the front)", fontsize=9)
-    ax.set_ylabel("y, m", fontsize=9, labelpad=0)
-    _quiet(ax)
+            panel.arrows(seen.x[rows], seen.y[rows], scale * lean[rows], colour)
+        key = round_below(size)
+        step = (panel.y[1] - panel.y[0]) / panel.height
+        corner = (panel.x[0] + 10.0 * step, panel.y[1] - 20.0 * step)
+        panel.arrows(*corner, [scale * key, 0.0], "#000")
+        panel.text(*corner, f"{key:g} mrad")
+    panel.dots(seen.x[good], seen.y[good], AFTER, _tips(o, good), size=1.8)
+    panel.crosses(seen.x[~good], seen.y[~good], OUTLIER, _tips(o, ~good))
+    return panel
 
 
-def _facets(ax: "Axes", o: Orientation) -> None:
-    rows = np.arange(len(o.facets))
-    for k, (colour, shift) in enumerate(((AFTER, -0.12), (OUTLIER, 0.12))):
-        mean = 1e3 * np.array([f.mean[k] for f in o.facets])
-        error = 1e3 * np.array([f.sigma[k] for f in o.facets])
-        ax.errorbar(
-            rows + shift, mean, yerr=error, fmt="o", color=colour, capsize=2, ms=4, label=_NAMES[k]
-        )
-    ax.axhline(0, color="k", lw=0.5)
-    ax.set_xticks(rows, [f"{f.facet}: {f.count}" for f in o.facets])
-    ax.set_xlim(-0.6, len(rows) - 0.4)
-    ax.set_title("mean of each facet (facet: points), mrad", fontsize=10, loc="left")
-    ax.legend(frameon=False, fontsize=8, ncols=2, loc="best")
-    _quiet(ax, across=False)
-
-
-def _distribution(ax: "Axes", o: Orientation, k: int) -> None:
+def _distribution(o: Orientation, k: int) -> Panel:
     values, rejected = 1e3 * o.difference[~o.outlier, k], 1e3 * o.difference[o.outlier, k]
-    count = len(values)
-    title = _NAMES[k]
+    count, title = len(values), _NAMES[k]
+    panel = Panel(
+        560.0, (60.0, 294.0)[k], 270.0, 156.0, around(1e3 * o.difference[:, k]), (0.0, 1.0), title,
+        f"difference in {_NAMES[k]}, mrad (× rejected)", "points",
+    )  # fmt: skip
     if count > 1 and (spread := float(values.std(ddof=1))) > 0.0:
         mean = float(values.mean())
-        bins = max(5, int(np.sqrt(count)) + 1)
-        _, edges, _ = ax.hist(values, bins=bins, color="#bbccdd")
-        line = mean + np.linspace(-3.5 * spread, 3.5 * spread, 100)
+        heights, edges = np.histogram(values, bins=max(5, int(np.sqrt(count)) + 1))
+        line = mean + np.linspace(-3.5 * spread, 3.5 * spread, 80)
         width = float(edges[1] - edges[0])
         height = np.exp(-0.5 * ((line - mean) / spread) ** 2) / (spread * np.sqrt(2.0 * np.pi))
-        ax.plot(line, count * width * height, color=AFTER)
-        title += f": σ = {spread:.2f} mrad; Shapiro and Wilk p = {float(o.normality[k]):.2g}"
-    ax.plot(rejected, np.zeros(len(rejected)), "x", color=OUTLIER, ms=7, clip_on=False)
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_xlabel(f"difference in {_NAMES[k]}, mrad (× rejected)", fontsize=9)
-    ax.set_ylabel("points", fontsize=9, labelpad=0)
-    _quiet(ax)
+        panel.y = (0.0, 1.1 * max(float(heights.max()), count * width * float(height.max())))
+        panel.x = around(np.concatenate([values, rejected, mean + 3.0 * spread * _ENDS]), 0.03)
+        panel.bars(edges, heights, _BAR)
+        panel.line(line, count * width * height, AFTER)
+        p = float(o.normality[k])
+        panel.title += f": σ = {spread:.2f} mrad; Shapiro and Wilk p = {p:.2g}"
+    panel.crosses(rejected, np.full(len(rejected), 0.04 * panel.y[1]), OUTLIER, _tips(o, o.outlier))
+    return panel
 
 
-def _order(ax: "Axes", o: Orientation) -> None:
-    good = ~o.outlier
-    for k, (colour, marker) in enumerate(((AFTER, "."), (OUTLIER, "^"))):
-        ax.plot(
-            o.reflections.photo[good], 1e3 * o.difference[good, k], marker, color=colour, ms=4,
-            label=_NAMES[k],
-        )  # fmt: skip
-    ax.axhline(0, color="k", lw=0.5)
-    ax.set_title("in the order of the photographs, mrad", fontsize=10, loc="left")
-    ax.set_xlabel("photograph", fontsize=9)
-    _quiet(ax)
+def _facets(o: Orientation) -> Panel:
+    means, errors = (
+        1e3 * np.array([getattr(f, what) for f in o.facets]) for what in ("mean", "sigma")
+    )
+    reach = np.where(np.isfinite(errors), errors, 0.0)
+    # As many texts as have room.
+    every = 1 + (len(o.facets) - 1) // _MOST_LABELS
+    labels = tuple("" if f.facet % every else f"{f.facet}: {f.count}" for f in o.facets)
+    panel = Panel(
+        890.0, 60.0, 270.0, 156.0, (-0.6, len(o.facets) - 0.4),
+        around(np.concatenate([means - reach, means + reach, np.zeros((1, 2))])),
+        "mean of each facet (● rotX, ○ rotY), mrad", "facet: points", labels=labels,
+    )  # fmt: skip
+    panel.line(panel.x, (0.0, 0.0), "#888", width=0.6)
+    for k, colour in enumerate(_COLOURS):
+        place = np.arange(len(o.facets)) + 0.12 * (2 * k - 1)
+        known = np.flatnonzero(np.isfinite(means[:, k]))
+        for i in known:
+            ends = means[i, k] + reach[i, k] * _ENDS
+            panel.line(np.full(2, place[i]), ends, colour)
+        panel.dots(place[known], means[known, k], colour, size=3.5, hollow=k == 1)
+    return panel
 
 
-def _quiet(ax: "Axes", across: bool = True) -> None:
-    """Draw few and small ticks: most of a picture's time goes into them."""
-    from matplotlib.ticker import MaxNLocator
-
-    if across:
-        ax.xaxis.set_major_locator(MaxNLocator(5))
-    ax.yaxis.set_major_locator(MaxNLocator(5))
-    ax.tick_params(labelsize=8)
+def _order(o: Orientation) -> Panel:
+    good, photo = ~o.outlier, o.reflections.photo.astype(np.float64)
+    panel = Panel(
+        890.0, 294.0, 270.0, 156.0, around(photo), around(1e3 * o.difference[good]),
+        "in the order of the photographs, mrad", "photograph",
+    )  # fmt: skip
+    panel.line(panel.x, (0.0, 0.0), "#888", width=0.6)
+    for k, colour in enumerate(_COLOURS):
+        panel.dots(photo[good], 1e3 * o.difference[good, k], colour, _tips(o, good), hollow=k == 1)
+    return panel

@@ -161,6 +161,8 @@ class MirrorShape:
             # The height changes x and y by its part along a canted facet's normal only.
             gap = wanted - self.on_facet(k, uv)[:, :2]
             uv = uv + (inverse @ gap[..., None])[..., 0]
+            if np.abs(gap).max(initial=0.0) < 1e-12:
+                break
         return uv
 
     def facet_at(self, xy: npt.ArrayLike) -> IntArray:

@@ -83,6 +83,8 @@ class Orientation:
         Where each stands, ENU metres, (n, 3).
     outlier
         (n,).
+    weight
+        Of each point in the mean, their sum 1; 0 for outliers, (n,).
     difference
         Of each point from the result, rotX and rotY, rad, (n, 2).
     sigma
@@ -112,6 +114,7 @@ class Orientation:
     reflections: Reflections
     point: FloatArray
     outlier: npt.NDArray[np.bool_]
+    weight: FloatArray
     difference: FloatArray
     sigma: FloatArray
     sigma_plain: FloatArray
@@ -229,6 +232,7 @@ def measure(
     pivot: npt.ArrayLike = (0.0, 0.0, 0.0),
     slopes: bool = True,
     budget: Budget | None = None,
+    place: npt.ArrayLike | None = None,
     mean: Mean = "area",
     alpha: float = ALPHA,
     rounds: int = ROUNDS,
@@ -249,6 +253,9 @@ def measure(
         Whether the slope map is used, if the mirror has one.
     budget
         Of what all points share; the default one if None.
+    place
+        Covariance of the mirror's place as seen from the drone, m², (3, 3), see
+        :meth:`~heliotrope.airborne.budget.Budget.covariance`.
     mean
         "area", weighted for the whole mirror, or "plain", all points alike, as in the paper.
         Without slope map that is worse: points crowd where the surface looks alike.
@@ -264,21 +271,22 @@ def measure(
     start, foot, lever = as_float(rotation), as_float(vertex), as_float(pivot)
     R, keep = start, np.ones(len(own), dtype=np.bool_)
 
-    def place(R: FloatArray) -> FloatArray:
+    def where(R: FloatArray) -> FloatArray:
         return as_float(foot + (start - R) @ lever)
 
     def update(R: FloatArray, mean: Mean) -> FloatArray:
-        omega = differences(own, shape, R, place(R), slopes=slopes)
+        omega = differences(own, shape, R, where(R), slopes=slopes)
         return turned(R, _mean(omega, own, shape, keep, mean))
 
     for _ in range(rounds):
         # Any mean brings the points to their places.
         R = update(R, "plain")
-    omega = differences(own, shape, R, place(R), slopes=slopes)
+    omega = differences(own, shape, R, where(R), slopes=slopes)
     keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
     R = update(R, mean)
-    found = differences(own, shape, R, place(R), slopes=slopes)
-    return _told(own, shape, R, place(R), start, found, keep, budget or Budget(), mean)
+    found = differences(own, shape, R, where(R), slopes=slopes)
+    known = budget or Budget()
+    return _told(own, shape, R, where(R), start, found, keep, known, mean, place)
 
 
 def measure_field(
@@ -291,6 +299,7 @@ def measure_field(
     wanted: npt.ArrayLike | None = None,
     slopes: bool = True,
     budget: Budget | None = None,
+    places: npt.ArrayLike | None = None,
     mean: Mean = "area",
 ) -> Orientations:
     """Return the orientations of all heliostats of a table of reflections.
@@ -309,12 +318,15 @@ def measure_field(
         Rows that were to be measured; all if None.
     slopes, budget, mean
         As :func:`measure`.
+    places
+        Covariances of their places as seen from the drone, m², (N, 3, 3).
 
     Notes
     -----
     A heliostat that cannot be measured is named with the reason; the others go on.
     """
     turns, feet = as_float(rotation), as_float(vertex)
+    seen = None if places is None else as_float(places)
     rows = np.arange(len(names)) if wanted is None else np.unique(np.asarray(wanted, dtype=np.intp))
     found, left_out = [], {}
     for row in rows.tolist():
@@ -324,8 +336,9 @@ def measure_field(
             continue
         try:
             one = measure(
-                mine, shape(row), turns[row], feet[row], slopes=slopes, budget=budget, mean=mean
-            )
+                mine, shape(row), turns[row], feet[row], slopes=slopes, budget=budget, mean=mean,
+                place=None if seen is None else seen[row],
+            )  # fmt: skip
         except InputError as error:
             left_out[names[row]] = str(error)
             continue
@@ -363,6 +376,7 @@ def _mean(
 def _told(
     own: Reflections, shape: MirrorShape, R: FloatArray, vertex: FloatArray, start: FloatArray,
     found: FloatArray, keep: npt.NDArray[np.bool_], budget: Budget, mean: Mean,
+    place: npt.ArrayLike | None,
 ) -> Orientation:  # fmt: skip
     part, kept = own.take(keep), found[keep]
     uv = shape.along_facet(part.facet, part.xy)
@@ -371,7 +385,9 @@ def _told(
     point = every[keep]
     # A turn about x moves the normal towards −y, one about y towards x.
     axes = np.stack([-R[:, 1], R[:, 0]])
-    shared = budget.covariance(point, part.camera, part.led, axes)
+    weight = np.zeros(len(own))
+    weight[keep] = known.weights if mean == "area" else 1.0 / len(kept)
+    shared = budget.covariance(point, part.camera, part.led, axes, place)
     told = Orientation(
         heliostat=int(own.heliostat[0]),
         rotation=R,
@@ -380,6 +396,7 @@ def _told(
         reflections=own,
         point=every,
         outlier=~keep,
+        weight=weight,
         difference=found,
         sigma=kept.std(axis=0, ddof=1) if len(kept) > 1 else np.full(2, np.nan),
         sigma_plain=plain_sigma(kept),

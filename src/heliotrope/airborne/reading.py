@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne._dark import find_lights, is_dark
 from heliotrope.airborne.detection import (
     Picture,
     decode,
@@ -159,6 +160,8 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> 
         if not found.reason:
             break
     if found.reason:
+        if is_dark(picture):
+            return _lights(picture, photo, camera, stand)
         return Seen(photo.name, found.reason)
     return _measure(picture, photo, camera, stand, found)
 
@@ -171,7 +174,7 @@ def _measure(
         return Seen(photo.name, "nothing: no mirror is wholly in the frame")
     size = np.sqrt(_area(expected))
     reach = float(np.clip(0.12 * np.median(size), 2.0, 6.0))
-    first = find_outlines(picture, expected, reach)
+    first = find_outlines(picture, expected, reach, profiles=16)
     better = np.where(first.found[:, None, None], first.corners, expected)
     lines = find_outlines(picture, better, 2.0)
     # Corners of a mirror move together if the camera is turned, not one by one.
@@ -200,6 +203,27 @@ def _measure(
         flux=spots.flux,
         clipped=spots.clipped,
         notes=tuple(notes),
+    )
+
+
+def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
+    """Return what a photograph shows in which the mirrors cannot be seen, but the lamp can."""
+    found, spots = find_lights(picture, photo, camera, stand)
+    if found.reason:
+        return Seen(photo.name, found.reason)
+    rows = np.unique(spots.mirror)
+    return Seen(
+        name=photo.name,
+        rotation=found.rotation,
+        mirror=rows,
+        corners=np.full((len(rows), 4, 2), np.nan),
+        corner_sigma=np.ones(len(rows)),
+        spot_mirror=spots.mirror,
+        spot=undistort(camera, spots.pixel),
+        spot_sigma=spots.sigma / camera.focal,
+        flux=spots.flux,
+        clipped=spots.clipped,
+        notes=("dark: its edges cannot be seen",) * len(rows),
     )
 
 

@@ -96,6 +96,11 @@ def night(led: float = 6.0) -> Conditions:
     return Conditions(sky=0.05, ground=0.012, sun=None, led=led, electrons=2500.0, read_noise=8.0)
 
 
+def dark(led: float = 6.0) -> Conditions:
+    """Return conditions of a night without moon: of the mirrors only the lamp is seen."""
+    return Conditions(sky=4e-4, ground=1e-4, sun=None, led=led, electrons=2500.0, read_noise=8.0)
+
+
 @dataclass(frozen=True)
 class Scene:
     """What a photograph shows.

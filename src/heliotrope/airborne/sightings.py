@@ -52,7 +52,8 @@ def to_sightings(
     Returns
     -------
     With a σ such that all sightings of an orientation together weigh what σ_tot (or σ_mean)
-    says, however many they are.
+    says, however many they are; those of single reflections as the mean over the mirror weighs
+    them. So both ways give a fit the same; single ones let it find outliers of its own.
 
     Raises
     ------
@@ -93,7 +94,10 @@ def _of_mean(o: Orientation, counts: FloatArray, time: float, systematic: bool) 
 
 
 def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
+    # A weight below a tenth of the usual (it may be negative, behind others) is no sighting.
+    share = np.maximum(o.weight, 0.1 / max(o.count, 1))
     kept = np.flatnonzero(~o.outlier)
+    share = share[kept] / share[kept].sum()
     seen, point = o.reflections.take(kept), o.point[kept]
     measured = measured_normal(point, seen.camera, seen.led)
     wanted = np.array([turned(o.rotation, omega)[:, 2] for omega in o.difference[kept]])
@@ -103,7 +107,7 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
     led, camera = (
         o.vertex + np.einsum("nij,nj->ni", turn, end - point) for end in (seen.led, seen.camera)
     )
-    sigma = 2.0 * np.sqrt(len(kept)) * _sigma(o, systematic)
+    sigma = 2.0 * _sigma(o, systematic) / np.sqrt(share)
     return drone(
         np.full(len(kept), o.heliostat), np.tile(counts, (len(kept), 1)), led, camera,
         time=time, sigma=sigma,

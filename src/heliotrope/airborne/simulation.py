@@ -95,6 +95,14 @@ class Flight:
     told: tuple[Photo, ...]
 
 
+@dataclass(frozen=True)
+class Installed:
+    """N heliostats as they really are: their mechanisms, and their surfaces with slopes."""
+
+    heliostats: Heliostats
+    shapes: tuple[MirrorShape, ...]
+
+
 def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
     """Return the drive counts (N, D) at which all mirrors look at one point.
 
@@ -158,6 +166,8 @@ def fly(
     start: datetime = datetime(2026, 6, 21, 10, 0, tzinfo=UTC),
     interval: float = 3.0,
     seed: int = 0,
+    installed: Installed | None = None,
+    flight: int = 0,
 ) -> Flight:
     """Return a flight over heliostats with its truth; the same seed gives the same flight.
 
@@ -181,17 +191,20 @@ def fly(
         Time of the first photograph, and seconds between two.
     seed
         Of all randomness.
+    installed
+        The heliostats as they really are, of :func:`install`, if several flights are over them;
+        ``focal`` is then not used.
+    flight
+        Number of this one of several flights: its photographs have errors of their own.
     """
     wrong = errors or Errors()
     rng = np.random.default_rng(seed)
-    really = _installed(heliostats, wrong, rng)
-    shapes = []
-    for row in range(len(heliostats)):
-        shape = ideal(heliostats, row, focal)
-        if wrong.slope > 0.0:
-            slopes = smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length)
-            shape = shape.with_slopes(slopes)
-        shapes.append(shape)
+    if installed is None:
+        really = _installed(heliostats, wrong, rng)
+        shapes = tuple(_shape(heliostats, r, focal, wrong, rng) for r in range(len(heliostats)))
+    else:
+        really, shapes = installed.heliostats, installed.shapes
+        rng = np.random.default_rng([seed, flight])
     places = as_vectors(positions, "positions").reshape(-1, 3)
     times = [start + timedelta(seconds=k * interval) for k in range(len(places))]
     pairs = [
@@ -199,9 +212,43 @@ def fly(
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
     return Flight(
-        camera, heliostats, as_float(counts), standing(really, counts), tuple(shapes),
+        camera, heliostats, as_float(counts), standing(really, counts), shapes,
         tuple(p[0] for p in pairs), tuple(p[1] for p in pairs),
     )  # fmt: skip
+
+
+def install(
+    heliostats: Heliostats, rows: npt.ArrayLike, errors: Errors, focal: npt.ArrayLike = np.inf,
+    seed: int = 0,
+) -> Installed:  # fmt: skip
+    """Return some heliostats of a field as they really are.
+
+    Parameters
+    ----------
+    heliostats
+        The whole field, as the plant file has it.
+    rows
+        Which of them.
+    errors, focal, seed
+        As :func:`fly`. A heliostat is the same whichever others are asked for.
+    """
+    index = np.asarray(rows, dtype=np.intp)
+    really = _installed(heliostats, errors, np.random.default_rng(seed)).take(index)
+    shapes = tuple(
+        _shape(heliostats, row, focal, errors, np.random.default_rng([seed, row]))
+        for row in index.tolist()
+    )
+    return Installed(really, shapes)
+
+
+def _shape(
+    heliostats: Heliostats, row: int, focal: npt.ArrayLike, wrong: Errors,
+    rng: np.random.Generator,
+) -> MirrorShape:  # fmt: skip
+    shape = ideal(heliostats, row, focal)
+    if wrong.slope <= 0.0:
+        return shape
+    return shape.with_slopes(smooth_slopes(shape, rng, wrong.slope, length=wrong.slope_length))
 
 
 def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) -> Heliostats:

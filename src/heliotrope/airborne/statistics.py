@@ -17,6 +17,7 @@ ratios by their likelihood, since one mirror says little about either.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,9 @@ import numpy.typing as npt
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
+
+if TYPE_CHECKING:
+    from threadpoolctl import ThreadpoolController
 
 #: Probability of a false alarm of Rosner's test.
 ALPHA = 0.05
@@ -174,6 +178,22 @@ def spread_mean(
         return SpreadMean(
             plain_sigma(data), np.full(n, 1.0 / max(n, 1)), plain_sigma(data), float("nan"), 1.0
         )
+    with _one_thread().limit(limits=1, user_api="blas"):
+        return _spread_mean(data, shape, k, place)
+
+
+@lru_cache(maxsize=1)
+def _one_thread() -> "ThreadpoolController":
+    """Matrices of a mirror's points are small: threads would wait longer than they work."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def _spread_mean(
+    data: FloatArray, shape: MirrorShape, k: npt.NDArray[np.intp], place: FloatArray
+) -> SpreadMean:
+    n = len(data)
     scale = float(np.linalg.norm(2.0 * shape.half_size, axis=-1).mean())
     lengths = scale * _LENGTHS
     same = k[:, None] == k[None, :]

@@ -81,12 +81,20 @@ def account(
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "viewer",
     by: Annotated[str, typer.Option(help="Your account; it must be an engineer's.")] = "engineer",
     disable: Annotated[bool, typer.Option("--disable", help="Keep the person out.")] = False,
+    reset: Annotated[
+        bool, typer.Option("--reset", help="Make a new password; it is printed once.")
+    ] = False,
 ) -> None:
-    """Let a person in, or keep them out."""
+    """Let a person in, keep them out, or give them a new password."""
+    if disable and reset:
+        raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
     with _client(context, token=False) as client:
         client.sign_in(by, own)
-        if disable:
+        if reset:
+            made = client.ask("POST", f"accounts/{name}/password")
+            print(f"new password of {name}, shown only now: {made['password']}")
+        elif disable:
             client.ask("PATCH", f"accounts/{name}", {"disabled": True})
         else:
             password = typer.prompt(
@@ -95,7 +103,8 @@ def account(
             new = {"name": name, "role": role, "password": password}
             client.ask("POST", "accounts", new)
         client.ask("DELETE", "session")
-    print(f"account {name}: {'kept out' if disable else role}")
+    if not reset:
+        print(f"account {name}: {'kept out' if disable else role}")
 
 
 @app.command()
@@ -121,14 +130,14 @@ def show(
     what: Annotated[
         str,
         typer.Argument(help="alarms, events, packets, clusters, calibration, schedule, holds, "
-                       "emergency, sun, or the name of a heliostat."),
+                       "emergency, sun, accounts, tokens, or the name of a heliostat."),
     ],
 ) -> None:  # fmt: skip
     """Print something of the plant as JSON."""
     from urllib.parse import quote
 
     known = ("alarms", "events", "packets", "clusters", "calibration", "schedule", "holds",
-             "emergency", "sun", "authority", "field")  # fmt: skip
+             "emergency", "sun", "authority", "field", "accounts", "tokens")  # fmt: skip
     path = what if what in known else f"heliostats/{quote(what, safe='')}"
     with _client(context) as client:
         print_json(client.get(path))

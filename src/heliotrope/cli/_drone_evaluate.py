@@ -1,6 +1,8 @@
 """``heliotrope drone evaluate``: the orientations of mirrors from a drone's photographs."""
 
 import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,13 +13,26 @@ from heliotrope.cli import _drone_shared as shared
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
+    from heliotrope.airborne._campaign import Campaign
+    from heliotrope.airborne.budget import Budget
     from heliotrope.airborne.evaluation import Evaluation
     from heliotrope.airborne.mirror import MirrorShape
     from heliotrope.airborne.orientation import Orientations
+    from heliotrope.calibration.sightings import Sightings
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """One flight with what came of it."""
+
+    flight: shared.FlightFolder
+    found: "Evaluation"
+    surfaces: "list[MirrorShape]"
+    orientations: "Orientations"
 
 
 def evaluate(
-    folder: shared.FolderArgument,
+    folder: shared.CampaignArgument,
     field: shared.FieldOption,
     camera: shared.CameraOption = None,
     commands: shared.CommandsOption = None,
@@ -28,9 +43,8 @@ def evaluate(
     ] = None,
     focal: shared.FocalOption = None,
     survey_mm: shared.SurveyOption = 10.0,
-    kinematics_mm: Annotated[
-        float, typer.Option(min=0.0, help="Standard deviation of vertices in their poses, mm.")
-    ] = 30.0,
+    kinematics_mm: shared.KinematicsOption = 30.0,
+    rtk_mm: shared.RtkOption = 30.0,
     out: shared.OutOption = Path("out/drone"),
     report: Annotated[
         bool, typer.Option("--report/--no-report", help="Write the page with its pictures.")
@@ -40,40 +54,87 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Find mirrors and lamp in a drone's photographs: orientations with their accuracy."""
-    import numpy as np
-
+    from heliotrope.airborne._campaign import Pose, evaluate_campaign
     from heliotrope.airborne.budget import Budget
     from heliotrope.airborne.bundle import Priors
-    from heliotrope.airborne.evaluation import evaluate as evaluate_flight
+
+    flights, problems = shared.open_campaign(folder, field, camera, commands, cluster, point, focal)
+    surfaces = _all_surfaces(flights, slopes)
+    poses = []
+    for flight, shapes in zip(flights, surfaces, strict=True):
+        seen = shared.read_flight(flight, out / "photographs", processes, scheduler, as_json)
+        poses.append(
+            Pose(flight.name, flight.photos, seen, flight.camera, flight.stand, flight.heliostat,
+                 shapes.__getitem__)
+        )  # fmt: skip
+    _tell(problems)
+    for flight in flights:
+        _tell(flight.problems, flight.name)
+    priors = Priors(1e-3 * rtk_mm, 1e-3 * survey_mm, 1e-3 * kinematics_mm)
+    found = evaluate_campaign(poses, priors)
+    for flight, lines in zip(flights, found.problems, strict=True):
+        _tell(lines, flight.name)
+    _tell(_far_off(found, priors.offset))
+    budget = Budget(priors.position, priors.kinematics, 0.0)
+    measured = _measure(flights, surfaces, found, budget)
+    _write(out, measured)
+    if report:
+        _report(out, measured, found, _not_used(flights, found, problems), as_json)
+    if as_json:
+        print_json(_document(measured, found, _not_used(flights, found, problems)))
+    else:
+        _show(measured, found, out, sum(len(f.photos) + len(f.problems) for f in flights))
+
+
+def _tell(lines: Iterable[str], flight: str = "") -> None:
+    for line in lines:
+        print(f"heliotrope: {flight}: {line}" if flight else f"heliotrope: {line}", file=sys.stderr)
+
+
+def _far_off(found: "Campaign", prior: float) -> list[str]:
+    """Return a line if RTK's offset is far larger than it was said to be."""
+    import numpy as np
+
+    size = float(np.abs(found.offset).max())
+    if size <= 3.0 * prior:
+        return []
+    line = (
+        f"RTK's common offset is {1e3 * size:.0f} mm, --rtk-mm {1e3 * prior:.0f}: is the base "
+        "where it is said to be? Give what is known of it with --rtk-mm"
+    )
+    return [line]
+
+
+def _measure(
+    flights: list[shared.FlightFolder], surfaces: "list[list[MirrorShape]]", found: "Campaign",
+    budget: "Budget",
+) -> list[_Measured]:  # fmt: skip
     from heliotrope.airborne.orientation import measure_field
 
-    flight = shared.open_flight(folder, field, camera, commands, cluster, point, focal)
-    surfaces = _surfaces(flight, slopes)
-    seen = shared.read_flight(flight, out / "photographs", processes, scheduler, as_json)
-    for line in flight.problems:
-        print(f"heliotrope: {line}", file=sys.stderr)
-    found = evaluate_flight(
-        flight.photos, seen, flight.camera, flight.stand, surfaces.__getitem__,
-        priors=Priors(position=1e-3 * survey_mm),
-    )  # fmt: skip
-    for line in found.problems:
-        print(f"heliotrope: {line}", file=sys.stderr)
-    offset_sigma = float(np.sqrt(np.trace(found.adjusted.offset_covariance) / 3.0))
-    budget = Budget(1e-3 * survey_mm, 1e-3 * kinematics_mm, offset_sigma)
-    orientations = measure_field(
-        found.reflections, flight.stand.names, surfaces.__getitem__, flight.stand.rotation,
-        found.stand.vertex, budget=budget,
-    )  # fmt: skip
-    _write(out, flight, found, orientations)
-    if report:
-        _report(out, flight, found, orientations, surfaces, as_json)
-    if as_json:
-        print_json(_document(found, orientations, flight.problems))
-    else:
-        _show(found, orientations, out, len(flight.photos) + len(flight.problems))
+    measured = []
+    for flight, shapes, one in zip(flights, surfaces, found.flights, strict=True):
+        if one is None:
+            continue
+        # Where the mirrors stand is known from the photographs, and how well.
+        orientations = measure_field(
+            one.reflections, flight.stand.names, shapes.__getitem__, flight.stand.rotation,
+            one.stand.vertex, budget=budget, places=one.place_covariance,
+        )  # fmt: skip
+        measured.append(_Measured(flight, one, shapes, orientations))
+    return measured
 
 
-def _surfaces(flight: shared.FlightFolder, slopes: Path | None) -> "list[MirrorShape]":
+def _all_surfaces(
+    flights: list[shared.FlightFolder], slopes: Path | None
+) -> "list[list[MirrorShape]]":
+    """Return the surfaces of all flights' mirrors; a map that is missing is told once."""
+    told: set[str] = set()
+    return [_surfaces(flight, slopes, told) for flight in flights]
+
+
+def _surfaces(
+    flight: shared.FlightFolder, slopes: Path | None, told: set[str]
+) -> "list[MirrorShape]":
     """Return the mirrors' surfaces, with the slope maps that there are."""
     from heliotrope.airborne.slopes import read_slopes
     from heliotrope.errors import InputError
@@ -93,98 +154,152 @@ def _surfaces(flight: shared.FlightFolder, slopes: Path | None) -> "list[MirrorS
         raise InputError(
             f"{slopes}: there is no slope map in it; name them after heliostats, {missing[0]}.npz"
         )
-    for name in missing:
-        print(f"heliotrope: {slopes}: no slope map of {name}; taken as ideal", file=sys.stderr)
+    _tell(f"{slopes}: no slope map of {n}; taken as ideal" for n in missing if n not in told)
+    told.update(missing)
     return surfaces
 
 
-def _write(
-    out: Path, flight: shared.FlightFolder, found: "Evaluation", orientations: "Orientations"
-) -> None:
-    import numpy as np
+def _write(out: Path, measured: list[_Measured]) -> None:
     import pandas as pd
 
     from heliotrope.airborne.flight_report import orientation_rows
     from heliotrope.airborne.reflections import write_reflections
-    from heliotrope.airborne.sightings import to_sightings
     from heliotrope.calibration.report import write_beside
     from heliotrope.calibration.sighting_table import write_sightings
+    from heliotrope.calibration.sightings import join
 
     out.mkdir(parents=True, exist_ok=True)
-    names = flight.stand.names
-    write_reflections(out / "reflections.csv", found.reflections, names)
-    times = [p.time.timestamp() for p in found.photos if p.time is not None]
-    sightings = to_sightings(
-        orientations, flight.counts, time=float(np.mean(times)) if times else 0.0,
-        per="orientation",
-    )  # fmt: skip
-    write_sightings(out / "sightings.csv", sightings, names, ["drone"] * len(sightings))
-    table = pd.DataFrame(orientation_rows(orientations))
+    for one in measured:
+        name = f"reflections-{one.flight.name}".rstrip("-")
+        write_reflections(out / f"{name}.csv", one.found.reflections, one.flight.stand.names)
+    parts = [_sightings(one) for one in measured if one.orientations.found]
+    if parts:
+        sightings = join(parts)
+        names = measured[0].flight.plant.names
+        write_sightings(out / "sightings.csv", sightings, names, ["drone"] * len(sightings))
+    rows = [
+        r for one in measured for r in orientation_rows(one.orientations, None, one.flight.name)
+    ]
+    table = pd.DataFrame(rows)
     write_beside(out / "orientations.csv", lambda part: table.to_csv(part, index=False))
 
 
-def _report(
-    out: Path, flight: shared.FlightFolder, found: "Evaluation", orientations: "Orientations",
-    surfaces: "list[MirrorShape]", quiet: bool,
-) -> None:  # fmt: skip
-    from heliotrope.airborne.flight_report import write_flight_report
-
-    notes = (f"{_offset(found)}.", *found.problems, *flight.problems)
-    with calibration.progress("drawing", quiet) as advance:
-        write_flight_report(
-            orientations, surfaces.__getitem__, found.stand.vertex, out, notes=notes,
-            progress=advance,
-        )  # fmt: skip
-
-
-def _offset(found: "Evaluation") -> str:
+def _sightings(one: _Measured) -> "Sightings":
+    """Return a flight's orientations as sightings, heliostats as the plant counts them."""
     import numpy as np
 
-    adjusted = found.adjusted
+    from heliotrope.airborne.sightings import to_sightings
+
+    times = [p.time.timestamp() for p in one.found.photos if p.time is not None]
+    made = to_sightings(
+        one.orientations, one.flight.counts, time=float(np.mean(times)) if times else 0.0,
+        per="orientation",
+    )  # fmt: skip
+    return replace(made, heliostat=one.flight.heliostat[made.heliostat])
+
+
+def _report(
+    out: Path, measured: list[_Measured], found: "Campaign", not_used: list[str], quiet: bool
+) -> None:
+    from heliotrope.airborne.flight_report import Flown, write_campaign_report
+
+    notes = (f"{_offset(found)}.", *not_used)
+    flown = [
+        Flown(f.flight.name, f.orientations, f.surfaces.__getitem__, f.found.stand.vertex)
+        for f in measured
+    ]
+    with calibration.progress("drawing", quiet) as advance:
+        write_campaign_report(flown, out, notes=notes, progress=advance)
+
+
+def _offset(found: "Campaign") -> str:
+    import numpy as np
+
     parts = [
         f"{axis} {1e3 * o:+.1f} ± {1e3 * s:.1f}"
         for axis, o, s in zip(
-            ("E", "N", "U"), adjusted.state.offset, np.sqrt(np.diag(adjusted.offset_covariance)),
-            strict=True,
+            ("E", "N", "U"), found.offset, np.sqrt(np.diag(found.offset_covariance)), strict=True
         )
-    ]  # fmt: skip
+    ]
     return f"common offset of RTK, told less true: {', '.join(parts)} mm"
 
 
-def _document(
-    found: "Evaluation", orientations: "Orientations", problems: tuple[str, ...]
-) -> dict[str, Any]:
+def _not_used(
+    flights: list[shared.FlightFolder], found: "Campaign", problems: list[str]
+) -> list[str]:
+    """Return a line for each flight and photograph that was not used."""
+    lines = [(f.name, line) for f in flights for line in f.problems]
+    lines += [(f.name, x) for f, own in zip(flights, found.problems, strict=True) for x in own]
+    return [*problems, *(f"{name}: {x}" if name else x for name, x in lines)]
+
+
+def _document(measured: list[_Measured], found: "Campaign", not_used: list[str]) -> dict[str, Any]:
     import numpy as np
 
     from heliotrope.airborne.flight_report import orientation_rows
 
-    adjusted = found.adjusted
+    every = [(m, o) for m in measured for o in m.orientations.found]
     return {
-        "photographs": [p.name for p in found.photos],
-        "not_used": [*problems, *found.problems],
-        "reflections": len(found.reflections),
-        "rtk_offset_m": adjusted.state.offset.tolist(),
-        "rtk_offset_sigma_m": np.sqrt(np.diag(adjusted.offset_covariance)).tolist(),
-        "orientations": orientation_rows(orientations),
-        "warnings": {orientations.names[o.heliostat]: list(o.warnings)
-                     for o in orientations.found if o.warnings},
-        "left_out": dict(orientations.left_out),
-    }  # fmt: skip
+        "photographs": [_full(m, p.name) for m in measured for p in m.found.photos],
+        "not_used": not_used,
+        "reflections": sum(len(m.found.reflections) for m in measured),
+        "rtk_offset_m": found.offset.tolist(),
+        "rtk_offset_sigma_m": np.sqrt(np.diag(found.offset_covariance)).tolist(),
+        "orientations": [
+            r for m in measured for r in orientation_rows(m.orientations, None, m.flight.name)
+        ],
+        "warnings": {
+            _full(m, m.orientations.names[o.heliostat]): list(o.warnings)
+            for m, o in every
+            if o.warnings
+        },
+        "left_out": {
+            _full(m, name): reason
+            for m in measured
+            for name, reason in m.orientations.left_out.items()
+        },
+    }
 
 
-def _show(found: "Evaluation", orientations: "Orientations", out: Path, given: int) -> None:
+def _full(one: _Measured, name: str) -> str:
+    return f"{one.flight.name}/{name}" if one.flight.name else name
+
+
+def _show(measured: list[_Measured], found: "Campaign", out: Path, given: int) -> None:
+    used = sum(len(m.found.photos) for m in measured)
+    mirrors = sum(len(s.mirror) for m in measured for s in m.found.seen)
+    reflections = sum(len(m.found.reflections) for m in measured)
+    flights = f"{len(measured)} of {len(found.flights)} flights, " if len(found.flights) > 1 else ""
+    print(f"{flights}{used} of {given} photographs used, {mirrors} pictures of mirrors, "
+          f"{reflections} reflections")  # fmt: skip
+    print(_offset(found))
+    _show_orientations(measured, out)
+    warned = [
+        (_full(m, m.orientations.names[o.heliostat]), w)
+        for m in measured
+        for o in m.orientations.found
+        for w in o.warnings
+    ]
+    for name, warning in warned[:12]:
+        print(f"{name}: {warning}")
+    if len(warned) > 12:
+        print(f"and {len(warned) - 12} more warnings with --json")
+    missing = [(_full(m, n), why) for m in measured for n, why in m.orientations.left_out.items()]
+    for name, reason in missing[:12]:
+        print(f"left out: {name}: {reason}")
+    print(f"written: {out}: orientations, reflections, sightings, and the report if wanted")
+
+
+def _show_orientations(measured: list[_Measured], out: Path) -> None:
     from heliotrope.airborne.flight_report import orientation_rows
 
-    mirrors = sum(len(s.mirror) for s in found.seen)
-    print(f"{len(found.photos)} of {given} photographs used, {mirrors} pictures of mirrors, "
-          f"{len(found.reflections)} reflections")  # fmt: skip
-    print(_offset(found))
-    rows = orientation_rows(orientations)
+    rows = [(_full(m, r["heliostat"]), r) for m in measured
+            for r in orientation_rows(m.orientations)]  # fmt: skip
     names = ("rot", "sigma_mean", "sigma_tot")
     body = [
-        [row["heliostat"], str(row["points"]), str(row["outliers"])]
+        [name, str(row["points"]), str(row["outliers"])]
         + [f"{row[f'{n}_{a}_mrad']:{'+' if n == 'rot' else ''}.3f}" for n in names for a in "xy"]
-        for row in rows[:40]
+        for name, row in rows[:40]
     ]
     print_table(
         ["heliostat", "points", "outliers", "rotX", "rotY", "σ_mean X", "σ_mean Y", "σ_tot X",
@@ -192,11 +307,3 @@ def _show(found: "Evaluation", orientations: "Orientations", out: Path, given: i
     )  # fmt: skip
     if len(rows) > 40:
         print(f"and {len(rows) - 40} more in {out / 'orientations.csv'}")
-    warned = [(orientations.names[o.heliostat], w) for o in orientations.found for w in o.warnings]
-    for name, warning in warned[:12]:
-        print(f"{name}: {warning}")
-    if len(warned) > 12:
-        print(f"and {len(warned) - 12} more warnings with --json")
-    for name, reason in list(orientations.left_out.items())[:12]:
-        print(f"left out: {name}: {reason}")
-    print(f"written: {out}: orientations, reflections, sightings, and the report if wanted")

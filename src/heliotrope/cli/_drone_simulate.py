@@ -1,6 +1,7 @@
 """``heliotrope drone simulate``: photographs of a simulated flight, with the truth."""
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,8 +12,11 @@ from heliotrope.cli._common import open_plant, parse_point
 
 if TYPE_CHECKING:
     from heliotrope.airborne.photo import LedCamera
-    from heliotrope.airborne.simulation import Flight
+    from heliotrope.airborne.rendering import Conditions
+    from heliotrope.airborne.simulation import Errors, Flight, Installed
     from heliotrope.field.heliostats import Heliostats
+    from heliotrope.geometry import FloatArray
+    from heliotrope.sun import Site
 
 
 def simulate(
@@ -37,46 +41,122 @@ def simulate(
     rtk_mm: Annotated[float, typer.Option(min=0.0, help="Of each position.")] = 8.0,
     offset_mm: Annotated[str, typer.Option(help="Common offset, E,N,U.")] = "0,0,0",
     survey_mm: Annotated[float, typer.Option(min=0.0, help="Of the heliostats' positions.")] = 5.0,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            help="plan.json of a campaign: its patterns are flown, each into a folder of its own; "
+            "--hover, --distance, --columns, --rows, --step, --heliostats do not count."
+        ),
+    ] = None,
+    stations: Annotated[
+        str, typer.Option(help="Of the plan: some, as C1-1,C1-4. Default: all.")
+    ] = "",
     focal: Annotated[
         float | None, typer.Option(min=1.0, help="Of the facets, m; default: flat.")
     ] = None,
     night: Annotated[bool, typer.Option("--night", help="By moonlight.")] = False,
+    dark: Annotated[
+        bool, typer.Option("--dark", help="Without moon: of the mirrors only the lamp is seen.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of all randomness.")] = 0,
 ) -> None:
     """Render a flight: photographs as a drone of DJI writes them, commands, camera, truth."""
     import numpy as np
 
     from heliotrope.airborne import rendering
-    from heliotrope.airborne.simulation import Errors, fly, hover_grid, look_counts
+    from heliotrope.airborne.simulation import Errors, hover_grid, look_counts
 
     plant = open_plant(field)
-    chosen = _nearest(plant.groups[_group(group, tuple(plant.groups))], heliostats)
-    middle = chosen.position.mean(axis=0)
-    # By default as seen from the tower's side, half way up to the zenith.
-    level = -middle[:2] / max(float(np.linalg.norm(middle[:2])), 1e-9)
-    place = middle + distance * np.sqrt(0.5) * np.array([*level, 1.0])
-    place = np.array(parse_point(hover, "--hover")) if hover else place
+    mirrors = plant.groups[_group(group, tuple(plant.groups))]
     errors = Errors(
         rtk=(1e-3 * rtk_mm,) * 3,
         rtk_offset=tuple(1e-3 * v for v in parse_point(offset_mm, "--offset-mm")),  # type: ignore[arg-type]  # three
         survey=1e-3 * survey_mm,
         slope=1e-3 * slope_mrad,
     )
-    flight = fly(
-        chosen, _camera(size, focal_px), look_counts(chosen, place),
-        hover_grid(place, middle, columns, rows, step), middle, errors=errors,
-        focal=np.inf if focal is None else focal, seed=seed,
-    )  # fmt: skip
-    site = plant.site
-    origin = (site.latitude_deg, site.longitude_deg, site.height)
     light = rendering.night() if night else rendering.Conditions()
-    with calibration.progress("rendering", False) as advance:
-        rendering.render_flight(
-            flight, folder, origin, conditions=light, seed=seed, progress=advance
-        )
-    _write_truth(folder / "truth", flight)
-    print(f"{len(flight.taken)} photographs of {len(chosen)} heliostats: {folder}")
+    light = rendering.dark() if dark else light
+    facets = np.inf if focal is None else focal
+    drawing = _Drawing(plant.site, _camera(size, focal_px), errors, light, facets, seed)
+    if plan is not None:
+        _campaign(drawing, plan, stations, mirrors, folder)
+        return
+    chosen = _nearest(mirrors, heliostats)
+    middle = chosen.position.mean(axis=0)
+    # By default as seen from the tower's side, half way up to the zenith.
+    level = -middle[:2] / max(float(np.linalg.norm(middle[:2])), 1e-9)
+    place = middle + distance * np.sqrt(0.5) * np.array([*level, 1.0])
+    place = np.array(parse_point(hover, "--hover")) if hover else place
+    counts, pattern = look_counts(chosen, place), hover_grid(place, middle, columns, rows, step)
+    photographs = drawing.draw(chosen, counts, pattern, middle, folder)
+    print(f"{photographs} photographs of {len(chosen)} heliostats: {folder}")
     print(f"truth (orientations.csv, photographs.csv, slopes): {folder / 'truth'}")
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """What all flights of a simulation share."""
+
+    site: "Site"
+    camera: "LedCamera"
+    errors: "Errors"
+    light: "Conditions"
+    focal: float
+    seed: int
+
+    def draw(
+        self, mirrors: "Heliostats", counts: "FloatArray", pattern: "FloatArray",
+        middle: "FloatArray", folder: Path, installed: "Installed | None" = None,
+        flight: int = 0,
+    ) -> int:  # fmt: skip
+        """Render one flight into a folder; returns the number of photographs."""
+        from datetime import UTC, datetime, timedelta
+
+        from heliotrope.airborne.rendering import render_flight
+        from heliotrope.airborne.simulation import fly
+
+        flown = fly(
+            mirrors, self.camera, counts, pattern, middle, errors=self.errors, focal=self.focal,
+            start=datetime(2026, 6, 21, 10, tzinfo=UTC) + timedelta(minutes=20 * flight),
+            seed=self.seed, installed=installed, flight=flight,
+        )  # fmt: skip
+        origin = (self.site.latitude_deg, self.site.longitude_deg, self.site.height)
+        with calibration.progress(f"rendering {folder.name}", False) as advance:
+            render_flight(
+                flown, folder, origin, conditions=self.light, seed=self.seed + 1000 * flight,
+                progress=advance,
+            )  # fmt: skip
+        _write_truth(folder / "truth", flown)
+        return len(flown.taken)
+
+
+def _campaign(
+    drawing: _Drawing, plan: Path, wanted: str, mirrors: "Heliostats", folder: Path
+) -> None:
+    """Render the stations of a plan, each into its folder CLUSTER-POINT."""
+    from heliotrope.airborne._stations import read_stations
+    from heliotrope.airborne.simulation import install
+    from heliotrope.errors import UnknownNameError
+
+    stations = read_stations(plan, mirrors.names)
+    names = [s.name for s in stations]
+    chosen = [name.strip() for name in wanted.split(",") if name.strip()] or names
+    for name in chosen:
+        if name not in names:
+            raise UnknownNameError("station", name, names)
+    photographs = 0
+    for k, station in enumerate(stations):
+        if station.name not in chosen:
+            continue
+        installed = install(
+            mirrors, station.heliostats, drawing.errors, drawing.focal, drawing.seed
+        )
+        photographs += drawing.draw(
+            mirrors.take(station.heliostats), station.counts, station.pattern, station.middle,
+            folder / station.name, installed, k,
+        )  # fmt: skip
+    print(f"{photographs} photographs in {len(chosen)} flights: {folder}")
+    print(f"truth of each (orientations.csv, photographs.csv, slopes): {folder}/*/truth")
 
 
 def _group(name: str, known: tuple[str, ...]) -> str:

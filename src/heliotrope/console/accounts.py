@@ -14,6 +14,7 @@ from heliotrope.console.auth import (
     Console,
     Engineer,
     Here,
+    checked,
     log_in,
     same_origin,
 )
@@ -47,13 +48,12 @@ async def sign_in(
     """Sign in: the answer sets the session's cookie."""
     if not same_origin(console, request):
         raise HTTPException(403, "this page is from elsewhere; sign in at the console itself")
-    address = request.client.host if request.client else ""
-    secret, expires = await log_in(console, given.name, given.password, address)
+    secret, expires = await log_in(console, given.name, given.password, _address(request))
     response.set_cookie(
         COOKIE, secret, max_age=int(console.settings.session_s), path="/", httponly=True,
         samesite="strict", secure=console.settings.tls or console.settings.plain,
     )  # fmt: skip
-    account = console.people.account(given.name)
+    account = await console.read(lambda: console.people.account(given.name))
     role = account.role if account is not None else "viewer"
     return models.Who(
         name=given.name, role=role, by="session", expires=expires, csrf=_secrets.csrf_of(secret)
@@ -69,11 +69,45 @@ async def sign_out(console: Here, who: Anyone, response: Response) -> None:
         response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
 
+@router.put(
+    "/session/password", status_code=204, tags=["people"],
+    responses={429: {"model": models.Problem, "description": "Too many failures"}},
+)  # fmt: skip
+async def own_password(
+    console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
+) -> None:
+    """Change one's own password; all one's sessions end, this one too."""
+    if who.by != "session":
+        raise HTTPException(403, "a token cannot change a password; sign in for it")
+    try:
+        await checked(console, who.person.name, given.old, _address(request))
+    except HTTPException as error:
+        if error.status_code == 401:
+            raise HTTPException(403, "the present password is wrong") from None
+        raise
+    await _set_password(console, who.person.name, given.new)
+    response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
+    console.operations.logbook.event("people", who.person.name, "has changed the own password")
+
+
+@router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
+async def reset_password(console: Here, who: Engineer, name: Named) -> models.GivenPassword:
+    """Give a person a new password, which is told once; all their sessions end."""
+    if name == who.person.name:
+        raise HTTPException(409, f"{name}: the own password is changed with PUT session/password")
+    if await console.read(lambda: console.people.account(name)) is None:
+        raise HTTPException(404, f"there is no account {name}")
+    password = _secrets.new_password()
+    await _set_password(console, name, password)
+    console.operations.logbook.event("people", who.person.name, f"new password for {name}")
+    return models.GivenPassword(name=name, password=password)
+
+
 @router.get("/accounts", response_model=list[models.AccountState], tags=["people"])
 async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
     """Return who may come in."""
     del who
-    return [_account(one) for one in console.people.accounts()]
+    return [_account(one) for one in await console.read(console.people.accounts)]
 
 
 @router.post("/accounts", response_model=models.AccountState, status_code=201, tags=["people"])
@@ -96,7 +130,7 @@ async def change_account(
     """Change role or password of a person, or keep them out."""
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: nobody takes away their own role; another must do it")
-    if console.people.account(name) is None:
+    if await console.read(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     kept = await _hashed(console, given.password) if given.password is not None else None
     made = await asyncio.to_thread(
@@ -111,7 +145,7 @@ async def change_account(
 @router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
 async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
     """Return the tokens: one's own, or all to an engineer."""
-    found = console.people.tokens(_whose(who))
+    found = await console.read(lambda: console.people.tokens(_whose(who)))
     return [models.TokenState(**asdict(one)) for one in found]
 
 
@@ -135,7 +169,8 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
 @router.delete("/tokens/{key}", status_code=204, tags=["people"])
 async def revoke(console: Here, who: Anyone, key: Named) -> None:
     """Revoke a token: one's own, or any as an engineer."""
-    if key not in {one.key for one in console.people.tokens(_whose(who))}:
+    found = await console.read(lambda: console.people.tokens(_whose(who)))
+    if key not in {one.key for one in found}:
         raise HTTPException(404, f"there is no token {key}")
     await asyncio.to_thread(console.people.revoke_token, key)
     console.known.clear()
@@ -144,6 +179,16 @@ async def revoke(console: Here, who: Anyone, key: Named) -> None:
 async def _hashed(console: Console, password: str) -> str:
     async with console.hashing:
         return await asyncio.to_thread(_secrets.hash_password, password)
+
+
+async def _set_password(console: Console, name: str, password: str) -> None:
+    kept = await _hashed(console, password)
+    await asyncio.to_thread(console.people.change, name, console.now(), password_hash=kept)
+    console.known.clear()
+
+
+def _address(request: Request) -> str:
+    return request.client.host if request.client else ""
 
 
 def _whose(who: Caller) -> str:

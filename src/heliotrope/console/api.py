@@ -1,5 +1,7 @@
 """The HTTP API, version 1: reading the plant."""
 
+import gzip
+import math
 import time
 from collections.abc import Callable
 from typing import Annotated, Any
@@ -10,8 +12,18 @@ from starlette.websockets import WebSocketDisconnect
 
 from heliotrope import __version__
 from heliotrope.console import models
-from heliotrope.console.auth import Anyone, Console, Here, console_of, find_caller, same_origin
+from heliotrope.console._files import SMALL, takes_gzip
+from heliotrope.console.auth import (
+    FIXED,
+    Anyone,
+    Console,
+    Here,
+    console_of,
+    find_caller,
+    same_origin,
+)
 from heliotrope.console.models import plain
+from heliotrope.control.operations import Operations
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 
@@ -38,14 +50,25 @@ def answer(value: Any) -> JSONResponse:
     return JSONResponse(plain(value), headers={"Cache-Control": "no-store"})
 
 
-def shared(console: Console, key: str, make: Callable[[], Any]) -> Response:
-    """Return a view that everybody sees the same, encoded once for all who ask together."""
+def shared(
+    console: Console, request: Request, key: str, make: Callable[[], Any], fresh: float = FRESH
+) -> Response:
+    """Return a view that everybody sees the same, encoded once for all who ask together.
+
+    Nothing in it is of the person who asks: what is compressed tells no secret by its length.
+    """
     now, kept = time.monotonic(), console.shared.get(key)
-    if kept is None or now - kept[0] >= FRESH:
+    if kept is None or now - kept[0] >= fresh:
         if len(console.shared) >= MOST_SHARED:
             console.shared.clear()
-        kept = console.shared[key] = (now, bytes(answer(make()).body))
-    return Response(kept[1], media_type="application/json", headers={"Cache-Control": "no-store"})
+        data = bytes(answer(make()).body)
+        packed = gzip.compress(data, 1, mtime=0) if len(data) > SMALL else None
+        kept = console.shared[key] = (now, data, packed)
+    _, data, packed = kept
+    headers = {"Cache-Control": "no-store", "Vary": "Accept-Encoding"}
+    if packed is not None and takes_gzip(request.headers):
+        data, headers["Content-Encoding"] = packed, "gzip"
+    return Response(data, media_type="application/json", headers=headers)
 
 
 @router.get("/health", tags=["plant"], responses={})
@@ -56,10 +79,13 @@ async def health(console: Here) -> dict[str, Any]:
 
 
 @router.get("/field", response_model=models.FieldState, tags=["field"])
-async def field(console: Here, who: Anyone) -> JSONResponse:
+async def field(console: Here, request: Request, who: Anyone) -> Response:
     """Return what does not change of the field."""
     del who
-    here = console.operations
+    return shared(console, request, FIXED, lambda: _field(console.operations), math.inf)
+
+
+def _field(here: Operations) -> dict[str, Any]:
     design, plant = here.design, here.plant.field
     middle = [0.0, 0.0, 0.0]
     if design.receivers:
@@ -68,29 +94,27 @@ async def field(console: Here, who: Anyone) -> JSONResponse:
             for k in range(3)
         ]
     sizes = sorted(here.sizes.max(axis=1).tolist())
-    return answer(
-        {
-            "plant": design.name, "names": here.names, "positions": here.positions.round(3),
-            "clusters": here.clusters, "cluster": plant.cluster,
-            "size": sizes[len(sizes) // 2], "tower": middle, "receivers": here.receivers,
-            "targets": here.targets, "surfaces": here.aim_names, "states": states.STATES,
-            "faults": meanings.FAULTS,
-        }
-    )  # fmt: skip
+    return {
+        "plant": design.name, "names": here.names, "positions": here.positions.round(3),
+        "clusters": here.clusters, "cluster": plant.cluster,
+        "size": sizes[len(sizes) // 2], "tower": middle, "receivers": here.receivers,
+        "targets": here.targets, "surfaces": here.aim_names, "states": states.STATES,
+        "faults": meanings.FAULTS,
+    }  # fmt: skip
 
 
 @router.get("/summary", response_model=models.Summary, tags=["plant"])
-async def summary(console: Here, who: Anyone) -> JSONResponse:
+async def summary(console: Here, request: Request, who: Anyone) -> Response:
     """Return the plant in one look."""
     del who
-    return answer(console.operations.summary())
+    return shared(console, request, "summary", console.operations.summary)
 
 
 @router.get("/sun", response_model=models.SunView, tags=["plant"])
-async def where_the_sun_is(console: Here, who: Anyone) -> JSONResponse:
+async def where_the_sun_is(console: Here, request: Request, who: Anyone) -> Response:
     """Return where the sun is."""
     del who
-    return answer(console.operations.sun())
+    return shared(console, request, "sun", console.operations.sun)
 
 
 @router.get("/heliostats/{name}", response_model=models.HeliostatView, tags=["field"])
@@ -101,24 +125,24 @@ async def heliostat(console: Here, who: Anyone, name: Named) -> JSONResponse:
 
 
 @router.get("/clusters", response_model=models.many(models.ClusterRow), tags=["field"])
-async def clusters(console: Here, who: Anyone) -> Response:
+async def clusters(console: Here, request: Request, who: Anyone) -> Response:
     """Return the health of each cluster."""
     del who
-    return shared(console, "clusters", console.operations.cluster_rows)
+    return shared(console, request, "clusters", console.operations.cluster_rows)
 
 
 @router.get("/receivers/{name}/flux", response_model=models.FluxView, tags=["plant"])
-async def flux(console: Here, who: Anyone, name: Named) -> Response:
+async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Response:
     """Return the predicted light on a receiver."""
     del who
-    return shared(console, f"flux {name}", lambda: console.operations.receiver_flux(name))
+    return shared(console, request, f"flux {name}", lambda: console.operations.receiver_flux(name))
 
 
 @router.get(
     "/targets/{name}/photograph", tags=["calibration"], response_class=Response,
     responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "None was taken yet"}},
 )  # fmt: skip
-async def photograph(console: Here, who: Anyone, name: Named, request: Request) -> Response:
+async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
     """Return the last photograph of a target, with what the software saw in it."""
     del who
     view = console.operations.camera(name)
@@ -143,43 +167,46 @@ async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
 
 
 @router.get("/alarms", response_model=models.many(models.AlarmRow), tags=["alarms"])
-async def alarms(console: Here, who: Anyone) -> Response:
+async def alarms(console: Here, request: Request, who: Anyone) -> Response:
     """Return the alarms, those that want attention first."""
     del who
-    return shared(console, "alarms", console.operations.alarms)
+    return shared(console, request, "alarms", console.operations.alarms)
 
 
 @router.get("/events", response_model=models.many(models.EventRow), tags=["logs"])
-async def events(console: Here, who: Anyone, limit: Limit = 200) -> Response:
+async def events(console: Here, request: Request, who: Anyone, limit: Limit = 200) -> Response:
     """Return the last events, newest first."""
     del who
-    return shared(console, f"events {limit}", lambda: console.operations.events(limit))
+    return shared(console, request, f"events {limit}", lambda: console.operations.events(limit))
 
 
 @router.get("/packets", response_model=models.many(models.PacketRow), tags=["logs"])
 async def packets(
-    console: Here, who: Anyone, limit: Limit = 200,
+    console: Here, request: Request, who: Anyone, limit: Limit = 200,
     cluster: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:  # fmt: skip
     """Return the last messages between plant and clusters, newest first."""
     del who
     return shared(
-        console, f"packets {limit} {cluster}", lambda: console.operations.packets(limit, cluster)
+        console,
+        request,
+        f"packets {limit} {cluster}",
+        lambda: console.operations.packets(limit, cluster),
     )
 
 
 @router.get("/calibration", response_model=models.CalibrationView, tags=["calibration"])
-async def calibration(console: Here, who: Anyone) -> Response:
+async def calibration(console: Here, request: Request, who: Anyone) -> Response:
     """Return how far calibration has come."""
     del who
-    return shared(console, "calibration", console.operations.calibration)
+    return shared(console, request, "calibration", console.operations.calibration)
 
 
 @router.get("/schedule", response_model=models.many(models.Planned), tags=["calibration"])
-async def schedule(console: Here, who: Anyone, limit: Limit = 20) -> Response:
+async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 20) -> Response:
     """Return the plan of the next measurements."""
     del who
-    return shared(console, f"schedule {limit}", lambda: console.operations.schedule(limit))
+    return shared(console, request, f"schedule {limit}", lambda: console.operations.schedule(limit))
 
 
 @router.get("/holds", response_model=models.many(models.Hold), tags=["calibration"])
@@ -200,7 +227,7 @@ async def emergency(console: Here, who: Anyone) -> JSONResponse:
 async def live(socket: WebSocket) -> None:
     """Send the live stream; see docs/reference/api-http.md."""
     console: Console = console_of(socket)
-    found = find_caller(console, socket)
+    found = await find_caller(console, socket)
     if found is None or not same_origin(console, socket):
         await socket.accept()
         await socket.close(4401, "sign in, or send a valid token")
@@ -211,12 +238,12 @@ async def live(socket: WebSocket) -> None:
         return
     checked = console.now()
 
-    def allowed() -> bool:
+    async def allowed() -> bool:
         nonlocal checked
         if console.now() - checked < 10.0:
             return True
         checked = console.now()
-        return find_caller(console, socket) is not None
+        return await find_caller(console, socket) is not None
 
     try:
         await console.stream.follow(socket.send_bytes, allowed)

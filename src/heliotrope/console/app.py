@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import time
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 
 from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -16,6 +15,7 @@ from starlette.staticfiles import StaticFiles
 from heliotrope import __version__
 from heliotrope.console import accounts, api, commands
 from heliotrope.console._attempts import Attempts
+from heliotrope.console._files import KEPT, PLAIN, STATIC, Files
 from heliotrope.console.auth import Console
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
@@ -27,7 +27,6 @@ from heliotrope.errors import HeliotropeError, UnknownNameError
 from heliotrope.store.people import People
 from heliotrope.store.records import StoreError
 
-STATIC = Path(__file__).with_name("static")
 ABOUT = (
     "Reads and commands a heliostat field. Sign in (POST /api/v1/session) or send a token "
     "(Authorization: Bearer). In a session, all that changes anything needs the header "
@@ -59,7 +58,8 @@ def create(
     async def alive(app: FastAPI) -> AsyncIterator[None]:
         del app
         async with asyncio.TaskGroup() as group:
-            works = [group.create_task(stream.run()), group.create_task(console.keep_authority())]
+            parts = (stream.run(), console.keep_authority(), console.forget_expired())
+            works = [group.create_task(part) for part in parts]
             yield
             for work in works:
                 work.cancel()
@@ -74,6 +74,8 @@ def create(
     for kind, status in ((HeliotropeError, 422), (UnknownNameError, 404), (RefusedError, 409),
                          (AuditError, 503), (StoreError, 503)):  # fmt: skip
         app.add_exception_handler(kind, _problem(status))
+    app.add_middleware(Files)
+    # The one that is added last stands first.
     app.add_middleware(Guard, console=lambda: console)
     _pages(app)
     if chosen.page:
@@ -93,7 +95,8 @@ def _problem(status: int) -> Callable[[Request, Exception], Response]:
 
 def _pages(app: FastAPI) -> None:
     """Add the files of the page, and signing in: plain, without the frame."""
-    app.mount("/console/static", StaticFiles(directory=STATIC), name="console")
+    for place in (KEPT, PLAIN):
+        app.mount(place, StaticFiles(directory=STATIC), name=place)
 
     @app.get("/login", include_in_schema=False)
     async def login() -> Response:

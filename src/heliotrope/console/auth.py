@@ -6,10 +6,12 @@ besides, which a page from elsewhere cannot read. Programs have a token (``Autho
 """
 
 import asyncio
+import contextlib
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, TypeVar, cast
 from urllib.parse import urlsplit
 
 from fastapi import Depends, HTTPException
@@ -23,14 +25,21 @@ from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.tickets import Tickets
 from heliotrope.control.authority import Person, RefusedError, Role
 from heliotrope.control.operations import Operations
-from heliotrope.store.people import People
+from heliotrope.store.people import Account, ApiToken, People, Session
+from heliotrope.store.records import StoreError
 
+T = TypeVar("T")
 COOKIE = "heliotrope_session"
 #: A session that was found valid is trusted for so long without the store, s.
 TRUSTED = 5.0
+#: And so long for EMERGENCY alone, s.
+LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
+DAY = 86_400.0
 #: Who has kept the authority up counts as there for so long, s.
 PRESENT = 8.0
+#: The shared answer that never changes.
+FIXED = "field"
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 
@@ -54,7 +63,7 @@ class Console:
     present: dict[str, float] = field(default_factory=dict)
 
     #: Answers that all viewers ask for, and when they were made: made at most twice a second.
-    shared: dict[str, tuple[float, bytes]] = field(default_factory=dict)
+    shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
 
     async def keep_authority(self) -> None:
         """Keep the authority up for a holder whose page (or program) has said so lately.
@@ -68,6 +77,34 @@ class Console:
                 continue
             if time.monotonic() - self.present.get(grant.holder.name, -math.inf) < PRESENT:
                 self.operations.keep_authority(grant.holder, grant.token)
+
+    async def forget_expired(self) -> None:
+        """Let the store go of sessions and tokens that have expired, at the start and once a day.
+
+        The loop's time may be faster than the machine's, by which sessions end.
+        """
+        last = -math.inf
+        while True:
+            if self.now() - last >= DAY:
+                last = self.now()
+                with contextlib.suppress(StoreError):  # a store that is full is told by others
+                    self.people.forget_expired(last)
+            await asyncio.sleep(60.0)
+
+    def forget(self) -> None:
+        """Let go of the answers that a change may have made old."""
+        fixed = self.shared.get(FIXED)
+        self.shared.clear()
+        if fixed is not None:
+            self.shared[FIXED] = fixed
+
+    async def read(self, look: Callable[[], T]) -> T:
+        """Return what the store says.
+
+        A file is asked at once, which takes below a millisecond: a thread beside a loop that is
+        busy would take a hundred. A server, which may be slow or gone, must not hold the loop.
+        """
+        return look() if self.people.near else await asyncio.to_thread(look)
 
     def now(self) -> float:
         """Return the machine's time, POSIX s: sessions end by it, whatever time the plant has."""
@@ -101,16 +138,25 @@ class Caller:
         return _secrets.csrf_of(self.secret) if self.by == "session" else ""
 
 
+async def here(connection: HTTPConnection) -> Console:
+    """Return the console of an application; in the loop: a thread for it would cost more."""
+    return console_of(connection)
+
+
 def console_of(connection: HTTPConnection) -> Console:
     """Return the console of an application."""
     return cast("Console", connection.app.state.console)
 
 
-Here = Annotated[Console, Depends(console_of)]
+Here = Annotated[Console, Depends(here)]
 
 
-def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
-    """Return who asks, None if they are not known (any more)."""
+async def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
+    """Return who asks, None if they are not known (any more).
+
+    For EMERGENCY it is enough that they were known lately: it must not wait for a store that is
+    slow or gone.
+    """
     bearer = connection.headers.get("authorization", "")
     kind, _, word = bearer.partition(" ")
     if bearer and kind.lower() != "bearer":
@@ -119,19 +165,37 @@ def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
     secret = secret or connection.cookies.get(COOKIE, "")
     if not secret or (bearer and not word.strip()):
         return None
+    trusted = LONG_TRUSTED if _is_emergency(connection) else TRUSTED
     known, now = console.known.get((by, secret)), time.monotonic()
-    if known is None or now - known[0] > TRUSTED:
-        look = console.people.token if by == "token" else console.people.session
-        found = look(secret, console.now())
-        if found is None:
-            console.known.pop((by, secret), None)
+    if known is None or now - known[0] > trusted:
+        known = await _look_up(console, by, secret)
+        if known is None:
             return None
-        who = Caller(person_of(found.name, found.role), by, secret, found.expires)
-        if len(console.known) > MOST_KNOWN:
-            console.known.clear()
-        known = console.known[by, secret] = (now, who)
     who = known[1]
     return who if who.expires is None or who.expires > console.now() else None
+
+
+async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
+    """Ask the store who has a secret."""
+    now = console.now()
+    found: ApiToken | Session | None
+    if by == "token":
+        found = await console.read(lambda: console.people.token(secret, now))
+    else:
+        found = await console.read(lambda: console.people.session(secret, now))
+    if found is None:
+        console.known.pop((by, secret), None)
+        return None
+    who = Caller(person_of(found.name, found.role), by, secret, found.expires)
+    if len(console.known) > MOST_KNOWN:
+        console.known.clear()
+    known = console.known[by, secret] = (time.monotonic(), who)
+    return known
+
+
+def _is_emergency(connection: HTTPConnection) -> bool:
+    scope = connection.scope
+    return scope.get("method") == "POST" and str(scope.get("path")).endswith("/emergency")
 
 
 def same_origin(console: Console, connection: HTTPConnection) -> bool:
@@ -149,7 +213,7 @@ def host_known(console: Console, netloc: str) -> bool:
     return host.lower() in console.settings.hosts
 
 
-def caller(connection: HTTPConnection, console: Here) -> Caller:
+async def caller(connection: HTTPConnection, console: Here) -> Caller:
     """Return who asks.
 
     Raises
@@ -157,13 +221,13 @@ def caller(connection: HTTPConnection, console: Here) -> Caller:
     HTTPException
         401 if they are not known; 403 if a page from elsewhere may have sent it.
     """
-    found = find_caller(console, connection)
+    found = await find_caller(console, connection)
     if found is None:
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
     changes = connection.scope.get("method", "GET") not in SAFE_METHODS
     if changes:
         # Who changes something sees it changed.
-        console.shared.clear()
+        console.forget()
     if found.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
         if not same_origin(console, connection) or not _secrets.same(word, found.csrf):
@@ -177,7 +241,7 @@ Anyone = Annotated[Caller, Depends(caller)]
 def at_least(role: Role) -> Any:
     """Return a dependency that lets only some in."""
 
-    def allowed(who: Anyone) -> Caller:
+    async def allowed(who: Anyone) -> Caller:
         if who.person.role < role:
             name, mine = who.person.name, who.person.role.name.lower()
             raise HTTPException(403, f"{name} is {mine}; it needs {role.name.lower()}")
@@ -214,6 +278,22 @@ async def log_in(console: Console, name: str, password: str, address: str) -> tu
     HTTPException
         401 if name or password is wrong; 429 after too many failures.
     """
+    account = await checked(console, name, password, address)
+    now, lifetime = console.now(), console.settings.session_s
+    secret = await asyncio.to_thread(
+        console.people.open_session, account.name, now, lifetime, address
+    )
+    return secret, now + lifetime
+
+
+async def checked(console: Console, name: str, password: str, address: str) -> Account:
+    """Return the account of somebody who knows its password.
+
+    Raises
+    ------
+    HTTPException
+        401 if name or password is wrong; 429 after too many failures.
+    """
     keys = (f"name {name}", f"address {address}")
     if (wait := console.attempts.wait(*keys)) > 0.0:
         seconds = math.ceil(wait)
@@ -222,15 +302,11 @@ async def log_in(console: Console, name: str, password: str, address: str) -> tu
             {"Retry-After": str(seconds)},
         )  # fmt: skip
     console.attempts.begin(*keys)
-    account = console.people.account(name)
+    account = await console.read(lambda: console.people.account(name))
     kept = account.password_hash if account is not None and not account.disabled else None
     async with console.hashing:
         good = await asyncio.to_thread(_secrets.verify_password, kept, password)
     if not good or account is None:
         raise HTTPException(401, "name or password is wrong")
     console.attempts.good(*keys)
-    now, lifetime = console.now(), console.settings.session_s
-    secret = await asyncio.to_thread(
-        console.people.open_session, account.name, now, lifetime, address
-    )
-    return secret, now + lifetime
+    return account

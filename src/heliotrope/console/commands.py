@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
 from heliotrope.console.auth import Anyone, Caller, Console, Here, Operator, token_of
+from heliotrope.control._operations_zero import zero
 from heliotrope.control.authority import OPERATOR_COMMANDS, Role
 from heliotrope.errors import InputError
 
@@ -122,7 +123,7 @@ async def defocus(console: Here, who: Operator, whom: models.Whom) -> models.Tic
 
 @router.post("/commands", response_model=models.TicketState, tags=["commands"])
 async def command(console: Here, who: Operator, order: models.CommandOrder) -> models.TicketState:
-    """Give a command of the wire: APPROACH, TRACK, IDLE, REFOCUS, LOCK, UNLOCK, SEARCH, JOG, ..."""
+    """Give a command of the wire: APPROACH, TRACK, IDLE, LOCK, SEARCH, JOG, ZERO, ..."""
     here, name = console.operations, order.command
     if name in ("STOW", "DEFOCUS"):
         act = here.stow if name == "STOW" else here.defocus
@@ -130,7 +131,11 @@ async def command(console: Here, who: Operator, order: models.CommandOrder) -> m
     if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
         raise HTTPException(403, f"{name}: {who.person.name} is operator; it needs engineer")
     token = token_of(console, who.person)
-    ticket = here.command(who.person, token, name, order.heliostats, order.values)
+    if name == "ZERO":
+        ticket = zero(here.plant, who.person, token, order.heliostats, order.values)
+        here.logbook.event("command", who.person.name, f"ZERO {order.heliostats[0]}")
+    else:
+        ticket = here.command(who.person, token, name, order.heliostats, order.values)
     return console.tickets.put(ticket)
 
 

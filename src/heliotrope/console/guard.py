@@ -48,7 +48,7 @@ class Guard:
         console = self._console()
         scope["heliotrope"] = console
         headers = Headers(scope=scope)
-        refusal = self._refusal(console, scope, headers)
+        refusal = await self._refusal(console, scope, headers)
 
         async def reply(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -64,7 +64,9 @@ class Guard:
             await receive()
             await send({"type": "websocket.close", "code": 4403})
 
-    def _refusal(self, console: Console, scope: Scope, headers: Headers) -> tuple[int, str] | None:
+    async def _refusal(
+        self, console: Console, scope: Scope, headers: Headers
+    ) -> tuple[int, str] | None:
         """Return status and reason for what may not pass."""
         if not host_known(console, headers.get("host", "")):
             return 421, "this machine is not known here by that name; see --name"
@@ -74,7 +76,7 @@ class Guard:
         if not length.isdigit() or int(length) > LARGEST:
             return 413, f"at most {LARGEST} bytes are taken"
         if scope["path"].startswith("/_nicegui_ws") and (
-            find_caller(console, HTTPConnection(scope)) is None
+            await find_caller(console, HTTPConnection(scope)) is None
         ):
             return 401, "sign in"
         return None

@@ -11,7 +11,7 @@ import asyncio
 import json
 import struct
 import time
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import numpy as np
@@ -126,7 +126,9 @@ class Stream:
             self._whole = message({**self._header, "whole": True}, self._rows)
         return self._whole
 
-    async def follow(self, send: Callable[[bytes], Any], allowed: Callable[[], bool]) -> None:
+    async def follow(
+        self, send: Callable[[bytes], Any], allowed: Callable[[], Awaitable[bool]]
+    ) -> None:
         """Send to one viewer for as long as they are allowed to look."""
         self.viewers += 1
         try:
@@ -136,7 +138,7 @@ class Stream:
             seen = self.tick
             while True:
                 await self._turned.wait()
-                if not allowed():
+                if not await allowed():
                     return
                 data = self.news if self.tick == seen + 1 else self.whole()
                 seen = self.tick

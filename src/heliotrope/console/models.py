@@ -183,6 +183,20 @@ class AccountChange(Strict):
     disabled: bool | None = None
 
 
+class OwnPassword(Strict):
+    """One's password, and the new one."""
+
+    old: Annotated[str, Field(min_length=1, max_length=200)]
+    new: Annotated[str, Field(min_length=10, max_length=200)]
+
+
+class GivenPassword(BaseModel):
+    """A password that was made for a person; it is in this answer and nowhere else."""
+
+    name: str
+    password: str
+
+
 class NewToken(Strict):
     """A token for a program."""
 

@@ -12,7 +12,9 @@ from fastapi import FastAPI, Request
 from fastapi.responses import RedirectResponse, Response
 from nicegui import ui
 
+from heliotrope.console._files import KEPT
 from heliotrope.console.auth import Caller, find_caller
+from heliotrope.control.authority import Role
 
 #: Tabs: name of the part, title.
 TABS = (
@@ -20,13 +22,15 @@ TABS = (
     ("calibration", "Calibration"), ("clusters", "Clusters"), ("alarms", "Alarms"),
     ("logs", "Logs"), ("schedule", "Schedule"),
 )  # fmt: skip
-_EMERGENCY = """
+#: Modules of the page, in the order in which they need each other.
+_SCRIPTS = ("live", "dom", "palette", "orders", "map", "panels", "people", "console")
+_EMERGENCY = f"""
 <div id="emergency-box">
   <span id="emergency-said" role="status"></span>
   <button id="emergency" type="button" title="Takes all beams off the receiver, at once">
     EMERGENCY</button>
 </div>
-<script defer src="/console/static/emergency.js"></script>
+<script defer src="{KEPT}/emergency.js"></script>
 """
 
 
@@ -41,7 +45,7 @@ class View(ui.element, component="static/view.js"):
 
     def __init__(self, kind: str) -> None:
         super().__init__()
-        self._props["kind"] = kind
+        self._props["kind"], self._props["base"] = kind, KEPT
 
 
 def attach(app: FastAPI) -> None:
@@ -55,9 +59,9 @@ def attach(app: FastAPI) -> None:
     )  # fmt: skip
 
 
-def _page(request: Request) -> Response | None:
+async def _page(request: Request) -> Response | None:
     """Return the page, or the way to the log-in."""
-    who = find_caller(request.scope["heliotrope"], request)
+    who = await find_caller(request.scope["heliotrope"], request)
     if who is None or who.by != "session":
         return RedirectResponse("/login", 303)
     ui.add_head_html(_head(who))
@@ -72,6 +76,8 @@ def _page(request: Request) -> Response | None:
         name = f"{who.person.name} · {who.person.role.name.lower()}"
         person = ui.button(name, icon="person", color=None).props("flat dense no-caps")
         with person, ui.menu():
+            for title, part in _menu(who):
+                ui.menu_item(title).on("click", js_handler=f"() => heliotrope.open('{part}')")
             ui.menu_item("Sign out").on("click", js_handler="() => heliotrope.leave()")
     View("alert")
     with ui.element("main").classes("hx-main"):
@@ -81,6 +87,12 @@ def _page(request: Request) -> Response | None:
     with ui.footer(elevated=False).classes("hx-footer"):
         View("bar")
     return None
+
+
+def _menu(who: Caller) -> list[tuple[str, str]]:
+    """Return what a person may do with accounts: title, and name of the part."""
+    own = [("Change password", "password"), ("API tokens", "tokens")]
+    return own + [("People", "people")] * (who.person.role >= Role.ENGINEER)
 
 
 def _tabs() -> None:
@@ -107,4 +119,7 @@ def _head(who: Caller) -> str:
     metas = "".join(
         f'<meta name="{name}" content="{escape(text)}">' for name, text in facts.items()
     )
-    return metas + '<link rel="stylesheet" href="/console/static/console.css">'
+    # The page's own scripts come while those of the frame do, and ask for the field at once.
+    links = "".join(f'<link rel="modulepreload" href="{KEPT}/{name}.js">' for name in _SCRIPTS)
+    style = f'<link rel="stylesheet" href="{KEPT}/console.css">'
+    return f'{metas}{style}{links}<script type="module" src="{KEPT}/live.js"></script>'

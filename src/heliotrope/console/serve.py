@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gc
 from collections.abc import Iterator
 
 import uvicorn
@@ -53,6 +54,9 @@ class ConsoleServer:
             If the address cannot be had.
         """
         try:
+            # What is there now stays. A look of the collector through the objects of 10,000
+            # heliostats holds the loop for up to a second, and comes every ten seconds.
+            gc.freeze()
             await self._server.serve()
         except SystemExit:
             # uvicorn's way to say that it could not begin.

@@ -120,6 +120,11 @@ class People:
         self._database, self._writer, self._entropy = database, writer, entropy
         self._noted: dict[str, float] = {}
 
+    @property
+    def near(self) -> bool:
+        """Whether the database is a file of this machine, and no server that may be slow."""
+        return self._database.file is not None
+
     # -- accounts ------------------------------------------------------------------------
 
     def empty(self) -> bool:

@@ -3,10 +3,11 @@ import { api, me, rowsWhere, store } from "./live.js";
 import { FieldMap } from "./map.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
+import * as people from "./people.js";
 import { bar, say, whoCommands } from "./orders.js";
 import { count, degrees, h, span } from "./dom.js";
 
-const ready = store.start().catch((error) => say(`the plant cannot be read: ${error.message}`, true));
+const ready = store.begun.catch((error) => say(`the plant cannot be read: ${error.message}`, true));
 
 function map(box) {
   const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
@@ -79,6 +80,7 @@ window.heliotrope = {
     localStorage.setItem("heliotrope-theme", night ? "dark" : "light");
     setTimeout(() => store.emit("theme"), 50);
   },
+  open: (part) => people[part](),
   async leave() { await api("DELETE", "session"); location.assign("/login"); },
   store,
 };

@@ -17,6 +17,7 @@ class Store extends EventTarget {
   selection = new Set(); // rows
   focus = -1; // the row that is looked at
   live = false;
+  early = []; // messages that came before the field
 
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
 
@@ -27,6 +28,7 @@ class Store extends EventTarget {
   }
 
   async start() {
+    this.connect(); // its first message is soon here; it waits for the field
     this.field = await api("GET", "field");
     const n = this.field.names.length;
     this.index = new Map(this.field.names.map((name, row) => [name, row]));
@@ -39,7 +41,8 @@ class Store extends EventTarget {
     this.error = new Float32Array(n).fill(NaN);
     this.measured = new Float32Array(n).fill(NaN);
     this.emit("field");
-    this.connect();
+    this.early.forEach((buffer) => this.take(buffer));
+    this.early = [];
     setInterval(() => this.watch(), 500);
   }
 
@@ -66,6 +69,7 @@ class Store extends EventTarget {
   }
 
   take(buffer) {
+    if (!this.state) { this.early.push(buffer); return; }
     const view = new DataView(buffer);
     const length = view.getUint32(4, true);
     this.head = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 8, length)));
@@ -101,6 +105,7 @@ class Store extends EventTarget {
 }
 
 export const store = new Store();
+store.begun = Promise.resolve().then(() => store.start());
 
 export class ApiError extends Error {
   constructor(status, text) { super(text); this.status = status; }

@@ -220,9 +220,11 @@ export class FieldMap {
       c.beginPath(); c.arc(px, py, half + 5, 0, 2 * Math.PI); c.stroke();
       const text = `${name} → ${ring}`;
       c.font = "600 11px sans-serif"; c.textAlign = "left"; c.fillStyle = night ? "#12161be0" : "#f4f5f6e0";
-      c.fillRect(px + half + 7, py - 8, c.measureText(text).width + 6, 16);
+      // On the side where there is room for it.
+      const wide = c.measureText(text).width, left = px + half + 10 + wide > this.width ? px - half - 10 - wide : px + half + 10;
+      c.fillRect(left - 3, py - 8, wide + 6, 16);
       c.fillStyle = night ? "#f2b134" : "#8a5a00";
-      c.fillText(text, px + half + 10, py + 4);
+      c.fillText(text, left, py + 4);
     }
   }
 

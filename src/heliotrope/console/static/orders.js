@@ -48,6 +48,17 @@ async function order(name, title, make, fields, sure) {
   await act(() => make(to.names, values), title);
 }
 
+// Declares where the axes stand: nothing moves, but all that it does afterwards hangs on it.
+async function zero() {
+  const rows = [...store.selection];
+  if (rows.length !== 1) { say("Zero: select one heliostat; the counts of one are not those of another", true); return; }
+  const name = store.field.names[rows[0]];
+  const v = await ask(`Declare where ${name} stands? It must be locked; its controller stores the counts.`, [
+    { name: "primary", label: "Primary axis (steps)", type: "number", value: "0" },
+    { name: "secondary", label: "Secondary axis (steps)", type: "number", value: "0" }], "Declare and store");
+  if (v) await act(() => api("POST", "commands", { command: "ZERO", heliostats: [name], values: [Number(v.primary), Number(v.secondary)] }), `Zero ${name}`);
+}
+
 const plainly = (name) => (heliostats) => api("POST", "commands", { command: name, heliostats });
 const ORDERS = [
   ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats }), null, scope === "field"), "safe"],
@@ -65,6 +76,7 @@ const ORDERS = [
   ["Search…", "", () => order("SEARCH", "Search", (heliostats, v) => api("POST", "commands", { command: "SEARCH", heliostats, values: [1e-3 * v.pitch, 1e-3 * v.radius] }),
     [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
   ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
+  ["Zero…", "", zero, "engineer"],
   ["Hold…", "", () => order("HOLD", "Hold back from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
     [{ name: "reason", label: "Why" }]), "free"],
   ["Automatic", "", () => order("AUTO", "Give to the automatic work", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],

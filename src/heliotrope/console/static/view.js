@@ -1,9 +1,9 @@
 // One part of the page within the frame: what is in it is drawn by console.js.
 export default {
-  props: { kind: String },
+  props: { kind: String, base: String },
   render() { return Vue.h("div", { class: `hx-view hx-${this.kind}` }); },
   mounted() {
-    import("/console/static/console.js").then((module) => { this.end = module.mount(this.kind, this.$el); });
+    import(`${this.base}/console.js`).then((module) => { this.end = module.mount(this.kind, this.$el); });
   },
   unmounted() { this.end?.(); },
 };

@@ -1,0 +1,340 @@
+"""The console under load: 10,000 heliostats, 50 viewers and 5 operators, and one page in a browser.
+
+The plant (the twin, all clusters, the console) is a process of its own, as ``heliotrope run`` has
+it; who looks is in a second one, Chromium in others. All of them share the machine: on two cores
+that is the hardest part of it. First the page is alone with the plant: how soon it is ready, how
+many frames a second it draws while the map is panned. Then everybody looks, and somebody clicks
+EMERGENCY in the page: how long until the last local controller has heard DEFOCUS on its bus, and
+until the plant knows the acknowledgement of each.
+"""
+
+import asyncio
+import contextlib
+import multiprocessing
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks._run import BenchmarkError, Result, Row
+
+CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
+ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+NAME, PASSWORD = "engineer", "a long enough password"
+VIEWERS, OPERATORS = 50, 5
+READY_S, FRAMES, EMERGENCY_S, MESSAGES = 3.0, 20.0, 1.0, 1.0
+#: Pans the map by a little in each frame, for some milliseconds; gives the frames in a second.
+PAN = """span => new Promise(done => { const map = window.heliotropeMap; let frames = 0, begin = 0;
+  const turn = now => { begin ||= now;
+    if (now - begin >= span) return done(1e3 * frames / (now - begin));
+    frames += 1; map.pan(frames % 120 < 60 ? 3 : -3, 1 - 2 * (frames % 2));
+    requestAnimationFrame(turn); };
+  requestAnimationFrame(turn); })"""
+#: What the tabs of the page ask for besides the stream, and how often, s; each has one open.
+ASKED = {"receivers/receiver/flux": 10.0, "clusters": 3.0, "calibration": 3.0, "alarms": 4.0}
+
+
+class Heard:
+    """When each heliostat has heard DEFOCUS since it was asked for the last time."""
+
+    def __init__(self, count: int) -> None:
+        self._who, self.at = np.zeros(count, dtype=np.bool_), 0.0
+
+    def begin(self) -> None:
+        """Forget."""
+        self._who[:], self.at = False, 0.0
+
+    def took(self, name: str, rows: range) -> None:
+        """Note who took a command."""
+        if name == "DEFOCUS" and not self.at:
+            self._who[rows.start : rows.stop] = True
+            if self._who.all():
+                self.at = time.time()
+
+
+def serve(pipe: Connection, folder: str, heliostats: int) -> None:
+    """Run a plant with its console; answer what the pipe asks. The body of a process."""
+    from heliotrope.twin._live_loop import PacedLoop
+
+    with asyncio.Runner(loop_factory=lambda: PacedLoop(1.0)) as runner:
+        runner.run(_serve(pipe, Path(folder), heliostats))
+
+
+async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
+    from heliotrope.console import _secrets
+    from heliotrope.console.serve import ConsoleServer
+    from heliotrope.console.settings import ConsoleSettings
+    from heliotrope.control.clock import VirtualClock
+    from heliotrope.control.link import running
+    from heliotrope.field.layouts import malan_plant
+    from heliotrope.store.keeper import Keeper
+    from heliotrope.twin.field_bus import FieldBus
+    from heliotrope.twin.live import LiveOptions, LivePlant
+
+    loop = asyncio.get_running_loop()
+    keeper, heard = Keeper(folder / "store.sqlite"), Heard(heliostats)
+    now, people = time.time(), keeper.people
+    people.add(NAME, _secrets.hash_password(PASSWORD), "engineer", now)
+    tokens = [people.add_token(NAME, f"load {i}", "operator", now)[1]
+              for i in range(VIEWERS + OPERATORS)]  # fmt: skip
+    live = LivePlant(
+        malan_plant(heliostats), VirtualClock(loop.time), LiveOptions(), records=keeper,
+        extra=lambda: {"speed": 1.0},
+    )  # fmt: skip
+    for part in live._parts:
+        if isinstance(part, FieldBus):
+            part._took = heard.took
+    made: dict[int, float] = {}
+    server = ConsoleServer(live.operations, people, ConsoleSettings(port=0))
+    stream = server.app.state.console.stream
+    make = stream.make
+
+    def noted() -> None:
+        make()
+        made[stream.tick] = time.time()
+
+    stream.make = noted
+    longest, acknowledged = _Longest(), _acknowledged(live.plant)
+    async with live.running(), running(server), asyncio.TaskGroup() as group:
+        watching = group.create_task(longest.run())
+        pipe.send((await server.address(), tokens, live.names))
+        while (question := await asyncio.to_thread(pipe.recv)) != "end":
+            if question == "begin":
+                heard.begin()
+                longest.wait, answer = 0.0, time.process_time()
+            elif question == "heard":
+                answer = heard.at
+            elif question == "busy":
+                answer = (time.process_time(), longest.wait)
+            elif question == "made":
+                answer = dict(made)
+            else:
+                answer = acknowledged[-1] if acknowledged else 0.0
+            pipe.send(answer)
+        watching.cancel()
+    keeper.close()
+
+
+def _acknowledged(plant: Any) -> list[float]:
+    """Return a list into which the time goes when the last heliostat has acknowledged."""
+    from heliotrope.control.emergency import EmergencyOrder
+    from heliotrope.control.protocol import Stage
+
+    when: list[float] = []
+    take, told = EmergencyOrder.take_stage, set()
+
+    def noted(order: Any, names: tuple[str, ...], stage: Stage, now: float) -> None:
+        take(order, names, stage, now)
+        if stage in (Stage.ACKNOWLEDGED, Stage.DONE):
+            told.update(names)
+        if not when and len(told) == len(plant.field):
+            when.append(time.time())
+
+    EmergencyOrder.take_stage = noted  # type: ignore[method-assign]
+    return when
+
+
+class _Longest:
+    """The longest time that the loop was held, s."""
+
+    wait = 0.0
+
+    async def run(self) -> None:
+        while True:
+            begin = time.perf_counter()
+            await asyncio.sleep(0.01)
+            self.wait = max(self.wait, time.perf_counter() - begin - 0.01)
+
+
+def look(pipe: Connection, address: str, tokens: list[str], viewers: int) -> None:
+    """Look, as many people do; tell the pipe what came. The body of a process."""
+    asyncio.run(_look(pipe, address, tokens, viewers))
+
+
+async def _look(pipe: Connection, address: str, tokens: list[str], viewers: int) -> None:
+    came: list[list[tuple[int, float, int]]] = [[] for _ in tokens]
+    answers: list[float] = []
+    async with asyncio.TaskGroup() as group:
+        works = [group.create_task(_view(address, token, mine))
+                 for token, mine in zip(tokens, came, strict=True)]  # fmt: skip
+        works += [group.create_task(_ask(address, token, answers, i, operator=i >= viewers))
+                  for i, token in enumerate(tokens)]  # fmt: skip
+        while (question := await asyncio.to_thread(pipe.recv)) != "end":
+            if question == "begin":
+                answers.clear()
+                for mine in came:
+                    mine.clear()
+            pipe.send((came, answers))
+        for work in works:
+            work.cancel()
+
+
+async def _view(address: str, token: str, came: list[tuple[int, float, int]]) -> None:
+    """Follow the stream, and only count: a browser has a machine of its own."""
+    import json
+
+    from websockets.asyncio.client import connect
+
+    url = f"ws{address.removeprefix('http')}api/v1/live"
+    headers = {"Authorization": f"Bearer {token}"}
+    async with connect(url, additional_headers=headers, proxy=None, max_size=None) as socket:
+        async for data in socket:
+            assert isinstance(data, bytes)
+            at, length = time.time(), int.from_bytes(data[4:8], "little")
+            came.append((json.loads(data[8 : 8 + length])["tick"], at, len(data)))
+
+
+async def _ask(
+    address: str, token: str, answers: list[float], number: int, *, operator: bool
+) -> None:
+    """Ask for what a page asks for; an operator sends heliostats to stow besides."""
+    import httpx
+
+    rng = np.random.default_rng(number)
+    path, every = list(ASKED.items())[number % len(ASKED)]
+    due = time.monotonic() + every * rng.random()
+    headers = {"Authorization": f"Bearer {token}"}
+    async with httpx.AsyncClient(
+        base_url=f"{address}api/v1/", headers=headers, trust_env=False, timeout=60.0,
+        verify=False,
+    ) as client:  # fmt: skip
+        names = (await client.get("field")).json()["names"] if operator else []
+        at = time.monotonic() + 5.0 * rng.random()
+        while True:
+            await asyncio.sleep(0.2)
+            if time.monotonic() >= due:
+                due, begin = time.monotonic() + every, time.perf_counter()
+                (await client.get(path)).raise_for_status()
+                answers.append(time.perf_counter() - begin)
+            if operator and time.monotonic() >= at:
+                at = time.monotonic() + 5.0
+                few = rng.choice(names, 3, replace=False).tolist()
+                (await client.post("stow", json={"heliostats": few})).raise_for_status()
+
+
+@contextlib.contextmanager
+def _process(work: Any, *given: Any) -> Iterator[Connection]:
+    context = multiprocessing.get_context("spawn")
+    mine, other = context.Pipe()
+    process = context.Process(target=work, args=(other, *given))
+    process.start()
+    other.close()
+    try:
+        yield mine
+        mine.send("end")
+        process.join(30.0)
+    finally:
+        if process.is_alive():
+            process.kill()
+
+
+def _told(pipe: Connection, question: str) -> Any:
+    pipe.send(question)
+    if not pipe.poll(120.0):
+        raise BenchmarkError(f"no answer to {question!r} within two minutes")
+    return pipe.recv()
+
+
+def _page(playwright: Any, address: str, span: float) -> tuple[Any, Row]:
+    """Open the page; return it, and how it does alone."""
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+    page = browser.new_page(viewport={"width": 1600, "height": 900})
+    page.set_default_timeout(60_000)
+    page.goto(f"{address}login")
+    page.fill("[name=name]", NAME)
+    page.fill("[name=password]", PASSWORD)
+    page.click("button")
+    marks = "() => performance.getEntriesByName('heliotrope-ready')[0]?.startTime ?? 0"
+    ready = []
+    for again in range(4 if span > 2.0 else 2):
+        if again:
+            page.goto(address)
+        page.wait_for_selector(".hx-legend b")
+        while not page.evaluate(marks):
+            page.wait_for_timeout(50)
+        ready.append(page.evaluate(marks) / 1e3)
+    frames = page.evaluate(PAN, 1e3 * span)
+    row: Row = {"page_first_ready_s": ready[0], "page_ready_s": float(np.median(ready[1:])),
+                "frames_panning": frames}  # fmt: skip
+    return page, row
+
+
+def _load(plant: Connection, people: Connection, page: Any, span: float) -> Row:
+    """Let everybody look, then click; return how it went."""
+    cpu, begun = _told(plant, "begin"), time.time()
+    _told(people, "begin")
+    page.wait_for_timeout(1e3 * span)
+    came, answers = _told(people, "came")
+    over = time.time() - begun
+    busy, held = _told(plant, "busy")
+    made = _told(plant, "made")
+    delays = [at - made[tick] for mine in came for tick, at, _ in mine if tick in made]
+    rates = [len(mine) / over for mine in came]
+    sizes = [size for mine in came for _, _, size in mine]
+    _told(plant, "begin")
+    clicked = time.time()
+    page.click("#emergency", no_wait_after=True)
+    heard = acknowledged = 0.0
+    while time.time() < clicked + 60.0 and not (heard and acknowledged):
+        time.sleep(0.2)
+        heard = heard or _told(plant, "heard")
+        acknowledged = _told(plant, "acknowledged")
+    if not (heard and acknowledged):
+        raise BenchmarkError("an emergency was not heard and acknowledged by all in a minute")
+    return {
+        "messages_a_second_least": min(rates), "messages_a_second": float(np.mean(rates)),
+        "delay_s": float(np.median(delays)), "delay_99_s": float(np.quantile(delays, 0.99)),
+        "message_kib": float(np.mean(sizes)) / 1024.0,
+        "answer_s": float(np.median(answers)), "answer_99_s": float(np.quantile(answers, 0.99)),
+        "plant_cores": (busy - cpu) / over, "loop_held_s": held,
+        "emergency_heard_s": heard - clicked, "emergency_acknowledged_s": acknowledged - clicked,
+    }  # fmt: skip
+
+
+def _measure(heliostats: int, people: int, span: float) -> Row:
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as folder, _process(serve, folder, heliostats) as plant:
+        if not plant.poll(180.0):
+            raise BenchmarkError("the plant was not there within three minutes")
+        address, tokens, _ = plant.recv()
+        if people == VIEWERS:
+            # The plant is at work: heliostats leave stow, cameras look.
+            time.sleep(30.0)
+        with sync_playwright() as playwright:
+            page, row = _page(playwright, address, span / 4.0)
+            some = tokens[:people] + tokens[VIEWERS:]
+            with _process(look, address, some, people) as lookers:
+                time.sleep(span / 6.0)  # until everybody has come
+                row |= _load(plant, lookers, page, span)
+            page.context.browser.close()
+    return {"heliostats": heliostats, "viewers": people, "operators": OPERATORS, **row}
+
+
+def run(quick: bool) -> Result:
+    """Return the figures."""
+    if not Path(CHROMIUM).exists():
+        raise BenchmarkError(f"{CHROMIUM} is not there; install chromium")
+    row = _measure(64, 5, 3.0) if quick else _measure(10_000, VIEWERS, 30.0)
+    shares = {
+        "page_ready": float(row["page_first_ready_s"] or 0.0) / READY_S,
+        "frames": FRAMES / float(row["frames_panning"] or 1e-9),
+        "messages": MESSAGES / float(row["messages_a_second_least"] or 1e-9),
+        "emergency_heard": float(row["emergency_heard_s"] or 0.0) / EMERGENCY_S,
+    }
+    row |= {f"of_limit_{name}": share for name, share in shares.items()}
+    return Result(
+        [row],
+        f"{row['heliostats']:,} heliostats, {row['viewers']} viewers: page ready in "
+        f"{row['page_first_ready_s']:.1f} s, {row['frames_panning']:.0f} frames/s, "
+        f"{row['messages_a_second_least']:.2f} messages/s, all have heard EMERGENCY after "
+        f"{row['emergency_heard_s']:.2f} s",
+        {"limit_ready_s": READY_S, "limit_frames": FRAMES, "limit_messages": MESSAGES,
+         "limit_emergency_s": EMERGENCY_S},
+        None if quick else all(share <= 1.05 for share in shares.values()),
+    )  # fmt: skip

@@ -1,0 +1,78 @@
+// Accounts and tokens: in windows over the page, since nobody needs them at work. All through the API.
+import { api, me } from "./live.js";
+import { ask, h, table } from "./dom.js";
+import { say } from "./orders.js";
+
+const day = (at) => (at ? new Date(1e3 * at).toISOString().slice(0, 10) : "never");
+const button = (text, onclick) => h("button", { type: "button", className: "hx-button", onclick }, text);
+
+// A window whose contents are made anew after whatever is done in it.
+function open(title, fill) {
+  const body = h("div"), told = h("p", { className: "hx-told", role: "status" });
+  const dialog = h("dialog", { className: "hx-dialog wide" }, h("h2", {}, title), body, told,
+    h("div", { className: "hx-row" }, button("Close", () => dialog.close())));
+  dialog.addEventListener("close", () => dialog.remove());
+  const show = async () => body.replaceChildren(...await fill(done));
+  const fail = (error) => { told.textContent = error.message; told.classList.add("bad"); };
+  async function done(work) {
+    told.classList.remove("bad");
+    told.textContent = "";
+    try { told.replaceChildren(...[await work()].flat().filter(Boolean)); await show(); } catch (error) { fail(error); }
+  }
+  document.body.append(dialog);
+  dialog.showModal();
+  show().catch(fail);
+}
+
+const once = (what, word) => [`${what}, shown only now: `, h("code", { className: "hx-secret" }, word)];
+const path = (name) => `accounts/${encodeURIComponent(name)}`;
+const ROLES = ["viewer", "operator", "engineer"];
+
+export const people = () => open("People", async (done) => {
+  const rows = await api("GET", "accounts");
+  const role = (one) => (one.name === me.name ? one.role
+    : h("select", { "aria-label": `Role of ${one.name}`, onchange: (event) => done(async () => { await api("PATCH", path(one.name), { role: event.target.value }); return `${one.name}: ${event.target.value}`; }) },
+      ROLES.map((name) => h("option", { value: name, selected: name === one.role }, name))));
+  const acts = (one) => (one.name === me.name ? h("span", { className: "hx-hint" }, "you") : h("div", { className: "hx-orders" },
+    button(one.disabled ? "Let in" : "Keep out", () => done(async () => { await api("PATCH", path(one.name), { disabled: !one.disabled }); return `${one.name} is ${one.disabled ? "let in" : "kept out"}`; })),
+    button("New password", () => done(async () => {
+      if (!await ask(`Make a new password for ${one.name}? The old one and all sessions end.`, [], "Make")) return "";
+      return once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`)).password);
+    }))));
+  const add = button("Add…", () => done(async () => {
+    const given = await ask("A person to let in", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
+      { name: "password", label: "Password (10 letters at least)", type: "password" }], "Let in");
+    if (!given) return "";
+    await api("POST", "accounts", given);
+    return `${given.name} is let in as ${given.role}`;
+  }));
+  return [table([["Name", (r) => r.name], ["Role", role], ["Since", (r) => day(r.created)],
+    ["", (r) => h("span", { className: r.disabled ? "warn" : "good" }, r.disabled ? "kept out" : "may come in")], ["", acts]], rows), h("div", { className: "hx-row" }, add)];
+});
+
+export const tokens = () => open("API tokens", async (done) => {
+  const rows = await api("GET", "tokens");
+  const revoke = (one) => button("Revoke", () => done(async () => {
+    if (!await ask(`Revoke ${one.label} of ${one.name}? Programs that use it are refused at once.`, [], "Revoke")) return "";
+    await api("DELETE", `tokens/${encodeURIComponent(one.key)}`);
+    return `${one.label} is revoked`;
+  }));
+  const make = button("Make…", () => done(async () => {
+    const given = await ask("A token for a program", [{ name: "label", label: "What it is for" },
+      { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "90" }], "Make");
+    return given ? once(`Secret of ${given.label}`, (await api("POST", "tokens", { ...given, days: Number(given.days) })).secret) : "";
+  }));
+  return [rows.length ? table([["For", (r) => r.label], ["Of", (r) => r.name], ["Role", (r) => r.role], ["Until", (r) => day(r.expires)],
+    ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "There is none."), h("div", { className: "hx-row" }, make)];
+});
+
+export async function password() {
+  const given = await ask("Change your password; you sign in anew", [{ name: "old", label: "Present password", type: "password" },
+    { name: "new", label: "New password (10 letters at least)", type: "password" }, { name: "again", label: "New password again", type: "password" }], "Change");
+  if (!given) return;
+  if (given.new !== given.again) { say("password: the two new ones differ; nothing was changed", true); return; }
+  try {
+    await api("PUT", "session/password", { old: given.old, new: given.new });
+    location.assign("/login");
+  } catch (error) { say(`password: ${error.message}`, true); }
+}

@@ -1,0 +1,132 @@
+"""ZERO on firmware-true boards, and what keeps a plant under its console quick; virtual time."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from heliotrope.control._operations_zero import zero
+from heliotrope.control.authority import Person, RefusedError, Role
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.operations import WorkSettings
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.layouts import lay_out
+from heliotrope.store.keeper import Keeper
+from heliotrope.store.records import Event
+from heliotrope.twin._live_field import LiveField
+from heliotrope.twin.live import LiveOptions, LivePlant, prototype_plant
+
+START = datetime(2026, 10, 21, 9, tzinfo=UTC)
+ENGINEER, OPERATOR = Person("engineer", Role.ENGINEER), Person("operator", Role.OPERATOR)
+
+
+def _live(work: Callable[[LivePlant], Awaitable[None]], records: Keeper | None = None) -> None:
+    """Run two boards that nobody wants to move."""
+    design = prototype_plant()
+    (group,) = design.groups.values()
+    two = replace(design, groups={"azel": group.take([0, 1])})
+    options = LiveOptions(
+        rendered=False, threads=0, boards=True, work=WorkSettings(calibrate=False, events=30.0)
+    )
+
+    async def main(clock: VirtualClock) -> None:
+        plant = LivePlant(two, clock, options, records=records)
+        async with plant.running():
+            await asyncio.sleep(4.0)
+            await work(plant)
+            await plant.end()
+
+    run_virtual(main, start=START)
+
+
+def test_zero_is_stored_by_the_one_that_is_locked() -> None:
+    async def work(live: LivePlant) -> None:
+        plant, (name, other) = live.plant, live.names
+        token = plant.take_authority(ENGINEER).token
+        await asyncio.sleep(3.0)
+        early = zero(plant, ENGINEER, token, [name], [1234, -567])
+        assert not await early.end(20.0)  # it is stowed, not locked
+        assert "state" in early.refusals[name]
+        assert await plant.command(ENGINEER, token, "LOCK", [name]).end(20.0)
+        still = int(plant.field.rows[plant.field.place(other)]["primary"])
+        ticket = zero(plant, ENGINEER, token, [name], [1234, -567])
+        assert await ticket.end(20.0), ticket.text
+        await asyncio.sleep(3.0)
+        row = plant.field.rows[plant.field.place(name)]
+        assert (int(row["primary"]), int(row["secondary"])) == (1234, -567)
+        assert plant.field.rows[plant.field.place(other)]["primary"] == still
+
+    _live(work)
+
+
+def test_who_may_and_what_fits() -> None:
+    async def work(live: LivePlant) -> None:
+        plant, (name, _) = live.plant, live.names
+        token = plant.take_authority(OPERATOR).token
+        with pytest.raises(RefusedError, match="needs engineer"):
+            zero(plant, OPERATOR, token, [name], [0, 0])
+        plant.release_authority(OPERATOR, token)
+        token = plant.take_authority(ENGINEER).token
+        for names, values, error, text in (
+            ([], [0, 0], RefusedError, "give one heliostat"),
+            (live.names, [0, 0], RefusedError, "2 heliostats"),
+            ([name], [0], InputError, "1 numbers given"),
+            ([name], [0.5, 0], InputError, "cannot be sent"),
+            (["nobody"], [0, 0], UnknownNameError, "nobody"),
+        ):
+            with pytest.raises(error, match=text):
+                zero(plant, ENGINEER, token, names, values)
+
+    _live(work)
+
+
+def test_buses_take_turns_in_an_emergency() -> None:
+    """So that neither the plant nor its console waits for 10,000 acknowledgements at once."""
+
+    async def main() -> None:
+        clock = VirtualClock(asyncio.get_running_loop().time, START)
+        field = LivePlant(lay_out("radial", 3), clock, LiveOptions(rendered=False)).field
+        assert isinstance(field, LiveField)
+        buses = {"a": field.bus(range(1)), "b": field.bus(range(1, 3))}
+        for urgent, expected in ((True, "ababab"), (False, "aaabbb")):
+            order: list[str] = []
+
+            async def ask(name: str, urgent: bool, order: list[str]) -> None:
+                for _ in range(3):
+                    await buses[name].transact(b"\0", 0.1, urgent=urgent)
+                    order.append(name)
+
+            await asyncio.gather(*(ask(name, urgent, order) for name in buses))
+            assert "".join(order) == expected
+
+    asyncio.run(main())
+
+
+def test_old_events_are_let_go_once_a_day(tmp_path: Path) -> None:
+    keeper, day = Keeper(tmp_path, inline=True), 86_400.0
+    now = START.timestamp()
+    keeper.record_event(Event(now - 31.0 * day, "plant", "long ago"))
+    keeper.record_event(Event(now - 29.0 * day, "plant", "lately"))
+
+    async def work(live: LivePlant) -> None:
+        await asyncio.sleep(15.0)
+        texts = [event.text for event in keeper.events(100)]
+        assert "lately" in texts
+        assert "long ago" not in texts
+        # Not again on the same day.
+        keeper.record_event(Event(now - 31.0 * day, "plant", "late news"))
+        await asyncio.sleep(30.0)
+        assert "late news" in [event.text for event in keeper.events(100)]
+
+    try:
+        _live(work, keeper)
+    finally:
+        keeper.close()
+
+
+def test_events_are_kept_for_some_time() -> None:
+    with pytest.raises(InputError, match="events of 0"):
+        WorkSettings(events=0.0)
