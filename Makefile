@@ -28,7 +28,7 @@ run: $(STAMP)  ## run a plant of 10,000 heliostats in simulation until Ctrl-C: O
 
 test: $(STAMP)  ## run the tests in parallel
 	@bash scripts/packages.sh & $(BIN)/python -m heliotrope.warm; warm=$$?; wait; exit $$warm
-	@HELIOTROPE_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" -q
+	@HELIOTROPE_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n $(JOBS) --dist worksteal -m "not slow" -q
 
 soak: $(STAMP)  ## run the slow tests too
 	@$(BIN)/python -m pytest -n $(JOBS) -q

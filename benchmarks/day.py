@@ -106,9 +106,9 @@ async def _live(count: int, minutes: float, looks: int) -> list[Row]:
 
 def run(quick: bool) -> Result:
     """Return the figures."""
-    rows, text = _day(24, 2.0) if quick else _day(10_000, 24.0)
+    rows, text = _day(10, 0.5) if quick else _day(10_000, 24.0)
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
-        whole = runner.run(_live(8, 4.0, 2) if quick else _live(64, 480.0, 8))
+        whole = runner.run(_live(4, 1.0, 2) if quick else _live(64, 480.0, 8))
     # The first hour loads modules, fills caches and calibrates everybody once.
     first, last = whole[len(whole) // 4], whole[-1]
     growth = float(last["memory_mib"] or 0.0) / float(first["memory_mib"] or 1.0) - 1.0

@@ -108,6 +108,7 @@ class ScriptedCluster:
             if self.link.connected and not self.mute:
                 rows = self.rows.copy()
                 rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
+                rows["steps_ms"] = rows["heard_ms"]
                 greet = self.first and self.greets
                 status = Status(
                     self.name, len(rows), self.clock.utc().timestamp(), "gps", 1e-3, 3.0, 0.2,

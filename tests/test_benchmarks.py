@@ -39,6 +39,14 @@ COLUMNS = {
         "order_s", "order_processing_s", "order_acknowledged_cpu_s", "dark_after_order_s",
         "dark_after_plant_loss_s", "dark_after_clock_jump_s", "stow_after_cluster_loss_s",
     },
+    "console": {
+        "heliostats", "viewers", "page_first_ready_s", "frames_panning", "messages_a_second_least",
+        "emergency_heard_s", "emergency_acknowledged_s",
+    },
+    "day": {
+        "work", "heliostats", "calibrated", "visits", "median_mrad", "predicted_mrad", "within_90",
+        "cpu_s_per_h", "memory_mib",
+    },
     "bus": {"line", "question", "bytes", "wire_ms", "median_ms", "p99_ms", "cycle_of_32_s"},
 }  # fmt: skip
 RESULT = {
@@ -72,7 +80,11 @@ def _no_number(text: str) -> float:
     raise AssertionError(f"{text} is no JSON")
 
 
-@pytest.mark.parametrize("name", COLUMNS)
+@pytest.mark.parametrize(
+    "name",
+    # A browser, fifty viewers and a plant take their time.
+    [pytest.param(n, marks=pytest.mark.slow) if n == "console" else n for n in COLUMNS],
+)
 def test_quick_run_gives_json(name: str) -> None:
     result = _quick(name)
     assert set(result) >= RESULT

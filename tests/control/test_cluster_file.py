@@ -289,6 +289,8 @@ def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
     table = np.frombuffer(rows(nodes, 100.5), dtype=NODE)
     assert table["heard_ms"][0] == 1500
     assert table["heard_ms"][1] == 2**32 - 1
+    nodes[0].steps_at = 98.0
+    assert np.frombuffer(rows(nodes, 100.5), dtype=NODE)["steps_ms"].tolist() == [2500, 2**32 - 1]
     first = table[0]
     named = ("state", "flags", "fault", "sun_age_ms", "supply_mv", "temperature_degc",
              "armature_crc", "boots")  # fmt: skip

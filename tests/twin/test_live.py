@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from heliotrope.control.authority import Person, Role
+from heliotrope.control.calibration_cycle import Shot
 from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.control.link import LinkClosedError, Outcome
 from heliotrope.control.operations import WorkSettings
@@ -19,12 +20,13 @@ from heliotrope.control.parameters import items_of
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import lay_out, malan_plant
 from heliotrope.field.plant import Plant
+from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, normalize, reflect
 from heliotrope.imaging.scenes import Scene
 from heliotrope.lcu import journal, messages, states, wire
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin._live_boards import BoardField
-from heliotrope.twin._live_camera import LiveCamera
+from heliotrope.twin._live_camera import LiveCamera, SeenExactly
 from heliotrope.twin._live_field import LiveField, near
 from heliotrope.twin._live_link import near_pair
 from heliotrope.twin._live_loop import LATE, PacedLoop
@@ -214,6 +216,54 @@ def test_a_small_plant_raises_itself_learns_and_is_stowed() -> None:
         assert plant.operations.summary().states == {"STOWED": 3}
 
     live(work, lay_out("radial", 3))
+
+
+def test_step_counts_that_come_seldom_are_not_taken_for_new(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # As in a large plant, whose clusters ask for counts every five seconds only.
+    monkeypatch.setattr("heliotrope.twin.live._SMALL", 0)
+    monkeypatch.setattr("heliotrope.control._orders.FOLLOWED", 0.0)
+
+    async def work(plant: LivePlant) -> None:
+        await asyncio.sleep(240.0)
+        results = plant.operations.calibration().results
+        assert len(results) >= 3
+        assert all(entry.text.startswith("calibrated") for entry in results), results
+        assert max(entry.after for entry in results) < 0.5 * MRAD
+
+    live(work, malan_plant(4))
+
+
+class Strangers:
+    """A camera on whose first photographs another's beam stands somewhere."""
+
+    def __init__(self, camera: SeenExactly, count: int) -> None:
+        self._camera, self.left = camera, count
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        shot = await self._camera.photograph(target, heliostat)
+        if self.left == 0:
+            return shot
+        self.left -= 1
+        place = np.array([3.0 - 2.0 * self.left, 2.0])
+        return Shot(np.asarray(target.center + place @ target.axes), shot.at, 1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
+    async def work(plant: LivePlant) -> None:
+        assert isinstance(plant.cameras, SeenExactly)
+        camera = Strangers(plant.cameras, count)
+        plant.operations.work._cycle._camera = camera  # type: ignore[union-attr]
+        await asyncio.sleep(150.0)
+        assert camera.left == 0
+        first = plant.operations.calibration().results[-1]
+        assert first.text.startswith("calibrated"), first
+        assert "another beam's" in first.text
+        assert first.after < 0.5 * MRAD
+
+    live(work, malan_plant(1))
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from heliotrope.control.cluster_config import Member
 from heliotrope.control.protocol import NEVER, NODE
 from heliotrope.lcu import messages, states, wire
 
-_ROW = struct.Struct("<BBIIiiiiIHbHIII")
+_ROW = struct.Struct("<BBIIiiiiIHbHIIII")
 assert _ROW.size == NODE.itemsize
 
 #: Questions to a node go out under as many sequences in turn: four minutes of them.
@@ -125,6 +125,8 @@ class Node:
         When they came, monotonic s; -inf: never.
     heard_at
         When it last answered anything, monotonic s; -inf: never.
+    follow_until
+        Its step counts are asked for each second until then, monotonic s.
     missed
         How many questions in a row it has not answered.
     """
@@ -136,7 +138,7 @@ class Node:
         self.status: tuple[Any, ...] = _NO_STATUS
         self.steps: tuple[Any, ...] = _NO_STEPS
         self.status_at = self.steps_at = -math.inf
-        self.heard_at = -math.inf
+        self.heard_at = self.follow_until = -math.inf
         self.missed = 0
         self._sequence = 0
 
@@ -188,13 +190,16 @@ class Node:
         """Write its row of `protocol.NODE`."""
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
         # An ACK shows that it is there, not what state it is in.
-        age = 1e3 * (now - self.status_at)
-        heard = int(age) if age < NEVER else NEVER
         _ROW.pack_into(
-            block, self.index * _ROW.size, state, fault, flags, heard, *self.steps, sun_age,
-            supply, temperature, boots, crc, self.counts.asked & NEVER,
-            self.counts.answered & NEVER,
+            block, self.index * _ROW.size, state, fault, flags, _age(now - self.status_at),
+            *self.steps, sun_age, supply, temperature, boots, crc, self.counts.asked & NEVER,
+            self.counts.answered & NEVER, _age(now - self.steps_at),
         )  # fmt: skip
+
+
+def _age(seconds: float) -> int:
+    age = 1e3 * seconds
+    return int(age) if age < NEVER else NEVER
 
 
 def rows(nodes: list[Node], now: float) -> bytes:

@@ -2,7 +2,8 @@
 
 A mirror that was never calibrated may miss by more than the target is wide. If nothing is seen,
 the aim goes along a square spiral in the target's plane until light appears; the aim is then
-moved by as much as the beam was off. Only what is seen on the target is used.
+moved by as much as the beam was off. Only what is seen on the target is used, and only light that
+goes where the aim goes: beams of others cross targets while a field is raised.
 """
 
 import math
@@ -45,6 +46,10 @@ class Centring:
         they tell. 0: all in the middle.
     slope
         Half the breadth of a beam, rad, beside that of its mirror.
+    astray
+        Light so far from where the aim has moved it is another's, as a share of the lesser side.
+    looks
+        A beam is looked for so often, if what was seen first was another's.
     """
 
     pitch: float = 0.7
@@ -52,6 +57,8 @@ class Centring:
     near: float = 0.15
     spread: float = 0.8
     slope: float = 8e-3
+    astray: float = 0.06
+    looks: int = 3
 
     def __post_init__(self) -> None:
         if not (0.0 < self.pitch <= 2.0 and self.most >= 0 and 0.0 < self.near <= 0.5):
@@ -123,14 +130,26 @@ class CentringCycle(CalibrationCycle):
             self.on_stage(visit.heliostat, visit.target.name, stage)
 
     async def _shoot(self, visit: Visit) -> tuple[list[Sightings], list[str]]:
-        plant, settings = self._plant, self._settings
         found: list[Sightings] = []
         rejected: list[str] = []
-        aim = await self._find(visit)
-        if aim is None:
-            tries = self._centring.most + 1
-            return found, [f"no beam was seen on {visit.target.name} in {tries} photographs"]
-        middle, room = aim, self._room(visit)
+        before: FloatArray | None = None
+        for _ in range(self._centring.looks):
+            light = await self._find(visit, before)
+            if light is None:
+                tries = self._centring.most + 1
+                rejected.append(f"no beam was seen on {visit.target.name} in {tries} photographs")
+                return [], rejected
+            found = await self._series(visit, light, rejected)
+            if found:
+                break
+            before = light.aim
+        return found, rejected
+
+    async def _series(self, visit: Visit, light: "_Light", rejected: list[str]) -> list[Sightings]:
+        """Take the photographs of a beam that was found; none if it was another's."""
+        plant, settings = self._plant, self._settings
+        found: list[Sightings] = []
+        aim, middle, room = light.aim, light.aim, self._room(visit)
         # Two more than are wanted: one or the other may be cut at an edge.
         for k in range(settings.shots + 2):
             if len(found) >= settings.shots:
@@ -138,19 +157,34 @@ class CentringCycle(CalibrationCycle):
             self._tell(visit, f"photograph {k + 1}")
             due = plant.now() + settings.interval
             shot = await self._photograph(visit)
-            if shot.reasons:
-                rejected.append(f"photograph {k + 1}: {'; '.join(shot.reasons)}")
+            astray = self._astray(visit.target, shot, aim, light)
+            if astray and not found:
+                rejected.append(f"photograph {k + 1}: {astray}")
+                return found
+            if astray or shot.reasons:
+                rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
             else:
                 found.append(self._sighting(shot, await visit.counts_at(shot.at)))
             if len(found) < settings.shots:
                 x, y = CORNERS[k % len(CORNERS)]
                 # What could not be used there may be better in the middle.
-                off = np.array([x, y]) * (0.0 if shot.reasons else room)
+                off = np.array([x, y]) * (0.0 if shot.reasons or astray else room)
                 await self._go(visit, np.asarray(middle + off @ visit.target.axes), aim)
                 aim = np.asarray(middle + off @ visit.target.axes)
             while plant.now() < due and len(found) < settings.shots:
                 await visit.look()
-        return found, rejected
+        return found
+
+    def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
+        """Return why light is not that which was found first, "" if it is; it moves as aims do."""
+        place = seen(target, shot)
+        if place is None:
+            return "" if shot.reasons else "no light on the target"
+        expected = light.place + target.axes @ (aim - light.first)
+        away = float(np.linalg.norm(place - expected))
+        if away <= self._centring.astray * min(target.width, target.height):
+            return ""
+        return f"light {away:.1f} m from where the aim went: another beam's"
 
     def _room(self, visit: Visit) -> float:
         """Return how far a beam may be off the middle on both sides, m."""
@@ -172,37 +206,44 @@ class CentringCycle(CalibrationCycle):
             raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")
         return shot
 
-    async def _find(self, visit: Visit) -> FloatArray | None:
-        """Return an aim with which the beam is seen near the middle; None if it is nowhere."""
+    async def _find(self, visit: Visit, before: FloatArray | None = None) -> "_Light | None":
+        """Look for the beam, and aim so that it is near the middle; None if it is nowhere."""
         target, centring = visit.target, self._centring
         middle = np.asarray(target.center)
         pitch = centring.pitch * min(target.width, target.height)
-        places = [(0, 0), *spiral(centring.most)]
-        for k, (x, y) in enumerate(places):
+        for k, (x, y) in enumerate([(0, 0), *spiral(centring.most)]):
             aim = np.asarray(middle + pitch * (np.array([x, y]) @ target.axes))
-            if k > 0:
-                self._tell(visit, f"search {k}")
+            self._tell(visit, f"search {k}" if k else "first look")
+            if k:
                 await visit.aim(aim)
                 await visit.arrived(self._settings.arrival)
             else:
-                self._tell(visit, "first look")
+                await self._go(visit, aim, middle if before is None else before)
             shot = await self._photograph(visit)
-            if seen(target, shot) is not None:
-                return await self._centre(visit, aim, shot)
+            place = seen(target, shot)
+            if place is not None:
+                return await self._centre(visit, aim, place)
         return None
 
-    async def _centre(self, visit: Visit, aim: FloatArray, shot: Shot) -> FloatArray:
-        """Move the aim by as much as the beam is off the middle; return it."""
-        target, place = visit.target, seen(visit.target, shot)
-        if place is None:
-            return aim
+    async def _centre(self, visit: Visit, aim: FloatArray, place: FloatArray) -> "_Light":
+        """Move the aim by as much as the beam is off the middle."""
+        target = visit.target
         if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
-            return aim
+            return _Light(aim, aim, place)
         self._tell(visit, "to the middle")
         moved = np.asarray(aim - place @ target.axes)
         await visit.aim(moved)
         await visit.arrived(self._settings.arrival)
-        return moved
+        return _Light(moved, aim, place)
+
+
+@dataclass(frozen=True)
+class _Light:
+    """Where to aim for the middle; light was first seen at ``place`` (m, (2,)) by ``first``."""
+
+    aim: FloatArray
+    first: FloatArray
+    place: FloatArray
 
 
 def seen(target: Target, shot: Shot) -> FloatArray | None:

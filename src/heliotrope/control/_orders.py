@@ -38,6 +38,9 @@ _ANEW = ("GOTO", "SEARCH", "DIAGNOSE")
 _RELATIVE = ("JOG",)
 #: For all heliostats together; the bus does about a hundred in a second.
 _MOST_JOBS = 2048
+#: Who is commanded alone or with so few others, is followed: its step counts are asked for in each
+#: second for so long, s.
+_FEW, FOLLOWED = 4, 60.0
 #: Written to flash before they are acknowledged.
 _STORED = ("STANDBY",)
 #: Moves a mirror, or may: refused while a safety row forbids new motion.
@@ -168,8 +171,11 @@ class Orders:
             for name in command.heliostats or ("",):
                 self._reports.add(command.identity, Stage.REFUSED, name, str(refusal))
             return
-        deadline = self._clock() + command.lifetime
+        now = self._clock()
+        deadline = now + command.lifetime
         for node, own in zip(nodes, steps, strict=True):
+            if len(nodes) <= _FEW:
+                node.follow_until = now + FOLLOWED
             order = Order(command.identity, command.name, (own,), deadline, command.token)
             self._begin(order, node)
 

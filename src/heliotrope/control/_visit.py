@@ -127,9 +127,9 @@ class Visit:
                 raise RefusedError(
                     f"{self.heliostat} is {states.STATES[self.state]}, not TRACKING any more"
                 )
-            heard = float(self.plant.field.heard[self.row])
-            if heard > since:
-                since = heard
+            counted = float(self.plant.field.counted_at[self.row])
+            if counted > since:
+                since = counted
                 seen = seen + 1 if self._left() < ARRIVED else 0
 
     def _left(self) -> float:
@@ -141,11 +141,12 @@ class Visit:
     async def look(self) -> None:
         """Let a little time pass, and note the counts if they are new."""
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
-        heard = float(self.plant.field.heard[self.row])
+        # Counts may be asked for less often than the state: their own age tells when they hold.
+        counted = float(self.plant.field.counted_at[self.row])
         node = self.plant.field.rows[self.row]
         # The age of a row jitters with the way of its message: not every change is a new answer.
-        if np.isfinite(heard) and (not self._times or heard > self._times[-1] + _LOOK):
-            self._times.append(heard)
+        if np.isfinite(counted) and (not self._times or counted > self._times[-1] + _LOOK):
+            self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:

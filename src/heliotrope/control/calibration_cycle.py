@@ -258,6 +258,10 @@ class CalibrationCycle:
         before, after = _rms(present, every), _rms(new, every)
         problem = self._problem(fitted, before, after)
         if problem:
+            if not old:
+                # Nothing stands against what these say but that it is nonsense.
+                del self.known[name]
+                every = None
             return result(f"unchanged: {problem}", before, after)
         pushed = await self._push(visit, new[0])
         self.values[name] = {p: float(v[0]) for p, v in fitted.parameters.items()}

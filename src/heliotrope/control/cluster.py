@@ -324,7 +324,8 @@ class Cluster:
         if status is None or not self._believes(node, status):
             return exchange.now
         waits = self._goals.waits(node)
-        if waits or (self._number + node.index) % self.config.steps_every == 0:
+        due = (self._number + node.index) % self.config.steps_every == 0
+        if waits or due or now < node.follow_until:
             steps = await exchange.poll(node, STEPS, sequence, exchange.now)
             if steps is not None:
                 node.steps, node.steps_at = steps, node.heard_at

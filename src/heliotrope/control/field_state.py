@@ -84,6 +84,8 @@ class FieldState:
         Last known rows of dtype `NODE`, (N,): use `values`, which masks what is stale.
     heard
         When each row was true, monotonic s, (N,); minus infinity if never.
+    counted_at
+        The same of its step counts and goals.
 
     Raises
     ------
@@ -106,6 +108,7 @@ class FieldState:
         self.limit = limit
         self.rows: npt.NDArray[Any] = np.zeros(len(pairs), NODE)
         self.heard = np.full(len(pairs), -np.inf)
+        self.counted_at = np.full(len(pairs), -np.inf)
         self.failed_at = np.full(len(pairs), -np.inf)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
         self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
@@ -141,6 +144,8 @@ class FieldState:
         self._note_failures(mine, new, at)
         self.rows[mine] = new
         self.heard[mine] = at - 1e-3 * new["heard_ms"].astype(np.float64)
+        steps = new["steps_ms"].astype(np.float64)
+        self.counted_at[mine] = np.where(steps < NEVER, at - 1e-3 * steps, -np.inf)
         return problems
 
     def _rows_of(self, cluster: str, names: Sequence[str]) -> npt.NDArray[np.intp]:

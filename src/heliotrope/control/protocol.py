@@ -28,7 +28,8 @@ VERSION = 1
 
 #: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
 #: age of its STATUS when the row was written (2^32 - 1: none has come, and the row says nothing);
-#: states and flags as in `lcu.names`.
+#: states and flags as in `lcu.names`. ``steps_ms`` is the age of its step counts and goals, which
+#: may be asked for less often.
 NODE = np.dtype(
     [
         ("state", "u1"), ("fault", "u1"), ("flags", "<u4"), ("heard_ms", "<u4"),
@@ -36,6 +37,7 @@ NODE = np.dtype(
         ("primary_goal", "<i4"), ("secondary_goal", "<i4"),
         ("sun_age_ms", "<u4"), ("supply_mv", "<u2"), ("temperature_degc", "i1"),
         ("boots", "<u2"), ("armature_crc", "<u4"), ("asked", "<u4"), ("answered", "<u4"),
+        ("steps_ms", "<u4"),
     ]
 )  # fmt: skip
 NEVER = 0xFFFFFFFF
