@@ -13,9 +13,9 @@ import typer
 from typer.testing import CliRunner
 
 from drone_case import ORIGIN, camera, field, plant
-from heliotrope.airborne import _campaign
-from heliotrope.airborne._campaign import Campaign, Pose
+from heliotrope.airborne import campaign
 from heliotrope.airborne._stations import read_stations
+from heliotrope.airborne.campaign import Campaign, Pose
 from heliotrope.airborne.detection import decode
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import LedCamera, read_photos
@@ -23,7 +23,7 @@ from heliotrope.airborne.reading import Seen
 from heliotrope.airborne.rendering import write_photo
 from heliotrope.airborne.simulation import Errors, hover_grid, install, look_counts
 from heliotrope.airborne.standing import Standing
-from heliotrope.cli._drone_evaluate import _far_off
+from heliotrope.cli._drone_evaluate import _far_off, _natural
 from heliotrope.cli._drone_evaluate import evaluate as evaluate_command
 from heliotrope.cli._drone_simulate import simulate as simulate_command
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -130,6 +130,22 @@ def test_campaign_gives_one_table(flown: Path, tmp_path) -> None:
         # Slopes of 0.8 mrad and few points: what it shows is that each flight has its own pose.
         assert len(off) >= 4
         assert np.radians(np.sqrt(np.mean(np.square(off)))) < 1.5e-3
+    # What is systematic is told by its causes: where mirrors stand is known from the images.
+    for row in table:
+        causes = [float(row[f"systematic_{c}_x_mrad"]) for c in ("place", "lamp")]
+        assert np.hypot(*causes) == pytest.approx(float(row["systematic_x_mrad"]), rel=1e-6)
+    # The report's table is the same, and the page has the causes.
+    kept = (tmp_path / "orientations.csv").read_bytes()
+    again = run("evaluate", flown / "shot", *[c for c in common if c != "--no-report"])
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "orientations.csv").read_bytes() == kept
+    assert "σ of place" in (tmp_path / "index.html").read_text(encoding="utf-8")
+
+
+def test_flights_stand_in_the_order_of_their_numbers() -> None:
+    names = ["C10-1", "C1-10", "C1-2", "C1-1b", "C2-1", "C1-1", "dusk", "7"]
+    wanted = ["7", "C1-1", "C1-1b", "C1-2", "C1-10", "C2-1", "C10-1", "dusk"]
+    assert sorted(names, key=_natural) == wanted
 
 
 def spoil(shot: Path) -> None:
@@ -235,10 +251,10 @@ def test_flights_that_share_heliostats_go_together(monkeypatch) -> None:
         bare("d", [2, 3], lens), bare("e", [0, 1], other), bare("f", [6], lens),
     ]  # fmt: skip
     # d shares none with a, but both do with c; another camera is adjusted by itself.
-    assert _campaign._groups(poses, range(6)) == [[0, 2, 3], [1, 5], [4]]
+    assert campaign._groups(poses, range(6)) == [[0, 2, 3], [1, 5], [4]]
     # Three flights of 8 corners each are too many for one adjustment of 20.
-    monkeypatch.setattr(_campaign, "MOST_CORNERS", 20)
-    assert _campaign._groups(poses, [0, 2, 3]) == [[0, 3], [2]]
+    monkeypatch.setattr(campaign, "MOST_CORNERS", 20)
+    assert campaign._groups(poses, [0, 2, 3]) == [[0, 3], [2]]
 
 
 def test_offsets_of_groups_count_as_they_are_known() -> None:
@@ -250,6 +266,6 @@ def test_offsets_of_groups_count_as_they_are_known() -> None:
             adjusted=SimpleNamespace(state=state, offset_covariance=known * np.eye(3))
         )
 
-    offset, covariance = _campaign._common([one(0.030, 0.004), one(0.020, 0.008)], 1.0)
+    offset, covariance = campaign._common([one(0.030, 0.004), one(0.020, 0.008)], 1.0)
     np.testing.assert_allclose(offset, 0.8 * 0.030 + 0.2 * 0.020, rtol=1e-3)
     np.testing.assert_allclose(np.diag(covariance), 1.0 / (1 / 0.004**2 + 1 / 0.008**2), rtol=1e-3)

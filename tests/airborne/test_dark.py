@@ -7,9 +7,9 @@ import pytest
 
 from drone_case import camera, flight
 from heliotrope.airborne import rendering
-from heliotrope.airborne._campaign import Pose, evaluate_campaign
 from heliotrope.airborne._dark import expected_feet
 from heliotrope.airborne.bundle import Priors
+from heliotrope.airborne.campaign import Pose, evaluate_campaign
 from heliotrope.airborne.evaluation import evaluate
 from heliotrope.airborne.mirror import ideal, measured_normal
 from heliotrope.airborne.orientation import measure_field, rotation_between

@@ -1,5 +1,6 @@
 """``heliotrope drone evaluate``: the orientations of mirrors from a drone's photographs."""
 
+import re
 import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -13,8 +14,8 @@ from heliotrope.cli import _drone_shared as shared
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
-    from heliotrope.airborne._campaign import Campaign
     from heliotrope.airborne.budget import Budget
+    from heliotrope.airborne.campaign import Campaign
     from heliotrope.airborne.evaluation import Evaluation
     from heliotrope.airborne.mirror import MirrorShape
     from heliotrope.airborne.orientation import Orientations
@@ -29,6 +30,15 @@ class _Measured:
     found: "Evaluation"
     surfaces: "list[MirrorShape]"
     orientations: "Orientations"
+    budget: "Budget"
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return one record an orientation, the systematic part told by its causes."""
+        from heliotrope.airborne.flight_report import orientation_rows
+
+        return orientation_rows(
+            self.orientations, self.budget, self.flight.name, self.found.place_covariance
+        )
 
 
 def evaluate(
@@ -54,11 +64,12 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Find mirrors and lamp in a drone's photographs: orientations with their accuracy."""
-    from heliotrope.airborne._campaign import Pose, evaluate_campaign
     from heliotrope.airborne.budget import Budget
     from heliotrope.airborne.bundle import Priors
+    from heliotrope.airborne.campaign import Pose, evaluate_campaign
 
     flights, problems = shared.open_campaign(folder, field, camera, commands, cluster, point, focal)
+    flights.sort(key=lambda flight: _natural(flight.name))
     surfaces = _all_surfaces(flights, slopes)
     poses = []
     for flight, shapes in zip(flights, surfaces, strict=True):
@@ -78,12 +89,19 @@ def evaluate(
     budget = Budget(priors.position, priors.kinematics, 0.0)
     measured = _measure(flights, surfaces, found, budget)
     _write(out, measured)
-    if report:
+    if not report:
+        _write_orientations(out, measured)
+    else:
         _report(out, measured, found, _not_used(flights, found, problems), as_json)
     if as_json:
         print_json(_document(measured, found, _not_used(flights, found, problems)))
     else:
         _show(measured, found, out, sum(len(f.photos) + len(f.problems) for f in flights))
+
+
+def _natural(name: str) -> list[tuple[str, int]]:
+    """Return a key by which C1-2 stands before C1-10."""
+    return [(text, int(number or 0)) for text, number in re.findall(r"([^0-9]*)([0-9]*)", name)]
 
 
 def _tell(lines: Iterable[str], flight: str = "") -> None:
@@ -120,7 +138,7 @@ def _measure(
             one.reflections, flight.stand.names, shapes.__getitem__, flight.stand.rotation,
             one.stand.vertex, budget=budget, places=one.place_covariance,
         )  # fmt: skip
-        measured.append(_Measured(flight, one, shapes, orientations))
+        measured.append(_Measured(flight, one, shapes, orientations, budget))
     return measured
 
 
@@ -160,11 +178,7 @@ def _surfaces(
 
 
 def _write(out: Path, measured: list[_Measured]) -> None:
-    import pandas as pd
-
-    from heliotrope.airborne.flight_report import orientation_rows
     from heliotrope.airborne.reflections import write_reflections
-    from heliotrope.calibration.report import write_beside
     from heliotrope.calibration.sighting_table import write_sightings
     from heliotrope.calibration.sightings import join
 
@@ -177,10 +191,15 @@ def _write(out: Path, measured: list[_Measured]) -> None:
         sightings = join(parts)
         names = measured[0].flight.plant.names
         write_sightings(out / "sightings.csv", sightings, names, ["drone"] * len(sightings))
-    rows = [
-        r for one in measured for r in orientation_rows(one.orientations, None, one.flight.name)
-    ]
-    table = pd.DataFrame(rows)
+
+
+def _write_orientations(out: Path, measured: list[_Measured]) -> None:
+    """Write the table that the report has too."""
+    import pandas as pd
+
+    from heliotrope.calibration.report import write_beside
+
+    table = pd.DataFrame([row for one in measured for row in one.rows()])
     write_beside(out / "orientations.csv", lambda part: table.to_csv(part, index=False))
 
 
@@ -205,9 +224,10 @@ def _report(
 
     notes = (f"{_offset(found)}.", *not_used)
     flown = [
-        Flown(f.flight.name, f.orientations, f.surfaces.__getitem__, f.found.stand.vertex)
+        Flown(f.flight.name, f.orientations, f.surfaces.__getitem__, f.found.stand.vertex,
+              f.budget, f.found.place_covariance)
         for f in measured
-    ]
+    ]  # fmt: skip
     with calibration.progress("drawing", quiet) as advance:
         write_campaign_report(flown, out, notes=notes, progress=advance)
 
@@ -236,8 +256,6 @@ def _not_used(
 def _document(measured: list[_Measured], found: "Campaign", not_used: list[str]) -> dict[str, Any]:
     import numpy as np
 
-    from heliotrope.airborne.flight_report import orientation_rows
-
     every = [(m, o) for m in measured for o in m.orientations.found]
     return {
         "photographs": [_full(m, p.name) for m in measured for p in m.found.photos],
@@ -245,9 +263,7 @@ def _document(measured: list[_Measured], found: "Campaign", not_used: list[str])
         "reflections": sum(len(m.found.reflections) for m in measured),
         "rtk_offset_m": found.offset.tolist(),
         "rtk_offset_sigma_m": np.sqrt(np.diag(found.offset_covariance)).tolist(),
-        "orientations": [
-            r for m in measured for r in orientation_rows(m.orientations, None, m.flight.name)
-        ],
+        "orientations": [row for m in measured for row in m.rows()],
         "warnings": {
             _full(m, m.orientations.names[o.heliostat]): list(o.warnings)
             for m, o in every
