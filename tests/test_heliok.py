@@ -414,18 +414,3 @@ def test_euler_angles_are_applied_about_x_first() -> None:
 )
 def test_mirror_frame(normal: Any, right: Any, up: Any) -> None:
     np.testing.assert_allclose(mirror_frame(normal), np.transpose([right, up, normal]), atol=1e-15)
-
-
-# -- the reference page ----------------------------------------------------------------
-
-
-def test_the_reference_page_shows_what_comes_out(capsys: pytest.CaptureFixture[str]) -> None:
-    page = Path(__file__).parents[1] / "docs" / "reference" / "formats.md"
-    shown = re.findall(
-        r"```python\n(.*?)```\n\n```text\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL
-    )
-    assert len(shown) == 3
-    names: dict[str, Any] = {}
-    for code, output in shown:
-        exec(code, names)
-        assert capsys.readouterr().out == output
