@@ -51,7 +51,7 @@ async def _learn(live: LivePlant, keeper: Keeper, seed: int, tell: Callable[[str
     while True:
         await asyncio.sleep(5.0)
         k += 1
-        keeper.record_event(Event(float(k), "load", f"{seed}-{k}"))
+        keeper.record_event(Event(live.clock.utc().timestamp(), "load", f"{seed}-{k}"))
         await keeper.confirm()
         tell(f"event {seed}-{k}")
         for name, version in keeper.latest_parameters().items():
