@@ -5,19 +5,18 @@ in a file of their own that nobody else may read.
 """
 
 import string
-import tomllib
-from collections.abc import Iterable
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from heliotrope.control.cluster_config import MOST_MEMBERS, ClusterConfig, Member
 from heliotrope.control.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._documents import read_document, read_toml
 from heliotrope.sun import Site
 
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
@@ -214,18 +213,7 @@ def read_cluster(path: str | Path) -> Installation:
         If something cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
-    raw = read_toml(path, "a cluster file")
-    if raw.get("format") != "heliotrope-cluster":
-        raise FormatError(
-            path, f"format is {raw.get('format')!r}; a cluster file says "
-            'format = "heliotrope-cluster" and version = 1'
-        )  # fmt: skip
-    try:
-        document = ClusterDocument.model_validate(raw)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise FormatError(path, explained(first, TABLES), where) from None
+    document = read_document(path, "cluster", ClusterDocument, TABLES)
     secrets = Keys(path.parent / document.keys if document.keys else None, "heliostats")
     try:
         return _install(path, document, secrets)
@@ -326,7 +314,9 @@ class Keys:
         self.members: dict[str, bytes] = {}
         if path is None:
             return
-        raw = read_toml(path, "a file of keys")
+        # An empty one has no keys; who lacks theirs is named later.
+        empty = path.is_file() and path.stat().st_size == 0
+        raw = {} if empty else read_toml(path, "a file of keys")
         if path.stat().st_mode & _OTHERS:
             mode = path.stat().st_mode & 0o777
             raise FormatError(path, f"others may read it (mode {mode:o}); say chmod 600")
@@ -361,36 +351,3 @@ class Keys:
                 raise FormatError(
                     self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
                 )
-
-
-def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Return what a TOML file holds; ``what`` it should be, as an error calls it.
-
-    Raises
-    ------
-    FormatError
-        If it cannot be read or is no TOML.
-    """
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise FormatError(path, f"there is no such file; give the path of {what}") from None
-    except OSError as error:
-        raise FormatError(path, f"cannot be read as {what}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise FormatError(path, f"is no text; give the path of {what}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(path, f"no TOML: {error}") from None
-
-
-def explained(error: Any, tables: Iterable[type[BaseModel]]) -> str:
-    """Return one line from pydantic's description of an error in a file of some tables."""
-    key = str(error["loc"][-1]) if error["loc"] else ""
-    if error["type"] == "missing":
-        return f"{key!r} is missing; add it"
-    if error["type"] == "extra_forbidden":
-        known = sorted({name for table in tables for name in table.model_fields})
-        close = get_close_matches(key, known, n=1)
-        return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
-    message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{error.get('input')!r:.80}: {message}"

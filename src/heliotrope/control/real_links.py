@@ -12,16 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from heliotrope.control.clock import Clock
-from heliotrope.control.cluster_file import Keys, Table, explained, read_toml, url_parts
+from heliotrope.control.cluster_file import Keys, Table, url_parts
 from heliotrope.control.link import Link
 from heliotrope.control.mqtt import Broker, mqtt_link
 from heliotrope.control.real_cluster import LocalCluster
 from heliotrope.control.real_sensors import FED, SensorFiles
 from heliotrope.control.tcp import TcpServer, client_tls, server_tls
 from heliotrope.errors import FormatError
+from heliotrope.field.formats._documents import read_document
 
 
 class TcpTable(Table):
@@ -203,18 +204,7 @@ def read_links(path: str | Path) -> LinksFile:
         If something cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
-    raw = read_toml(path, "a links file")
-    if raw.get("format") != "heliotrope-links":
-        raise FormatError(
-            path, f"format is {raw.get('format')!r}; a links file says "
-            'format = "heliotrope-links" and version = 1'
-        )  # fmt: skip
-    try:
-        document = LinksDocument.model_validate(raw)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise FormatError(path, explained(first, TABLES), where) from None
+    document = read_document(path, "links", LinksDocument, TABLES)
     keys = Keys(path.parent / document.keys if document.keys else None, "clusters")
     keys.check(list(document.clusters))
     found = LinksFile(path, document, keys.members, keys.password)

@@ -6,17 +6,15 @@ column of its dotted name. Written files give every number with all its digits, 
 what is read again is the same plant.
 """
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import ValidationError
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats._documents import read_document
 from heliotrope.field.formats._plant_cameras import (
     build_camera,
     build_mark,
@@ -26,7 +24,7 @@ from heliotrope.field.formats._plant_cameras import (
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
-from heliotrope.field.formats._textfile import read_text, write_text
+from heliotrope.field.formats._textfile import write_text
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, direction
@@ -50,7 +48,7 @@ def read_plant(path: str | Path) -> Plant:
         If something cannot be used; the text names file, place, value and limit, and
         how many more problems there are.
     """
-    document = _read_document(Path(path))
+    document = read_document(path, "plant", PlantDocument, _MODELS)
     table = read_table(Path(path).parent / document.heliostats)
     problems = list(table.problems)
     plant = None
@@ -62,42 +60,6 @@ def read_plant(path: str | Path) -> Plant:
         first = problems[0]
         raise FormatError(first.path, first.problem + hint, first.where)
     return plant
-
-
-def _read_document(path: Path) -> PlantDocument:
-    text = read_text(path, "a plant file")
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(path, f"no TOML: {error}") from None
-    if raw.get("format") != "heliotrope-plant":
-        raise FormatError(
-            path, f"format is {raw.get('format')!r}; a plant file says "
-            'format = "heliotrope-plant" and version = 1'
-        )  # fmt: skip
-    try:
-        return PlantDocument.model_validate(raw)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise FormatError(path, _explain(first), _place(first["loc"])) from None
-
-
-def _place(location: tuple[int | str, ...]) -> str:
-    return ".".join(str(part) for part in location)
-
-
-def _explain(error: Any) -> str:
-    """One line from pydantic's description of an error."""
-    value, kind = error.get("input"), error["type"]
-    key = str(error["loc"][-1]) if error["loc"] else ""
-    if kind == "missing":
-        return f"{key!r} is missing; add it"
-    if kind == "extra_forbidden":
-        known = sorted({n for m in _MODELS for n in m.model_fields})
-        close = get_close_matches(key, known, n=1)
-        return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
-    message = error["msg"][0].lower() + error["msg"][1:]
-    return f"{value!r:.80}: {message}"
 
 
 def _models() -> list[Any]:
@@ -280,7 +242,7 @@ def check_plant(path: str | Path) -> list[Finding]:
     """Return everything that is wrong or strange in a plant file, as findings."""
     place = Path(path)
     try:
-        document = _read_document(place)
+        document = read_document(place, "plant", PlantDocument, _MODELS)
         table = read_table(place.parent / document.heliostats)
     except FormatError as error:
         return [Finding("error", str(error))]

@@ -1,0 +1,77 @@
+"""TOML files of a format and version of our own: read, checked against their tables, explained."""
+
+import tomllib
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from heliotrope.errors import FormatError
+from heliotrope.field.formats._textfile import read_text
+
+D = TypeVar("D", bound=BaseModel)
+
+
+def read_toml(path: str | Path, what: str) -> dict[str, Any]:
+    """Return what a TOML file holds; ``what`` it should be, as an error calls it.
+
+    Raises
+    ------
+    FormatError
+        If it cannot be read or is no TOML.
+    """
+    text = read_text(path, what)
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise FormatError(path, f"no TOML: {error}") from None
+
+
+def read_document(
+    path: str | Path, kind: str, model: type[D], tables: Iterable[type[BaseModel]]
+) -> D:
+    """Return the document of a file that says ``format = "heliotrope-KIND"``.
+
+    Parameters
+    ----------
+    path
+        Of the file.
+    kind
+        "plant", "cluster", …
+    model
+        Of the whole file.
+    tables
+        All tables whose keys may be meant where one is not known.
+
+    Raises
+    ------
+    FormatError
+        If something cannot be used; the text names file, place, value and limit.
+    """
+    raw = read_toml(path, f"a {kind} file")
+    if raw.get("format") != f"heliotrope-{kind}":
+        raise FormatError(
+            path, f"format is {raw.get('format')!r}; a {kind} file says "
+            f'format = "heliotrope-{kind}" and version = 1'
+        )  # fmt: skip
+    try:
+        return model.model_validate(raw)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise FormatError(path, _explained(first, tables), where) from None
+
+
+def _explained(error: Any, tables: Iterable[type[BaseModel]]) -> str:
+    """Return one line from pydantic's description of an error."""
+    key = str(error["loc"][-1]) if error["loc"] else ""
+    if error["type"] == "missing":
+        return f"{key!r} is missing; add it"
+    if error["type"] == "extra_forbidden":
+        known = sorted({name for table in tables for name in table.model_fields})
+        close = get_close_matches(key, known, n=1)
+        return f"{key!r} is not known" + (f"; did you mean {close[0]!r}?" if close else "")
+    message = error["msg"][0].lower() + error["msg"][1:]
+    return f"{error.get('input')!r:.80}: {message}"
