@@ -139,6 +139,44 @@ def test_a_lost_answer_is_asked_for_again_and_nothing_acts_twice() -> None:
     run(main, "IDLE", bus=interrupted)
 
 
+@pytest.mark.parametrize("lost", [0, 1, 2])
+@pytest.mark.parametrize("steps", [500.0, -30.0, 3.0])
+def test_a_jog_is_done_only_if_the_counts_go_elsewhere(lost: int, steps: float) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        for name in ("A1", "A2"):
+            for what in ("LOCK", "UNLOCK"):
+                await field.order(name + what, what, heliostats=(name,))
+                assert await final(field, name + what, name) is Stage.DONE
+        taker, refuser = (board.node.controller for board in field.boards)
+        goals = taker.motion.goal(1), refuser.motion.goal(1)
+        refuser._may_move = lambda name, values: messages.BAD_VALUE
+        for name, identity in (("A1", "taken"), ("A2", "refused")):
+            field.bus.lose("JOG", lost)
+            await field.order(identity, "JOG", 1.0, steps, heliostats=(name,))
+            await final(field, identity, name)
+        assert field.plant.stages("taken", "A1") == ALL_STAGES
+        # Its first answer was lost, the others say "duplicate".
+        end = Stage.FAILED if lost else Stage.REFUSED
+        assert field.plant.stages("refused", "A2")[-1] is end
+        text = "nothing shows that it was taken" if lost else "value out of range"
+        assert text in field.plant.text("refused")
+        assert (taker.motion.goal(1), refuser.motion.goal(1)) == (goals[0] + steps, goals[1])
+
+    run(main, "IDLE", bus=interrupted)
+
+
+def test_a_jog_of_no_axis_is_refused_or_not_shown() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        for lost, end in ((0, Stage.REFUSED), (1, Stage.FAILED)):
+            field.bus.lose("JOG", lost)
+            await field.order(f"{lost}", "JOG", 7.0, 10.0, heliostats=("A1",))
+            assert await final(field, f"{lost}") is end
+
+    run(main, "IDLE", bus=interrupted)
+
+
 def test_where_the_answer_was_lost_the_state_decides() -> None:
     async def main(field: Field) -> None:
         await field.until(field.sun_is_fresh)

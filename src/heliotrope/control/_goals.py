@@ -95,7 +95,7 @@ GOALS = {
     "LOCK": Goal(frozenset({LOCKED})),
     "UNLOCK": Goal(_ALL - {LOCKED}),
     "CLEAR_FAULT": Goal(_ALL - {FAULT}),
-    "JOG": Goal(frozenset({IDLE}), clear=_MOVING),
+    "JOG": Goal(frozenset({IDLE}), clear=_MOVING, told=_NOTHING),
     "GOTO": Goal(frozenset({IDLE}), clear=_MOVING, told=_NOTHING),
     "DIAGNOSE": Goal(frozenset({IDLE}), clear=_DIAGNOSING, told=(frozenset(), _DIAGNOSING)),
     "DEFOCUS": Goal(_ALL - BEAM_OUT, near=True, limit=DEFOCUS_BUDGET),
@@ -107,12 +107,36 @@ assert STOWED in GOALS["STOW"].there
 assert STOWING in GOALS["STOW"].there
 
 
+@dataclass(frozen=True)
+class Shift:
+    """What a command changes of where the step counts of an axis go.
+
+    Attributes
+    ----------
+    axis
+        0 or 1.
+    origin, steps
+        Where they went before, and by how many steps that changes.
+    """
+
+    axis: int
+    origin: int
+    steps: int
+
+    def shown(self, goals: tuple[int, int]) -> bool:
+        """Whether where the counts go now can only be due to the command."""
+        off = abs(goals[self.axis] - self.origin - self.steps)
+        # The sun moves them as well, until the command ends that.
+        return off == 0 or (off <= _NEAR and abs(self.steps) > 2 * _NEAR)
+
+
 @dataclass
 class _Watch:
     identity: str
     name: str
     since: float
     sure: bool  # that it was taken
+    shift: Shift | None = None
 
 
 class Goals:
@@ -122,10 +146,13 @@ class Goals:
         self._reports = reports
         self._watches: dict[int, list[_Watch]] = {}
 
-    def begin(self, identity: str, name: str, node: Node, now: float, *, sure: bool = True) -> None:
+    def begin(
+        self, identity: str, name: str, node: Node, now: float,
+        *, sure: bool = True, shift: Shift | None = None,
+    ) -> None:  # fmt: skip
         """Note that a node has acknowledged a command; goals of other commands are void.
 
-        Not ``sure``: it may have, its answer was lost.
+        Not ``sure``: it may have, its answer was lost; ``shift``, if known, tells whether it has.
         """
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
@@ -133,7 +160,7 @@ class Goals:
         same = [watch for watch in self._watches.get(node.index, []) if watch.name == name]
         if not same:
             self.end(node, f"{name} came after it")
-        self._watches[node.index] = [*same, _Watch(identity, name, now, sure)]
+        self._watches[node.index] = [*same, _Watch(identity, name, now, sure, shift)]
 
     def waits(self, node: Node) -> bool:
         """Whether a node is to reach something."""
@@ -177,15 +204,20 @@ class Goals:
             return None
         goal = GOALS[watch.name]
         watch.sure = watch.sure or goal.shown(node.state, node.flags)
-        if goal.near and node.steps_at < watch.since + _SETTLE:
+        counted = goal.near or (watch.shift is not None and not watch.sure)
+        if counted and node.steps_at < watch.since + _SETTLE:
             return None
         primary, secondary, primary_goal, secondary_goal = node.steps
+        if watch.shift is not None:
+            watch.sure = watch.sure or watch.shift.shown((primary_goal, secondary_goal))
         off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
         reached = goal.reached(node.state, node.flags, off)
-        if reached is None:
+        # What nothing will show later need not be waited for.
+        ended = not watch.sure and goal.told is _NOTHING
+        if reached is None and not ended:
             return None
         state = states.STATES[node.state]
-        if reached and not watch.sure:
+        if ended or (reached and not watch.sure):
             return f"its answer was lost, and nothing shows that it was taken; it is {state}"
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
         return "" if reached else f"went to {state}{fault}"

@@ -3,7 +3,7 @@
 A command that is not answered is sent again as the same frame, which acts once, and in the next
 second as a new one, until it expires. If the answer to an earlier frame was lost, "duplicate" or
 "not in this state" may mean that the command was taken: then the state decides. What must not act
-twice (JOG) is not sent as a new frame.
+twice (JOG) is not sent as a new frame; whether it was taken shows in where the step counts go.
 """
 
 import re
@@ -16,7 +16,7 @@ from typing import Any
 
 from heliotrope.control._discovery import SPAN, heard
 from heliotrope.control._exchange import Exchange
-from heliotrope.control._goals import GOALS, Goals
+from heliotrope.control._goals import GOALS, Goals, Shift
 from heliotrope.control._kept import Kept
 from heliotrope.control._nodes import Node
 from heliotrope.control._reports import Reports
@@ -94,11 +94,19 @@ class Job:
         self.edition = -1  # that the node holds; not known yet
         self.last = ""  # why it is tried again
         self.void = ""  # why it is given up as soon as its frame has been answered
+        self.origin: tuple[int, int] | None = None  # where the counts went before it, if asked
 
     @property
     def step(self) -> Step:
         """What is to be done now."""
         return self.order.steps[self.place]
+
+    def shift(self) -> Shift | None:
+        """What a JOG changes; None if that is not known."""
+        if self.origin is None:
+            return None
+        axis, steps = self.step.values
+        return Shift(axis, self.origin[axis], steps) if axis < len(self.origin) else None
 
 
 class Orders:
@@ -262,13 +270,23 @@ class Orders:
             return self._fail(job, job.last or "not acknowledged before it expired")
         if not job.told_sent:
             job.told_sent = True
-            if self._goals.waits(job.node):
+            if job.step.name in _RELATIVE:
+                await self._note_origin(job)
+            elif self._goals.waits(job.node):
                 # What it has reached since it was last asked would be forgotten.
                 await self._look(job.node)
             self._reports.add(job.order.identity, Stage.SENT, job.node.name)
         if job.step.item:
             return await self._check(job)
         return await self._set(job)
+
+    async def _note_origin(self, job: Job) -> None:
+        """Ask where the step counts go now: if its answer is lost, that tells what was done."""
+        node, asked_at = job.node, self._clock()
+        node.follow_until = max(node.follow_until, asked_at + FOLLOWED)
+        await self._look(node)
+        if node.steps_at >= asked_at:
+            job.origin = node.steps[2], node.steps[3]
 
     async def _set(self, job: Job) -> None:
         step, node, order = job.step, job.node, job.order
@@ -384,6 +402,7 @@ class Orders:
         if job.void:
             return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
+        shift = job.shift()
         job.place += 1
         job.unanswered = False
         left = order.steps[job.place :]
@@ -394,7 +413,8 @@ class Orders:
         elif done.item:
             self._reports.add(order.identity, Stage.DONE, node.name)
         else:
-            self._goals.begin(order.identity, done.name, node, self._clock(), sure=sure)
+            now = self._clock()
+            self._goals.begin(order.identity, done.name, node, now, sure=sure, shift=shift)
         return None
 
     def _again(self, job: Job, why: str) -> None:
