@@ -5,7 +5,7 @@ before them; who has not acknowledged is asked again in every second, and named,
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from heliotrope.control._exchange import Exchange
 from heliotrope.control._goals import Goals
@@ -32,8 +32,16 @@ class _Order:
         self.began = now
         self.calls = _CALLS if everybody else 0
         self.waiting = deque(sorted(nodes, key=lambda node: node.missed >= _SILENT))
+        self.tries = {node.index: 0 for node in nodes}
+        self.sent: set[int] = set()  # who of them was called or asked
         self.new = True
-        self.told_sent = self.given_up = False
+        self.given_up = False
+
+
+def _rank(order: _Order) -> tuple[bool, bool, bool]:
+    """Who is served first: False before True."""
+    silent = all(node.missed >= _SILENT for node in order.waiting)
+    return bool(order.sent), silent, not order.new
 
 
 class Urgent:
@@ -53,6 +61,7 @@ class Urgent:
         self._goals, self._reports, self._clock = goals, reports, clock
         self._orders: list[_Order] = []
         self._serving = 0.0
+        self._asked: set[tuple[str, int]] = set()
         self.pressing = False
 
     def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
@@ -70,17 +79,19 @@ class Urgent:
         self.pressing = True
 
     async def serve(self) -> None:
-        """Call and ask until every order has had its round; a new one goes first.
+        """Call and ask until every order has had its round.
 
+        What has not been on the bus at all goes first, and of that what is for someone who answers.
         Once this has gone on for the budget of an order, who is silent waits for the next second,
         so that many orders on a dead bus take no longer than a few.
         """
         self._serving = self._clock()
+        self._asked.clear()
         while self.pressing:
             self.pressing = False
             for order in self._orders:
                 await self._call(order)
-            for order in list(self._orders):
+            for order in sorted(self._orders, key=_rank):
                 await self._round(order)
                 if self.pressing:
                     break
@@ -103,48 +114,67 @@ class Urgent:
             if not await self._exchange.broadcast(order.name, urgent=True):
                 return
             order.calls -= 1
-            self._sent(order)
+            self._sent(order, order.waiting)
 
-    def _sent(self, order: _Order) -> None:
-        if not order.told_sent:
-            order.told_sent = True
-            for node in order.waiting:
+    def _sent(self, order: _Order, nodes: Iterable[Node]) -> None:
+        for node in nodes:
+            if node.index not in order.sent:
+                order.sent.add(node.index)
                 self._reports.add(order.identity, Stage.SENT, node.name)
 
     async def _round(self, order: _Order) -> None:
         """Ask each that has not acknowledged."""
         begin = self._clock()
-        rounds, order.new = (_ROUNDS if order.new else 1), False
-        for number in range(rounds):
+        for number in range(_ROUNDS if order.new else 1):
             if number and self._clock() - begin > ORDER_BUDGET:
-                return
+                break
             for _ in range(len(order.waiting)):
                 if self.pressing or not self._exchange.connected:
                     return
-                if rounds == 1 and self._clock() - begin > _SHARE:
+                if not order.new and self._clock() - begin > _SHARE:
                     return
                 node = order.waiting.popleft()
-                late = self._clock() - self._serving > ORDER_BUDGET
-                if (order.given_up and node.missed > 0) or (late and node.missed >= _SILENT):
-                    order.waiting.append(node)  # polling finds it when it comes back
+                if self._later(order, node, number):
+                    order.waiting.append(node)
                 else:
                     await self._ask(order, node)
+        order.new = False
+
+    def _later(self, order: _Order, node: Node, number: int) -> bool:
+        """Whether a node is not asked now, in a round of the order."""
+        if order.given_up and node.missed > 0:
+            return True  # polling finds it when it comes back
+        if node.missed < _SILENT:
+            return False
+        # Others may have asked it for the same.
+        if order.new:
+            enough = order.tries[node.index] > number
+        else:
+            enough = (order.name, node.index) in self._asked
+        return enough or self._clock() - self._serving > ORDER_BUDGET
 
     async def _ask(self, order: _Order, node: Node) -> None:
         begin = self._clock()
         answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
-        self._sent(order)
+        self._asked.add((order.name, node.index))
+        # An order that came when this was on its way already is asked for itself.
+        same = [
+            other for other in self._orders
+            if other is not order and other.name == order.name and other.began <= begin
+            and node in other.waiting
+        ]  # fmt: skip
+        for one in (order, *same):
+            one.tries[node.index] += 1
+            self._sent(one, [node])
         if answer is None:
             node.counts.retries += 1
             order.waiting.append(node)
             return
         self._reports.clear("order_unacknowledged", node.name, f"{node.name} has acknowledged")
         self._acknowledged(order, node)
-        for other in self._orders:
-            # An order that came when this was on its way already is asked for itself.
-            if other.name == order.name and other.began <= begin and node in other.waiting:
-                other.waiting.remove(node)
-                self._acknowledged(other, node)
+        for other in same:
+            other.waiting.remove(node)
+            self._acknowledged(other, node)
 
     def _acknowledged(self, order: _Order, node: Node) -> None:
         if not order.given_up:
