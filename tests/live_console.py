@@ -5,6 +5,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,12 +17,15 @@ from heliotrope.control.authority import Person, RefusedError, Role
 from heliotrope.control.clock import VirtualClock
 from heliotrope.control.link import running
 from heliotrope.field.layouts import malan_plant
+from heliotrope.field.volumes import Box
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin._live_loop import PacedLoop
 from heliotrope.twin.live import LiveOptions, LivePlant
 
 PASSWORD = "correct horse"
 ROLES = ("viewer", "operator", "engineer")
+#: North of the tower, where no beam goes.
+GATE = Box("gate", (0.0, 60.0, 2.0), (6.0, 4.0, 4.0))
 T = TypeVar("T")
 
 
@@ -67,8 +71,9 @@ class LiveConsole:
         now = time.time()
         for role in ROLES:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
+        design = replace(malan_plant(heliostats), keep_outs=(GATE,))
         self.live = LivePlant(
-            malan_plant(heliostats), clock, LiveOptions(rendered=rendered),
+            design, clock, LiveOptions(rendered=rendered),
             audit=JsonLines(self.folder / "audit.jsonl", clock.utc()), records=self.keeper,
             extra=lambda: {"speed": speed},
         )  # fmt: skip

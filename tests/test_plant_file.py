@@ -9,12 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data import juelich
-from heliotrope.errors import InputError
+from heliotrope.control.aims import BeamCheck
+from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
 from heliotrope.field.formats import paint, plant_file
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.sun import Site
@@ -104,6 +106,93 @@ def test_prototype_and_juelich_survive(tmp_path: Path) -> None:
         _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
         assert not [f for f in plant_file.check_plant(tmp_path / "plant.toml")
                     if f.severity == "error"]  # fmt: skip
+
+
+KEEP_OUT = """
+[[keep_out]]
+name = "control room"
+kind = "box"
+center_m = [20, -60, 3]
+size_m = [12, 8, 6]
+azimuth_deg = 30
+
+[[keep_out]]
+name = "mast"
+kind = "cylinder"
+start_m = [0, 0, 0]
+end_m = [0, 0, 60]
+radius_m = 1.5
+
+[[keep_out]]
+name = "walkway"
+kind = "prism"
+corners_m = [[-5, -20], [5, -20], [5, -18], [-5, -18]]
+bottom_m = 4
+top_m = 8
+
+[[keep_out]]
+name = "drone"
+kind = "sphere"
+center_m = [50, 0, 80]
+radius_m = 10
+
+[eyes_m]
+gate = [0, 120, 1.7]
+"""
+
+
+def with_text(folder: Path, text: str) -> Path:
+    """The prototype's file with more at its end."""
+    path = folder / "plant.toml"
+    plant_file.write_plant(prototype(), path)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    kept = [line for line in lines if not line.startswith(("keep_out =", "[eyes_m]"))]
+    path.write_text("\n".join(kept) + text, encoding="utf-8")
+    return path
+
+
+def test_keep_out_volumes_and_eyes_are_read_and_survive(tmp_path: Path) -> None:
+    plant = plant_file.read_plant(with_text(tmp_path, KEEP_OUT))
+    room, mast, walkway, drone = plant.keep_outs
+    assert isinstance(room, Box)
+    assert room.azimuth == np.radians(30)
+    assert isinstance(mast, Cylinder)
+    assert isinstance(walkway, Prism)
+    assert (walkway.bottom, walkway.top) == (4.0, 8.0)
+    assert isinstance(drone, Sphere)
+    assert plant.eyes["gate"].tolist() == [0.0, 120.0, 1.7]
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    again = plant_file.read_plant(tmp_path / "again.toml")
+    assert str(again.keep_outs) == str(plant.keep_outs)
+    assert str(again.eyes) == str(plant.eyes)
+    # The plant's controller takes them from there.
+    check = BeamCheck(again, again.names)
+    assert check.volumes == again.keep_outs
+    assert check.eyes.tolist() == [[0.0, 120.0, 1.7]]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ('kind = "sphere"', 'kind = "ball"', "keep_out.3: "),
+        ("radius_m = 10", "radius_m = 0", "keep_out.3.sphere.radius_m: 0: input should be greater"),
+        ("radius_m = 1.5", "radius = 1.5", "keep_out.1.cylinder.radius"),
+        ("end_m = [0, 0, 60]", "end_m = [0, 0, 0]", "keep_out[1]: volume mast: its ends are one"),
+        ("top_m = 8", "top_m = 2", "keep_out[2]: volume walkway: top 2 m must be above bottom 4 m"),
+        ('name = "mast"', 'name = "walkway"', "keep-out volume walkway: the name occurs twice"),
+        ("gate = [0, 120, 1.7]", "gate = [0, 120]", "eyes_m.gate: "),
+    ],
+)
+def test_what_is_no_volume_is_one_clear_line(
+    before: str, after: str, text: str, tmp_path: Path
+) -> None:
+    assert before in KEEP_OUT
+    path = with_text(tmp_path, KEEP_OUT.replace(before, after))
+    with pytest.raises(FormatError) as caught:
+        plant_file.read_plant(path)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
 
 
 def test_by_hand_is_as_built(tmp_path: Path) -> None:

@@ -83,6 +83,11 @@ def test_every_route_has_its_role(console: LiveConsole, ask: Ask) -> None:
                 assert status in expected, (method, path, role, status)
 
 
+def test_the_field_shows_where_no_beam_may_be(ask: Ask) -> None:
+    (gate,) = ask("viewer", "GET", "field").json()["keep_outs"]
+    assert gate == {"name": "gate", "outline": [[-3, 58], [3, 58], [3, 62], [-3, 62]]}
+
+
 def test_the_page_of_the_api_has_every_route() -> None:
     page = Path(__file__).parents[2] / "docs" / "reference" / "api-http.md"
     rows = re.findall(r"^\| `([A-Z]+) (\S+)` \| (\w+) \| \S", page.read_text("utf-8"), re.MULTILINE)

@@ -614,3 +614,20 @@ def test_the_page_is_current() -> None:
     assert script.PAGE.read_text(encoding="utf-8") == script.page(), (
         "run scripts/safety_table.py to write the page anew"
     )
+
+
+def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
+    row = next(r for r in CONDITIONS if r.name == "keep_out_predicted")
+    state = safety.start([row], 0.0)
+    for now, subjects, tripped in (
+        (1.0, (), set()), (2.0, ("A", "B"), {"A", "B"}), (3.0, ("A",), {"A", "B"}),
+        # Clear for two seconds.
+        (6.0, ("A",), {"A"}), (7.0, (), {"A"}), (10.0, (), set()), (11.0, (), set()),
+    ):  # fmt: skip
+        state = safety.narrowed(state, row.name, subjects)
+        readings = {(row.reading, subject): Reading(1.0, now) for subject in subjects}
+        readings[row.reading, ""] = Reading(0.0, now)
+        state, actions = safety.evaluate(readings, state, now)
+        assert {a.subject for a in actions} == tripped
+        assert {a.act for a in actions} <= {Act.HOLD}
+    assert set(safety.narrowed(state, row.name, ()).tracks) == {(row.name, "")}

@@ -24,6 +24,7 @@ from heliotrope.console.auth import (
 )
 from heliotrope.console.models import plain
 from heliotrope.control.operations import Operations
+from heliotrope.field.volumes import outline
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 
@@ -94,12 +95,14 @@ def _field(here: Operations) -> dict[str, Any]:
             for k in range(3)
         ]
     sizes = sorted(here.sizes.max(axis=1).tolist())
+    volumes = here.plant.beams.volumes
+    keep_outs = [{"name": v.name, "outline": outline(v).round(2).tolist()} for v in volumes]
     return {
         "plant": design.name, "names": here.names, "positions": here.positions.round(3),
         "clusters": here.clusters, "cluster": plant.cluster,
         "size": sizes[len(sizes) // 2], "tower": middle, "receivers": here.receivers,
-        "targets": here.targets, "surfaces": here.aim_names, "states": states.STATES,
-        "faults": meanings.FAULTS,
+        "targets": here.targets, "keep_outs": keep_outs, "surfaces": here.aim_names,
+        "states": states.STATES, "faults": meanings.FAULTS,
     }  # fmt: skip
 
 

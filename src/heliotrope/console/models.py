@@ -227,6 +227,13 @@ class AuthorityState(BaseModel):
     lifetime: float = Field(description="How long it lasts without being kept up, s")
 
 
+class KeepOut(BaseModel):
+    """A volume where no beam may be, as seen on a map."""
+
+    name: str
+    outline: list[tuple[float, float]] = Field(description="East and north of its corners, m")
+
+
 class FieldState(BaseModel):
     """What does not change of the field, in the order of all its rows."""
 
@@ -239,6 +246,7 @@ class FieldState(BaseModel):
     tower: Place = Field(description="Middle of the receivers, ENU, m")
     receivers: list[str]
     targets: list[str]
+    keep_outs: list[KeepOut]
     surfaces: list[str] = Field(description="What `on` of a row counts")
     states: list[str]
     faults: list[str]

@@ -130,8 +130,8 @@ class Joiner:
         }
         if not unknown.all():
             known = rows[~unknown]
-            counts = np.stack(
-                [self._field.rows[end][known] for end in ("primary", "secondary")], axis=-1
-            ).astype(np.float64)
-            found |= self._beams.on_the_way(known, counts, aims[~unknown], self._sun())
+            counts, light = self._field.counts(known), self._sun()
+            found |= self._beams.on_the_way(known, counts, aims[~unknown], light)
+            if job.name == "SEARCH":
+                found |= self._beams.around(known, aims[~unknown], job.values[1], light)
         return found

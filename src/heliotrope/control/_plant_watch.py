@@ -13,6 +13,7 @@ from heliotrope.control.safety import (
     Watcher,
     acknowledge,
     evaluate,
+    narrowed,
     start,
     watched_by,
 )
@@ -40,6 +41,8 @@ class PlantWatch:
         Readings that are fed from outside by `put`.
     now
         Monotonic s.
+    looks
+        Whether beams are looked at, because there are volumes that they must keep out of.
 
     Attributes
     ----------
@@ -63,6 +66,8 @@ class PlantWatch:
         clusters: Sequence[str],
         sensors: Iterable[str],
         now: float,
+        *,
+        looks: bool = False,
     ) -> None:
         rows = watched_by(table, Watcher.PLANT)
         fed = frozenset(sensors)
@@ -73,10 +78,12 @@ class PlantWatch:
                 f"outside; known: {', '.join(sorted(known))}"
             )
         self.sensors = fed
-        able = tuple(row for row in rows if row.reading in fed | OWN_READINGS)
+        own = OWN_READINGS | ({"keep_out_predicted"} if looks else set())
+        able = tuple(row for row in rows if row.reading in fed | own)
         self.unwatched = tuple(row.name for row in rows if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
+        self._single = tuple(row for row in able if row.scope is Scope.HELIOSTAT)
         subjects = {row.name: clusters for row in able if row.scope is Scope.CLUSTER}
         self._state = start(able, now, subjects)
         self._readings: dict[tuple[str, str], Reading] = {}
@@ -88,7 +95,11 @@ class PlantWatch:
 
     def evaluate(self, own: Mapping[tuple[str, str], Reading], now: float) -> list[Alarm]:
         """Look at all rows; return what is to be told since the last time."""
-        self._state, self.actions = evaluate({**self._readings, **own}, self._state, now)
+        readings = {**self._readings, **own}
+        for row in self._single:
+            whom = [subject for reading, subject in readings if reading == row.reading and subject]
+            self._state = narrowed(self._state, row.name, whom)
+        self._state, self.actions = evaluate(readings, self._state, now)
         found: dict[tuple[str, str], Alarm] = {}
         news = []
         for action in self.actions:
@@ -116,6 +127,14 @@ class PlantWatch:
         scope = Scope.CLUSTER if cluster else Scope.FIELD
         acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
         return max(acts, default=None)
+
+    def held(self) -> dict[str, str]:
+        """Return heliostats that are to be held from now on, and why."""
+        return {
+            a.subject: a.text
+            for a in self.actions
+            if a.scope is Scope.HELIOSTAT and a.act is Act.HOLD and a.new and a.subject
+        }
 
     def caused(self) -> bool:
         """Whether anything but the consequences of an emergency demands one for the field."""

@@ -12,6 +12,7 @@ from heliotrope.control._plant_orders import PlantOrders
 from heliotrope.control._plant_watch import PlantWatch
 from heliotrope.control._sun_line import sun_now
 from heliotrope.control._tickets import Ticket
+from heliotrope.control._ways import Lookout
 from heliotrope.control.authority import Authority
 from heliotrope.control.clock import Clock
 from heliotrope.control.emergency import EmergencyOrder
@@ -37,6 +38,8 @@ class Sentinel:
         Of the plant.
     drives
         Of the heliostats, (N, 2), for the proof.
+    lookout
+        Sees whose beams go into keep-out volumes.
     repeat
         Between repetitions of an order to those that have not acknowledged, s.
 
@@ -61,6 +64,7 @@ class Sentinel:
         authority: Authority,
         watch: PlantWatch,
         drives: Drive,
+        lookout: Lookout,
         repeat: float,
     ) -> None:
         self.order: EmergencyOrder | None = None
@@ -68,6 +72,7 @@ class Sentinel:
         self._clock, self._site, self._field, self._ends = clock, site, field, ends
         self._orders, self._joining, self._authority = orders, joining, authority
         self._watch, self._drives, self._repeat = watch, drives, repeat
+        self._lookout = lookout
         self._repeated_at = self._sun_at = -math.inf
         self._sun: FloatArray = np.array([0.0, 0.0, -1.0])
 
@@ -76,6 +81,7 @@ class Sentinel:
         news = self._watch.evaluate(self._readings(now), now)
         self._obey_field(now)
         self._obey_clusters()
+        self._obey_heliostats()
         return news
 
     def _readings(self, now: float) -> dict[tuple[str, str], Reading]:
@@ -91,6 +97,7 @@ class Sentinel:
             ("audit_silence", ""): Reading(now - self._orders.confirmed_at, now),
             ("sun_elevation", ""): Reading(math.asin(float(self._sun[2])), now),
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
+            **self._lookout.readings(now),
         }
         for name, at in self._field.status_at.items():
             if math.isfinite(at):
@@ -125,6 +132,18 @@ class Sentinel:
                 text = self._watch.reasons(Act.DEFOCUS, end.name)
                 self._joining.drop(text, frozenset(end.members))
                 self.send_safe(("safety table", "plant"), act, end.members, text)
+
+    def _obey_heliostats(self) -> None:
+        """Hold mirrors where they are; without an authority they cannot be, and go off."""
+        token = self._authority.token
+        for name, text in self._watch.held().items():
+            who = ("safety table", "plant")
+            self._joining.drop(text, frozenset([name]))
+            if token:
+                ticket = self._orders.accept((*who, "LOCK"), (), (name,), text, late=True)
+                self._orders.command(ticket, "LOCK", (), (name,), token)
+            else:
+                self.send_safe(who, Act.DEFOCUS, (name,), text)
 
     def order_field(
         self, act: Act, who: str, reason: str, now: float, role: str = "plant"

@@ -1,121 +1,12 @@
-"""Keep-out volumes: where no beam may be."""
+"""Keep-out volumes as the kernels read them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.control import _beam_kernels as kernels
-from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, as_vectors
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A ball: name, centre (ENU, m, (3,)) and radius (m)."""
-
-    name: str
-    center: npt.ArrayLike
-    radius: float
-
-    def __post_init__(self) -> None:
-        _point(self.name, "center", self.center)
-        _positive(self.name, "radius", self.radius)
-
-
-@dataclass(frozen=True)
-class Box:
-    """An upright box, such as a building.
-
-    Attributes
-    ----------
-    name
-        What an operator calls it.
-    center
-        ENU, m, (3,).
-    size
-        To its right, forwards and up, m, (3,).
-    azimuth
-        Of its forward direction, clockwise from north, rad.
-    """
-
-    name: str
-    center: npt.ArrayLike
-    size: npt.ArrayLike
-    azimuth: float = 0.0
-
-    def __post_init__(self) -> None:
-        _point(self.name, "center", self.center)
-        for value in _point(self.name, "size", self.size):
-            _positive(self.name, "size", float(value))
-        if not np.isfinite(self.azimuth):
-            raise InputError(f"volume {self.name}: azimuth {self.azimuth} rad is not finite")
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """A cylinder between two points of its axis, such as a tower or an approach corridor.
-
-    Attributes
-    ----------
-    name
-        What an operator calls it.
-    start, end
-        Centres of its two ends, ENU, m, (3,).
-    radius
-        m.
-    """
-
-    name: str
-    start: npt.ArrayLike
-    end: npt.ArrayLike
-    radius: float
-
-    def __post_init__(self) -> None:
-        way = _point(self.name, "end", self.end) - _point(self.name, "start", self.start)
-        if not np.linalg.norm(way) > 0.0:
-            raise InputError(f"volume {self.name}: its ends are one point; give two")
-        _positive(self.name, "radius", self.radius)
-
-
-@dataclass(frozen=True)
-class Prism:
-    """A polygon extruded upwards, such as a walkway, a site or a sector of the sky.
-
-    Attributes
-    ----------
-    name
-        What an operator calls it.
-    corners
-        Of the polygon in order, either way round, east and north, m, (K, 2), K ≥ 3.
-    bottom, top
-        Heights, m.
-    """
-
-    name: str
-    corners: npt.ArrayLike
-    bottom: float
-    top: float
-
-    def __post_init__(self) -> None:
-        corners = as_float(self.corners)
-        if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
-            raise InputError(
-                f"volume {self.name}: corners of shape {corners.shape}; give at least 3 points "
-                "of 2 numbers, (K, 2)"
-            )
-        if not (np.isfinite(corners).all() and np.isfinite([self.bottom, self.top]).all()):
-            raise InputError(f"volume {self.name}: a corner or height is not finite")
-        if not self.top > self.bottom:
-            raise InputError(
-                f"volume {self.name}: top {self.top:g} m must be above bottom {self.bottom:g} m"
-            )
-        if (np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) == 0.0).any():
-            raise InputError(f"volume {self.name}: two neighbouring corners are one point")
-
-
-Volume = Sphere | Box | Cylinder | Prism
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
+from heliotrope.geometry import FloatArray, as_float
 
 
 def packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
@@ -155,15 +46,3 @@ def packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
 
 def _head(row: FloatArray, kind: int, center: FloatArray, bound: float) -> None:
     row[0], row[1:4], row[4] = kind, center, bound
-
-
-def _point(name: str, what: str, value: npt.ArrayLike) -> FloatArray:
-    point = as_vectors(value, f"volume {name}: {what}")
-    if point.shape != (3,):
-        raise InputError(f"volume {name}: {what} of shape {point.shape}; give 3 numbers")
-    return point
-
-
-def _positive(name: str, what: str, value: float) -> None:
-    if not (np.isfinite(value) and value > 0.0):
-        raise InputError(f"volume {name}: {what} {value} m must be above 0 and finite")

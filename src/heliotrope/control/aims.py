@@ -6,10 +6,11 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.control._beams import crossing
-from heliotrope.control.beam_paths import Mirrors, Volume, beams, enter, move
+from heliotrope.control.beam_paths import Mirrors, beams, enter, move
 from heliotrope.control.eye import Hazard, glare_at
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
+from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
@@ -90,9 +91,9 @@ class BeamCheck:
     names
         Of the N heliostats, in the order of all arrays here.
     volumes
-        Where no beam may be.
+        Where no beam may be; None: those of the design.
     eyes
-        Places from where somebody may look into beams at rest, ENU, m, (P, 3).
+        Places from where somebody may look into beams at rest, ENU, m, (P, 3); None: the design's.
 
     Raises
     ------
@@ -101,13 +102,15 @@ class BeamCheck:
     """
 
     def __init__(
-        self, design: Plant, names: Sequence[str], volumes: Sequence[Volume],
-        eyes: npt.ArrayLike = (),
+        self, design: Plant, names: Sequence[str], volumes: Sequence[Volume] | None = None,
+        eyes: npt.ArrayLike | None = None,
     ) -> None:  # fmt: skip
         place = {name: i for i, name in enumerate(design.names)}
         rows = np.array([place[name] for name in names], dtype=np.intp)
-        self.names, self.volumes = tuple(names), tuple(volumes)
-        self.eyes = as_vectors(np.reshape(as_float(eyes), (-1, 3)), "eyes")
+        self.names = tuple(names)
+        self.volumes = tuple(design.keep_outs if volumes is None else volumes)
+        places = [*design.eyes.values()] if eyes is None else eyes
+        self.eyes = as_vectors(np.reshape(as_float(places), (-1, 3)), "eyes")
         self.armature = Armature(design.armature.table[rows])
         self.drives = Drive(design.drives.table[rows])
         groups = design.groups.values()
@@ -238,10 +241,59 @@ class BeamCheck:
                 f"the aim {_point(aims[i])} m: {Status(int(status[i])).text}"
             )
         good = status == Status.OK
-        if good.any() and sun[2] > 0.0:
+        if good.any():
             begin = Drive(self.drives.table[rows]).angles(counts)
             path = np.stack([begin, solved.chosen(solved.angles)], axis=-2)[good]
-            self._check_motion(found, rows[good], path, sun)
+            found |= self.moving(rows[good], path, sun)
+        return found
+
+    def around(
+        self, rows: npt.NDArray[np.intp], aims: FloatArray, radius: float, sun: FloatArray
+    ) -> dict[str, str]:
+        """Return whose beams would enter a volume near their aims (K, 3), by name.
+
+        Parameters
+        ----------
+        rows, aims, sun
+            As of `problems`.
+        radius
+            How far the beams move off their aims, rad. Nothing stops them there.
+        """
+        found: dict[str, str] = {}
+        if not (self.volumes and sun[2] > 0.0):
+            return found
+        solved = self.poses(rows, aims, sun)
+        vertices = solved.chosen(solved.vertex)
+        for k in np.flatnonzero(solved.chosen(solved.status) == Status.OK):
+            part = _rows_of(self.mirrors, rows[k : k + 1])
+            # Beams beside each other overlap: none is narrower than the mirror.
+            apart = 0.5 * float(np.hypot(part.width[0], part.height[0]))
+            points = _disc(vertices[k], aims[k], radius, apart)
+            many = Mirrors(**{name: np.repeat(v, len(points), 0) for name, v in vars(part).items()})
+            vertex = np.broadcast_to(vertices[k], points.shape)
+            rest = enter(beams(vertex, points, many, reach=np.full(len(points), FAR)), self.volumes)
+            hit = np.flatnonzero(rest.entered.any(axis=-1))[:1]
+            same = np.repeat(rows[k : k + 1], len(hit))
+            self._tell(found, same, rest.entered[hit], rest.first[hit], "while it searches")
+        return found
+
+    def moving(
+        self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
+    ) -> dict[str, str]:
+        """Return whose beams would enter a volume on a way of their axes, by name.
+
+        Parameters
+        ----------
+        rows
+            Of the heliostats, (K,).
+        path
+            Angles that the axes go through, W of them, rad, (K, W, 2).
+        sun
+            As of `problems`.
+        """
+        found: dict[str, str] = {}
+        if len(rows) and self.volumes and sun[2] > 0.0:
+            self._check_motion(found, rows, path, sun)
         return found
 
     def _sweep(
@@ -279,6 +331,21 @@ class BeamCheck:
 
 def _rows_of(mirrors: Mirrors, rows: npt.NDArray[np.intp]) -> Mirrors:
     return Mirrors(**{name: values[rows] for name, values in vars(mirrors).items()})
+
+
+def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:
+    """Return points (P, 3) of the disc that a cone of half angle ``radius`` makes at the aim."""
+    way = aim - eye
+    distance = float(np.linalg.norm(way))
+    right = np.cross(way, (0.0, 0.0, 1.0)) if way[:2].any() else np.array([1.0, 0.0, 0.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, way) / distance
+    wide = distance * float(np.tan(min(radius, 0.5)))
+    points = [aim]
+    for ring in np.linspace(0.0, wide, int(np.ceil(wide / apart)) + 1)[1:]:
+        turn = np.linspace(0.0, 2.0 * np.pi, int(np.ceil(2.0 * np.pi * ring / apart)) + 3)[:-1]
+        points += [aim + ring * (np.cos(t) * right + np.sin(t) * up) for t in turn]
+    return np.stack(points)
 
 
 def _point(point: FloatArray) -> str:

@@ -29,8 +29,9 @@ from heliotrope.control._beams import (
     crossing,
     reaches,
 )
-from heliotrope.control._volumes import Box, Cylinder, Prism, Sphere, Volume, packed
+from heliotrope.control._volumes import packed
 from heliotrope.errors import InputError
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive

@@ -204,6 +204,17 @@ class FieldState:
             raise UnknownNameError("value of a heliostat", field, NODE.names or ())
         return np.ma.MaskedArray(self.rows[field].copy(), mask=~self.live(now))
 
+    def counts(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        """Return the step counts of heliostats (K,) as last heard, (K, 2)."""
+        return self._pairs(rows, "primary", "secondary")
+
+    def goals(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        """Return where the step counts of heliostats (K,) were going, (K, 2)."""
+        return self._pairs(rows, "primary_goal", "secondary_goal")
+
+    def _pairs(self, rows: npt.NDArray[np.intp], *names: str) -> FloatArray:
+        return np.stack([self.rows[name][rows] for name in names], axis=-1).astype(np.float64)
+
     def among(self, wanted: Sequence[int], now: float) -> Mask:
         """Return which heliostats are live and in one of some states, (N,)."""
         return np.asarray(self.live(now) & np.isin(self.rows["state"], list(wanted)))

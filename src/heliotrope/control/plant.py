@@ -28,11 +28,11 @@ from heliotrope.control._pushing import Pusher, stored_items
 from heliotrope.control._sentinel import Sentinel
 from heliotrope.control._sun_line import sun_now
 from heliotrope.control._tickets import Ticket
+from heliotrope.control._ways import Lookout, Ways
 from heliotrope.control.aims import BeamCheck, default_aims
 from heliotrope.control.assigned import Assigned, Points, grouped, points_of
 from heliotrope.control.audit import Audit, AuditError
 from heliotrope.control.authority import Authority, Grant, Person, RefusedError, Role
-from heliotrope.control.beam_paths import Volume
 from heliotrope.control.clock import Clock, sleep_until
 from heliotrope.control.emergency import EmergencyOrder
 from heliotrope.control.field_state import FieldState
@@ -54,6 +54,7 @@ from heliotrope.control.protocol import (
 from heliotrope.control.safety import Act, Condition, conditions
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
+from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages as wire
 from heliotrope.lcu import states
@@ -86,7 +87,7 @@ class PlantController:
     settings
         Times and limits.
     volumes, eyes
-        Where no beam may be; from where people may look into beams at rest, ENU, m, (P, 3).
+        Where no beam may be; eyes, ENU, m, (P, 3), that look into beams; None: the design's.
     wanted
         What local controllers should hold.
     assigned
@@ -124,8 +125,8 @@ class PlantController:
         *,
         clusters: Mapping[str, Sequence[str]] | None = None,
         settings: PlantSettings | None = None,
-        volumes: Sequence[Volume] = (),
-        eyes: npt.ArrayLike = (),
+        volumes: Sequence[Volume] | None = None,
+        eyes: npt.ArrayLike | None = None,
         wanted: Wanted | None = None,
         assigned: Assigned | None = None,
         table: Iterable[Condition] | None = None,
@@ -153,18 +154,23 @@ class PlantController:
             clock, audit, self._ends, prefix, self.settings.lifetime, self.settings.patience
         )
         rows = conditions(self.settings.autonomy) if table is None else table
-        self._watch = PlantWatch(rows, tuple(held), self.settings.sensors, clock.monotonic())
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
+        looks = bool(self.beams.volumes)
+        self._watch = PlantWatch(
+            rows, tuple(held), self.settings.sensors, clock.monotonic(), looks=looks
+        )
         self._points = Points(self.field.names, assigned)
         self.aims, self.standbys = self._points.aims, self._points.standbys
         self._joiner = Joiner(
             self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector,
             self.settings.join_life,
         )  # fmt: skip
+        self._ways = Ways(self.beams, self.field, self.aims, self.standbys, self.sun_vector)
         self._sentinel = Sentinel(
             clock, design.site, self.field, self._ends, self._orders, self._joining,
-            self.authority, self._watch, self.beams.drives, self.settings.repeat,
+            self.authority, self._watch, self.beams.drives,
+            Lookout(self.beams, self.field, self.sun_vector), self.settings.repeat,
         )  # fmt: skip
         self._pusher = Pusher(self.field, self.wanted, self._orders, self._ask_stored)
         self._paid_at = -math.inf
@@ -503,14 +509,17 @@ class PlantController:
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         whom = tuple(dict.fromkeys(heliostats)) or self.field.names
+        clear, blocked = self._ways.clear(name, numbers, whom, self.now())
         ticket = self._accept(person, token, name, numbers, whom)
+        for heliostat, text in blocked.items():
+            ticket.advance((heliostat,), Stage.FAILED, text)
         if name not in SETTINGS:
             # What still waits to join must not undo what is commanded after it.
             self._joining.drop(f"{name} came after it", frozenset(whom))
         if name in JOINING:
-            self._join(ticket, name, numbers, whom, token)
+            self._join(ticket, name, numbers, clear, token)
         else:
-            self._orders.command(ticket, name, numbers, whom, token)
+            self._orders.command(ticket, name, numbers, clear, token)
         return ticket
 
     def default_aims(
@@ -597,16 +606,7 @@ class PlantController:
         rows = np.array([self.field.place(n) for n in whom], dtype=np.intp)
         wanted = points_of(name, points)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
-        start = np.where(tracking[:, None], self.aims[rows], self.standbys[rows])
-        stopped = name == "AIM"
-        light = self.sun_vector()
-        wrong = self.beams.problems(rows, wanted, light, start=start, stopped=stopped)
-        if not stopped:
-            wrong |= self.beams.glare(rows, wanted, self.standbys, light)
-        if wrong:
-            first, text = next(iter(wrong.items()))
-            more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-            raise RefusedError(f"{name} {first}{more}: {text}")
+        self._ways.check_points(name, rows, wanted, tracking)
         groups = grouped(whom, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         ticket = self._accept(person, token, name, values, whom, f"{len(groups)} points")
@@ -614,7 +614,7 @@ class PlantController:
             ticket.advance(whom, Stage.FAILED, f"not sent, since it is not kept: {problem}")
             return ticket
         self._joining.drop(f"another {name} came after it", frozenset(whom), name)
-        moving = {whom[i] for i in np.flatnonzero(tracking)} if stopped else set()
+        moving = {whom[i] for i in np.flatnonzero(tracking)} if name == "AIM" else set()
         for point, members in groups.items():
             still = [n for n in members if n not in moving]
             if still:

@@ -157,6 +157,30 @@ def start(
     return SafetyState(rows, now, {key: Track(seen=now) for key in keys})
 
 
+def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
+    """Return the state with a row evaluated for some subjects, besides those that it trips for.
+
+    For a row about heliostats, of which few are ever worth a look.
+
+    Parameters
+    ----------
+    state
+        As of :func:`start` or the last evaluation.
+    name
+        Of the row.
+    subjects
+        Whose readings are there.
+    """
+    tracks = {
+        key: track for key, track in state.tracks.items()
+        if key[0] != name or not key[1] or track.tripped_at is not None
+    }  # fmt: skip
+    for subject in subjects:
+        key = (name, subject)
+        tracks[key] = state.tracks.get(key, Track(seen=state.now))
+    return replace(state, tracks=tracks)
+
+
 def evaluate(
     readings: Mapping[Key, Reading], state: SafetyState, now: float
 ) -> tuple[SafetyState, list[Action]]:

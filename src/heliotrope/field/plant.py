@@ -11,6 +11,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.camera import Camera
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Receiver, Target
+from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
@@ -37,6 +38,10 @@ class Plant:
         Surfaces that beams are sent to.
     cameras
         That look at the targets.
+    keep_outs
+        Where no beam may be.
+    eyes
+        From where people may look into beams at rest, ENU, m, (3,), by name.
     """
 
     name: str
@@ -46,6 +51,8 @@ class Plant:
     receivers: tuple[Receiver, ...] = ()
     notes: Mapping[str, str] = field(default_factory=dict)
     cameras: tuple[Camera, ...] = ()
+    keep_outs: tuple[Volume, ...] = ()
+    eyes: Mapping[str, FloatArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         seen: dict[str, str] = {}
@@ -67,6 +74,10 @@ class Plant:
                 raise InputError(f"camera {camera.name}: the name occurs twice")
             for target in camera.targets:
                 self.target(target)
+        names = [volume.name for volume in self.keep_outs]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"keep-out volume {name}: the name occurs twice")
 
     def __len__(self) -> int:
         return sum(len(group) for group in self.groups.values())

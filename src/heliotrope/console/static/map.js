@@ -179,6 +179,20 @@ export class FieldMap {
     c.fillStyle = night ? "#e8eaed" : "#202428";
     c.beginPath(); c.arc(tx, ty, 5, 0, 2 * Math.PI); c.fill();
     c.fillText("tower", tx + 8, ty - 6);
+    this.drawKeepOuts(c, night);
+  }
+
+  drawKeepOuts(c, night) {
+    // Where no beam may be.
+    c.strokeStyle = c.fillStyle = night ? "#ff8a5c" : "#c04a00"; c.lineWidth = 1.5; c.setLineDash([6, 4]);
+    for (const { name, outline } of store.field.keep_outs) {
+      const places = outline.map(([east, north]) => this.toScreen(east, north));
+      c.beginPath(); places.forEach(([px, py], i) => (i ? c.lineTo(px, py) : c.moveTo(px, py))); c.closePath(); c.stroke();
+      const xs = places.map(([px]) => px), ys = places.map(([, py]) => py);
+      const left = Math.min(...xs), wide = Math.max(...xs) - left;
+      if (wide > 14) c.fillText(name, left, Math.min(...ys) - 5);
+    }
+    c.setLineDash([]);
   }
 
   drawMarks(c, half, night) {

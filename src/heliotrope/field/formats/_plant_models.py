@@ -110,6 +110,55 @@ class CameraTable(Strict):
     deviation_px: Annotated[float, Field(ge=0)] = 0.0
 
 
+class BoxTable(Strict):
+    """``[[keep_out]]`` of kind box: an upright box, such as a building."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["box"]
+    center_m: Vector
+    size_m: Annotated[list[Positive], Field(min_length=3, max_length=3)] = Field(
+        description="To its right, forwards and up."
+    )
+    azimuth_deg: Number = Field(0.0, description="Of its forward direction.")
+    azimuth_rad: Number | None = Field(None, description="Instead, as the writer leaves it.")
+
+
+class SphereTable(Strict):
+    """``[[keep_out]]`` of kind sphere."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["sphere"]
+    center_m: Vector
+    radius_m: Positive
+
+
+class CylinderTable(Strict):
+    """``[[keep_out]]`` of kind cylinder, such as a mast or an approach corridor."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["cylinder"]
+    start_m: Vector = Field(description="Centre of one end.")
+    end_m: Vector = Field(description="Centre of the other.")
+    radius_m: Positive
+
+
+class PrismTable(Strict):
+    """``[[keep_out]]`` of kind prism: a polygon extruded upwards, such as a walkway."""
+
+    name: str = Field(min_length=1)
+    kind: Literal["prism"]
+    corners_m: Annotated[
+        list[Annotated[list[Number], Field(min_length=2, max_length=2)]], Field(min_length=3)
+    ] = Field(description="East and north of each, in order.")
+    bottom_m: Number
+    top_m: Number
+
+
+AnyVolume = Annotated[
+    BoxTable | SphereTable | CylinderTable | PrismTable, Field(discriminator="kind")
+]
+
+
 class ChainTable(Strict):
     """``chain``: a mechanism number by number, as the writer leaves it."""
 
@@ -205,3 +254,9 @@ class PlantDocument(Strict):
     targets: list[TargetTable] = Field(default_factory=list)
     receivers: list[ReceiverTable] = Field(default_factory=list)
     cameras: list[CameraTable] = Field(default_factory=list)
+    keep_out: list[AnyVolume] = Field(
+        default_factory=list, description="Volumes where no beam may be."
+    )
+    eyes_m: dict[str, Vector] = Field(
+        default_factory=dict, description="From where people may look into beams at rest."
+    )

@@ -24,6 +24,7 @@ from heliotrope.field.formats._plant_cameras import (
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
+from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.formats._textfile import write_text
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
@@ -68,7 +69,8 @@ def _models() -> list[Any]:
     return [
         models.PlantDocument, models.PlantTable, models.SiteTable, models.TargetTable,
         models.MarkTable, models.ReceiverTable, models.CameraTable, models.GroupTable,
-        models.ChainTable, models.RotaryDrive, models.LinearDrive,
+        models.ChainTable, models.RotaryDrive, models.LinearDrive, models.BoxTable,
+        models.SphereTable, models.CylinderTable, models.PrismTable,
     ]  # fmt: skip
 
 
@@ -84,7 +86,7 @@ def _assemble(
         pressure=document.site.pressure_pa, temperature_c=document.site.temperature_c,
         name=document.site.name, delta_t=document.site.delta_t_s,
     )  # fmt: skip
-    groups, targets, receivers, cameras = {}, [], [], []
+    groups, targets, receivers, cameras, keep_outs = {}, [], [], [], []
     for group in sorted(set(table.group) - set(document.groups)):
         known = ", ".join(document.groups)
         problems.append(
@@ -118,11 +120,17 @@ def _assemble(
             cameras.append(build_camera(camera))
         except InputError as error:
             problems.append(FormatError(path, str(error), f"cameras[{k}]"))
+    for k, volume in enumerate(document.keep_out):
+        try:
+            keep_outs.append(build_volume(volume))
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"keep_out[{k}]"))
+    eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
     if problems:
         return None
     try:
         return Plant(document.plant.name, site, groups, tuple(targets), tuple(receivers),
-                     cameras=tuple(cameras))  # fmt: skip
+                     cameras=tuple(cameras), keep_outs=tuple(keep_outs), eyes=eyes)  # fmt: skip
     except InputError as error:
         problems.append(FormatError(path, str(error)))
         return None
@@ -213,6 +221,8 @@ def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"]
         ],
         "receivers": [_receiver_document(r) for r in plant.receivers],
         "cameras": [camera_document(camera) for camera in plant.cameras],
+        "keep_out": [volume_document(volume) for volume in plant.keep_outs],
+        "eyes_m": {name: np.asarray(point).tolist() for name, point in plant.eyes.items()},
         "groups": groups,
     }
     write_text(place, tomli_w.dumps(document))

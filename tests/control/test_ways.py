@@ -1,0 +1,219 @@
+"""Commands that move axes by counts are proven too: no beam enters a keep-out volume."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.control.aims import BeamCheck
+from heliotrope.control.authority import RefusedError
+from heliotrope.control.beam_paths import Sphere
+from heliotrope.control.clock import VirtualClock, run_virtual
+from heliotrope.control.plant import PlantController
+from heliotrope.control.protocol import Emergency
+from heliotrope.field.example import prototype
+from heliotrope.lcu import states
+from heliotrope.mechanism.tracking import track
+from plant_bench import ENGINEER, OPERATOR, Bench, running
+
+#: South of the tower; P5A stands due south of it and shines to the tower.
+WALKWAY = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)
+WEST, EAST = (-8.0, 0.0, 8.0), (8.0, 0.0, 16.5)
+DESIGN = replace(prototype(), keep_outs=(WALKWAY,))
+
+
+def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> Bench:
+    """Run a scene in virtual time, on a plant that declares the walkway."""
+    made: list[Bench] = []
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, folder, design=DESIGN)
+        made.append(bench)
+        async with running(bench):
+            await scene(bench)
+
+    run_virtual(main)
+    return made[0]
+
+
+def counts(plant: PlantController, name: str, point: tuple[float, float, float]) -> list[int]:
+    """The step counts that put the beam of a heliostat on a point."""
+    group, row = DESIGN.find(name)
+    found = track(group.mechanism[row], plant.sun_vector(), point)
+    return [round(float(x)) for x in found.chosen(found.counts)]
+
+
+async def stands(bench: Bench, name: str, state: int, at: list[int]) -> None:
+    """Let a heliostat report that it stands at counts."""
+    cluster = bench.cluster_of(name)
+    cluster.set(state, name)
+    row = cluster.names.index(name)
+    for end, value in zip(("primary", "secondary"), at, strict=True):
+        cluster.rows[end][row] = cluster.rows[f"{end}_goal"][row] = value
+    await bench.wait(2.0)
+
+
+def test_a_move_by_counts_through_a_volume_is_refused(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded(ENGINEER)
+        west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
+        await stands(bench, "P5A", states.IDLE, west)
+        text = r"P5A: the beam enters walkway \d+ m from the mirror on its way"
+        with pytest.raises(RefusedError, match="GOTO " + text):
+            plant.command(ENGINEER, token, "GOTO", ("P5A",), east)
+        # One axis alone, right across the middle of it.
+        middle = counts(plant, "P5A", (0.0, -12.0, 8.0))
+        for axis in (0, 1):
+            begin = [n - 200_000 * (axis == i) for i, n in enumerate(middle)]
+            await stands(bench, "P5A", states.IDLE, begin)
+            with pytest.raises(RefusedError, match="JOG " + text):
+                plant.command(ENGINEER, token, "JOG", ("P5A",), (axis, 400_000))
+            # Away from it, and a little towards it.
+            for steps in (-10_000, 1_000):
+                assert await plant.command(ENGINEER, token, "JOG", ("P5A",), (axis, steps)).end(5.0)
+        await stands(bench, "P5A", states.IDLE, west)
+        # One of two: the other is sent.
+        ticket = plant.command(ENGINEER, token, "GOTO", ("P5A", "P5B"), east)
+        assert not await ticket.end(5.0)
+        assert list(ticket.refusals) == ["P5A"]
+        # There is no such axis: the local controller says so.
+        plant.command(ENGINEER, token, "JOG", ("P5A",), (7, 10))
+
+    bench = play(tmp_path, scene)
+    assert [m.heliostats for m in bench.cluster_of("P5A").commands("GOTO")] == [("P5B",)]
+
+
+def test_a_diagnosis_beside_a_volume_is_refused(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded(ENGINEER)
+        for east, clear in ((-8.0, True), (-1.9, False)):
+            await stands(bench, "P5A", states.IDLE, counts(plant, "P5A", (east, -12.0, 8.0)))
+            if clear:
+                assert plant.command(ENGINEER, token, "DIAGNOSE", ("P5A",))
+            else:
+                with pytest.raises(RefusedError, match="DIAGNOSE P5A: the beam enters walkway"):
+                    plant.command(ENGINEER, token, "DIAGNOSE", ("P5A",))
+
+    play(tmp_path, scene)
+
+
+def test_to_standby_only_where_the_way_is_clear(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        plant.standby(OPERATOR, token, {"P5A": EAST})
+        await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", EAST))
+        assert await plant.command(OPERATOR, token, "IDLE", ("P5A",)).end(5.0)
+        await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", WEST))
+        with pytest.raises(RefusedError, match="IDLE P5A: the beam enters walkway"):
+            plant.command(OPERATOR, token, "IDLE", ("P5A",))
+        # Off is always possible.
+        assert await plant.command(OPERATOR, token, "STOW", ("P5A",)).end(300.0)
+
+    play(tmp_path, scene)
+
+
+def test_a_search_does_not_reach_into_a_volume(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        aim = (-6.0, 0.0, 14.0)
+        assert await plant.aim(OPERATOR, token, {"P5A": aim}).end(5.0)
+        await stands(bench, "P5A", states.IDLE, counts(plant, "P5A", aim))
+        narrow = plant.command(OPERATOR, token, "SEARCH", ("P5A",), (2e-3, 1e-2))
+        assert await narrow.end(10.0)
+        wide = plant.command(OPERATOR, token, "SEARCH", ("P5A",), (2e-2, 0.3))
+        assert not await wide.end(10.0)
+        assert "walkway" in wide.refusals["P5A"]
+        assert "while it searches" in wide.refusals["P5A"]
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.05, 0.2, 0.4])
+def test_a_search_is_wide_enough_as_seen_by_single_beams(radius: float) -> None:
+    """Whatever a beam at a random offset enters, the check of the search has found."""
+    rng = np.random.default_rng(int(1000 * radius))
+    sun = np.array([0.3, -0.4, 0.866])
+    sun /= np.linalg.norm(sun)
+    names, rows = DESIGN.names, np.array([DESIGN.names.index("P5A")], dtype=np.intp)
+    mirror = DESIGN.position[rows[0]]
+    aim = np.array([[0.5, 0.0, 15.0]])
+    hits = 0
+    for _ in range(60):
+        place = mirror + rng.uniform(0.3, 0.9) * (aim[0] - mirror) + rng.normal(0.0, 3.0, 3)
+        check = BeamCheck(DESIGN, names, [Sphere("ball", place, 0.3)])
+        way = aim[0] - mirror
+        right = np.cross(way, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        up = np.cross(right, way) / np.linalg.norm(way)
+        turn, off = rng.uniform(0, 2 * np.pi), np.linalg.norm(way) * np.tan(radius) * 0.95
+        point = aim + off * (np.cos(turn) * right + np.sin(turn) * up)
+        nowhere = np.full((1, 3), np.nan)
+        single = check.problems(rows, point, sun, start=nowhere, stopped=False)
+        if any("enters" in text for text in single.values()):
+            hits += 1
+            assert check.around(rows, aim, radius, sun)
+    assert hits > 0
+
+
+def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
+    rows = np.array([0], dtype=np.intp)
+    path = np.array([[[0.0, 0.0], [6.0, 1.5]]])
+    aim = np.array([[0.0, 0.0, 15.0]])
+    for design, sun in ((DESIGN, (0.0, 0.6, -0.8)), (prototype(), (0.0, -0.6, 0.8))):
+        check = BeamCheck(design, design.names)
+        assert check.moving(rows, path, np.array(sun)) == {}
+        assert check.around(rows, aim, 0.3, np.array(sun)) == {}
+
+
+@pytest.mark.parametrize("commanded", [True, False])
+def test_who_goes_into_a_volume_is_held(commanded: bool, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        assert "keep_out_predicted" not in plant.unwatched
+        if commanded:
+            await bench.commanded()
+        west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
+        inside = counts(plant, "P5B", (0.0, -12.0, 8.0))
+        cluster = bench.cluster_of("P5A")
+        # P5C goes to stow across it, which is never held up; the beam of P5B stands in it.
+        for name, state, begin, end in (
+            ("P5A", states.IDLE, west, east), ("P5B", states.TRACKING, inside, inside),
+            ("P5C", states.STOWING, counts(plant, "P5C", WEST), counts(plant, "P5C", EAST)),
+        ):  # fmt: skip
+            cluster.set(state, name)
+            row = cluster.names.index(name)
+            for axis, what in enumerate(("primary", "secondary")):
+                cluster.rows[what][row] = begin[axis]
+                cluster.rows[f"{what}_goal"][row] = end[axis]
+        await bench.wait(6.0)
+        told = [a for a in plant.alarms if a.condition == "keep_out_predicted" and a.active]
+        assert {a.subject for a in told} == {"P5A", "P5B"}
+        # They are held, so that nothing moves into it any more.
+        await bench.wait(8.0)
+        over = [a for a in plant.alarms if a.condition == "keep_out_predicted" and not a.active]
+        assert {a.subject for a in over} == {"P5A", "P5B"}
+
+    bench = play(tmp_path, scene)
+    cluster = bench.cluster_of("P5A")
+    if commanded:
+        assert {m.heliostats for m in cluster.commands("LOCK")} == {("P5A",), ("P5B",)}
+        assert not cluster.of(Emergency)
+    else:
+        assert {m.heliostats for m in cluster.of(Emergency)} == {("P5A",), ("P5B",)}
+        assert not cluster.commands("LOCK")
+
+
+def test_without_volumes_nobody_is_looked_at(tmp_path: Path) -> None:
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, tmp_path)
+        async with running(bench):
+            await bench.wait(2.0)
+            assert "keep_out_predicted" in bench.plant.unwatched
+
+    run_virtual(main)
