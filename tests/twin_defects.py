@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import plant_defects
-from heliotrope.control import _nodes, _reports, _watch
+from heliotrope.control import _nodes, _reports, _watch, aims
 from heliotrope.control.protocol import Stage
 from heliotrope.lcu import (
     controller,
@@ -170,6 +170,11 @@ def _approach_swapped(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(motion, "SECONDARY_FIRST", stepper.PRIMARY_FIRST)
 
 
+def _beams_not_proven(patch: pytest.MonkeyPatch) -> None:
+    """What enters a volume is seen, and told to nobody."""
+    patch.setattr(aims.BeamCheck, "_tell", lambda *_: None)
+
+
 def _acceptance_lost(patch: pytest.MonkeyPatch) -> None:
     add = _reports.Reports.add
 
@@ -238,6 +243,7 @@ DEFECTS = (
     Defect((9,), "a jump back extends the lease", _jump_extends_lease,
            ("tick_jump", "cluster_crash"), 3.0, first=4),
     Defect((10,), "approach with elevation first", _approach_swapped, ("line_drop",), 60.0),
+    Defect((10,), "beams not proven", _beams_not_proven, ("line_drop",), 60.0, first=1),
     Defect((11,), "acceptance never reported", _acceptance_lost, ("line_drop",), 60.0),
     Defect((11,), "every value told as new", _always_new, ("bus_bad", "power_cut"), 10.0),
     Defect((11,), "an acknowledgement makes a row young", _young_by_any_answer, ("bus_bad",), 5.0),

@@ -38,7 +38,14 @@ from heliotrope.lcu import messages, states, wire
 from heliotrope.twin._account import Account, fingerprint
 from heliotrope.twin.board import Board
 from heliotrope.twin.ledger import FrameLedger, Order, OrderLedger, Sent
-from heliotrope.twin.outfit import LIMITS, RANGES, RECEIVER, STOW
+from heliotrope.twin.outfit import (
+    KEEP_OUT,
+    KEEP_OUT_RADIUS,
+    LIMITS,
+    RANGES,
+    RECEIVER,
+    STOW,
+)
 
 #: Gives the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]
@@ -101,7 +108,8 @@ BY_COMMAND = {
 }  # fmt: skip
 #: States that a boot may lead to.
 AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
-#: What DEFOCUS and STOW never leave a mirror in.
+#: What DEFOCUS and STOW never leave a mirror in: its beam is out by command, and no way of it may
+#: lead through a keep-out volume.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
 #: States that a command asks for: what DONE must mean.
 ASKED = {
@@ -563,6 +571,12 @@ class Observer:
             if passed > STOW_WITHIN and account.must_stow(why):
                 saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {STOW}"
                 self.check(2, account.place() == STOW, now, name, saw)
+        if board.state in ON_THE_WAY:
+            miss = board.miss(sun, KEEP_OUT, believed=True)
+            saw = (
+                f"{states.STATES[board.state]}, its beam is {miss:.1f} m from the middle of a house"
+            )
+            self.check(10, miss > KEEP_OUT_RADIUS, now, name, saw)
         if on_way:
             miss = board.miss(sun, RECEIVER, believed=True)
             saw = f"{states.STATES[board.state]}, its beam passes the receiver at {miss:.1f} m"

@@ -20,7 +20,7 @@ from heliotrope.control.link import LinkClosedError
 from heliotrope.control.plant import PlantController
 from heliotrope.control.protocol import Command, encode
 from heliotrope.control.safety import Act
-from heliotrope.twin.outfit import RECEIVER, STANDBY
+from heliotrope.twin.outfit import KEEP_OUT, RECEIVER, STANDBY
 from heliotrope.twin.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.pod import PlantEar, Pod
 
@@ -157,8 +157,8 @@ class Operator:
             self._acknowledge(plant)
             does = self._chance.choices(
                 [self._onward, self._everybody, self._parameters, self._emergency, self._one_safe,
-                 self._lock, self._wrong, self._change],
-                [60, 14, 8, 4, 2, 3, 5, 4],
+                 self._lock, self._wrong, self._change, self._astray],
+                [60, 14, 8, 4, 2, 3, 5, 4, 4],
             )[0]  # fmt: skip
             does(plant)
             if self._chance.random() < 0.06:
@@ -188,6 +188,24 @@ class Operator:
     def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
         self.counts["accepted"] += 1
         self._observer.accepted(who, token, ticket, what, self._clock.monotonic())
+
+    def _astray(self, plant: PlantController) -> None:
+        """Ask for what would lead a beam through the house, which is to be refused."""
+        name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
+        point = self._points((name,), KEEP_OUT, 0.5)
+        what = self._chance.choice(["AIM", "STANDBY", "SEARCH"])
+        self.counts["commands"] += 1
+        try:
+            if what == "AIM":
+                ticket = plant.aim(self._duty, mine, point)
+            elif what == "STANDBY":
+                ticket = plant.standby(self._duty, mine, point)
+            else:
+                ticket = plant.command(self._duty, mine, what, (name,), (0.05, 0.5))
+        except RefusedError:
+            self.counts["refused"] += 1
+            return
+        self._accepted(self._duty, mine, ticket, what)
 
     def _points(
         self, names: Sequence[str], about: tuple[float, float, float], size: float

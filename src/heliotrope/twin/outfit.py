@@ -28,6 +28,8 @@ RANGES = ((-20_000, 406_000), (-4000, 104_000))
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
+#: Middle and radius of a ball that no beam may enter; nothing leads there that is not asked for.
+KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
 #: Imperfections that are drawn.
 CAUSES = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
 #: A cluster has no more.

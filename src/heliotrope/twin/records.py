@@ -1,7 +1,9 @@
 """Records of commands on a simulated disk, which may be full and outlasts the plant."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 
+from heliotrope.control.assigned import Places
 from heliotrope.control.audit import STOPPED, AuditError, Record
 from heliotrope.errors import InputError
 
@@ -107,3 +109,18 @@ class SimulatedAudit:
 
     def close(self) -> None:
         """End it: everything is on the disk."""
+
+
+class AssignedDisk:
+    """Assigned points on a disk that outlasts the plant's program; an `assigned.Assigned`."""
+
+    def __init__(self) -> None:
+        self._points: dict[str, Places] = {}
+
+    def read(self) -> dict[str, Places]:
+        """Return what is kept, by kind."""
+        return {kind: dict(places) for kind, places in self._points.items()}
+
+    def keep(self, points: Mapping[str, Places]) -> None:
+        """Keep all points in place of those before."""
+        self._points = {kind: dict(places) for kind, places in points.items()}

@@ -26,6 +26,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
+from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.sun import Site, vector
@@ -36,10 +37,17 @@ from heliotrope.twin.damage import Damage
 from heliotrope.twin.faults import Fault
 from heliotrope.twin.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.operator import Operator
-from heliotrope.twin.outfit import RECEIVER, Outfit, mechanisms, outfits
+from heliotrope.twin.outfit import (
+    KEEP_OUT,
+    KEEP_OUT_RADIUS,
+    RECEIVER,
+    Outfit,
+    mechanisms,
+    outfits,
+)
 from heliotrope.twin.plant_observer import PlantObserver
 from heliotrope.twin.pod import PlantEar, Pod
-from heliotrope.twin.records import RecordsDisk, SimulatedAudit
+from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.tapped import TappedLink
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
@@ -77,7 +85,8 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: 
     receiver = Receiver(
         "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
     )
-    return Plant("simulation", site, {"all": group}, receivers=(receiver,))
+    house = Sphere("house", KEEP_OUT, KEEP_OUT_RADIUS)
+    return Plant("simulation", site, {"all": group}, receivers=(receiver,), keep_outs=(house,))
 
 
 @dataclass(frozen=True)
@@ -232,7 +241,8 @@ class Simulation:
         self.pods = self._new_pods()
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         self._design, self._homes = design_of(fits, homes, SITE), homes
-        self._wanted = Wanted()  # what is wanted of the boards outlasts the plant's program
+        # What is wanted of the boards, and assigned to them, outlasts the plant's program.
+        self._wanted, self._assigned = Wanted(), AssignedDisk()
         self.disk = RecordsDisk()
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
@@ -301,7 +311,8 @@ class Simulation:
         audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         plant = self.plant = PlantController(
             self._design, links, self._clock, audit, clusters=self._homes, settings=SETTINGS,
-            wanted=self._wanted, table=TABLE, entropy=self._chance.randbytes,
+            wanted=self._wanted, assigned=self._assigned, table=TABLE,
+            entropy=self._chance.randbytes,
         )  # fmt: skip
         self.operator.begins(plant)
         self._program = [group.create_task(link.run()) for link in links.values()]
