@@ -24,6 +24,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.intercept import intercept_rectangle
 from heliotrope.field.layouts import lay_out
 from heliotrope.field.target import Receiver, Target
+from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import normalize
 from heliotrope.store.records import StoreError
 from heliotrope.twin.live import LiveOptions, LivePlant
@@ -222,9 +223,20 @@ def test_a_store_that_keeps_nothing_is_an_alarm_and_stops_nothing() -> None:
 # -- a plant at work -----------------------------------------------------------------------------
 
 
-def live(work: Callable[[LivePlant], Awaitable[None]], settings: WorkSettings) -> None:
-    """Run four heliostats on two clusters in virtual time."""
+def live(
+    work: Callable[[LivePlant], Awaitable[None]], settings: WorkSettings,
+    keep_out: tuple[int, float] | None = None,
+) -> None:  # fmt: skip
+    """Run four heliostats on two clusters in virtual time.
+
+    ``keep_out``: a volume stands in the way of one of them to the receiver, at a share of it.
+    """
     design = lay_out("radial", 4)
+    if keep_out is not None:
+        row, share = keep_out
+        middle = design.receivers[0].center
+        place = design.position[row] + share * (middle - design.position[row])
+        design = replace(design, keep_outs=(Sphere("mast", place, 0.2),))
     (group,) = design.groups.values()
     group = replace(group, cluster=("C1", "C1", "C2", "C2"))
     options = LiveOptions(rendered=False, threads=0, plain=True, work=settings)
@@ -237,6 +249,26 @@ def live(work: Callable[[LivePlant], Awaitable[None]], settings: WorkSettings) -
             await plant.end()
 
     run_virtual(main, start=START)
+
+
+def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.names[3]
+        await asyncio.sleep(600.0)
+        field = plant.plant.field
+        found = {each: field.of(each, plant.plant.now()).state for each in plant.names}
+        assert found.pop(name) == "IDLE"
+        assert set(found.values()) == {"TRACKING"}
+        (alarm,) = [a for a in shown.alarms() if a.condition == "beam_blocked"]
+        assert alarm.subject == name
+        assert "the beam enters mast" in alarm.text
+        # What was in the way is gone: within five minutes it joins, and the alarm is over.
+        plant.plant.beams.volumes = ()
+        await asyncio.sleep(330.0)
+        assert field.of(name, plant.plant.now()).state == "TRACKING"
+        assert not [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
+
+    live(work, WorkSettings(wanted=True, calibrate=False, margin=0.0), keep_out=(3, 0.3))
 
 
 def test_what_a_plant_shows() -> None:

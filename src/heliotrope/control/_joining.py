@@ -114,8 +114,7 @@ class Joiner:
         """Send those whose turn it is."""
         for job, part in self._queue.admit(now, token):
             wrong = self._problems(job, part) if self._beams.volumes else {}
-            for name, text in wrong.items():
-                job.ticket.advance((name,), Stage.FAILED, text)
+            job.ticket.block(wrong)
             clear = [name for name in part if name not in wrong]
             self._orders.command(job.ticket, job.name, job.values, clear, token, self._life)
 

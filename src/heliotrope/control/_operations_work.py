@@ -7,8 +7,9 @@ calibrated goes to the receiver only if it would miss every target by a wide mar
 """
 
 import asyncio
+import functools
 import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -27,6 +28,8 @@ from heliotrope.control._operations_views import (
     Planned,
     Running,
 )
+from heliotrope.control._tickets import Ticket
+from heliotrope.control._ways import BeamError
 from heliotrope.control.authority import Person, RefusedError, Role
 from heliotrope.control.calibration_cycle import CycleResult
 from heliotrope.control.clock import sleep_until
@@ -45,6 +48,8 @@ _READY = (states.IDLE, states.TRACKING)
 
 #: Looks at the sun, s apart.
 _SUN_EVERY = 30.0
+#: Whose beam would enter a keep-out volume is tried again after this time, s.
+_BLOCKED = 300.0
 
 
 class Photographer(Protocol):
@@ -153,6 +158,8 @@ class Automat:
         self._wanted = np.full(count, settings.wanted, dtype=np.bool_)
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
+        self._blocked: set[str] = set()
+        self._joins: list[Ticket] = []  # whose turn has not come for all
         self._running: dict[str, Running] = {}
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
         self._true: tuple[float, FloatArray] | None = None
@@ -358,6 +365,9 @@ class Automat:
         if self._why_idle():
             return
         plant, now = self._plant, self._plant.now()
+        for ticket in [ticket for ticket in self._joins if ticket.finished]:
+            self._block(ticket.blocked)
+            self._joins.remove(ticket)
         most = max(1, round(self._settings.rate * self._settings.beat))
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self._wanted & ~busy
@@ -365,21 +375,58 @@ class Automat:
         for state, name in ((states.STOWED, "APPROACH"), (states.DEFOCUSED, "IDLE")):
             rows = np.flatnonzero(free & plant.field.among((state,), now))[:most]
             if len(rows):
-                plant.command(AUTOMAT, self._token, name, self._names(rows))
                 self._note_told(rows, state)
+                self._give(rows, functools.partial(plant.command, AUTOMAT, self._token, name))
         able = free & (self._clear | np.isfinite(self.book.calibrated_at))
         rows = np.flatnonzero(able & plant.field.among((states.IDLE,), now))[:most]
         if len(rows) and self._aims and plant.waiting < most:
-            names = self._names(rows)
             self._note_told(rows, states.IDLE)
-            ticket = plant.aim(AUTOMAT, self._token, {name: self._aims[name] for name in names})
-            await ticket.end(10.0)
-            done = tuple(name for name in names if name not in ticket.refusals)
-            # A visit may have begun meanwhile: its aim must not be undone.
-            visited = {run.heliostat for run in self._running.values()}
-            done = tuple(name for name in done if name not in visited)
-            if done:
-                plant.command(AUTOMAT, self._token, "TRACK", done)
+            await self._join(rows)
+
+    async def _join(self, rows: npt.NDArray[np.intp]) -> None:
+        """Give heliostats their aims on the receiver, and send them there."""
+        plant, aims = self._plant, self._aims
+        given = self._give(
+            rows, lambda names: plant.aim(AUTOMAT, self._token, {n: aims[n] for n in names})
+        )
+        if given is None:
+            return
+        names, ticket = given
+        await ticket.end(10.0)
+        done = tuple(name for name in names if name not in ticket.refusals)
+        for name in self._blocked.intersection(done):
+            self._blocked.remove(name)
+            text = f"{name}: its beam has a way again"
+            self._log.take_alarm(Alarm("beam_blocked", name, "warning", text, False))
+        # A visit may have begun meanwhile: its aim must not be undone.
+        visited = {run.heliostat for run in self._running.values()}
+        done = tuple(name for name in done if name not in visited)
+        if done:
+            self._joins.append(plant.command(AUTOMAT, self._token, "TRACK", done))
+
+    def _give(
+        self, rows: npt.NDArray[np.intp], give: Callable[[tuple[str, ...]], Ticket]
+    ) -> tuple[tuple[str, ...], Ticket] | None:
+        """Give a command to those whose beams may do it; the others wait, and are named."""
+        names = self._names(rows)
+        while names:
+            try:
+                ticket = give(names)
+            except BeamError as error:
+                refusals = error.refusals
+            else:
+                self._block(ticket.blocked)
+                return names, ticket
+            self._block(refusals)
+            names = tuple(name for name in names if name not in refusals)
+        return None
+
+    def _block(self, refusals: Mapping[str, str]) -> None:
+        """Leave heliostats where they are until the sun has moved on."""
+        for name, text in refusals.items():
+            self._busy_until[self._plant.field.place(name)] = self._plant.now() + _BLOCKED
+            self._blocked.add(name)
+            self._log.take_alarm(Alarm("beam_blocked", name, "warning", f"{name}: {text}"))
 
     def _note_told(self, rows: npt.NDArray[np.intp], state: int) -> None:
         """Note who was commanded in which state: not again before something has come of it."""

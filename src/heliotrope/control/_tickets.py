@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -29,6 +29,8 @@ class Ticket:
         What, to whom.
     refusals
         Why it was refused or failed, by heliostat.
+    blocked
+        Of those, whose beams would have entered a keep-out volume.
     accepted_at
         Monotonic s.
     """
@@ -38,6 +40,7 @@ class Ticket:
     ) -> None:
         self.identity, self.name, self.heliostats = identity, name, tuple(heliostats)
         self.refusals: dict[str, str] = {}
+        self.blocked: dict[str, str] = {}
         self.accepted_at = clock.monotonic()
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
@@ -66,6 +69,12 @@ class Ticket:
                 self.refusals[self.heliostats[i]] = text or stage.value
         if index.size:
             self._news.set()
+
+    def block(self, refusals: Mapping[str, str]) -> None:
+        """End it for heliostats whose beams may not do it."""
+        self.blocked.update(refusals)
+        for name, text in refusals.items():
+            self.advance((name,), Stage.FAILED, text)
 
     def expect(self, heliostats: Iterable[str], until: float) -> None:
         """Say until when (monotonic s) heliostats must have acknowledged."""

@@ -27,6 +27,22 @@ _BEAM_OUT = (states.IDLE, states.TRACKING, states.SEARCHING)
 _TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
 
 
+class BeamError(RefusedError):
+    """A command that would bring beams where none may be.
+
+    Attributes
+    ----------
+    refusals
+        Why, by the names of the heliostats.
+    """
+
+    def __init__(self, command: str, refusals: dict[str, str]) -> None:
+        self.refusals = refusals
+        first, text = next(iter(refusals.items()))
+        more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
+        super().__init__(f"{command} {first}{more}: {text}")
+
+
 class Ways:
     """Says whose beams may not do what a command would make them do.
 
@@ -57,7 +73,7 @@ class Ways:
 
         Raises
         ------
-        RefusedError
+        BeamError
             If one of the beams may not go there.
         """
         start = np.where(tracking[:, None], self._aims[rows], self._standbys[rows])
@@ -66,7 +82,7 @@ class Ways:
         if not stopped:
             wrong |= self._beams.glare(rows, wanted, self._standbys, light)
         if wrong:
-            raise RefusedError(_told(name, wrong))
+            raise BeamError(name, wrong)
 
     def clear(
         self, name: str, values: Sequence[float], whom: tuple[str, ...], now: float
@@ -75,7 +91,7 @@ class Ways:
 
         Raises
         ------
-        RefusedError
+        BeamError
             If nobody may.
         """
         if not self._beams.volumes or name not in ("JOG", "GOTO", "DIAGNOSE", "IDLE"):
@@ -91,7 +107,7 @@ class Ways:
             path = self._by_counts(name, values, rows)
         wrong = self._beams.moving(rows, path, light)
         if wrong and len(wrong) == len(whom):
-            raise RefusedError(_told(name, wrong))
+            raise BeamError(name, wrong)
         return tuple(n for n in whom if n not in wrong), wrong
 
     def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
@@ -165,9 +181,3 @@ class Lookout:
         looked = {field.names[row] for row in rows}
         still = {field.names[row] for row in out} - looked
         self._names = frozenset(wrong) | (self._names & still)
-
-
-def _told(name: str, wrong: dict[str, str]) -> str:
-    first, text = next(iter(wrong.items()))
-    more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-    return f"{name} {first}{more}: {text}"

@@ -511,8 +511,7 @@ class PlantController:
         whom = tuple(dict.fromkeys(heliostats)) or self.field.names
         clear, blocked = self._ways.clear(name, numbers, whom, self.now())
         ticket = self._accept(person, token, name, numbers, whom)
-        for heliostat, text in blocked.items():
-            ticket.advance((heliostat,), Stage.FAILED, text)
+        ticket.block(blocked)
         if name not in SETTINGS:
             # What still waits to join must not undo what is commanded after it.
             self._joining.drop(f"{name} came after it", frozenset(whom))
