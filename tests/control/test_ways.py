@@ -209,6 +209,25 @@ def test_who_goes_into_a_volume_is_held(commanded: bool, tmp_path: Path) -> None
         assert not cluster.commands("LOCK")
 
 
+@pytest.mark.parametrize("field", [False, True])
+def test_who_goes_off_is_not_stopped_on_the_way(field: bool, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        await bench.commanded()
+        cluster = bench.cluster_of("P5A")
+        cluster.deaf.add("P5A")  # it does not show yet that it obeys
+        if field:
+            plant.raise_emergency("Vera")
+        else:
+            plant.defocus("Vera", ("P5A",))
+        await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", (0.0, -12.0, 8.0)))
+        await bench.wait(5.0)
+        assert [a for a in plant.alarms if a.condition == "keep_out_predicted" and a.active]
+
+    bench = play(tmp_path, scene)
+    assert not bench.cluster_of("P5A").commands("LOCK")
+
+
 def test_without_volumes_nobody_is_looked_at(tmp_path: Path) -> None:
     async def main(clock: VirtualClock) -> None:
         bench = Bench(clock, tmp_path)

@@ -23,6 +23,8 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.drives import Drive
 from heliotrope.sun import Site
 
+#: Who was sent off the receiver shows it after this time at the latest, s.
+OFF_SHOWS = 10.0
 #: The sun's elevation is computed so often, s.
 SUN_PERIOD = 5.0
 
@@ -73,6 +75,7 @@ class Sentinel:
         self._orders, self._joining, self._authority = orders, joining, authority
         self._watch, self._drives, self._repeat = watch, drives, repeat
         self._lookout = lookout
+        self._sent_off: dict[str, float] = {}
         self._repeated_at = self._sun_at = -math.inf
         self._sun: FloatArray = np.array([0.0, 0.0, -1.0])
 
@@ -134,9 +137,15 @@ class Sentinel:
                 self.send_safe(("safety table", "plant"), act, end.members, text)
 
     def _obey_heliostats(self) -> None:
-        """Hold mirrors where they are; without an authority they cannot be, and go off."""
-        token = self._authority.token
+        """Hold mirrors where they are; without an authority they cannot be, and go off.
+
+        Who is on its way off, which its state may not show yet, is not stopped there.
+        """
+        token, now = self._authority.token, self._clock.monotonic()
+        self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
         for name, text in self._watch.held().items():
+            if self.on or name in self._sent_off:
+                continue
             who = ("safety table", "plant")
             self._joining.drop(text, frozenset([name]))
             if token:
@@ -172,6 +181,7 @@ class Sentinel:
         """Send DEFOCUS or STOW to some heliostats."""
         ticket = self._orders.accept((*who, act.name), (), heliostats, note, late=True)
         self._orders.emergency(ticket, act, heliostats)
+        self._sent_off.update(dict.fromkeys(heliostats, self._clock.monotonic()))
         return ticket
 
     def repeat(self, ends: Iterable[ClusterEnd]) -> None:
