@@ -8,6 +8,7 @@ all answers to it.
 import asyncio
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -30,10 +31,16 @@ from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
+from heliotrope.field.volumes import Box, Cylinder, Volume
 from heliotrope.lcu import states
 from heliotrope.sun import Site
 
 MEMBERS = 32
+#: Where no beam of the benchmark goes.
+VOLUMES = (
+    Box("house", (0.0, -300.0, 5.0), (30.0, 20.0, 10.0)),
+    Cylinder("mast", (900.0, 0.0, 0.0), (900.0, 0.0, 60.0), 2.0),
+)
 #: Half a core is for the plant and the twin together.
 BUDGET_S = 0.5
 ORDER_BUDGET_S = 1.0
@@ -89,15 +96,27 @@ def _design(clusters: int) -> Plant:
 class _Run:
     """One plant, and what its parts took, s of CPU."""
 
-    def __init__(self, clock: VirtualClock, clusters: int, seconds: int, folder: Path) -> None:
+    def __init__(
+        self, clock: VirtualClock, clusters: int, seconds: int, folder: Path,
+        volumes: Sequence[Volume] = (),
+    ) -> None:  # fmt: skip
         self.clock, self.seconds = clock, seconds
         design = _design(clusters)
         self.names = design.names
         self.links = [_Direct(f"K{k:03d}") for k in range(clusters)]
         audit = JsonLines(folder / "audit.jsonl", clock.utc())
-        self.plant = PlantController(design, {x.name: x for x in self.links}, clock, audit)
-        self.rows = np.zeros(MEMBERS, NODE)
+        self.plant = PlantController(
+            design, {x.name: x for x in self.links}, clock, audit, volumes=volumes
+        )
+        self.rows = np.zeros(len(design), NODE)
         self.rows["state"] = states.TRACKING
+        # All stand where their beams are on the receiver.
+        everybody = np.arange(len(design), dtype=np.intp)
+        aims = np.broadcast_to(design.receivers[0].center, (len(design), 3))
+        found = self.plant.beams.poses(everybody, aims, self.plant.sun_vector())
+        counts = found.chosen(found.counts)
+        for axis, name in enumerate(("primary", "secondary")):
+            self.rows[name] = self.rows[f"{name}_goal"] = counts[:, axis]
 
     def _members(self, k: int) -> tuple[str, ...]:
         return self.names[k * MEMBERS : (k + 1) * MEMBERS]
@@ -107,7 +126,7 @@ class _Run:
             names = self._members(k) if greet else ()
             status = Status(
                 link.name, MEMBERS, 0.0, "gps", 1e-3, 3.0, 0.2, names=names,
-                block=self.rows.tobytes(),
+                block=self.rows[k * MEMBERS : (k + 1) * MEMBERS].tobytes(),
             )  # fmt: skip
             link.arrived.put_nowait(encode(status))
 
@@ -122,6 +141,9 @@ class _Run:
             begin = time.process_time()
             await asyncio.sleep(1.0)
             spent += time.process_time() - begin
+        for alarm in self.plant.alarms:
+            if alarm.condition == "keep_out_predicted":
+                raise BenchmarkError(f"a beam in a volume: {alarm.text}")
         live = int(self.plant.field.live(self.clock.monotonic()).sum())
         if live != len(self.names):
             raise BenchmarkError(f"{live} of {len(self.names)} heliostats are live")
@@ -155,22 +177,28 @@ class _Run:
 def run(quick: bool) -> Result:
     """Return the figures."""
     found: list[tuple[float, float, float]] = []
+    looking: list[float] = []
     clusters, seconds = (20, 2) if quick else (313, 20)
 
     async def main(clock: VirtualClock) -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            one = _Run(clock, clusters, seconds, Path(folder))
-            task = asyncio.create_task(one.plant.run())
-            steady = await one.steady()
-            found.append((steady, *await one.emergency()))
-            await one.plant.close()
-            await task
+        for volumes in (VOLUMES, ()):
+            with tempfile.TemporaryDirectory() as folder:
+                one = _Run(clock, clusters, seconds, Path(folder), volumes)
+                task = asyncio.create_task(one.plant.run())
+                steady = await one.steady()
+                if volumes:
+                    looking.append(steady)
+                else:
+                    found.append((steady, *await one.emergency()))
+                await one.plant.close()
+                await task
 
     for _ in range(1 if quick else 3):
         run_virtual(main)
     steady, out, answers = (min(column) for column in zip(*found, strict=True))
     rows: list[Row] = [
         {"work": "a second of operation", "cpu_s": steady, "budget_s": BUDGET_S},
+        {"work": "the same, two keep-out volumes", "cpu_s": min(looking), "budget_s": BUDGET_S},
         {"work": "order to all links", "cpu_s": out, "budget_s": ORDER_BUDGET_S},
         {"work": "all answers to it", "cpu_s": answers, "budget_s": None},
     ]
@@ -179,5 +207,5 @@ def run(quick: bool) -> Result:
         f"{clusters * MEMBERS:,} heliostats: {steady:.3f} s of CPU a second; an emergency order is "
         f"with all {clusters} links after {out:.3f} s of CPU",
         {"heliostats": clusters * MEMBERS, "clusters": clusters},
-        None if quick else steady <= BUDGET_S and out <= ORDER_BUDGET_S,
+        None if quick else max(steady, *looking) <= BUDGET_S and out <= ORDER_BUDGET_S,
     )
