@@ -51,7 +51,7 @@ def _fetch(work: Path) -> Path:
     (work / "lists" / "partial").mkdir(parents=True)
     settings = {
         "APT::Architecture": "i386", "APT::Architectures": "i386", "APT::Sandbox::User": "",
-        "Acquire::Languages": "none", "Dir::Etc::sourcelist": sources,
+        "Acquire::Languages": "none", "Acquire::Retries": "3", "Dir::Etc::sourcelist": sources,
         "Dir::Etc::sourceparts": "-", "Dir::State::lists": work / "lists", "Dir::Cache": work,
     }  # fmt: skip
     apt = ["apt-get", "-qq", *(f"-o{key}={value}" for key, value in settings.items())]
