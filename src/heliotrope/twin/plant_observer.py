@@ -213,15 +213,19 @@ class PlantObserver:
     def _bounded(
         self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
     ) -> None:
-        """In any span that ends now, no more mirrors join than the settings allow."""
+        """In any span that ends now, no more mirrors join than the settings allow.
+
+        What goes out when the plant goes on after it stood still may have been admitted earlier by
+        the life of the command: at the end of a span, and at its begin.
+        """
         rate, burst = self._settings.join_rate, self._settings.join_burst
-        if now - self._hung_at < 2.0 * self._settings.join_life:
-            slack += self._settings.join_life
+        life = self._settings.join_life
         count = 0
         for at, some in reversed(joined):
             count += some
             span = now - at
-            most = burst + rate * (span + slack) + 1e-6
+            held = min(abs(now - self._hung_at), abs(at - self._hung_at)) < 2.0 * life
+            most = burst + rate * (span + slack + life * held) + 1e-6
             saw = f"{count} mirrors {how} within {span:.2f} s, at most {most:.1f} may join"
             self.check(10, count <= most, now, saw)
             if span > 60.0:
