@@ -365,12 +365,14 @@ class Simulation:
         """Let boards, faults and observers go on until the end."""
         end, judged = self.begin + self.plan.seconds, self.begin
         while (now := self._clock.monotonic()) < end:
+            # What ends now has hindered until now.
+            hindered = [damage.hinders(pod) for pod in self.pods]
             damage.look(now, group)
             for board in self.boards:
                 if board.due(now) <= now:
                     board.step(now)
-            for pod in self.pods:
-                pod.look(now, hindered=damage.hinders(pod))
+            for pod, before in zip(self.pods, hindered, strict=True):
+                pod.look(now, hindered=before or damage.hinders(pod))
             if now >= judged:
                 for pod in self.pods:
                     pod.observer.look(now)
