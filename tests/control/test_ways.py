@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from heliotrope.control.aims import BeamCheck
+from heliotrope.control.assigned import rest_on
 from heliotrope.control.authority import RefusedError
 from heliotrope.control.beam_paths import Sphere
 from heliotrope.control.clock import VirtualClock, run_virtual
@@ -111,6 +112,12 @@ def test_to_standby_only_where_the_way_is_clear(tmp_path: Path) -> None:
         await stands(bench, "P5A", states.TRACKING, counts(plant, "P5A", WEST))
         with pytest.raises(RefusedError, match="IDLE P5A: the beam enters walkway"):
             plant.command(OPERATOR, token, "IDLE", ("P5A",))
+        await stands(bench, "P5B", states.DEFOCUSED, counts(plant, "P5B", WEST))
+        with pytest.raises(RefusedError, match="IDLE P5B: its standby point is not known here"):
+            plant.command(OPERATOR, token, "IDLE", ("P5B",))
+        rest_on(plant.standbys, (-12.0, 0.0, 8.0))
+        assert np.array_equal(plant.standbys[plant.field.place("P5A")], EAST)
+        assert await plant.command(OPERATOR, token, "IDLE", ("P5B",)).end(5.0)
         # Off is always possible.
         assert await plant.command(OPERATOR, token, "STOW", ("P5A",)).end(300.0)
 

@@ -100,18 +100,24 @@ class Ways:
         # Of whom nothing is known here, the local controller decides.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
         light = self._sun()
+        wrong: dict[str, str] = {}
         if name == "IDLE":
             rows = rows[self._field.among(_TO_STANDBY, now)[rows]]
-            rows, path = self._to_standby(rows, light)
+            known = np.isfinite(self._standbys[rows]).all(axis=-1)
+            wrong = {
+                self._field.names[row]: "its standby point is not known here; give it one "
+                "(STANDBY) first, or stow it"
+                for row in rows[~known]
+            }
+            rows, path = self._to_standby(rows[known], light)
         else:
             path = self._by_counts(name, values, rows)
-        wrong = self._beams.moving(rows, path, light)
+        wrong |= self._beams.moving(rows, path, light)
         if wrong and len(wrong) == len(whom):
             raise BeamError(name, wrong)
         return tuple(n for n in whom if n not in wrong), wrong
 
     def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
-        rows = rows[np.isfinite(self._standbys[rows]).all(axis=-1)]
         counts = self._field.counts(rows)
         found = self._beams.poses(rows, self._standbys[rows], light, counts)
         path = np.stack([self._angles(rows, counts), found.chosen(found.angles)], axis=-2)

@@ -155,6 +155,12 @@ class Points:
         return {self._names[int(i)]: tuple(array[i].tolist()) for i in known}
 
 
+def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:
+    """Take a point, ENU, m, as that of all who were assigned none: what their machines hold."""
+    if point is not None:
+        standbys[~np.isfinite(standbys).all(axis=-1)] = point
+
+
 def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
     """Return points by name as an array, ENU, m, (K, 3), in their order.
 

@@ -19,7 +19,7 @@ from heliotrope.control._operations_log import Logbook
 from heliotrope.control._operations_views import CalibrationEntry, Planned
 from heliotrope.control._operations_work import LeastKnown, Scheduling, WorkSettings
 from heliotrope.control._schedule_live import PlantSchedule, settings_for
-from heliotrope.control.assigned import Assigned
+from heliotrope.control.assigned import Assigned, rest_on
 from heliotrope.control.audit import Audit
 from heliotrope.control.calibration_cycle import CycleSettings
 from heliotrope.control.clock import SystemClock
@@ -132,6 +132,7 @@ class RealPlant:
 
     def _want(self, machine: Machine, cycle: CentringCycle | None) -> None:
         """Want of every local controller what the design and the last calibration say."""
+        rest_on(self.plant.standbys, machine.standby)
         for name in self.plant.field.names:
             group, row = self.design.find(name)
             mechanism = group.calibrated[row]

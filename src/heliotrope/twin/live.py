@@ -19,7 +19,7 @@ import numpy as np
 from heliotrope import sun
 from heliotrope.control._operations_cycle import CentringCycle
 from heliotrope.control._schedule_live import PlantSchedule, settings_for
-from heliotrope.control.assigned import Assigned
+from heliotrope.control.assigned import Assigned, rest_on
 from heliotrope.control.audit import Audit, Record
 from heliotrope.control.calibration_cycle import CycleSettings
 from heliotrope.control.clock import VirtualClock
@@ -201,6 +201,7 @@ class LivePlant:
             settings=chosen.plant or PlantSettings(), assigned=assigned,
             on_alarm=self.logbook.take_alarm,
         )  # fmt: skip
+        rest_on(self.plant.standbys, self.machine.standby)
         # The plant's rows go cluster by cluster, the field's as the design has them.
         self._rows = np.array([group.index(name) for name in self.plant.field.names])
         aims = self.plant.default_aims()

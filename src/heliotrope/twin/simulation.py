@@ -41,6 +41,7 @@ from heliotrope.twin.outfit import (
     KEEP_OUT,
     KEEP_OUT_RADIUS,
     RECEIVER,
+    STANDBY,
     Outfit,
     mechanisms,
     outfits,
@@ -243,6 +244,7 @@ class Simulation:
         self._design, self._homes = design_of(fits, homes, SITE), homes
         # What is wanted of the boards, and assigned to them, outlasts the plant's program.
         self._wanted, self._assigned = Wanted(), AssignedDisk()
+        self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
