@@ -366,7 +366,7 @@ class Automat:
             return
         plant, now = self._plant, self._plant.now()
         for ticket in [ticket for ticket in self._joins if ticket.finished]:
-            self._block(ticket.blocked)
+            self._block(ticket.blocked, states.IDLE)
             self._joins.remove(ticket)
         most = max(1, round(self._settings.rate * self._settings.beat))
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
@@ -375,19 +375,20 @@ class Automat:
         for state, name in ((states.STOWED, "APPROACH"), (states.DEFOCUSED, "IDLE")):
             rows = np.flatnonzero(free & plant.field.among((state,), now))[:most]
             if len(rows):
-                self._note_told(rows, state)
-                self._give(rows, functools.partial(plant.command, AUTOMAT, self._token, name))
+                give = functools.partial(plant.command, AUTOMAT, self._token, name)
+                self._give(rows, state, give)
         able = free & (self._clear | np.isfinite(self.book.calibrated_at))
         rows = np.flatnonzero(able & plant.field.among((states.IDLE,), now))[:most]
         if len(rows) and self._aims and plant.waiting < most:
-            self._note_told(rows, states.IDLE)
             await self._join(rows)
 
     async def _join(self, rows: npt.NDArray[np.intp]) -> None:
         """Give heliostats their aims on the receiver, and send them there."""
         plant, aims = self._plant, self._aims
         given = self._give(
-            rows, lambda names: plant.aim(AUTOMAT, self._token, {n: aims[n] for n in names})
+            rows,
+            states.IDLE,
+            lambda names: plant.aim(AUTOMAT, self._token, {n: aims[n] for n in names}),
         )
         if given is None:
             return
@@ -405,7 +406,7 @@ class Automat:
             self._joins.append(plant.command(AUTOMAT, self._token, "TRACK", done))
 
     def _give(
-        self, rows: npt.NDArray[np.intp], give: Callable[[tuple[str, ...]], Ticket]
+        self, rows: npt.NDArray[np.intp], state: int, give: Callable[[tuple[str, ...]], Ticket]
     ) -> tuple[tuple[str, ...], Ticket] | None:
         """Give a command to those whose beams may do it; the others wait, and are named."""
         names = self._names(rows)
@@ -415,16 +416,18 @@ class Automat:
             except BeamError as error:
                 refusals = error.refusals
             else:
-                self._block(ticket.blocked)
+                self._note_told(np.array([self._plant.field.place(n) for n in names]), state)
+                self._block(ticket.blocked, state)
                 return names, ticket
-            self._block(refusals)
+            self._block(refusals, state)
             names = tuple(name for name in names if name not in refusals)
         return None
 
-    def _block(self, refusals: Mapping[str, str]) -> None:
+    def _block(self, refusals: Mapping[str, str], state: int) -> None:
         """Leave heliostats where they are until the sun has moved on."""
         for name, text in refusals.items():
-            self._busy_until[self._plant.field.place(name)] = self._plant.now() + _BLOCKED
+            row = self._plant.field.place(name)
+            self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
             self._blocked.add(name)
             self._log.take_alarm(Alarm("beam_blocked", name, "warning", f"{name}: {text}"))
 
