@@ -262,6 +262,14 @@ def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
         (alarm,) = [a for a in shown.alarms() if a.condition == "beam_blocked"]
         assert alarm.subject == name
         assert "the beam enters mast" in alarm.text
+        # Whoever takes it elsewhere has seen to it; it comes back, and is named again.
+        shown.stow(VIEWER, (name,))
+        await asyncio.sleep(60.0)
+        assert not [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
+        shown.give_back(OPERATOR, (name,))
+        await asyncio.sleep(900.0)
+        assert field.of(name, plant.plant.now()).state == "IDLE"
+        assert [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
         # What was in the way is gone: within five minutes it joins, and the alarm is over.
         plant.plant.beams.volumes = ()
         await asyncio.sleep(330.0)

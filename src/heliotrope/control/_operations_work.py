@@ -365,9 +365,7 @@ class Automat:
         if self._why_idle():
             return
         plant, now = self._plant, self._plant.now()
-        for ticket in [ticket for ticket in self._joins if ticket.finished]:
-            self._block(ticket.blocked, states.IDLE)
-            self._joins.remove(ticket)
+        self._look_at_blocked()
         most = max(1, round(self._settings.rate * self._settings.beat))
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
         free = self._wanted & ~busy
@@ -395,10 +393,6 @@ class Automat:
         names, ticket = given
         await ticket.end(10.0)
         done = tuple(name for name in names if name not in ticket.refusals)
-        for name in self._blocked.intersection(done):
-            self._blocked.remove(name)
-            text = f"{name}: its beam has a way again"
-            self._log.take_alarm(Alarm("beam_blocked", name, "warning", text, False))
         # A visit may have begun meanwhile: its aim must not be undone.
         visited = {run.heliostat for run in self._running.values()}
         done = tuple(name for name in done if name not in visited)
@@ -430,6 +424,18 @@ class Automat:
             self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
             self._blocked.add(name)
             self._log.take_alarm(Alarm("beam_blocked", name, "warning", f"{name}: {text}"))
+
+    def _look_at_blocked(self) -> None:
+        """Name who was refused when its turn to join came; who is elsewhere now is not any more."""
+        for ticket in [ticket for ticket in self._joins if ticket.finished]:
+            self._joins.remove(ticket)
+            self._block(ticket.blocked, states.IDLE)
+        for name in sorted(self._blocked):
+            row = self._plant.field.place(name)
+            if self._plant.field.rows["state"][row] != self._told_in[row]:
+                self._blocked.remove(name)
+                text = f"{name}: it is no longer where it had no way"
+                self._log.take_alarm(Alarm("beam_blocked", name, "warning", text, False))
 
     def _note_told(self, rows: npt.NDArray[np.intp], state: int) -> None:
         """Note who was commanded in which state: not again before something has come of it."""
