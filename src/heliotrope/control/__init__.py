@@ -1,1 +1,0 @@
-"""Three tiers: the plant, its clusters, and the links between them."""
