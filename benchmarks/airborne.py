@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._run import BenchmarkError, Call, Result, Row, timed
-from heliotrope.airborne.detection import decode
+from heliotrope.airborne.evaluate.detection import decode
+from heliotrope.airborne.evaluate.reading import Seen, look, read_photo
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.reading import Seen, look, read_photo
-from heliotrope.airborne.rendering import render_flight
-from heliotrope.airborne.simulation import Errors, Flight, fly, hover_grid, look_counts
+from heliotrope.airborne.simulate.rendering import render_flight
+from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, hover_grid, look_counts
 from heliotrope.airborne.standing import Standing, standing
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Facets, Heliostats

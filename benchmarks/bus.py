@@ -15,14 +15,14 @@ import time
 from collections.abc import Iterator
 
 from benchmarks._run import ROOT, BenchmarkError, Result, Row
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.serial_bus import BusSettings, SerialBus
+from heliotrope.cluster.serial_bus import BusSettings, SerialBus
 from heliotrope.lcu import wire
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
 
 sys.path.append(str(ROOT / "tests"))
 
-from paced_pty import PacedBus
+from support.paced_pty import PacedBus
 
 HELIOSTATS = 32
 BAUD_RATES = (19_200, 115_200, 921_600)

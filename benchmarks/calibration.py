@@ -14,7 +14,7 @@ from scipy.optimize import least_squares, minimize
 
 from benchmarks import _artist
 from benchmarks._run import BenchmarkError, Result, Row, agree, peak_bytes, timed
-from heliotrope.calibration.estimator import fit
+from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.sightings import ray_directions, sightings
 from heliotrope.geometry import direction, reflect, tangent_axes
 from heliotrope.mechanism import kinds, parameters

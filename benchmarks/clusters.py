@@ -14,14 +14,14 @@ from typing import ClassVar
 import numpy as np
 
 from benchmarks._run import Result, Row
-from heliotrope.control._nodes import SEQUENCES, STATUS, STEPS
-from heliotrope.control.clock import Clock, SystemClock, VirtualClock, run_virtual
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
-from heliotrope.control.link import LinkClosedError, Outcome, Statistics, running
-from heliotrope.control.protocol import Lease, Status, decode, encode
-from heliotrope.control.timekeeping import SystemTime
+from heliotrope.cluster._nodes import SEQUENCES, STATUS, STEPS
+from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.lcu import messages, wire
+from heliotrope.links.clock import Clock, SystemClock, VirtualClock, run_virtual
+from heliotrope.links.link import LinkClosedError, Outcome, Statistics, running
+from heliotrope.links.messages import Lease, Status, decode, encode
 from heliotrope.sun import Site
 
 HELIOSTATS = 32

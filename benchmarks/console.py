@@ -59,7 +59,7 @@ class Heard:
 
 def serve(pipe: Connection, folder: str, heliostats: int) -> None:
     """Run a plant with its console; answer what the pipe asks. The body of a process."""
-    from heliotrope.twin._live_loop import PacedLoop
+    from heliotrope.twin.live.loop import PacedLoop
 
     with asyncio.Runner(loop_factory=lambda: PacedLoop(1.0)) as runner:
         runner.run(_serve(pipe, Path(folder), heliostats))
@@ -69,12 +69,12 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     from heliotrope.console import _secrets
     from heliotrope.console.serve import ConsoleServer
     from heliotrope.console.settings import ConsoleSettings
-    from heliotrope.control.clock import VirtualClock
-    from heliotrope.control.link import running
     from heliotrope.field.layouts import malan_plant
+    from heliotrope.links.clock import VirtualClock
+    from heliotrope.links.link import running
     from heliotrope.store.keeper import Keeper
-    from heliotrope.twin.field_bus import FieldBus
-    from heliotrope.twin.live import LiveOptions, LivePlant
+    from heliotrope.twin.field.field_bus import FieldBus
+    from heliotrope.twin.live.live import LiveOptions, LivePlant
 
     loop = asyncio.get_running_loop()
     keeper, heard = Keeper(folder / "store.sqlite"), Heard(heliostats)
@@ -122,8 +122,8 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
 
 def _acknowledged(plant: Any) -> list[float]:
     """Return a list into which the time goes when the last heliostat has acknowledged."""
-    from heliotrope.control.emergency import EmergencyOrder
-    from heliotrope.control.protocol import Stage
+    from heliotrope.links.messages import Stage
+    from heliotrope.plant.emergency import EmergencyOrder
 
     when: list[float] = []
     take, told = EmergencyOrder.take_stage, set()

@@ -17,20 +17,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks._run import BenchmarkError, Result, Row
-from heliotrope.control._sun_line import sun_values
-from heliotrope.control.clock import VirtualClock, gps_seconds, run_virtual
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
-from heliotrope.control.link import LinkClosedError, Outcome, Statistics, running
-from heliotrope.control.protocol import Acknowledge, Command, Emergency, Lease, Message, encode
+from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
+from heliotrope.cluster.controller import Cluster
 from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
+from heliotrope.links.link import LinkClosedError, Outcome, Statistics, running
+from heliotrope.links.messages import Acknowledge, Command, Emergency, Lease, Message, encode
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
 from heliotrope.sun import Site, vector
-from heliotrope.twin.clocks import SimulatedTime
-from heliotrope.twin.field import Field
-from heliotrope.twin.field_bus import FieldBus
-from heliotrope.twin.outfit import LIMITS, RANGES, STEPS_PER_TURN, STOW
+from heliotrope.sun.line import sun_values
+from heliotrope.twin.boards.clocks import SimulatedTime
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, STEPS_PER_TURN, STOW
+from heliotrope.twin.field.field import Field
+from heliotrope.twin.field.field_bus import FieldBus
 
 EACH = 32
 SITE = Site(37.4, -6.0, 100.0)

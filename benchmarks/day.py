@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._run import BenchmarkError, Result, Row
-from heliotrope.control._schedule_live import settings_for
-from heliotrope.control.clock import VirtualClock, VirtualLoop
-from heliotrope.control.schedule import Scheduler, Weather
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD
+from heliotrope.links.clock import VirtualClock, VirtualLoop
+from heliotrope.plant.schedule.live import settings_for
+from heliotrope.plant.schedule.schedule import Scheduler, Weather
 from heliotrope.sun import vector
 from heliotrope.twin.days import Days
-from heliotrope.twin.live import CYCLE, LiveOptions, LivePlant
+from heliotrope.twin.live.live import CYCLE, LiveOptions, LivePlant
 
 #: Midsummer, an hour after midnight, UTC.
 BEGIN = datetime(2026, 6, 21, 1, 0, tzinfo=UTC)

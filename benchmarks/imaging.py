@@ -18,15 +18,21 @@ import numpy as np
 from benchmarks._run import BenchmarkError, Call, Result, Row, Times, timed
 from heliotrope.field.formats.paint import read_tower
 from heliotrope.field.target import Target
-from heliotrope.imaging.background import from_frame
-from heliotrope.imaging.baseline import moments_centroid, threshold_centroid
-from heliotrope.imaging.beams import gaussian_beam
+from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.photograph import read_photograph
-from heliotrope.imaging.reading import read_image, write_image
-from heliotrope.imaging.rectify import rectify
-from heliotrope.imaging.rendering import Scene, Sensor, example_camera, example_target, exposed
-from heliotrope.imaging.rendering import render as render_scene
-from heliotrope.imaging.view import View
+from heliotrope.imaging.spots.background import from_frame
+from heliotrope.imaging.spots.baseline import moments_centroid, threshold_centroid
+from heliotrope.imaging.synthetic.rendering import (
+    Scene,
+    Sensor,
+    example_camera,
+    example_target,
+    exposed,
+)
+from heliotrope.imaging.synthetic.rendering import render as render_scene
+from heliotrope.imaging.targets.rectify import rectify
+from heliotrope.imaging.targets.view import View
+from heliotrope.optics.mirror_image import gaussian_beam
 
 #: One photograph to a sighting may take so many times its decoding.
 BUDGET = 1.5

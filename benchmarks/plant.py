@@ -14,11 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks._run import BenchmarkError, Result, Row
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.link import LinkClosedError, Outcome, Statistics
-from heliotrope.control.plant import PlantController
-from heliotrope.control.protocol import (
+from heliotrope.field.example import azimuth_elevation
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver
+from heliotrope.field.volumes import Box, Cylinder, Volume
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.link import LinkClosedError, Outcome, Statistics
+from heliotrope.links.messages import (
     NODE,
     Emergency,
     Progress,
@@ -27,12 +31,8 @@ from heliotrope.control.protocol import (
     decode,
     encode,
 )
-from heliotrope.field.example import azimuth_elevation
-from heliotrope.field.heliostats import Heliostats
-from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver
-from heliotrope.field.volumes import Box, Cylinder, Volume
-from heliotrope.lcu import states
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.controller import PlantController
 from heliotrope.sun import Site
 
 MEMBERS = 32

@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 
 from heliotrope import sun
 from heliotrope.field.image import image_offsets
-from heliotrope.field.intercept import beam_sigma, intercept_circle
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
+from heliotrope.optics.intercept import beam_sigma, intercept_circle
 
 SITE = sun.Site(-33.93, 18.87, 120.0)
 AIM = np.array([0.0, 0.0, 13.0])

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliotrope import sun
-from heliotrope.calibration.estimator import Calibration, fit
+from heliotrope.calibration.fit.estimator import Calibration, fit
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.calibration.uncertainty import expected
 from heliotrope.geometry import FloatArray, angle_between, reflect

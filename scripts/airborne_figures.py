@@ -18,9 +18,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from heliotrope.airborne.flight_pictures import heliostat_drawing
-from heliotrope.airborne.orientation import measure
-from heliotrope.airborne.trial import Conditions, four_facets, scene
+from heliotrope.airborne.evaluate.orientation import measure
+from heliotrope.airborne.evaluate.pictures import heliostat_drawing
+from heliotrope.airborne.simulate.trial import Conditions, four_facets, scene
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial" / "airborne.md"

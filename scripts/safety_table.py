@@ -3,15 +3,15 @@
 import math
 from pathlib import Path
 
-from heliotrope.control import safety
-from heliotrope.control.safety import Act, Condition, Watcher
+from heliotrope.safety import evaluation as safety
+from heliotrope.safety.evaluation import Act, Condition, Watcher
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "safety.md"
 
 _INTRO = """\
 # Safety
 
-What trips, what is then done, and when it ends is one table (`heliotrope.control.safety`). The
+What trips, what is then done, and when it ends is one table (`heliotrope.safety.evaluation`). The
 plant, the clusters and the local controllers evaluate the rows that name them; the evaluation is
 a pure function of readings, state and monotonic time. This page is made from the table by
 `scripts/safety_table.py`.

@@ -16,12 +16,12 @@ from typing import Any
 from heliotrope.console import _secrets
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.control.clock import VirtualClock
-from heliotrope.control.link import running
 from heliotrope.field.layouts import malan_plant
+from heliotrope.links.clock import VirtualClock
+from heliotrope.links.link import running
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin._live_loop import PacedLoop
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.twin.live.live import LiveOptions, LivePlant
+from heliotrope.twin.live.loop import PacedLoop
 
 NAME = "engineer"
 CHROMIUM = "/usr/bin/chromium"

@@ -20,10 +20,10 @@ from heliotrope.field.formats.paint import Tower, read_calibration_properties, r
 from heliotrope.field.target import Target
 from heliotrope.geometry import geodetic_to_enu
 from heliotrope.imaging.annotate import annotate
+from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.hybrid import Hybrid, compose
 from heliotrope.imaging.photograph import Photograph, read_crop, read_photograph
-from heliotrope.imaging.reading import read_image, write_image
+from heliotrope.imaging.synthetic.hybrid import Hybrid, compose
 
 Floats = npt.NDArray[np.float64]
 

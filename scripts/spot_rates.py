@@ -26,12 +26,11 @@ import numpy as np
 from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, direction
-from heliotrope.imaging.background import EmptyTarget
-from heliotrope.imaging.beams import Beam, reflected_beam
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
-from heliotrope.imaging.quality import Expectation
-from heliotrope.imaging.rendering import (
+from heliotrope.imaging.spots.background import EmptyTarget
+from heliotrope.imaging.spots.quality import Expectation
+from heliotrope.imaging.synthetic.rendering import (
     Lens,
     Paint,
     Rendered,
@@ -45,6 +44,7 @@ from heliotrope.imaging.rendering import (
     exposed,
     render,
 )
+from heliotrope.optics.mirror_image import Beam, reflected_beam
 
 TARGET = example_target(8.0)
 #: Off by more than this is wrong, m.

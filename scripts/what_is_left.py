@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliotrope.calibration import drift, evaluation
-from heliotrope.calibration.assessment import ENOUGH, assess
-from heliotrope.calibration.drift import DAY, Process
-from heliotrope.calibration.estimator import fit
-from heliotrope.calibration.learning import Learned, learn, left_out_errors
+from heliotrope.calibration import evaluation
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.learn import drift
+from heliotrope.calibration.learn.assessment import ENOUGH, assess
+from heliotrope.calibration.learn.drift import DAY, Process
+from heliotrope.calibration.learn.learning import Learned, learn, left_out_errors
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.heliostats import Heliostats

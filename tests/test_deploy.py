@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from heliotrope.control.real_links import TABLES, read_links
-from heliotrope.control.safety import CONDITIONS, Watcher
 from heliotrope.errors import FormatError
 from heliotrope.lcu import messages, names, states
+from heliotrope.plant.links_file import TABLES, read_links
+from heliotrope.safety.evaluation import CONDITIONS, Watcher
 
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
@@ -216,7 +216,7 @@ def test_the_plant_has_time_to_stow() -> None:
 
 @pytest.mark.parametrize(("kind", "name"), [("conf", "mosquitto.conf"), ("acl", "mosquitto.acl")])
 def test_the_brokers_files_are_those_that_are_tried(kind: str, name: str) -> None:
-    """tests/control/test_mqtt.py starts a real Mosquitto with the blocks of the page."""
+    """tests/links/test_mqtt.py starts a real Mosquitto with the blocks of the page."""
     page = (ROOT / "docs" / "how-to" / "mqtt.md").read_text(encoding="utf-8")
     block = re.search(rf"```{kind}\n(.*?)^```", page, re.S | re.M)
     assert block

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from data import juelich
-from heliotrope.calibration import report
+from heliotrope.calibration.report import page as report
 from heliotrope.cli import main
+from support.data import juelich
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -9,7 +9,7 @@ def main() -> None:
     """Run every kernel once on a small case."""
     import numpy as np
 
-    from heliotrope.calibration.estimator import fit
+    from heliotrope.calibration.fit.estimator import fit
     from heliotrope.calibration.sightings import sightings
     from heliotrope.mechanism import kinds
     from heliotrope.mechanism.tracking import track

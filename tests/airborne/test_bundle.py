@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drone_case import camera, field, flight
-from heliotrope.airborne.bundle import (
+from heliotrope.airborne.evaluate.bundle import (
     Adjusted,
     Corners,
     Priors,
@@ -16,11 +15,19 @@ from heliotrope.airborne.bundle import (
     jacobian_matrix,
     residuals,
 )
-from heliotrope.airborne.simulation import Errors, Flight, fly, hover_grid, install, look_counts
+from heliotrope.airborne.simulate.simulation import (
+    Errors,
+    Flight,
+    fly,
+    hover_grid,
+    install,
+    look_counts,
+)
 from heliotrope.airborne.standing import join_standing, standing
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import rotation
+from support.drone_case import camera, field, flight
 
 SIGMA = 0.1 / 1140.0
 OFFSET = (0.018, -0.018, 0.017)

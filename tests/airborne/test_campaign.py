@@ -12,22 +12,22 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from drone_case import ORIGIN, camera, field, plant
-from heliotrope.airborne import campaign
-from heliotrope.airborne._stations import read_stations
-from heliotrope.airborne.campaign import Campaign, Pose
-from heliotrope.airborne.detection import decode
+from heliotrope.airborne.evaluate import campaign
+from heliotrope.airborne.evaluate.campaign import Campaign, Pose
+from heliotrope.airborne.evaluate.detection import decode
+from heliotrope.airborne.evaluate.reading import Seen
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import LedCamera, read_photos
-from heliotrope.airborne.reading import Seen
-from heliotrope.airborne.rendering import write_photo
-from heliotrope.airborne.simulation import Errors, hover_grid, install, look_counts
+from heliotrope.airborne.plan.stations import read_stations
+from heliotrope.airborne.simulate.rendering import write_photo
+from heliotrope.airborne.simulate.simulation import Errors, hover_grid, install, look_counts
 from heliotrope.airborne.standing import Standing
-from heliotrope.cli._drone_evaluate import _far_off, _natural
-from heliotrope.cli._drone_evaluate import evaluate as evaluate_command
-from heliotrope.cli._drone_simulate import simulate as simulate_command
+from heliotrope.cli.drone.evaluate import _far_off, _natural
+from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
+from heliotrope.cli.drone.simulate import simulate as simulate_command
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.formats import plant_file
+from support.drone_case import ORIGIN, camera, field, plant
 
 app = typer.Typer()
 app.command("evaluate")(evaluate_command)
@@ -208,7 +208,7 @@ def test_what_is_wrong_with_a_flight_does_not_stop_the_others(flown: Path, tmp_p
 
 
 def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> None:
-    from heliotrope.airborne import evaluation
+    from heliotrope.airborne.evaluate import evaluation
 
     read, calls = evaluation.read_photo, []
 

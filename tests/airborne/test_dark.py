@@ -5,19 +5,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from drone_case import camera, flight
-from heliotrope.airborne import rendering
-from heliotrope.airborne._dark import expected_feet
-from heliotrope.airborne.bundle import Priors
-from heliotrope.airborne.campaign import Pose, evaluate_campaign
-from heliotrope.airborne.evaluation import evaluate
+from heliotrope.airborne.evaluate._dark import expected_feet
+from heliotrope.airborne.evaluate.bundle import Priors
+from heliotrope.airborne.evaluate.campaign import Pose, evaluate_campaign
+from heliotrope.airborne.evaluate.evaluation import evaluate
+from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
+from heliotrope.airborne.evaluate.reading import Seen, look
+from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal, measured_normal
-from heliotrope.airborne.orientation import measure_field, rotation_between
-from heliotrope.airborne.reading import Seen, look
-from heliotrope.airborne.reflections import Reflections
-from heliotrope.airborne.simulation import Errors, Flight, exact_reflections
+from heliotrope.airborne.simulate import rendering
+from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
 from heliotrope.airborne.standing import Standing, standing
 from heliotrope.errors import InputError
+from support.drone_case import camera, flight
 
 MRAD = 1e-3
 PRIORS = Priors(offset=0.005, position=0.005)

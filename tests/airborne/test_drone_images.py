@@ -10,24 +10,25 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from drone_case import ORIGIN, camera, field, flight, plant
-from heliotrope.airborne import evaluation, rendering
-from heliotrope.airborne.bundle import Priors
-from heliotrope.airborne.detection import decode, find_outlines, find_patches, find_spots
-from heliotrope.airborne.identification import identify
+from heliotrope.airborne.evaluate import evaluation
+from heliotrope.airborne.evaluate.bundle import Priors
+from heliotrope.airborne.evaluate.detection import decode, find_outlines, find_patches, find_spots
+from heliotrope.airborne.evaluate.identification import identify
+from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
+from heliotrope.airborne.evaluate.reading import Seen, look, read_photo
+from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal
-from heliotrope.airborne.orientation import measure_field, rotation_between
 from heliotrope.airborne.photo import Photo, read_camera, read_photos, rotation_of_gimbal
 from heliotrope.airborne.pinhole import project
-from heliotrope.airborne.reading import Seen, look, read_photo
-from heliotrope.airborne.reflections import Reflections
-from heliotrope.airborne.simulation import Errors, Flight, exact_reflections
+from heliotrope.airborne.simulate import rendering
+from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
 from heliotrope.airborne.standing import Standing, standing
-from heliotrope.cli._drone_evaluate import evaluate as evaluate_command
-from heliotrope.cli._drone_rtk import rtk as rtk_command
-from heliotrope.cli._drone_simulate import simulate as simulate_command
+from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
+from heliotrope.cli.drone.rtk import rtk as rtk_command
+from heliotrope.cli.drone.simulate import simulate as simulate_command
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import plant_file
+from support.drone_case import ORIGIN, camera, field, flight, plant
 
 OFFSET = (0.018, -0.018, 0.016)
 MRAD = 1e-3

@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
-from drone_case import HOVER, field, flight
 from heliotrope.airborne.mirror import measured_normal
-from heliotrope.airborne.simulation import Errors, exact_reflections, look_counts, reflections_of
+from heliotrope.airborne.simulate.simulation import (
+    Errors,
+    exact_reflections,
+    look_counts,
+    reflections_of,
+)
 from heliotrope.airborne.standing import outline, read_commands, standing, write_commands
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.geometry import angle_between, normalize
+from support.drone_case import HOVER, field, flight
 
 EXACT = Errors(
     rtk=(1e-9,) * 3, gimbal=0.0, survey=0.0, slope=0.0, reflection=0.0, mechanism={}

@@ -10,11 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.airborne import flight_pictures, flight_report
-from heliotrope.airborne._report_drawing import Panel, round_below
-from heliotrope.airborne._report_drawing import numbered as ticks_of
-from heliotrope.airborne.budget import Budget
-from heliotrope.airborne.flight_report import (
+from heliotrope.airborne.evaluate import pictures as flight_pictures
+from heliotrope.airborne.evaluate import report as flight_report
+from heliotrope.airborne.evaluate._report_drawing import Panel, round_below
+from heliotrope.airborne.evaluate._report_drawing import numbered as ticks_of
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.orientation import Orientations, measure
+from heliotrope.airborne.evaluate.reflections import (
+    join,
+    read_reflections,
+    reflections,
+    write_reflections,
+)
+from heliotrope.airborne.evaluate.report import (
     Flown,
     difference_rows,
     facet_rows,
@@ -24,15 +32,8 @@ from heliotrope.airborne.flight_report import (
     write_campaign_report,
     write_flight_report,
 )
-from heliotrope.airborne.orientation import Orientations, measure
-from heliotrope.airborne.reflections import (
-    join,
-    read_reflections,
-    reflections,
-    write_reflections,
-)
-from heliotrope.airborne.trial import Conditions, four_facets, scene
-from heliotrope.calibration import report
+from heliotrope.airborne.simulate.trial import Conditions, four_facets, scene
+from heliotrope.calibration.report import page as report
 from heliotrope.errors import FormatError, InputError
 
 SHAPE = four_facets()

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from heliotrope.airborne.budget import Budget, Noise, lever
-from heliotrope.airborne.mirror import MirrorShape, measured_normal, orientation, reflection_points
-from heliotrope.airborne.orientation import (
+from heliotrope.airborne.evaluate.budget import Budget, Noise, lever
+from heliotrope.airborne.evaluate.orientation import (
     Orientations,
     differences,
     measure,
@@ -15,12 +14,13 @@ from heliotrope.airborne.orientation import (
     rotation_between,
     turned,
 )
-from heliotrope.airborne.reflections import Reflections, join, reflections
-from heliotrope.airborne.sightings import to_sightings
-from heliotrope.airborne.trial import Conditions, Trials, four_facets, scene, table, trials
+from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
+from heliotrope.airborne.evaluate.sightings import to_sightings
+from heliotrope.airborne.mirror import MirrorShape, measured_normal, orientation, reflection_points
+from heliotrope.airborne.simulate.trial import Conditions, Trials, four_facets, scene, table, trials
 from heliotrope.calibration import sightings as kinds
-from heliotrope.calibration.estimator import fit
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, direction, normalize, reflect, tangent_axes
 from heliotrope.mechanism.kinds import azimuth_elevation

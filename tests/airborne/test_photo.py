@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drone_case import ORIGIN, camera
 from heliotrope.airborne import pinhole
 from heliotrope.airborne.photo import (
     LedCamera,
@@ -20,8 +19,9 @@ from heliotrope.airborne.photo import (
     rotation_of_gimbal,
     write_camera,
 )
-from heliotrope.airborne.rendering import write_photo
+from heliotrope.airborne.simulate.rendering import write_photo
 from heliotrope.errors import FormatError, InputError
+from support.drone_case import ORIGIN, camera
 
 TIME = datetime(2026, 6, 21, 10, 0, 0, 250_000, tzinfo=UTC)
 PICTURE = np.full((60, 80, 3), 90, np.uint8)

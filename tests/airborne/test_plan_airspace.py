@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.airborne.airspace import Airspace, KeepOut, inside, path_length, tower
-from heliotrope.airborne.flight_files import read_airspace
+from heliotrope.airborne.plan.airspace import Airspace, KeepOut, inside, path_length, tower
+from heliotrope.airborne.plan.flight_files import read_airspace
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
 from heliotrope.geometry import FloatArray, as_float

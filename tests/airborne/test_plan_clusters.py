@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flight_case import radial
-from heliotrope.airborne.clusters import clusters, ground_areas, tour
+from heliotrope.airborne.plan.clusters import clusters, ground_areas, tour
 from heliotrope.errors import InputError
+from support.flight_case import radial
 
 
 def test_ten_thousand_heliostats() -> None:

@@ -6,20 +6,20 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from flight_case import staggered
-from heliotrope.airborne import flight
-from heliotrope.airborne.airspace import Airspace, KeepOut, tower
-from heliotrope.airborne.clusters import clusters
-from heliotrope.airborne.flight import APART, REST, Craft, camera_target, grouped, timeline
-from heliotrope.airborne.flight_map import flight_map
-from heliotrope.airborne.flight_plan import FlightPlan, Wishes, _check_patterns, plan_flight
-from heliotrope.airborne.hover import mirrors
-from heliotrope.airborne.look_points import Choosing
+from heliotrope.airborne.plan import flight
+from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
+from heliotrope.airborne.plan.clusters import clusters
+from heliotrope.airborne.plan.flight import APART, REST, Craft, camera_target, grouped, timeline
+from heliotrope.airborne.plan.flight_map import flight_map
+from heliotrope.airborne.plan.flight_plan import FlightPlan, Wishes, _check_patterns, plan_flight
+from heliotrope.airborne.plan.hover import mirrors
+from heliotrope.airborne.plan.look_points import Choosing
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.mechanism import kinds
 from heliotrope.sun import Site
+from support.flight_case import staggered
 
 CRAFT = Craft(count=2, endurance=900.0)
 

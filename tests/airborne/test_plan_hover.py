@@ -3,13 +3,20 @@
 import numpy as np
 import pytest
 
-from flight_case import CENTRE, HALF, staggered
-from heliotrope.airborne.airspace import Airspace
-from heliotrope.airborne.hover import Mirrors, Pattern, Sampling, face, mirrors, pattern, spacing
-from heliotrope.airborne.look_points import Choosing, LookPoints, directions, look_points
 from heliotrope.airborne.mirror import ideal, orientation, reflection_points
+from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.hover import (
+    Mirrors,
+    Pattern,
+    Sampling,
+    face,
+    mirrors,
+    pattern,
+    spacing,
+)
+from heliotrope.airborne.plan.look_points import Choosing, LookPoints, directions, look_points
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.information import precision, suns_of_year
-from heliotrope.calibration.residuals import linearise
 from heliotrope.calibration.sightings import drone
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
@@ -25,6 +32,7 @@ from heliotrope.geometry import (
     tangent_axes,
 )
 from heliotrope.mechanism.parameters import MODELS
+from support.flight_case import CENTRE, HALF, staggered
 
 NAMES = MODELS["malan8"]
 TOWARDS = direction(np.radians(35.0), np.radians(40.0))

@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from lxml import etree
 
-from flight_case import staggered
-from heliotrope.airborne.airspace import Airspace, KeepOut, tower
-from heliotrope.airborne.flight import Craft, Sortie
-from heliotrope.airborne.flight_files import commands, document, fence, mission, write_plan
-from heliotrope.airborne.flight_plan import FlightPlan, Wishes, plan_flight
-from heliotrope.airborne.look_points import Choosing
-from heliotrope.airborne.waypoints import (
+from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
+from heliotrope.airborne.plan.flight import Craft, Sortie
+from heliotrope.airborne.plan.flight_files import commands, document, fence, mission, write_plan
+from heliotrope.airborne.plan.flight_plan import FlightPlan, Wishes, plan_flight
+from heliotrope.airborne.plan.look_points import Choosing
+from heliotrope.airborne.plan.waypoints import (
     Mission,
     litchi,
     qgc,
@@ -31,6 +30,7 @@ from heliotrope.airborne.waypoints import (
 )
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, angle_between, as_float, geodetic_to_enu
+from support.flight_case import staggered
 
 SPACES = {"k": "http://www.opengis.net/kml/2.2", "w": "http://www.dji.com/wpmz/1.0.2"}
 FENCE = as_float([[-400.0, -400.0], [400.0, -400.0], [400.0, 400.0], [-400.0, 400.0]])

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from heliotrope.airborne.mirror import MirrorShape, tiled
-from heliotrope.airborne.slopes import smooth_slopes
-from heliotrope.airborne.statistics import (
+from heliotrope.airborne.evaluate.statistics import (
     matern,
     normality,
     plain_sigma,
@@ -13,6 +11,8 @@ from heliotrope.airborne.statistics import (
     spread_mean,
     studentized_deviates,
 )
+from heliotrope.airborne.mirror import MirrorShape, tiled
+from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.errors import InputError
 
 # NIST/SEMATECH e-Handbook of Statistical Methods, 1.3.5.17.3: Rosner's own example.

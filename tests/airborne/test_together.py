@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from heliotrope.airborne.evaluate.sightings import _by_turn, _turned_back, fit_together
 from heliotrope.airborne.mirror import orientation
-from heliotrope.airborne.sightings import _by_turn, _turned_back, fit_together
 from heliotrope.calibration import sightings as kinds
-from heliotrope.calibration.estimator import Calibration, fit
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.estimator import Calibration, fit
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, direction, normalize, reflect
 from heliotrope.mechanism.chain import Mechanism

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope.calibration import evaluation
-from heliotrope.calibration.estimator import Outcome, fit
+from heliotrope.calibration.fit.estimator import Outcome, fit
 from heliotrope.calibration.sightings import Sightings, of_measurements, sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.formats import measurements, paint
@@ -14,7 +13,8 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
-from machines import every_kind
+from support.data import juelich
+from support.machines import every_kind
 
 AIM = np.array([0.0, 0.0, 40.0])
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from heliotrope import sun
-from heliotrope.calibration._allocation import Option, allocate, exchanged
-from heliotrope.calibration.campaign import Campaign, Fleet, Timing, campaign
 from heliotrope.calibration.information import Expectation, expectation, precision, suns_of_year
-from heliotrope.calibration.planning import Limits
+from heliotrope.calibration.plan._allocation import Option, allocate, exchanged
+from heliotrope.calibration.plan.campaign import Campaign, Fleet, Timing, campaign
+from heliotrope.calibration.plan.planning import Limits
 from heliotrope.calibration.sightings import camera_target
 from heliotrope.errors import InputError
 from heliotrope.field.example import azimuth_elevation
@@ -21,7 +21,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, linear_paint
 from heliotrope.mechanism.parameters import MODELS
 from heliotrope.mechanism.tracking import Status, track
-from planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
+from support.planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
 
 
 def _jack_plant() -> Mechanism:

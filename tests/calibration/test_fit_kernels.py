@@ -5,11 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.calibration import _fit_kernels as kernels
-from heliotrope.calibration._residual_kernels import scratch_mechanism
+from heliotrope.calibration.fit import _fit_kernels as kernels
+from heliotrope.calibration.fit._residual_kernels import scratch_mechanism
 from heliotrope.geometry import direction, tangent_axes
 from heliotrope.mechanism.chain import Mechanism
-from machines import every_kind, imperfect, random_counts
+from support.machines import every_kind, imperfect, random_counts
 
 ROWS = 12
 

@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from heliotrope.calibration import drift, learning
-from heliotrope.calibration.assessment import assess
 from heliotrope.calibration.evaluation import split
-from heliotrope.calibration.learning import Learned, learn
-from heliotrope.calibration.outliers import critical, generalised_esd
-from heliotrope.calibration.regimes import find_regimes, regime_at
+from heliotrope.calibration.learn import drift, learning
+from heliotrope.calibration.learn.assessment import assess
+from heliotrope.calibration.learn.learning import Learned, learn
+from heliotrope.calibration.learn.outliers import critical, generalised_esd
+from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, direction, reflect
@@ -255,7 +255,7 @@ def test_gradient_of_the_evidence() -> None:
     prepared = learning.prepare(
         nominal, seen, ("tilt_north", "azimuth_bias", "elevation_bias"), first.names, used
     )
-    from heliotrope.calibration import _drift_kernels as kernels
+    from heliotrope.calibration.learn import _drift_kernels as kernels
 
     data = dataclasses.replace(prepared.field[0], steps=np.array([START / DAY + 80.0]))
 

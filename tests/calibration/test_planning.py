@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from heliotrope import sun
-from heliotrope.calibration.estimator import fit
+from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.information import Expectation, expectation, precision, suns_of_year
-from heliotrope.calibration.planning import Candidates, Limits, Plan, candidates, grid, plan
+from heliotrope.calibration.plan.planning import Candidates, Limits, Plan, candidates, grid, plan
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.cli import main
@@ -25,7 +25,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.parameters import MODELS
 from heliotrope.mechanism.tracking import track
-from planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
+from support.planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
 
 
 @pytest.fixture(scope="module")

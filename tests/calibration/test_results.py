@@ -7,17 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data import juelich
-from heliotrope.calibration import cluster, evaluation, learning, models, results
-from heliotrope.calibration.assessment import assess
-from heliotrope.calibration.report import Result, blind_spots, write_report
+from calibration.test_learning import PRIORS, START, field, measured
+from heliotrope.calibration import evaluation
+from heliotrope.calibration.learn import learning, models
+from heliotrope.calibration.learn import on_dask as cluster
+from heliotrope.calibration.learn.assessment import assess
+from heliotrope.calibration.report.page import Result, blind_spots, results, write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
 from heliotrope.field.formats import measurements, paint
 from heliotrope.field.formats.plant_file import read_plant
 from heliotrope.field.plant import Plant
-from test_learning import PRIORS, START, field, measured
+from support.data import juelich
 
 NAMES = tuple(f"H{i}" for i in range(6))
 

@@ -11,9 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from heliotrope.calibration import sighting_table
-from heliotrope.calibration._cells import format_time, parse_time
-from heliotrope.calibration.estimator import Outcome, fit
-from heliotrope.calibration.residuals import whitening
+from heliotrope.calibration.fit.estimator import Outcome, fit
+from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.sighting_table import read_malan, read_sightings, write_sightings
 from heliotrope.calibration.sightings import (
     Sightings,
@@ -28,6 +27,7 @@ from heliotrope.calibration.sightings import (
 )
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.example import azimuth_elevation, prototype
+from heliotrope.files.cells import format_time, parse_time
 from heliotrope.geometry import MRAD, TAU, bisector, direction, normalize, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism
 

@@ -8,10 +8,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from heliotrope.calibration.drift import NINETY
-from heliotrope.calibration.estimator import fit
-from heliotrope.calibration.learning import learn
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn.drift import NINETY
+from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.calibration.uncertainty import expected, unobservable, year_map
 from heliotrope.geometry import FloatArray, direction, reflect
@@ -19,10 +19,10 @@ from heliotrope.mechanism import kinds, parameters
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
-from machines import every_kind
+from support.machines import every_kind
 
 AIM = np.array([0.0, 0.0, 40.0])
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")

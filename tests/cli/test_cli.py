@@ -11,9 +11,8 @@ import httpx
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope import __version__, sun
-from heliotrope.calibration import report
+from heliotrope.calibration.report import page as report
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import join, sightings
 from heliotrope.cli import main
@@ -21,7 +20,8 @@ from heliotrope.field.example import prototype
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.geometry import azimuth_elevation, reflect
 from heliotrope.mechanism.tracking import track
-from paint_server import PLANT, serve
+from support.data import juelich
+from support.paint_server import PLANT, serve
 
 
 def _call(arguments: list[str], capsys: Any, monkeypatch: pytest.MonkeyPatch) -> str:
@@ -119,7 +119,7 @@ def test_field_check(call: Any, plant_file: Path) -> None:
 
 
 def test_track_reads_heliok(call: Any) -> None:
-    scene = Path(__file__).parent / "files" / "heliok-scene.xml"
+    scene = Path(__file__).parents[1] / "files" / "heliok-scene.xml"
     found = json.loads(call("track", scene, "--heliostat", "HeliostatA", "--aim", "0,0,20",
                             "--sun", "0.6123724,-0.3535534,0.7071068", "--json"))  # fmt: skip
     angles = np.degrees(found["branches"][0]["angles_rad"])

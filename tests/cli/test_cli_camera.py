@@ -17,8 +17,19 @@ from heliotrope.cli import main
 from heliotrope.field.example import prototype
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.imaging.projection import project
-from test_lens import HELD, MATRIX, drawn, held
-from test_teaching import ALL, BARE, BLOTS, CAMERA, LEAVES, MARKS, PLAIN, TRUE, at, photograph
+from imaging.test_lens import HELD, MATRIX, drawn, held
+from imaging.test_teaching import (
+    ALL,
+    BARE,
+    BLOTS,
+    CAMERA,
+    LEAVES,
+    MARKS,
+    PLAIN,
+    TRUE,
+    at,
+    photograph,
+)
 
 TAUGHT = ("--kind", "corner", "--size", "0.4", "--stroke", "0.09", "--kind", "middle=tee",
           "--kind", "dot=disc", "--size", "dot=0.3")  # fmt: skip

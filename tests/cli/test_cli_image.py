@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.cli import main
 from heliotrope.field.example import azimuth_elevation
@@ -18,9 +17,8 @@ from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import enu_to_geodetic
-from heliotrope.imaging.beams import gaussian_beam
-from heliotrope.imaging.reading import read_image, write_image
-from heliotrope.imaging.rendering import (
+from heliotrope.imaging.files import read_image, write_image
+from heliotrope.imaging.synthetic.rendering import (
     Rendered,
     Scene,
     example_camera,
@@ -28,7 +26,9 @@ from heliotrope.imaging.rendering import (
     exposed,
     render,
 )
+from heliotrope.optics.mirror_image import gaussian_beam
 from heliotrope.sun import Site, vector
+from support.data import juelich
 
 SITE = Site(37.0, -2.0, 500.0)
 ORIGIN = (37.0, -2.0, 500.0)

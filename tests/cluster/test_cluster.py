@@ -5,12 +5,12 @@ import dataclasses
 
 import pytest
 
-from clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
-from heliotrope.control import _nodes
-from heliotrope.control._kept import Kept
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.link import LinkError, running
-from heliotrope.control.protocol import (
+from heliotrope.cluster import _nodes
+from heliotrope.cluster.memory import Kept
+from heliotrope.lcu import states, wire
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.link import LinkError, running
+from heliotrope.links.messages import (
     NEVER,
     Acknowledge,
     Alarm,
@@ -21,8 +21,8 @@ from heliotrope.control.protocol import (
     Status,
     encode,
 )
-from heliotrope.lcu import states, wire
-from heliotrope.twin.bus import BusFaults, TwinBus
+from heliotrope.twin.boards.bus import BusFaults, TwinBus
+from support.clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 

@@ -9,17 +9,27 @@ from pathlib import Path
 
 import pytest
 
-from cluster_process import COMMAND, KEY, PATIENCE, Line, Plant, ended, start, until, written
-from clusters import Board
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.protocol import (
+from heliotrope.lcu import states
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
+from heliotrope.links.messages import (
     Command,
     Stage,
     Status,
 )
-from heliotrope.control.tcp import TcpServer
-from heliotrope.lcu import states
+from heliotrope.links.tcp import TcpServer
+from support.cluster_process import (
+    COMMAND,
+    KEY,
+    PATIENCE,
+    Line,
+    Plant,
+    ended,
+    start,
+    until,
+    written,
+)
+from support.clusters import Board
 
 
 @pytest.fixture

@@ -10,23 +10,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from clusters import SITE, config_of
 from heliotrope import sun
 from heliotrope.cli.cluster import _link
-from heliotrope.control import timekeeping
-from heliotrope.control._kept import Kept
-from heliotrope.control._nodes import NODE, STATUS, STEPS, Node, rows
-from heliotrope.control._sun_line import HORIZON, sun_at, sun_now, sun_values
-from heliotrope.control.clock import SystemClock, VirtualClock
-from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
-from heliotrope.control.cluster_file import TABLES, read_cluster
-from heliotrope.control.gps import GpsTime
-from heliotrope.control.real_cluster import line_of, time_of
-from heliotrope.control.timekeeping import Time
+from heliotrope.cluster import timekeeping
+from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Node, rows
+from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
+from heliotrope.cluster.config_file import TABLES, read_cluster
+from heliotrope.cluster.gps import GpsTime
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.program import line_of, time_of
+from heliotrope.cluster.timekeeping import Time
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
+from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.sun import Site
-from nmea_talk import rmc
+from heliotrope.sun.line import HORIZON, sun_at, sun_now, sun_values
+from support.clusters import SITE, config_of
+from support.nmea_talk import rmc
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "cluster"

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import pytest
 
-from broker import Mosquitto, mosquitto_for
-from cluster_process import KEY, Line, Plant, ended, start, until, written
-from clusters import Board
-from heliotrope.control.clock import SystemClock, gps_seconds
-from heliotrope.control.link import running
-from heliotrope.control.mqtt import Broker, mqtt_link
-from heliotrope.control.protocol import Status
-from nmea_talk import gga, rmc
+from heliotrope.links.clock import SystemClock, gps_seconds
+from heliotrope.links.link import running
+from heliotrope.links.messages import Status
+from heliotrope.links.mqtt import Broker, mqtt_link
+from support.broker import Mosquitto, mosquitto_for
+from support.cluster_process import KEY, Line, Plant, ended, start, until, written
+from support.clusters import Board
+from support.nmea_talk import gga, rmc
 
 PREFIX = "heliotrope/test"
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
-from heliotrope.control._kept import Kept
-from heliotrope.control.protocol import Answer, Ask, Command, Parameters, Stage
+from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, wire
 from heliotrope.lcu.journal import CODES_OF
-from heliotrope.twin.bus import TwinBus
-from lcu_machines import heliostat, items_of_heliostat
+from heliotrope.links.messages import Answer, Ask, Command, Parameters, Stage
+from heliotrope.twin.boards.bus import TwinBus
+from support.clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
+from support.lcu_machines import heliostat, items_of_heliostat
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.control.clock import LEAP_SECONDS, VirtualClock, gps_seconds, run_virtual
-from heliotrope.control.discipline import DisciplinedClock, DisciplineSettings
-from heliotrope.control.link import running
-from heliotrope.control.timekeeping import Quality, Time
+from heliotrope.cluster.discipline import DisciplinedClock, DisciplineSettings
+from heliotrope.cluster.timekeeping import Quality, Time
 from heliotrope.errors import InputError
-from nmea_talk import gga, rmc, sentence, zda
+from heliotrope.links.clock import LEAP_SECONDS, VirtualClock, gps_seconds, run_virtual
+from heliotrope.links.link import running
+from support.nmea_talk import gga, rmc, sentence, zda
 
 START = datetime(2026, 6, 21, 10, tzinfo=UTC)
 LATENCY = 0.12
@@ -351,7 +351,7 @@ def test_a_leap_second_of_the_table_is_no_step(monkeypatch: pytest.MonkeyPatch) 
                 sky.kept.hear(rmc(midnight + timedelta(seconds=second - 8) - late))
             sky.passes(1.0)
 
-    monkeypatch.setattr("heliotrope.control.clock.LEAP_SECONDS", table)
+    monkeypatch.setattr("heliotrope.links.clock.LEAP_SECONDS", table)
     across()
     now = sky.now()
     assert (now.quality, now.jumped) == ("gps", False)

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.discipline import DisciplineSettings
-from heliotrope.control.gps import GpsSettings, GpsTime
-from heliotrope.control.link import LinkError, running
-from heliotrope.control.timekeeping import SystemTime, TimeKeeper
+from heliotrope.cluster.discipline import DisciplineSettings
+from heliotrope.cluster.gps import GpsSettings, GpsTime
+from heliotrope.cluster.timekeeping import SystemTime, TimeKeeper
 from heliotrope.errors import InputError
-from nmea_talk import gga, rmc, zda
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import LinkError, running
+from support.nmea_talk import gga, rmc, zda
 
 PATIENCE = 20.0
 #: A receiver of ten fixes a second, and a wide latency, since a busy machine takes its time.

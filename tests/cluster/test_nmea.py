@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.control.nmea import NmeaReader, Report
-from heliotrope.control.timekeeping import NOT_BEFORE
-from nmea_talk import gga, rmc, sentence, zda
+from heliotrope.cluster.nmea import NmeaReader, Report
+from heliotrope.cluster.timekeeping import NOT_BEFORE
+from support.nmea_talk import gga, rmc, sentence, zda
 
 T = datetime(2026, 6, 21, 10, 0, 0, 250000, tzinfo=UTC)
 TIMES = st.integers(0, 44 * 365 * 86400 * 100).map(

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.serial_bus import BusSettings, SerialBus
+from heliotrope.cluster.serial_bus import BusSettings, SerialBus
 from heliotrope.lcu import wire
-from paced_pty import PacedBus
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
+from support.paced_pty import PacedBus
 
 PATIENCE = 20.0
 

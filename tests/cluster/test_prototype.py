@@ -22,28 +22,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from boards_process import PrototypeField, key_of, prototype_field
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.calibration_cycle import CalibrationCycle, CycleSettings, Shot
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.parameters import Wanted
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import Stage
-from heliotrope.control.tcp import TcpServer
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.lcu import states
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
+from heliotrope.links.messages import Stage
+from heliotrope.links.tcp import TcpServer
+from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings, Shot
 from heliotrope.sun import Site
-from heliotrope.twin import outfit
-from paced_pty import PacedBus
-from whole_plant import ENGINEER
+from heliotrope.twin.boards import outfit
+from support.boards_process import PrototypeField, key_of, prototype_field
+from support.paced_pty import PacedBus
+from support.whole_plant import ENGINEER
 
-BOARDS = Path(__file__).parents[1] / "boards_process.py"
+TESTS = Path(__file__).parents[1]
 CLUSTER = [sys.executable, "-c", "from heliotrope.cli import main; main()", "cluster"]
 #: Real seconds for what should take a fraction of them; the machine may be busy.
 PATIENCE = 60.0
@@ -81,7 +81,16 @@ class Installation:
             first = cluster * self.members + begin
             part = ports[begin : begin + self.per_process]
             process = subprocess.Popen(
-                [sys.executable, str(BOARDS), str(len(self.field.names)), "5", str(first), *part],
+                [
+                    sys.executable,
+                    "-m",
+                    "support.boards_process",
+                    str(len(self.field.names)),
+                    "5",
+                    str(first),
+                    *part,
+                ],
+                cwd=TESTS,
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             )  # fmt: skip
             stack.callback(_end, process)

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import LinkClosedError, LinkError, Outcome, running
-from heliotrope.control.serial_bus import BusSettings, SerialBus, ends_in_zero
+from heliotrope.cluster.serial_bus import BusSettings, SerialBus, ends_in_zero
 from heliotrope.errors import InputError
 from heliotrope.lcu import messages, wire
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import LinkClosedError, LinkError, Outcome, running
 
 QUICK = BusSettings(baud_rate=115200, first_pause=0.02, longest_pause=0.1)
 PATIENCE = 10.0

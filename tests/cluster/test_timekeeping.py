@@ -8,10 +8,10 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from heliotrope.control.clock import VirtualClock, gps_seconds, run_virtual
-from heliotrope.control.link import running
-from heliotrope.control.timekeeping import SystemTime, kernel_synchronised
+from heliotrope.cluster.timekeeping import SystemTime, kernel_synchronised
 from heliotrope.errors import InputError
+from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
+from heliotrope.links.link import running
 
 START = datetime(2026, 6, 21, 10, tzinfo=UTC)
 

@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from heliotrope.console import _secrets
-from live_console import PASSWORD, ROLES, LiveConsole
+from support.live_console import PASSWORD, ROLES, LiveConsole
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -21,11 +21,11 @@ from heliotrope.console.client import Client, RemoteError
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.control import audit
 from heliotrope.errors import InputError
+from heliotrope.plant import audit
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import StoreError
-from live_console import PASSWORD, LiveConsole
+from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
 ORDER = ("", "viewer", "operator", "engineer")

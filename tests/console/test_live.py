@@ -22,7 +22,7 @@ from heliotrope.console._secrets import verify_password
 from heliotrope.console.client import Client, Message, RemoteError, read_message
 from heliotrope.console.live import MARK, ROW, changed, message
 from heliotrope.console.models import plain
-from live_console import PASSWORD, LiveConsole
+from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
 

@@ -12,8 +12,8 @@ import pytest
 from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin._live_field import LiveBus
-from live_console import PASSWORD, LiveConsole
+from heliotrope.twin.live._field import LiveBus
+from support.live_console import PASSWORD, LiveConsole
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
 ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control._operations_zero import zero
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.operations import WorkSettings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.zero import zero
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
-from heliotrope.twin._live_field import LiveField
-from heliotrope.twin.live import LiveOptions, LivePlant, prototype_plant
+from heliotrope.twin.live._field import LiveField
+from heliotrope.twin.live.live import LiveOptions, LivePlant, prototype_plant
 
 START = datetime(2026, 10, 21, 9, tzinfo=UTC)
 ENGINEER, OPERATOR = Person("engineer", Role.ENGINEER), Person("operator", Role.OPERATOR)

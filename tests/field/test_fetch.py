@@ -17,7 +17,7 @@ from heliotrope.errors import FetchError
 from heliotrope.field.formats import fetch, paint
 from heliotrope.field.formats._download import JOURNAL
 from heliotrope.field.formats.fetch import FetchState, Settings, fetch_heliostats, fetch_tower
-from paint_server import (
+from support.paint_server import (
     BIG,
     FAST,
     PLANT,

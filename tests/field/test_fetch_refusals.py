@@ -14,7 +14,7 @@ import pytest
 
 from heliotrope.errors import FetchError, InputError, UnknownNameError
 from heliotrope.field.formats.fetch import Settings, fetch_heliostats
-from paint_server import (
+from support.paint_server import (
     BIG,
     FAST,
     PLANT,

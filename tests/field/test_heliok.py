@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliok_files import SCENE, SITE, edited, mixed_plant, scene
 from heliotrope.field.formats import heliok
-from heliotrope.field.formats._frames import euler_angles, euler_matrix, mirror_frame
+from heliotrope.field.formats.frames import euler_angles, euler_matrix, mirror_frame
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import angle_between, normalize, reflect, rotation
@@ -19,6 +18,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
 from reference import cases
+from support.heliok_files import SCENE, SITE, edited, mixed_plant, scene
 
 
 def plant() -> Plant:

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliok_files import SCENE, SITE, edited, mixed_plant, scene
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import heliok
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Receiver
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
+from support.heliok_files import SCENE, SITE, edited, mixed_plant, scene
 
 WRONG = [
     ('unitLength="m" ', "", "line 3: <HelioK> has no unitLength; give one"),

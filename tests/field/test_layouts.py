@@ -28,10 +28,10 @@ from heliotrope.field.layouts import (
 )
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, angle_between, direction
-from heliotrope.imaging.finding import find_targets
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.rendering import render
-from heliotrope.imaging.scenes import Scene
+from heliotrope.imaging.synthetic.rendering import render
+from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.imaging.targets.finding import find_targets
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site
 

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as nps
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.formats import opencsp
-from heliotrope.field.formats._frames import mirror_frame
+from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.field.formats.opencsp import Centroids, Field
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
@@ -19,7 +19,7 @@ from heliotrope.geometry import rotation
 from heliotrope.mechanism import kinds
 from heliotrope.sun import Site
 
-FILES = Path(__file__).parent / "files"
+FILES = Path(__file__).parents[1] / "files"
 FIELD, CENTROIDS = FILES / "opencsp-field.csv", FILES / "opencsp-centroids.csv"
 SITE = Site(34.96, -106.51, 1700.0, name="test field")
 

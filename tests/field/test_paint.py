@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope.errors import InputError
 from heliotrope.field.formats import measurements, paint
 from heliotrope.geometry import MRAD, geodetic_to_enu
+from support.data import juelich
 
 
 def test_targets_stand_where_they_were_surveyed() -> None:

@@ -8,8 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from data import juelich
-from heliotrope.control.aims import BeamCheck
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
 from heliotrope.field.formats import paint, plant_file
@@ -19,10 +17,12 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.aims import BeamCheck
 from heliotrope.sun import Site
-from machines import every_kind, imperfect
+from support.data import juelich
+from support.machines import every_kind, imperfect
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 def _same(a: Plant, b: Plant) -> None:

@@ -16,7 +16,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import azimuth_elevation
 from heliotrope.sun import Site
 
-EXPORT = Path(__file__).parent / "files" / "solarpilot-export.csv"
+EXPORT = Path(__file__).parents[1] / "files" / "solarpilot-export.csv"
 SITE = Site(37.0, -5.0, 20.0, name="field")
 TEMPLATES = {0: Template(12.2, 12.0, 6.5, 0.2), 1: Template(6.0, 5.0, 3.0)}
 

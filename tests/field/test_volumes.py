@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from matplotlib.path import Path as Polygon
 
-from heliotrope.control.beam_paths import clearance
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume, outline
+from heliotrope.optics.keep_out import clearance
 
 
 @pytest.mark.parametrize(

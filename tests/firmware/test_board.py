@@ -5,10 +5,19 @@ from typing import Any
 
 import pytest
 
-from board_chips import DRIVE, Partition, World, board_path
 from heliotrope.lcu import controller, messages, states, wire
 from heliotrope.lcu.journal import Journal
-from lcu_machines import ADDRESS, KEY, START_S, STOW, TOKEN, heliostat, items_of_heliostat, sha256
+from support.board_chips import DRIVE, Partition, World, board_path
+from support.lcu_machines import (
+    ADDRESS,
+    KEY,
+    START_S,
+    STOW,
+    TOKEN,
+    heliostat,
+    items_of_heliostat,
+    sha256,
+)
 
 BOARDS = ("rp2", "esp32", "stm32")
 

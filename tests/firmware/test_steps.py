@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from board_chips import World, board_path
 from heliotrope.lcu.stepper import BOTH, Axis, Stepper
+from support.board_chips import World, board_path
 
 PINS = ("step1", "way1", "step2", "way2")
 BOARDS = ("rp2", "esp32", "stm32")

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from heliotrope.field.target import Target
-from heliotrope.imaging.background import from_frame
-from heliotrope.imaging.baseline import moments_centroid, threshold_centroid
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import read_crop
-from heliotrope.imaging.rectify import Rectified, from_crop
+from heliotrope.imaging.spots.background import from_frame
+from heliotrope.imaging.spots.baseline import moments_centroid, threshold_centroid
+from heliotrope.imaging.targets.rectify import Rectified, from_crop
 
 TARGET = Target(
     "t", np.array([[-4.0, 0, 44], [4, 0, 44], [4, 0, 36], [-4, 0, 36]]), np.array([0.0, 0, 40])

@@ -9,18 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope.field.camera import Camera
 from heliotrope.field.formats.paint import read_tower
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, rotation
-from heliotrope.imaging.beams import gaussian_beam
-from heliotrope.imaging.finding import FoundTarget, find_targets, symmetries
+from heliotrope.imaging.files import read_image
 from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.reading import read_image
-from heliotrope.imaging.rendering import (
+from heliotrope.imaging.synthetic.rendering import (
     Lens,
     Rendered,
     Scene,
@@ -33,7 +30,10 @@ from heliotrope.imaging.rendering import (
     exposed,
     render,
 )
-from heliotrope.imaging.view import View
+from heliotrope.imaging.targets.finding import FoundTarget, find_targets, symmetries
+from heliotrope.imaging.targets.view import View
+from heliotrope.optics.mirror_image import gaussian_beam
+from support.data import juelich
 
 #: Small frames: the strokes of an L are 4.5 px broad.
 SIZE = (480, 360)
@@ -307,7 +307,7 @@ def test_symmetries_of_marks() -> None:
 def test_a_camera_or_an_earlier_view_need_no_search(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, view = plain().frame, view_of(only(plain().frame))
     shifted = Frame(np.roll(frame.pixels, (9, -7), axis=(0, 1)))
-    monkeypatch.setattr("heliotrope.imaging.detection.lighten", None)
+    monkeypatch.setattr("heliotrope.imaging.targets.detection.lighten", None)
     assert off(only(frame, TARGET, CAMERA), CAMERA) < 3e-3
     np.testing.assert_allclose(
         [m.pixel for m in only(shifted, TARGET, None, view).marks],
@@ -366,7 +366,7 @@ def clutter(seed: int) -> Image:
 
 
 def _shapes(mark: Mark, place: FloatArray) -> list[Image]:
-    from heliotrope.imaging.marks import polygons
+    from heliotrope.imaging.targets.marks import polygons
 
     return [np.round(place + shape * [1, -1]).astype(np.int32) for shape in polygons(mark)]
 

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FormatError, InputError
+from heliotrope.imaging.files import find_images, read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.reading import find_images, read_image, write_image
 
 _SECOND = 1.0 / math.sqrt(12.0)
 
@@ -531,5 +531,5 @@ def test_images_are_found_in_natural_order(tmp_path: Path) -> None:
 def test_opencv_is_loaded_when_an_image_is_read() -> None:
     import subprocess
 
-    code = "import sys, heliotrope.imaging.reading; sys.exit('cv2' in sys.modules)"
+    code = "import sys, heliotrope.imaging.files; sys.exit('cv2' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

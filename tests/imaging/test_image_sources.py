@@ -20,8 +20,8 @@ import pytest
 
 from heliotrope.errors import FetchError, FormatError, InputError, TimeError
 from heliotrope.imaging import sources
+from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.reading import read_image, write_image
 from heliotrope.imaging.sources import (
     CameraSource,
     FolderSource,

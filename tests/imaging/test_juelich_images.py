@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 import pytest
 
-from data import juelich
 from heliotrope.errors import InputError
 from heliotrope.field.formats.paint import read_tower
 from heliotrope.imaging.annotate import LONGEST, annotate
-from heliotrope.imaging.hybrid import compose
+from heliotrope.imaging.files import read_image
 from heliotrope.imaging.photograph import Photograph, read_photograph
-from heliotrope.imaging.reading import read_image
+from heliotrope.imaging.synthetic.hybrid import compose
+from support.data import juelich
 
-SCRIPTS = Path(__file__).parents[1] / "scripts"
+SCRIPTS = Path(__file__).parents[2] / "scripts"
 #: Frames of the solar tower, which show both of its targets, and of the multi-focus tower.
 BOTH = ("137608-raw", "213508-raw", "215701-raw", "216331-raw", "99927-raw", "stj_image")
 ONE = ("203718-raw", "mft_image")

@@ -9,10 +9,10 @@ import pytest
 from heliotrope.errors import InputError
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging import refinement
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.marks import polygons, tag_cells, tag_dictionary
-from heliotrope.imaging.refinement import Refined, coverage, locate, refine
+from heliotrope.imaging.targets import refinement
+from heliotrope.imaging.targets.marks import polygons, tag_cells, tag_dictionary
+from heliotrope.imaging.targets.refinement import Refined, coverage, locate, refine
 
 ORIGIN = np.zeros(3)
 MARKS = {

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.imaging.background import EmptyTarget
-from heliotrope.imaging.beams import gaussian_beam
 from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
-from heliotrope.imaging.quality import REASONS, Expectation
-from heliotrope.imaging.rendering import (
+from heliotrope.imaging.spots.background import EmptyTarget
+from heliotrope.imaging.spots.quality import REASONS, Expectation
+from heliotrope.imaging.synthetic.rendering import (
     Lens,
     Paint,
     Rendered,
@@ -28,6 +27,7 @@ from heliotrope.imaging.rendering import (
     exposed,
     render,
 )
+from heliotrope.optics.mirror_image import gaussian_beam
 
 TARGET = example_target(8.0)
 CAMERA = example_camera(TARGET, 200.0, (1000, 750))

@@ -10,16 +10,9 @@ from scipy.stats import norm
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, direction
-from heliotrope.imaging import _painting
-from heliotrope.imaging._render_kernels import coverage
-from heliotrope.imaging.beams import (
-    Beam,
-    flat_top_beam,
-    gaussian_beam,
-    reflected_beam,
-)
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.rendering import (
+from heliotrope.imaging.synthetic import _painting
+from heliotrope.imaging.synthetic.rendering import (
     Lens,
     Paint,
     Rendered,
@@ -34,6 +27,13 @@ from heliotrope.imaging.rendering import (
     point_spread,
     render,
 )
+from heliotrope.optics.mirror_image import (
+    Beam,
+    flat_top_beam,
+    gaussian_beam,
+    reflected_beam,
+)
+from heliotrope.optics.render_kernels import coverage
 
 TARGET = example_target()
 #: Small frames, and a lens five times as bent as the example's.

@@ -26,11 +26,11 @@ from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging._click_page import ask, click_points
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.marks import polygons
 from heliotrope.imaging.projection import look_at, project, rays
-from heliotrope.imaging.teaching import (
+from heliotrope.imaging.targets.click_page import ask, click_points
+from heliotrope.imaging.targets.marks import polygons
+from heliotrope.imaging.targets.teaching import (
     Taught,
     Wish,
     fit_marks,

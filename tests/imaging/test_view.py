@@ -9,8 +9,8 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.scenes import example_camera, example_target
-from heliotrope.imaging.view import View, distort, faces, fit_view, homography, unknown_lens
+from heliotrope.imaging.synthetic.scenes import example_camera, example_target
+from heliotrope.imaging.targets.view import View, distort, faces, fit_view, homography, unknown_lens
 
 TARGET = example_target()
 FACE = faces((TARGET,))[0]

@@ -18,7 +18,7 @@ from heliotrope.lcu.messages import (
     REFUSED_KEY,
     REFUSED_STATE,
 )
-from lcu_machines import (
+from support.lcu_machines import (
     ADDRESS,
     AIM,
     KEY,

@@ -12,7 +12,7 @@ from heliotrope.lcu import states
 from lcu.controller_on_micropython import Replay
 from lcu.micropython32 import run32
 from lcu.test_micropython import FILES, HERE, NEWEST, OLDEST, compile_with, cross_compiler, run
-from lcu_machines import STOW, Bench
+from support.lcu_machines import STOW, Bench
 
 SCRIPTS = HERE.parents[1] / "scripts"
 shrink = runpy.run_path(str(SCRIPTS / "shrink.py"))["shrink"]

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from heliotrope.lcu import controller, messages, motion, names, states, ticks, wire
-from lcu_machines import (
+from support.lcu_machines import (
     ADDRESS,
     AIM,
     STANDBY,

@@ -7,8 +7,8 @@ import pytest
 
 from heliotrope.lcu import drives
 from heliotrope.mechanism.drives import Drive, linear_paint, rotary
-from lcu_machines import numbers_of, single
-from machines import jacks, steppers
+from support.lcu_machines import numbers_of, single
+from support.machines import jacks, steppers
 
 
 def every_drive() -> dict[str, tuple[Drive, int, int]]:

@@ -7,7 +7,7 @@ import pytest
 from heliotrope.lcu import controller, messages, node, wire
 from heliotrope.lcu.journal import ITEMS, Journal
 from heliotrope.lcu.messages import DONE, NOT_STORED
-from lcu_machines import (
+from support.lcu_machines import (
     ADDRESS,
     AIM,
     KEY,

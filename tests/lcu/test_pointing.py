@@ -10,8 +10,8 @@ from heliotrope.geometry import angle_between, direction
 from heliotrope.lcu import pointing
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.tracking import Status, track
-from lcu_machines import f32, single
-from machines import every_kind, imperfect
+from support.lcu_machines import f32, single
+from support.machines import every_kind, imperfect
 
 KINDS = ("azimuth_elevation", "tilt_roll", "target_aligned", "two_jacks")
 FREE = [[-math.inf, math.inf], [-math.inf, math.inf]]

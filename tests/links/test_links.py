@@ -13,9 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control.clock import SystemClock, VirtualClock, run_virtual, sleep_until
-from heliotrope.control.conversation import OVERHEAD, Conversation
-from heliotrope.control.link import (
+from heliotrope.errors import InputError
+from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual, sleep_until
+from heliotrope.links.envelope import OVERHEAD, Conversation
+from heliotrope.links.in_process import Faults, memory_pair
+from heliotrope.links.link import (
     Backoff,
     Heartbeat,
     Link,
@@ -27,9 +29,7 @@ from heliotrope.control.link import (
     messages,
     running,
 )
-from heliotrope.control.memory import Faults, memory_pair
-from heliotrope.control.tcp import TcpServer, client_tls, server_tls, tcp_link
-from heliotrope.errors import InputError
+from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
 
 SETTINGS = LinkSettings(period=0.5, deadline=1.5)
 #: For real sockets: quick beats, so that a test need not wait.

@@ -13,12 +13,12 @@ from pathlib import Path
 import aiomqtt
 import pytest
 
-from broker import MOSQUITTO, Mosquitto, mosquitto_for
-from heliotrope.control.clock import SystemClock, sleep_until
-from heliotrope.control.link import Link, LinkSettings, Outcome, running
-from heliotrope.control.mqtt import Broker, mqtt_link
-from heliotrope.control.tcp import client_tls
 from heliotrope.errors import InputError
+from heliotrope.links.clock import SystemClock, sleep_until
+from heliotrope.links.link import Link, LinkSettings, Outcome, running
+from heliotrope.links.mqtt import Broker, mqtt_link
+from heliotrope.links.tcp import client_tls
+from support.broker import MOSQUITTO, Mosquitto, mosquitto_for
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 PREFIX = "heliotrope/test"

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.control import protocol
-from heliotrope.control.protocol import (
+from heliotrope.links import messages as protocol
+from heliotrope.links.messages import (
     NODE,
     Alarm,
     Answer,

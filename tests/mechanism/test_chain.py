@@ -7,7 +7,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import azimuth_elevation, direction, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
-from machines import every_kind, imperfect, random_counts
+from support.machines import every_kind, imperfect, random_counts
 
 KINDS = list(every_kind())
 

@@ -19,7 +19,7 @@ from heliotrope.mechanism import azel, kinds
 from heliotrope.mechanism.armature import armature
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import Status, track
-from machines import every_kind, imperfect
+from support.machines import every_kind, imperfect
 
 UNIT = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 

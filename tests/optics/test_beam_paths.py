@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.control import beam_paths as bp
-from heliotrope.control.beam_paths import Box, Cylinder, Mirrors, Prism, Sphere, Volume
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, direction, normalize, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics import keep_out as bp
+from heliotrope.optics.keep_out import Box, Cylinder, Mirrors, Prism, Sphere, Volume
 
 L_SHAPE = ((0.0, 0.0), (20.0, 0.0), (20.0, 8.0), (8.0, 8.0), (8.0, 20.0), (0.0, 20.0))
 ZOO: tuple[Volume, ...] = (

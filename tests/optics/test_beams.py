@@ -7,7 +7,8 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, FloatArray, bisector, direction, normalize, reflect
-from heliotrope.imaging.beams import (
+from heliotrope.imaging.synthetic.scenes import example_target
+from heliotrope.optics.mirror_image import (
     AUREOLE_RADIUS,
     SUN_RADIUS,
     Beam,
@@ -17,7 +18,6 @@ from heliotrope.imaging.beams import (
     reflected_beam,
     sun_profile,
 )
-from heliotrope.imaging.scenes import example_target
 
 MM = 1e-3
 TARGET = example_target()

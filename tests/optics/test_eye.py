@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.control import eye
-from heliotrope.control.beam_paths import SUN_HALF_ANGLE, Mirrors, beams, concentration
-from heliotrope.control.eye import Eye, Hazard
 from heliotrope.errors import InputError
 from heliotrope.geometry import normalize
+from heliotrope.optics import glare as eye
+from heliotrope.optics.glare import Eye, Hazard
+from heliotrope.optics.keep_out import SUN_HALF_ANGLE, Mirrors, beams, concentration
 
 #: One watt per square centimetre.
 CM2 = 1e4

@@ -11,23 +11,23 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.control._operations_cycle import Centring, seen, spiral
-from heliotrope.control._operations_log import Logbook
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.flux import air_loss, predicted
-from heliotrope.control.link import Outcome, Statistics
-from heliotrope.control.operations import WorkSettings
-from heliotrope.control.protocol import Alarm, Ask, Lease, Status, encode
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.intercept import intercept_rectangle
 from heliotrope.field.layouts import lay_out
 from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import normalize
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.link import Outcome, Statistics
+from heliotrope.links.messages import Alarm, Ask, Lease, Status, encode
+from heliotrope.optics.flux import air_loss, predicted
+from heliotrope.optics.intercept import intercept_rectangle
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.centring import Centring, seen, spiral
 from heliotrope.store.records import StoreError
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.twin.live.live import LiveOptions, LivePlant
 
 MRAD = 1e-3
 ENGINEER, OPERATOR, VIEWER = (

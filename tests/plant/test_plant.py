@@ -9,14 +9,12 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from heliotrope.control.audit import AuditError, read
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.beam_paths import Sphere
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.memory import Faults
-from heliotrope.control.parameters import Axis, Machine, Wanted, items_of
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import (
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.example import prototype
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.in_process import Faults
+from heliotrope.links.messages import (
     NODE,
     Alarm,
     Answer,
@@ -29,11 +27,13 @@ from heliotrope.control.protocol import (
     Status,
     encode,
 )
-from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.example import prototype
-from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import Axis, Machine, Wanted, items_of
 from heliotrope.mechanism.tracking import track
-from plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
+from heliotrope.optics.keep_out import Sphere
+from heliotrope.plant.audit import AuditError, read
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.settings import PlantSettings
+from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.control.aims import BeamCheck
-from heliotrope.control.assigned import AssignedError, AssignedFile, grouped, points_of
-from heliotrope.control.audit import read
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
-from plant_bench import OPERATOR, Bench, running
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.assigned import AssignedError, AssignedFile, grouped, points_of
+from heliotrope.plant.audit import read
+from heliotrope.plant.authority import RefusedError
+from support.plant_bench import OPERATOR, Bench, running
 
 AIM, STANDBY = (0.1, 0.2, 16.5), (4.0, 0.0, 14.0)
 

@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control._visit import Visit
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.calibration_cycle import (
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.target import Target
+from heliotrope.imaging.frame import Frame
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Parameters
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
     CycleResult,
     CycleSettings,
     Shot,
 )
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.parameters import items_of
-from heliotrope.control.protocol import Parameters
-from heliotrope.control.target_search import Found, Search, search
-from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.target import Target
-from heliotrope.imaging.frame import Frame
-from heliotrope.lcu import states
-from heliotrope.mechanism.tracking import track
-from plant_bench import ENGINEER, OPERATOR, Bench, running
+from heliotrope.plant.visits.target_search import Found, Search, search
+from heliotrope.plant.visits.visit import Visit
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 NAME = "P2A"
 HOME = states.IDLE

@@ -7,19 +7,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control.audit import read
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.emergency import done
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import NODE, Acknowledge, Emergency
-from heliotrope.control.safety import Act, adjusted, conditions
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import NODE, Acknowledge, Emergency
 from heliotrope.mechanism.drives import Drive, rotary
+from heliotrope.plant.audit import read
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.emergency import done
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.safety.evaluation import Act, adjusted, conditions
 from heliotrope.twin.wind import Wind
-from plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
 WINDY = PlantSettings(sensors=frozenset({"wind_gust", "receiver_flux"}))

@@ -10,14 +10,13 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from heliotrope.control._joining import Job, JoinQueue
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.aims import spread
-from heliotrope.control.audit import STOPPED, AuditError, JsonLines, Record, read
-from heliotrope.control.authority import Authority, Person, RefusedError, Role
-from heliotrope.control.clock import VirtualClock
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.parameters import (
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.example import prototype
+from heliotrope.lcu import drives, states
+from heliotrope.lcu.config import Config
+from heliotrope.links.clock import VirtualClock
+from heliotrope.links.messages import NODE, ProtocolError, Stage, Status
+from heliotrope.mechanism.board_items import (
     Axis,
     Machine,
     Wanted,
@@ -27,14 +26,15 @@ from heliotrope.control.parameters import (
     items_of,
     packed,
 )
-from heliotrope.control.plant_settings import clusters_of
-from heliotrope.control.protocol import NODE, ProtocolError, Stage, Status
-from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.example import prototype
-from heliotrope.lcu import drives, states
-from heliotrope.lcu.config import Config
-from lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
-from machines import every_kind, imperfect, jacks
+from heliotrope.plant._joining import Job, JoinQueue
+from heliotrope.plant.aims import spread
+from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
+from heliotrope.plant.authority import Authority, Person, RefusedError, Role
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.settings import clusters_of
+from heliotrope.plant.tickets import Ticket
+from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
+from support.machines import every_kind, imperfect, jacks
 
 AT = datetime(2026, 6, 21, 10, tzinfo=UTC)
 
@@ -127,7 +127,7 @@ def test_a_disk_that_fails_is_an_error_and_the_line_is_not_glued_to_the_next(
 
 
 def test_a_full_disk_is_no_confirmation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("heliotrope.control.audit.LEAST_FREE", 1 << 62)
+    monkeypatch.setattr("heliotrope.plant.audit.LEAST_FREE", 1 << 62)
     audit = JsonLines(tmp_path / "a.jsonl", AT)
     with pytest.raises(AuditError, match="bytes are left on its disk"):
         audit.confirm()

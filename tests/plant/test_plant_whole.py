@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control.audit import read
-from heliotrope.control.calibration_cycle import CalibrationCycle, CycleSettings
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.parameters import checksums, items_of
-from heliotrope.control.protocol import Stage
-from heliotrope.control.safety import Act
-from whole_plant import ENGINEER, MACHINE, WholePlant
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Stage
+from heliotrope.mechanism.board_items import checksums, items_of
+from heliotrope.plant.audit import read
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings
+from heliotrope.safety.evaluation import Act
+from support.whole_plant import ENGINEER, MACHINE, WholePlant
 
 
 @pytest.mark.parametrize(

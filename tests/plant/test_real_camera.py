@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.protocol import Alarm
-from heliotrope.control.real_camera import RealCameras, source_of
 from heliotrope.errors import FetchError, InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import normalize
+from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.reading import read_image, write_image
-from heliotrope.imaging.scenes import Scene
 from heliotrope.imaging.snapshot import SnapshotSource, is_snapshot
 from heliotrope.imaging.sources import SimulatedSource, Source, open_source
+from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.messages import Alarm
+from heliotrope.plant.cameras import RealCameras, source_of
 from heliotrope.twin.cameras import Mirror, Optics, RenderedCamera, Sight
-from heliotrope.twin.live import prototype_plant
+from heliotrope.twin.live.live import prototype_plant
 
 SUN = normalize(np.array([0.2, -0.7, 0.7]), "sun")
 OFF = 0.4

@@ -14,21 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.operations import WorkSettings
-from heliotrope.control.real_camera import RealCameras
-from heliotrope.control.real_links import PlantLinks
-from heliotrope.control.real_plant import RealPlant
 from heliotrope.field.camera import Camera
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.plant import Plant
-from heliotrope.imaging.rendering import render
-from heliotrope.imaging.scenes import exposed
 from heliotrope.imaging.sources import SimulatedSource, Source
+from heliotrope.imaging.synthetic.rendering import render
+from heliotrope.imaging.synthetic.scenes import exposed
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
+from heliotrope.plant.assembly import RealPlant
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.links_file import PlantLinks
+from heliotrope.plant.operations.operations import WorkSettings
 from heliotrope.twin.cameras import PEAK
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.twin.live.live import LiveOptions, LivePlant
 
 #: Heliostats that must have learnt, and the time for it, s.
 LEARNT, PATIENCE = 2, 200.0

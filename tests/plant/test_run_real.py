@@ -25,28 +25,28 @@ from typing import Any
 import numpy as np
 import pytest
 
-from broker import Mosquitto, mosquitto_for
-from cluster_process import Line
-from clusters import Board, key_of
 from heliotrope.cli import main
 from heliotrope.console.client import Client
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.parameters import Axis, Machine, items_of
-from heliotrope.control.plant_settings import clusters_of
-from heliotrope.control.real_links import LinksFile, read_links
-from heliotrope.control.real_plant import RealPlant
-from heliotrope.control.real_sensors import FED, SensorFiles
 from heliotrope.errors import FormatError
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.lcu.journal import Journal
+from heliotrope.links.clock import SystemClock
 from heliotrope.mechanism import kinds
+from heliotrope.mechanism.board_items import Axis, Machine, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
+from heliotrope.plant.assembly import RealPlant
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.links_file import LinksFile, read_links
+from heliotrope.plant.sensors import FED, SensorFiles
+from heliotrope.plant.settings import clusters_of
 from heliotrope.sun import Site
+from support.broker import Mosquitto, mosquitto_for
+from support.cluster_process import Line
+from support.clusters import Board, key_of
 
 MAIN = [sys.executable, "-c", "from heliotrope.cli import main; main()"]
 PREFIX = "heliotrope/test"

@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.control import schedule
-from heliotrope.control.calibration_cycle import CycleResult
-from heliotrope.control.schedule import (
+from heliotrope.errors import InputError, TimeError, UnknownNameError
+from heliotrope.field.layouts import malan_plant
+from heliotrope.geometry import MRAD, direction
+from heliotrope.lcu import states
+from heliotrope.plant.schedule import schedule
+from heliotrope.plant.schedule.schedule import (
     Assignment,
     Finished,
     Scheduler,
@@ -20,10 +23,7 @@ from heliotrope.control.schedule import (
     Weather,
     compare,
 )
-from heliotrope.errors import InputError, TimeError, UnknownNameError
-from heliotrope.field.layouts import malan_plant
-from heliotrope.geometry import MRAD, direction
-from heliotrope.lcu import states
+from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.sun import vector
 from heliotrope.twin.days import Days, Standing
 

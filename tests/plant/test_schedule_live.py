@@ -6,13 +6,13 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
-from heliotrope.control._schedule_live import PlantSchedule, settings_for
-from heliotrope.control.calibration_cycle import CycleSettings
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.schedule import Scheduler, Settings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.lcu import states
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.plant.schedule.live import PlantSchedule, settings_for
+from heliotrope.plant.schedule.schedule import Scheduler, Settings
+from heliotrope.plant.visits.calibration_cycle import CycleSettings
+from heliotrope.twin.live.live import LiveOptions, LivePlant
 
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 DESIGN = malan_plant(12)

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.control.aims import BeamCheck
-from heliotrope.control.assigned import rest_on
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.beam_paths import Sphere
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.plant import PlantController
-from heliotrope.control.protocol import Emergency
 from heliotrope.field.example import prototype
 from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.tracking import track
-from plant_bench import ENGINEER, OPERATOR, Bench, running
+from heliotrope.optics.keep_out import Sphere
+from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.assigned import rest_on
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.controller import PlantController
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: South of the tower; P5A stands due south of it and shines to the tower.
 WALKWAY = Sphere("walkway", (0.0, -12.0, 8.0), 1.0)

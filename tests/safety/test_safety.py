@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.control import safety
-from heliotrope.control.safety import (
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.safety import evaluation as safety
+from heliotrope.safety.evaluation import (
     CONDITIONS,
     Act,
     Action,
@@ -25,7 +26,6 @@ from heliotrope.control.safety import (
     Severity,
     Watcher,
 )
-from heliotrope.errors import InputError, UnknownNameError
 
 ROWS = {row.name: row for row in CONDITIONS}
 #: Row: a bad value, a safe one, what is done to what, what the line says. Written by hand

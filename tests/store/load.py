@@ -18,9 +18,9 @@ import numpy as np
 import plant_load
 
 from heliotrope.calibration.sightings import sightings
-from heliotrope.control.audit import Record
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.kept_audit import KeptAudit, KeptPoints
+from heliotrope.links.clock import SystemClock
+from heliotrope.plant.audit import Record
+from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event, ParameterVersion, StoreError
 from heliotrope.store.telemetry import Look, Telemetry, TelemetrySettings

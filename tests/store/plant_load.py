@@ -7,16 +7,16 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.clock import SystemClock, VirtualClock
-from heliotrope.control.kept_audit import KeptAudit, KeptPoints
-from heliotrope.control.operations import WorkSettings
-from heliotrope.control.plant import PlantController
 from heliotrope.field.layouts import malan_plant
+from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.operations.operations import WorkSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
-from heliotrope.twin._live_loop import PacedLoop
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.twin.live.live import LiveOptions, LivePlant
+from heliotrope.twin.live.loop import PacedLoop
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 COUNT = 6

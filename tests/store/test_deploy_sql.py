@@ -7,7 +7,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 from sqlalchemy import create_engine, text
 
-from heliotrope.cli._run_shared import Shown, store
+from heliotrope.cli.run._shared import Shown, store
 from heliotrope.errors import InputError
 
 SQL = Path(__file__).parents[2] / "deploy" / "postgresql.sql"

@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 from sqlalchemy import event
 
-from heliotrope.control.assigned import AssignedError, Points
-from heliotrope.control.audit import STOPPED, AuditError, Record
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.kept_audit import KeptAudit, KeptPoints
-from heliotrope.control.protocol import Stage
 from heliotrope.errors import InputError
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Stage
+from heliotrope.plant.assigned import AssignedError, Points
+from heliotrope.plant.audit import STOPPED, AuditError, Record
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store import audit as kept
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import AuditEntry, StoreError
-from plant_bench import OPERATOR, Bench, running
+from support.plant_bench import OPERATOR, Bench, running
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 RECORD = Record("p-1", "anna", "operator", "AIM", START.isoformat(), (1.5, 2.0), ("A", "B"), "why")
@@ -153,7 +153,7 @@ class TestAudit:
         if keeper.database.file is None:
             audit.confirm()  # the server's disk is not ours to look at
             return
-        monkeypatch.setattr("heliotrope.control.kept_audit.LEAST_FREE", 1 << 62)
+        monkeypatch.setattr("heliotrope.plant.kept_audit.LEAST_FREE", 1 << 62)
         with pytest.raises(AuditError, match=r"bytes are left on its disk.*make room"):
             audit.confirm()
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.calibration.estimator import fit
 from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype

@@ -1,7 +1,7 @@
 """Local controllers in a process of their own, each at its serial port, in real time.
 
-``python tests/boards_process.py COUNT SEED FIRST PORT…`` runs the boards FIRST, FIRST + 1, … of a
-field (`prototype_field`), one at each port. A line on the standard input asks where the motors
+``python -m support.boards_process COUNT SEED FIRST PORT…`` runs the boards FIRST, FIRST + 1, …
+of a field (`prototype_field`), one at each port. A line on the standard input asks where the motors
 stand: the answer is one line of JSON, ``{name: [state, primary, secondary]}``. The end of the
 input ends the process, as a power cut ends a board: at any instant.
 """
@@ -17,12 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliotrope.control.parameters import items_of
 from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.twin import outfit
-from heliotrope.twin.board import Board
-from whole_plant import MACHINE, installed, nominal
+from heliotrope.twin.boards import outfit
+from heliotrope.twin.boards.board import Board
+from support.whole_plant import MACHINE, installed, nominal
 
 
 @dataclass(frozen=True)

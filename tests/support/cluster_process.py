@@ -12,10 +12,9 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from clusters import Board
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import Link, messages
-from heliotrope.control.protocol import (
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import Link, messages
+from heliotrope.links.messages import (
     Lease,
     Message,
     Progress,
@@ -24,6 +23,7 @@ from heliotrope.control.protocol import (
     decode,
     encode,
 )
+from support.clusters import Board
 
 KEY = bytes(range(32))
 PATIENCE = 40.0

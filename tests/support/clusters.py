@@ -9,14 +9,18 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from datetime import UTC, datetime
 from typing import Any, TypeVar
 
-from heliotrope.control._kept import Kept
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
-from heliotrope.control.link import Bus, messages, running
-from heliotrope.control.memory import memory_pair
-from heliotrope.control.protocol import (
+from heliotrope.cluster.config import ClusterConfig, Member
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.timekeeping import SystemTime
+from heliotrope.lcu import states, ticks
+from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.node import Node
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.in_process import memory_pair
+from heliotrope.links.link import Bus, messages, running
+from heliotrope.links.messages import (
     Alarm,
     Command,
     Emergency,
@@ -28,13 +32,9 @@ from heliotrope.control.protocol import (
     decode,
     encode,
 )
-from heliotrope.control.timekeeping import SystemTime
-from heliotrope.lcu import states, ticks
-from heliotrope.lcu.journal import Journal
-from heliotrope.lcu.node import Node
 from heliotrope.sun import Site
-from heliotrope.twin.bus import TwinBus
-from lcu_machines import STOW, Flash, heliostat, items_of_heliostat, sha256
+from heliotrope.twin.boards.bus import TwinBus
+from support.lcu_machines import STOW, Flash, heliostat, items_of_heliostat, sha256
 
 SITE = Site(37.09, -2.36, 500.0, name="Tabernas")
 TOKEN = 0xABCD

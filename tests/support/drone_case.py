@@ -3,7 +3,7 @@
 import numpy as np
 
 from heliotrope.airborne.photo import LedCamera
-from heliotrope.airborne.simulation import Errors, Flight, fly, hover_grid, look_counts
+from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, hover_grid, look_counts
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant

@@ -13,7 +13,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import linear_paint, rotary
 from heliotrope.sun import Site
 
-SCENE = Path(__file__).parent / "files" / "heliok-scene.xml"
+SCENE = Path(__file__).parents[1] / "files" / "heliok-scene.xml"
 SITE = Site(34.707, 33.261, 10.0, name="Pentakomo")
 
 

@@ -18,11 +18,11 @@ from heliotrope.geometry import direction
 from heliotrope.lcu import controller, drives, messages, states, ticks, wire
 from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.lcu.node import Node
-from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive, rotary
-from machines import imperfect
+from heliotrope.mechanism.kernels import slots as slot
+from support.machines import imperfect
 
 
 def single(name: str) -> ModuleType:

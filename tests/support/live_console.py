@@ -12,15 +12,15 @@ from typing import Any, TypeVar
 from heliotrope.console import _secrets
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.clock import VirtualClock
-from heliotrope.control.link import running
 from heliotrope.field.layouts import malan_plant
 from heliotrope.field.volumes import Box
+from heliotrope.links.clock import VirtualClock
+from heliotrope.links.link import running
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin._live_loop import PacedLoop
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.twin.live.live import LiveOptions, LivePlant
+from heliotrope.twin.live.loop import PacedLoop
 
 PASSWORD = "correct horse"
 ROLES = ("viewer", "operator", "engineer")

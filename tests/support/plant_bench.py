@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.authority import Person, Role
-from heliotrope.control.clock import VirtualClock, sleep_until
-from heliotrope.control.link import Link, LinkClosedError, messages
-from heliotrope.control.memory import Faults, MemoryLine, memory_pair
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import (
+from heliotrope.field.example import prototype
+from heliotrope.field.plant import Plant
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, sleep_until
+from heliotrope.links.in_process import Faults, MemoryLine, memory_pair
+from heliotrope.links.link import Link, LinkClosedError, messages
+from heliotrope.links.messages import (
     NEVER,
     NODE,
     Answer,
@@ -32,9 +31,10 @@ from heliotrope.control.protocol import (
     decode,
     encode,
 )
-from heliotrope.field.example import prototype
-from heliotrope.field.plant import Plant
-from heliotrope.lcu import states
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.settings import PlantSettings
 
 OPERATOR = Person("Olga", Role.OPERATOR)
 ENGINEER = Person("Egon", Role.ENGINEER)

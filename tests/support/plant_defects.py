@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control import _emergency, authority, field_state
-from heliotrope.control._plant_orders import PlantOrders
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.audit import AuditError
+from heliotrope.plant import authority, field_state
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety import proof as _emergency
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 

@@ -1,4 +1,4 @@
-"""No test of the controllers leaves a task behind, or an exception that nobody looked at."""
+"""Fixtures that fail a test which leaves a task behind, or an exception that nobody looked at."""
 
 import asyncio
 import asyncio.runners

@@ -7,9 +7,7 @@ from typing import Any
 
 import pytest
 
-import plant_defects
-from heliotrope.control import _nodes, _reports, _watch, aims
-from heliotrope.control.protocol import Stage
+from heliotrope.cluster import _nodes, _reports, _watch
 from heliotrope.lcu import (
     controller,
     journal,
@@ -21,8 +19,11 @@ from heliotrope.lcu import (
     ticks,
     wire,
 )
-from heliotrope.twin.faults import Fault
-from heliotrope.twin.simulation import Plan
+from heliotrope.links.messages import Stage
+from heliotrope.plant import aims
+from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.simulation import Plan
+from support import plant_defects
 
 #: The plant stands still for a minute when mirrors track.
 STILL = (Fault("plant_silent", 110.0, 60.0, 0, 0.5),)

@@ -11,30 +11,30 @@ from typing import Any
 
 import numpy as np
 
-from heliotrope.control.audit import JsonLines
-from heliotrope.control.authority import Person, Role
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import VirtualClock, sleep_until
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
-from heliotrope.control.link import Link, running
-from heliotrope.control.memory import memory_pair
-from heliotrope.control.parameters import Axis, Machine, Wanted, items_of
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.timekeeping import SystemTime
+from heliotrope.cluster.config import ClusterConfig, Member
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, sleep_until
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.in_process import memory_pair
+from heliotrope.links.link import Link, running
 from heliotrope.mechanism import kinds
+from heliotrope.mechanism.board_items import Axis, Machine, Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
+from heliotrope.plant.audit import JsonLines
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.visits.calibration_cycle import Shot
 from heliotrope.sun import Site
-from heliotrope.twin import outfit
-from heliotrope.twin.board import Board
-from heliotrope.twin.bus import TwinBus
+from heliotrope.twin.boards import outfit
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.bus import TwinBus
 
 ENGINEER = Person("Egon", Role.ENGINEER)
 SITE = Site(37.09, -2.36, 500.0, name="Tabernas")

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.control.calibration_cycle import CalibrationCycle, CycleSettings, Shot
-from heliotrope.control.clock import VirtualClock, run_virtual
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, bisector, normalize
-from heliotrope.imaging.beams import gaussian_beam
-from heliotrope.imaging.rendering import Thrown, example_camera, example_target
-from heliotrope.imaging.scenes import Scene
+from heliotrope.imaging.synthetic.rendering import Thrown, example_camera, example_target
+from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.optics.mirror_image import gaussian_beam
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings, Shot
+from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.cameras import ExactCamera, Mirror, RenderedCamera, Sight, mirrors_of
-from heliotrope.twin.outfit import RECEIVER
-from whole_plant import ENGINEER, WholePlant
+from support.whole_plant import ENGINEER, WholePlant
 
 MRAD = 1e-3
 TARGET = example_target(6.0, name="white")

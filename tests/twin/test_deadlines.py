@@ -11,14 +11,14 @@ from hypothesis.stateful import (
     run_state_machine_as_test,
 )
 
-from heliotrope.control._sun_line import sun_values
-from heliotrope.control.clock import gps_seconds
 from heliotrope.lcu import states, ticks, wire
-from heliotrope.twin.board import Board
-from heliotrope.twin.clocks import TickCounter
-from heliotrope.twin.outfit import RECEIVER, outfits, sha256
-from heliotrope.twin.simulation import SITE, START
-from twin_defects import DEFECTS
+from heliotrope.links.clock import gps_seconds
+from heliotrope.sun.line import sun_values
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.clocks import TickCounter
+from heliotrope.twin.boards.outfit import RECEIVER, outfits, sha256
+from heliotrope.twin.world.simulation import SITE, START
+from support.twin_defects import DEFECTS
 
 TOKEN, ADDRESS = 5, 11
 #: Around the ends of a slot, a second, the lease, the two silences and the wait for stow, ms.

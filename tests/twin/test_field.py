@@ -5,18 +5,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliotrope.control._sun_line import sun_values
-from heliotrope.control.clock import gps_seconds
 from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
 from heliotrope.lcu.controller import STUCK_PRIMARY
+from heliotrope.links.clock import gps_seconds
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
 from heliotrope.sun import vector
-from heliotrope.twin.board import Board
-from heliotrope.twin.field import Field
-from heliotrope.twin.outfit import (
+from heliotrope.sun.line import sun_values
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import (
     CAUSES,
     DEFOCUS,
     LIMITS,
@@ -28,8 +27,9 @@ from heliotrope.twin.outfit import (
     outfits,
     sha256,
 )
-from heliotrope.twin.simulation import SITE, START
+from heliotrope.twin.field.field import Field
 from heliotrope.twin.wind import Wind
+from heliotrope.twin.world.simulation import SITE, START
 
 TOKEN, COUNT = 0xF1E1D, 3
 

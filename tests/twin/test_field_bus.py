@@ -5,21 +5,21 @@ import asyncio
 import numpy as np
 import pytest
 
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
-from heliotrope.control.link import LinkClosedError, Outcome, running
-from heliotrope.control.memory import memory_pair
-from heliotrope.control.protocol import Command, Emergency, Lease, Stage, decode, encode
+from heliotrope.cluster.config import ClusterConfig, Member
+from heliotrope.cluster.controller import Cluster
 from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.in_process import memory_pair
+from heliotrope.links.link import LinkClosedError, Outcome, running
+from heliotrope.links.messages import Command, Emergency, Lease, Stage, decode, encode
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
-from heliotrope.twin.clocks import SimulatedTime
-from heliotrope.twin.field import Field
-from heliotrope.twin.field_bus import FieldBus, _stuffed, _unstuffed
-from heliotrope.twin.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STEPS_PER_TURN, STOW
-from heliotrope.twin.simulation import SITE
+from heliotrope.twin.boards.clocks import SimulatedTime
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STEPS_PER_TURN, STOW
+from heliotrope.twin.field.field import Field
+from heliotrope.twin.field.field_bus import FieldBus, _stuffed, _unstuffed
+from heliotrope.twin.world.simulation import SITE
 
 TOKEN = 77
 

@@ -11,33 +11,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.control.authority import Person, Role
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.link import LinkClosedError, Outcome
-from heliotrope.control.operations import WorkSettings
-from heliotrope.control.parameters import items_of
 from heliotrope.errors import InputError
 from heliotrope.field.layouts import lay_out, malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import bisector, normalize, reflect
-from heliotrope.imaging.scenes import Scene
+from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.lcu import journal, messages, states, wire
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.plant.authority import Person, Role
+from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.visits.calibration_cycle import Shot
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin._live_boards import BoardField
-from heliotrope.twin._live_camera import LiveCamera, SeenExactly
-from heliotrope.twin._live_field import LiveField, near
-from heliotrope.twin._live_link import near_pair
-from heliotrope.twin._live_loop import LATE, PacedLoop
 from heliotrope.twin.cameras import Mirror, Sight
-from heliotrope.twin.live import (
+from heliotrope.twin.live._boards import BoardField
+from heliotrope.twin.live._camera import LiveCamera, SeenExactly
+from heliotrope.twin.live._field import LiveField, near
+from heliotrope.twin.live._link import near_pair
+from heliotrope.twin.live.live import (
     LiveOptions,
     LivePlant,
     machine_of,
     prototype_plant,
     standby_of,
 )
+from heliotrope.twin.live.loop import LATE, PacedLoop
 
 MRAD = 1e-3
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
@@ -222,8 +222,8 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # As in a large plant, whose clusters ask for counts every five seconds only.
-    monkeypatch.setattr("heliotrope.twin.live._SMALL", 0)
-    monkeypatch.setattr("heliotrope.control._orders.FOLLOWED", 0.0)
+    monkeypatch.setattr("heliotrope.twin.live.live._SMALL", 0)
+    monkeypatch.setattr("heliotrope.cluster._orders.FOLLOWED", 0.0)
 
     async def work(plant: LivePlant) -> None:
         await asyncio.sleep(240.0)

@@ -5,17 +5,17 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.control.clock import VirtualClock, run_virtual
-from heliotrope.control.link import LinkClosedError, Outcome
 from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
-from heliotrope.twin.bus import BusFaults, TwinBus
-from heliotrope.twin.clocks import DriftingClock, SimulatedTime, TickCounter
-from heliotrope.twin.flash import NorFlash, PowerCutError
-from heliotrope.twin.motors import Axis
-from heliotrope.twin.outfit import outfits
-from heliotrope.twin.simulation import Plan
-from heliotrope.twin.soak import soak
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.twin.boards.bus import BusFaults, TwinBus
+from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
+from heliotrope.twin.boards.flash import NorFlash, PowerCutError
+from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.outfit import outfits
+from heliotrope.twin.world.simulation import Plan
+from heliotrope.twin.world.soak import soak
 
 
 def test_flash_takes_what_came_before_the_cut() -> None:

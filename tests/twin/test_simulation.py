@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 from heliotrope.cli import app
 from heliotrope.errors import InputError
 from heliotrope.lcu import states
-from heliotrope.twin import faults as kinds
-from heliotrope.twin.faults import Fault
-from heliotrope.twin.invariants import TITLES
-from heliotrope.twin.simulation import Outcome, Plan, run, shrink
-from twin_defects import DEFECTS, Defect
+from heliotrope.twin.invariants.invariants import TITLES
+from heliotrope.twin.world import faults as kinds
+from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.simulation import Outcome, Plan, run, shrink
+from support.twin_defects import DEFECTS, Defect
 
 #: Seeds that may be spent on a defect.
 SEEDS = 8

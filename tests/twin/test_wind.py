@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from heliotrope.control.safety import CONDITIONS
 from heliotrope.errors import InputError
 from heliotrope.geometry import normalize
+from heliotrope.safety.evaluation import CONDITIONS
 from heliotrope.twin.wind import DENSITY, GUST_S, MEAN_S, Wind
 
 HERE = (0.0, 0.0, 2.0)

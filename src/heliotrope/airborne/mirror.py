@@ -28,7 +28,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.field.formats._frames import mirror_frame
+from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, bisector, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import read_text, write_text
+from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import (
     FloatArray,
     as_float,

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.calibration._cells import read_rows
-from heliotrope.calibration.report import write_beside
+from heliotrope.calibration.report.page import write_beside
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import check_file
+from heliotrope.files.cells import read_rows
+from heliotrope.files.text import check_file
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")

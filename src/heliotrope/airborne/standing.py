@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from heliotrope.airborne.mirror import orientation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.formats._textfile import read_text, write_text
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.residuals import frame
+from heliotrope.calibration.fit.residuals import frame
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, angle_between, bisector, reflect

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors

@@ -14,7 +14,10 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration._cells import (
+from heliotrope.calibration.sightings import Sightings, camera_target, is_covariance, sightings
+from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.field.target import Target
+from heliotrope.files.cells import (
     Rows,
     find_heliostats,
     format_time,
@@ -22,10 +25,7 @@ from heliotrope.calibration._cells import (
     read_rows,
     rows_of,
 )
-from heliotrope.calibration.sightings import Sightings, camera_target, is_covariance, sightings
-from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.formats._textfile import LIMIT, write_file
-from heliotrope.field.target import Target
+from heliotrope.files.text import LIMIT, write_file
 from heliotrope.geometry import FloatArray, direction
 
 #: Kinds of sightings; whether their source and their destination are at infinity.

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.drift import NINETY
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn.drift import NINETY
 from heliotrope.calibration.sightings import sightings
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism

@@ -16,13 +16,13 @@ from heliotrope.cli.calibrate import calibrate
 from heliotrope.cli.camera import app as camera_app
 from heliotrope.cli.cluster import cluster
 from heliotrope.cli.demo import demo
-from heliotrope.cli.drone import app as drone_app
+from heliotrope.cli.drone.commands import app as drone_app
 from heliotrope.cli.evaluate import evaluate
 from heliotrope.cli.fetch import fetch
 from heliotrope.cli.field import app as field_app
 from heliotrope.cli.image import image
 from heliotrope.cli.plan import plan
-from heliotrope.cli.run import GroupedCommand, run
+from heliotrope.cli.run.command import GroupedCommand, run
 from heliotrope.cli.simulate import simulate
 from heliotrope.cli.sun import sun
 from heliotrope.cli.track import track

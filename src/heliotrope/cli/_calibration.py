@@ -13,8 +13,8 @@ from heliotrope.cli._common import open_plant
 if TYPE_CHECKING:
     from distributed import Client
 
-    from heliotrope.calibration.learning import Learned, Progress
-    from heliotrope.calibration.models import Candidate
+    from heliotrope.calibration.learn.learning import Learned, Progress
+    from heliotrope.calibration.learn.models import Candidate
     from heliotrope.calibration.sightings import Sightings
     from heliotrope.field.heliostats import Heliostats
     from heliotrope.field.plant import Plant
@@ -154,7 +154,7 @@ def connected(scheduler: str | None) -> "Iterator[Client | None]":
     if scheduler is None:
         yield None
         return
-    from heliotrope.calibration import cluster
+    from heliotrope.calibration.learn import on_dask as cluster
 
     client = cluster.connect(scheduler)
     try:
@@ -176,7 +176,7 @@ def choose_model(
         return parse_model(model), ()
     import numpy as np
 
-    from heliotrope.calibration import learning, models
+    from heliotrope.calibration.learn import learning, models
 
     keep = np.ones(len(loaded.seen), np.bool_) if used is None else np.asarray(used, np.bool_)
     counts = np.bincount(loaded.seen.heliostat[keep], minlength=len(loaded.heliostats))
@@ -201,7 +201,7 @@ def describe(scored: "tuple[Candidate, ...]") -> tuple[str, ...]:
     """Return a line on the comparison of models."""
     if not scored:
         return ()
-    from heliotrope.calibration.models import choose
+    from heliotrope.calibration.learn.models import choose
 
     best = choose(scored)
     listed = ", ".join(f"{c.name} {c.behind:.3f}±{c.behind_error:.3f}" for c in scored)
@@ -212,7 +212,7 @@ def describe(scored: "tuple[Candidate, ...]") -> tuple[str, ...]:
 @contextmanager
 def workers(scheduler: str | None) -> "Iterator[Callable[..., object] | None]":
     """Give a runner on a dask scheduler, or None for this process."""
-    from heliotrope.calibration import cluster
+    from heliotrope.calibration.learn import on_dask as cluster
 
     with connected(scheduler) as client:
         yield None if client is None else cluster.runner(client)
@@ -223,7 +223,7 @@ def learn(
     priors: dict[str, float] | None = None, scheduler: str | None = None, quiet: bool = False,
 ) -> "Learned":  # fmt: skip
     """Learn the heliostats behind a progress bar."""
-    from heliotrope.calibration import learning
+    from heliotrope.calibration.learn import learning
 
     with workers(scheduler) as run, progress("learning", quiet) as advance:
         return learning.learn(

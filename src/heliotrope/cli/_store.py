@@ -26,7 +26,7 @@ def _root() -> None:
 @app.command()
 def info(place: Place, as_json: JsonOption = False) -> None:
     """Print what is in a store."""
-    from heliotrope.calibration._cells import format_time
+    from heliotrope.files.cells import format_time
     from heliotrope.store.backup import summary
     from heliotrope.store.database import Database
 

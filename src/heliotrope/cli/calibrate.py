@@ -10,7 +10,7 @@ from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.report import Result
+    from heliotrope.calibration.report.page import Result
 
 
 def calibrate(
@@ -29,8 +29,9 @@ def calibrate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Learn every heliostat from all its sightings, test on held-out ones, write a report."""
-    from heliotrope.calibration import assessment, evaluation
-    from heliotrope.calibration.report import Result
+    from heliotrope.calibration import evaluation
+    from heliotrope.calibration.learn import assessment
+    from heliotrope.calibration.report.page import Result
 
     priors = shared.parse_priors(prior or [])
     if fraction != 1.0:
@@ -53,7 +54,7 @@ def calibrate(
 
 
 def _show(result: "Result", report: Path, as_json: bool) -> None:
-    from heliotrope.calibration.report import write_beside
+    from heliotrope.calibration.report.page import write_beside
 
     page = show_report(result, report, quiet=as_json)
     left_out = result.left_out
@@ -74,7 +75,7 @@ def _show(result: "Result", report: Path, as_json: bool) -> None:
 
 def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
     """Write the report behind a progress bar."""
-    from heliotrope.calibration.report import write_report
+    from heliotrope.calibration.report.page import write_report
 
     with shared.progress("drawing", quiet) as advance:
         return write_report(result, folder, advance)

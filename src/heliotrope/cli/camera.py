@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from heliotrope.field.plant import Plant
     from heliotrope.imaging.frame import Frame
     from heliotrope.imaging.lens import CameraFit, Lens
-    from heliotrope.imaging.teaching import Taught, Wish
+    from heliotrope.imaging.targets.teaching import Taught, Wish
 
 app = typer.Typer(help="Calibrate and teach target cameras.", no_args_is_help=True)
 
@@ -74,7 +74,7 @@ def _from_chessboard(
     from dataclasses import replace
 
     from heliotrope.imaging.lens import calibrate_chessboard
-    from heliotrope.imaging.teaching import with_camera, write_with_pictures
+    from heliotrope.imaging.targets.teaching import with_camera, write_with_pictures
 
     lens = calibrate_chessboard([f.grey for f in frames], *board, [f.name for f in frames])
     old = next((c for c in plant.cameras if c.name == name), None)
@@ -132,7 +132,7 @@ def _from_marks(
 ) -> None:  # fmt: skip
     from dataclasses import replace
 
-    from heliotrope.imaging import teaching
+    from heliotrope.imaging.targets import teaching
 
     old = next((c for c in plant.cameras if c.name == name), None)
     sizes = {frame.size for frame in frames} | ({old.size} if old else set())
@@ -184,7 +184,7 @@ def teach(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Tell once where a target's points are in a picture: its marks and the camera's place."""
-    from heliotrope.imaging import teaching
+    from heliotrope.imaging.targets import teaching
 
     place = _place_to_write(plant, out)
     loaded = open_plant(plant)
@@ -193,7 +193,7 @@ def teach(
     given = dict(_at(text) for text in at or [])
     wishes, wish = _wishes(kind or [], size or [], stroke or [])
     if click:
-        from heliotrope.imaging._click_page import click_points
+        from heliotrope.imaging.targets.click_page import click_points
 
         given |= click_points(surface, frame, given, image.name, _announcer(as_json))
     taught = teaching.teach(
@@ -227,7 +227,7 @@ def _at(text: str) -> tuple[str, tuple[float, float]]:
 def _wishes(
     kinds: Sequence[str], sizes: Sequence[str], strokes: Sequence[str]
 ) -> "tuple[dict[str, Wish], Wish]":
-    from heliotrope.imaging.teaching import Wish
+    from heliotrope.imaging.targets.teaching import Wish
 
     def metres(text: str) -> float:
         try:
@@ -300,7 +300,7 @@ def show(
     """Print the cameras of a plant and how they see its targets."""
     import numpy as np
 
-    from heliotrope.imaging.teaching import sights
+    from heliotrope.imaging.targets.teaching import sights
 
     loaded = open_plant(plant)
     if not loaded.cameras and not as_json:
@@ -358,7 +358,7 @@ def _place_to_write(plant: Path, out: Path | None) -> Path:
 
 
 def _read(image: Path) -> "Frame":
-    from heliotrope.imaging.reading import read_image
+    from heliotrope.imaging.files import read_image
 
     return read_image(image)
 

@@ -8,10 +8,10 @@ import typer
 if TYPE_CHECKING:
     import asyncio
 
-    from heliotrope.control.clock import Clock
-    from heliotrope.control.cluster import Cluster
-    from heliotrope.control.cluster_file import Installation
-    from heliotrope.control.link import Link
+    from heliotrope.cluster.config_file import Installation
+    from heliotrope.cluster.controller import Cluster
+    from heliotrope.links.clock import Clock
+    from heliotrope.links.link import Link
 
 
 def cluster(
@@ -25,7 +25,7 @@ def cluster(
     if not 1.0 <= every <= 86400.0:
         raise InputError(f"--every {every:g} s is not within 1 to 86400 s")
     try:
-        from heliotrope.control.cluster_file import read_cluster
+        from heliotrope.cluster.config_file import read_cluster
     except ImportError as error:
         raise InputError(
             f"cluster: {error.name} is not installed; say pip install 'heliotrope[control]'"
@@ -45,12 +45,12 @@ async def _run(installation: "Installation", every: float) -> None:
     import asyncio
     import signal
 
-    from heliotrope.control._kept import Kept
-    from heliotrope.control.clock import SystemClock
-    from heliotrope.control.cluster import Cluster
-    from heliotrope.control.link import running
-    from heliotrope.control.real_cluster import line_of, time_of
-    from heliotrope.control.serial_bus import SerialBus
+    from heliotrope.cluster.controller import Cluster
+    from heliotrope.cluster.memory import Kept
+    from heliotrope.cluster.program import line_of, time_of
+    from heliotrope.cluster.serial_bus import SerialBus
+    from heliotrope.links.clock import SystemClock
+    from heliotrope.links.link import running
 
     clock = SystemClock()
     bus = SerialBus(installation.bus_url, clock, installation.bus)
@@ -82,13 +82,13 @@ async def _log(cluster: "Cluster", ending: "asyncio.Event", every: float) -> Non
 def _link(installation: "Installation", clock: "Clock") -> "Link":
     name, key = installation.config.name, installation.plant_key
     if installation.scheme == "tcp":
-        from heliotrope.control.tcp import client_tls, tcp_link
+        from heliotrope.links.tcp import client_tls, tcp_link
 
         authority = installation.plant.authority
         tls = None if authority is None else client_tls(authority)
         return tcp_link(installation.host, installation.port, name, key, clock, tls=tls)
-    from heliotrope.control.mqtt import Broker, mqtt_link
-    from heliotrope.control.tcp import client_tls
+    from heliotrope.links.mqtt import Broker, mqtt_link
+    from heliotrope.links.tcp import client_tls
 
     authority = installation.plant.authority
     tls = None

@@ -9,7 +9,7 @@ import typer
 from heliotrope.cli._common import print_json
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.report import Result
+    from heliotrope.calibration.report.page import Result
     from heliotrope.field.plant import Plant
     from heliotrope.geometry import FloatArray
 
@@ -25,8 +25,9 @@ def demo(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Make an example plant, measure it, calibrate it, track a day, and write a report."""
-    from heliotrope.calibration import assessment, evaluation, learning
-    from heliotrope.calibration.report import Result, write_beside
+    from heliotrope.calibration import evaluation
+    from heliotrope.calibration.learn import assessment, learning
+    from heliotrope.calibration.report.page import Result, write_beside
     from heliotrope.cli.calibrate import show_report
     from heliotrope.field.example import prototype, roughly_installed
     from heliotrope.field.formats.plant_file import write_plant

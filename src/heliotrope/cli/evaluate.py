@@ -25,7 +25,8 @@ def evaluate(
     Everything, the model and what is common to the field included, is learnt from the
     training part alone.
     """
-    from heliotrope.calibration import assessment, evaluation
+    from heliotrope.calibration import evaluation
+    from heliotrope.calibration.learn import assessment
 
     evaluation.check_fraction(fraction)
     priors = shared.parse_priors(prior or [])

@@ -162,7 +162,7 @@ def open_place(path: Path) -> Place:
 
 def _files(paths: Sequence[Path]) -> list[Path]:
     from heliotrope.errors import FormatError
-    from heliotrope.imaging.reading import find_images
+    from heliotrope.imaging.files import find_images
 
     files: list[Path] = []
     for path in paths:
@@ -182,10 +182,10 @@ def _job(
 ) -> "Job":  # fmt: skip
     from heliotrope.errors import InputError, UnknownNameError
     from heliotrope.imaging.campaign import Job
+    from heliotrope.imaging.files import read_image
     from heliotrope.imaging.memory import Memory
     from heliotrope.imaging.photograph import Settings
-    from heliotrope.imaging.reading import read_image
-    from heliotrope.imaging.teaching import read_pictures
+    from heliotrope.imaging.targets.teaching import read_pictures
 
     names = [t.name for t in place.targets]
     if target and target not in names:

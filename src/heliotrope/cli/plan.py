@@ -19,7 +19,7 @@ from heliotrope.cli._common import (
 )
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.planning import Candidates, Plan
+    from heliotrope.calibration.plan.planning import Candidates, Plan
     from heliotrope.calibration.sightings import Sightings
     from heliotrope.field.heliostats import Heliostats
     from heliotrope.field.plant import Plant
@@ -74,8 +74,8 @@ def plan(
     picture: Annotated[Path | None, typer.Option(help="File .png, .svg or .pdf.")] = None,
 ) -> None:
     """Plan the measurements that tell most: times, targets, and the beam error to expect."""
-    from heliotrope.calibration.campaign import Timing
-    from heliotrope.calibration.planning_report import check_picture
+    from heliotrope.calibration.plan.campaign import Timing
+    from heliotrope.calibration.plan.report import check_picture
 
     if picture is not None:
         check_picture(picture)
@@ -270,7 +270,7 @@ def _aims(plant: "Plant", group: "Heliostats") -> "FloatArray":
 
 
 def _plans(plant: "Plant", parts: list[_Part], order: _Order) -> None:
-    from heliotrope.calibration.planning_report import (
+    from heliotrope.calibration.plan.report import (
         plan_picture,
         plan_rows,
         write_picture,
@@ -310,7 +310,7 @@ def _all_plans(
 ) -> "tuple[dict[str, Plan], Candidates]":
     import numpy as np
 
-    from heliotrope.calibration import planning
+    from heliotrope.calibration.plan import planning
     from heliotrope.errors import InputError
 
     start, stop = (t.timestamp() for t in order.span)
@@ -387,8 +387,8 @@ def _print_files(order: _Order) -> None:
 def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
     import numpy as np
 
-    from heliotrope.calibration import campaign as planner
-    from heliotrope.calibration.planning_report import (
+    from heliotrope.calibration.plan import campaign as planner
+    from heliotrope.calibration.plan.report import (
         campaign_picture,
         campaign_rows,
         write_picture,

@@ -36,8 +36,8 @@ def simulate(
     The eleven safety invariants are checked at every step. The exit code is 1 if one is broken.
     """
     from heliotrope.errors import InputError
-    from heliotrope.twin.simulation import Plan
-    from heliotrope.twin.soak import soak
+    from heliotrope.twin.world.simulation import Plan
+    from heliotrope.twin.world.soak import soak
 
     if runs < 1 or (minutes is not None and not minutes > 0.0):
         raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
@@ -63,7 +63,7 @@ def simulate(
 
 def _document(found: Any) -> dict[str, Any]:
     from heliotrope.lcu import states
-    from heliotrope.twin.invariants import TITLES
+    from heliotrope.twin.invariants.invariants import TITLES
 
     return {
         "runs": found.runs,
@@ -80,7 +80,7 @@ def _document(found: Any) -> dict[str, Any]:
 
 def _shrunk(plans: list[Any], found: Any) -> list[str]:
     """Shrink the first run that failed."""
-    from heliotrope.twin.simulation import run, shrink
+    from heliotrope.twin.world.simulation import run, shrink
 
     for plan in plans:
         if any(f"--seed {plan.seed} " in line for line in found.broken):

@@ -47,7 +47,7 @@ def track(
 
     plant = open_plant(field)
     if calibration is not None:
-        from heliotrope.calibration.results import apply_to_plant, read_json
+        from heliotrope.calibration.report.results import apply_to_plant, read_json
 
         plant = apply_to_plant(plant, read_json(calibration))
     mechanism = plant.heliostat(heliostat)

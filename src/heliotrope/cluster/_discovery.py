@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from heliotrope.control._exchange import Exchange
-from heliotrope.control._nodes import Node
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._nodes import Node
 from heliotrope.lcu import messages, wire
 from heliotrope.lcu.node import HERE_SLOT_MS, HERE_SLOTS
 

@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from heliotrope.control._nodes import Node, Question, answer_in
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import Bus, Outcome
+from heliotrope.cluster._nodes import Node, Question, answer_in
 from heliotrope.lcu import messages, wire
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Bus, Outcome
 
 #: The share of bad frames is taken over so many seconds.
 _WINDOW = 10

@@ -8,10 +8,8 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from heliotrope.control._nodes import Node
-from heliotrope.control._reports import Reports
-from heliotrope.control.protocol import Stage
-from heliotrope.control.safety import DEFOCUS_BUDGET, STOW_BUDGET
+from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._reports import Reports
 from heliotrope.lcu import names, states
 from heliotrope.lcu.states import (
     APPROACHING,
@@ -23,6 +21,8 @@ from heliotrope.lcu.states import (
     STOWING,
     TRACKING,
 )
+from heliotrope.links.messages import Stage
+from heliotrope.safety.evaluation import DEFOCUS_BUDGET, STOW_BUDGET
 
 _ALL = frozenset(range(len(states.STATES)))
 #: States in which a beam may be on the receiver, on its standby point, or under way to them.

@@ -14,9 +14,9 @@ from binascii import crc32
 from dataclasses import dataclass
 from typing import Any
 
-from heliotrope.control.cluster_config import Member
-from heliotrope.control.protocol import NEVER, NODE
+from heliotrope.cluster.config import Member
 from heliotrope.lcu import messages, states, wire
+from heliotrope.links.messages import NEVER, NODE
 
 _ROW = struct.Struct("<BBIIiiiiIHbHIIII")
 assert _ROW.size == NODE.itemsize

@@ -14,16 +14,16 @@ from collections.abc import Awaitable, Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from heliotrope.control._discovery import SPAN, heard
-from heliotrope.control._exchange import Exchange
-from heliotrope.control._goals import GOALS, Goals, Shift
-from heliotrope.control._kept import Kept
-from heliotrope.control._nodes import Node
-from heliotrope.control._reports import Reports
-from heliotrope.control.cluster_config import ClusterConfig
-from heliotrope.control.protocol import Command, Parameters, ProtocolError, Stage
+from heliotrope.cluster._discovery import SPAN, heard
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._goals import GOALS, Goals, Shift
+from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster.config import ClusterConfig
+from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
+from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
 
 #: The same frame is sent so often before others get their turn.
 TRIES = 3

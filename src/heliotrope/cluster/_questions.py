@@ -5,14 +5,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
-from heliotrope.control._discovery import Discovery
-from heliotrope.control._exchange import Exchange
-from heliotrope.control._nodes import Node
-from heliotrope.control._orders import stored
-from heliotrope.control._reports import Reports
-from heliotrope.control.cluster_config import ClusterConfig
-from heliotrope.control.protocol import Answer, Ask
+from heliotrope.cluster._discovery import Discovery
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._orders import stored
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster.config import ClusterConfig
 from heliotrope.lcu.journal import ITEMS
+from heliotrope.links.messages import Answer, Ask
 
 _SECRET = "key_id"  # noqa: S105 (the name of an item that is never told)
 _PATIENCE = 5.0

@@ -2,7 +2,7 @@
 
 from collections import deque
 
-from heliotrope.control.protocol import Alarm, Answer, Message, Progress, Stage, Status
+from heliotrope.links.messages import Alarm, Answer, Message, Progress, Stage, Status
 
 #: Messages that wait; the oldest are dropped first. A status waits alone: only the newest counts.
 _CAPACITY = 256

@@ -7,12 +7,12 @@ before them; who has not acknowledged is asked again in every second, and named,
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 
-from heliotrope.control._exchange import Exchange
-from heliotrope.control._goals import Goals
-from heliotrope.control._nodes import Node
-from heliotrope.control._reports import Reports
-from heliotrope.control.protocol import Stage
-from heliotrope.control.safety import ORDER_BUDGET
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._goals import Goals
+from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._reports import Reports
+from heliotrope.links.messages import Stage
+from heliotrope.safety.evaluation import ORDER_BUDGET
 
 NAMES = ("DEFOCUS", "STOW")
 _CALLS = 3

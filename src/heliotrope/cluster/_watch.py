@@ -4,9 +4,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from heliotrope.control._reports import Reports
-from heliotrope.control.protocol import Lease
-from heliotrope.control.safety import (
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster.timekeeping import Time
+from heliotrope.links.messages import Lease
+from heliotrope.safety.evaluation import (
     Act,
     Action,
     Condition,
@@ -22,7 +23,6 @@ from heliotrope.control.safety import (
     start,
     watched_by,
 )
-from heliotrope.control.timekeeping import Time
 
 _LINE = "emergency_line"
 #: The row of the plant's silence trips after so long, autonomy apart; a lease may be no longer.

@@ -13,10 +13,10 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from heliotrope.control.cluster_config import MOST_MEMBERS, ClusterConfig, Member
-from heliotrope.control.serial_bus import BusSettings
+from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member
+from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._documents import read_document, read_toml
+from heliotrope.files.documents import read_document, read_toml
 from heliotrope.sun import Site
 
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64

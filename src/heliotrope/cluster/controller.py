@@ -23,21 +23,22 @@ import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from heliotrope.control._asked import Asked
-from heliotrope.control._exchange import Exchange
-from heliotrope.control._goals import BEAM_OUT, Goals
-from heliotrope.control._kept import Kept
-from heliotrope.control._nodes import STATUS, STEPS, Node, rows
-from heliotrope.control._orders import Orders, Refusal
-from heliotrope.control._reports import Reports
-from heliotrope.control._sun_line import sun_values
-from heliotrope.control._urgent import NAMES, Urgent
-from heliotrope.control._watch import Watch
-from heliotrope.control.clock import WEEK, Clock
-from heliotrope.control.cluster_config import ClusterConfig
-from heliotrope.control.link import Bus, Link, LinkClosedError, LinkError, Outcome
-from heliotrope.control.link import messages as received
-from heliotrope.control.protocol import (
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._goals import BEAM_OUT, Goals
+from heliotrope.cluster._nodes import STATUS, STEPS, Node, rows
+from heliotrope.cluster._orders import Orders, Refusal
+from heliotrope.cluster._questions import Asked
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster._urgent import NAMES, Urgent
+from heliotrope.cluster._watch import Watch
+from heliotrope.cluster.config import ClusterConfig
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.timekeeping import Time, TimeKeeper
+from heliotrope.lcu import names, states, wire
+from heliotrope.links.clock import WEEK, Clock
+from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError, Outcome
+from heliotrope.links.link import messages as received
+from heliotrope.links.messages import (
     Acknowledge,
     Alarm,
     Answer,
@@ -54,9 +55,8 @@ from heliotrope.control.protocol import (
     decode,
     encode,
 )
-from heliotrope.control.safety import Act, Role
-from heliotrope.control.timekeeping import Time, TimeKeeper
-from heliotrope.lcu import names, states, wire
+from heliotrope.safety.evaluation import Act, Role
+from heliotrope.sun.line import sun_values
 
 #: Of TIME on the wire.
 _QUALITIES = ("none", "gps", "holdover", "system")

@@ -22,10 +22,10 @@ import math
 from dataclasses import dataclass
 from datetime import datetime
 
-from heliotrope.control.clock import GPS_EPOCH, Clock, gps_seconds, utc_of_gps
-from heliotrope.control.nmea import NmeaReader, Report
-from heliotrope.control.timekeeping import Quality, Steadiness, Time
+from heliotrope.cluster.nmea import NmeaReader, Report
+from heliotrope.cluster.timekeeping import Quality, Steadiness, Time
 from heliotrope.errors import InputError, TimeError
+from heliotrope.links.clock import GPS_EPOCH, Clock, gps_seconds, utc_of_gps
 
 #: A sentence may begin this much before the time it names, in s: receivers round.
 _EARLY = 0.01

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field
 
 import serialx
 
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.discipline import (
+from heliotrope.cluster.discipline import (
     DisciplinedClock,
     DisciplineSettings,
     DisciplineStatistics,
 )
-from heliotrope.control.link import Backoff, LinkError, until_closed
-from heliotrope.control.timekeeping import Time
+from heliotrope.cluster.timekeeping import Time
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import Backoff, LinkError, until_closed
 
 _BAUD_RATES = (1200, 921_600)
 #: How often the computer's clock is looked at, in s.

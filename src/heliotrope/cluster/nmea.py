@@ -28,7 +28,7 @@ from pynmeagps.exceptions import (  # type: ignore[import-untyped]
     NMEATypeError,
 )
 
-from heliotrope.control.timekeeping import NOT_BEFORE
+from heliotrope.cluster.timekeeping import NOT_BEFORE
 
 #: The standard allows 82 characters; receivers of several systems send somewhat more.
 _LONGEST = 120

@@ -8,18 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from heliotrope.control import timekeeping
-from heliotrope.control._kept import Kept
-from heliotrope.control.clock import Clock
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_file import Installation, read_cluster
-from heliotrope.control.discipline import DisciplineSettings
-from heliotrope.control.gps import GpsSettings, GpsTime
-from heliotrope.control.link import Link
-from heliotrope.control.memory import memory_pair
-from heliotrope.control.serial_bus import SerialBus
-from heliotrope.control.timekeeping import SystemTime, TimeKeeper
+from heliotrope.cluster import timekeeping
+from heliotrope.cluster.config_file import Installation, read_cluster
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.discipline import DisciplineSettings
+from heliotrope.cluster.gps import GpsSettings, GpsTime
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.serial_bus import SerialBus
+from heliotrope.cluster.timekeeping import SystemTime, TimeKeeper
 from heliotrope.errors import FormatError
+from heliotrope.links.clock import Clock
+from heliotrope.links.in_process import memory_pair
+from heliotrope.links.link import Link
 
 
 def time_of(installation: Installation, clock: Clock) -> TimeKeeper:

@@ -20,16 +20,16 @@ from dataclasses import dataclass
 
 import serialx
 
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.link import (
+from heliotrope.cluster.turns import Turns
+from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import (
     Backoff,
     LinkClosedError,
     LinkError,
     Outcome,
     until_closed,
 )
-from heliotrope.control.turns import Turns
-from heliotrope.errors import InputError
 
 #: Start, eight data bits, stop.
 _BITS = 10

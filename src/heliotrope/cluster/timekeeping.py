@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, Protocol
 
-from heliotrope.control.clock import GPS_EPOCH, Clock, gps_seconds, sleep_until
 from heliotrope.errors import InputError, TimeError
+from heliotrope.links.clock import GPS_EPOCH, Clock, gps_seconds, sleep_until
 
 Quality = Literal["gps", "system", "holdover", "none"]
 

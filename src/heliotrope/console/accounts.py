@@ -19,7 +19,7 @@ from heliotrope.console.auth import (
     same_origin,
 )
 from heliotrope.console.people import ROLES
-from heliotrope.control.authority import Role
+from heliotrope.plant.authority import Role
 from heliotrope.store.people import Account
 
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)

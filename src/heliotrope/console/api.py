@@ -23,10 +23,10 @@ from heliotrope.console.auth import (
     same_origin,
 )
 from heliotrope.console.models import plain
-from heliotrope.control.operations import Operations
 from heliotrope.field.volumes import outline
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.plant.operations.operations import Operations
 
 #: Answers that any route behind the door may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {

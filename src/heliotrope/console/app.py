@@ -20,10 +20,10 @@ from heliotrope.console.auth import Console
 from heliotrope.console.guard import Guard
 from heliotrope.console.live import Stream
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.control.audit import AuditError
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.operations import Operations
 from heliotrope.errors import HeliotropeError, UnknownNameError
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.people import People
 from heliotrope.store.records import StoreError
 

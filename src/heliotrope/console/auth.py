@@ -23,8 +23,8 @@ from heliotrope.console.live import Stream
 from heliotrope.console.people import person_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.tickets import Tickets
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.operations import Operations
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.people import Account, ApiToken, People, Session
 from heliotrope.store.records import StoreError
 

@@ -14,9 +14,9 @@ from fastapi.responses import JSONResponse
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
 from heliotrope.console.auth import Anyone, Caller, Console, Here, Operator, token_of
-from heliotrope.control._operations_zero import zero
-from heliotrope.control.authority import OPERATOR_COMMANDS, Role
 from heliotrope.errors import InputError
+from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
+from heliotrope.plant.operations.zero import zero
 
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.console.models import plain
-from heliotrope.control.operations import Operations
 from heliotrope.errors import HeliotropeError
 from heliotrope.lcu import names as meanings
+from heliotrope.plant.operations.operations import Operations
 
 MARK = b"HLS1"
 ROW = np.dtype(

@@ -17,7 +17,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
-from heliotrope.control import _operations_views as views
+from heliotrope.optics import flux
+from heliotrope.plant.operations import views
 
 _MADE: dict[type, type[BaseModel]] = {}
 
@@ -297,7 +298,7 @@ def many(model: type[BaseModel]) -> Any:
 
 #: Answers with the data of views.
 Summary, SunView = model_of(views.Summary), model_of(views.SunView)
-FluxView, HeliostatView = model_of(views.FluxView), model_of(views.HeliostatView)
+FluxView, HeliostatView = model_of(flux.FluxView), model_of(views.HeliostatView)
 ClusterRow, AlarmRow = model_of(views.ClusterRow), model_of(views.AlarmRow)
 EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
 CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)

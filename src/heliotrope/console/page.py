@@ -14,7 +14,7 @@ from nicegui import ui
 
 from heliotrope.console._files import KEPT
 from heliotrope.console.auth import Caller, find_caller
-from heliotrope.control.authority import Role
+from heliotrope.plant.authority import Role
 
 #: Tabs: name of the part, title.
 TABS = (

@@ -1,7 +1,7 @@
 """Who may come in: persons of the store's accounts, and the first of them."""
 
 from heliotrope.console import _secrets
-from heliotrope.control.authority import Person, Role
+from heliotrope.plant.authority import Person, Role
 from heliotrope.store.people import People
 
 ROLES = {"viewer": Role.VIEWER, "operator": Role.OPERATOR, "engineer": Role.ENGINEER}

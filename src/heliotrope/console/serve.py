@@ -9,8 +9,8 @@ import uvicorn
 
 from heliotrope.console.app import create
 from heliotrope.console.settings import ConsoleSettings
-from heliotrope.control.operations import Operations
 from heliotrope.errors import InputError
+from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.people import People
 
 

@@ -3,8 +3,8 @@
 from collections import OrderedDict
 
 from heliotrope.console.models import TicketState
-from heliotrope.control._tickets import Ticket
 from heliotrope.errors import UnknownNameError
+from heliotrope.plant.tickets import Ticket
 
 #: Tickets that are kept; those of whole fields are large.
 KEPT = 200

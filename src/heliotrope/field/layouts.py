@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field import _layout_tower as tower
+from heliotrope.field import layout_tower as tower
 from heliotrope.field.camera import Camera
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.formats._textfile import read_text
+from heliotrope.files.text import read_text
 from heliotrope.geometry import FloatArray
 
 #: A column as it was read: texts, or what Parquet holds.

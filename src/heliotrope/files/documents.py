@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from heliotrope.errors import FormatError
-from heliotrope.field.formats._textfile import read_text
+from heliotrope.files.text import read_text
 
 D = TypeVar("D", bound=BaseModel)
 

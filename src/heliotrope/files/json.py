@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.errors import FormatError
-from heliotrope.field.formats._textfile import read_text
+from heliotrope.files.text import read_text
 
 
 class Node:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import check_file, write_file
+from heliotrope.files.text import check_file, write_file
 
 
 @dataclass(frozen=True)

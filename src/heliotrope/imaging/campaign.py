@@ -17,6 +17,7 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, enu_to_geodetic
 from heliotrope.imaging.annotate import annotate
+from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.log import Entry, Log, beside
 from heliotrope.imaging.photograph import (
@@ -28,8 +29,7 @@ from heliotrope.imaging.photograph import (
     read_crop,
     read_photograph,
 )
-from heliotrope.imaging.reading import read_image, write_image
-from heliotrope.imaging.view import View
+from heliotrope.imaging.targets.view import View
 from heliotrope.sun import Site, vector
 
 if TYPE_CHECKING:

@@ -28,7 +28,7 @@ from typing import Any, cast
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import write_file
+from heliotrope.files.text import write_file
 from heliotrope.imaging.frame import Frame, Pixels
 
 #: What :func:`find_images` looks for; :func:`read_image` goes by the content, not by these.

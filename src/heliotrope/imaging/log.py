@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from heliotrope.errors import FormatError
-from heliotrope.field.formats._textfile import check_file
 from heliotrope.field.formats.paint import read_calibration_properties
+from heliotrope.files.text import check_file
 from heliotrope.geometry import FloatArray, direction
 
 #: Columns of a log; a row needs a file's name or id, a heliostat and two counts.

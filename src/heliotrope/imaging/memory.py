@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from heliotrope.errors import InputError
-from heliotrope.imaging.background import EmptyTarget
 from heliotrope.imaging.photograph import LookedAt
+from heliotrope.imaging.spots.background import EmptyTarget
 
 
 class Memory:

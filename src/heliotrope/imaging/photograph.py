@@ -11,14 +11,14 @@ from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging import background as backgrounds
-from heliotrope.imaging.background import Background, EmptyTarget
-from heliotrope.imaging.finding import FoundTarget, Pictures, find_targets
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.quality import Expectation, Limits, Reason, judge
-from heliotrope.imaging.rectify import ACROSS, Rectified, from_crop, rectify
-from heliotrope.imaging.spot import Spot, find_spots
-from heliotrope.imaging.view import Face, View
+from heliotrope.imaging.spots import background as backgrounds
+from heliotrope.imaging.spots.background import Background, EmptyTarget
+from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
+from heliotrope.imaging.spots.spot import Spot, find_spots
+from heliotrope.imaging.targets.finding import FoundTarget, Pictures, find_targets
+from heliotrope.imaging.targets.rectify import ACROSS, Rectified, from_crop, rectify
+from heliotrope.imaging.targets.view import Face, View
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from heliotrope.errors import FetchError, InputError
+from heliotrope.imaging.files import IMAGE_SUFFIXES, read_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.reading import IMAGE_SUFFIXES, read_image
 from heliotrope.imaging.sources import Source
 
 if TYPE_CHECKING:

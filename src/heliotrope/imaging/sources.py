@@ -25,10 +25,10 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from heliotrope.errors import FetchError, FormatError, InputError, TimeError
-from heliotrope.field.formats._textfile import write_text
+from heliotrope.files.text import write_text
+from heliotrope.imaging.files import IMAGE_SUFFIXES, find_images, read_image, write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.motion import find_shift
-from heliotrope.imaging.reading import IMAGE_SUFFIXES, find_images, read_image, write_image
 
 VIDEO_SUFFIXES = (".avi", ".mp4", ".m4v", ".mkv", ".mov", ".mpg", ".mpeg", ".ts", ".webm", ".mjpeg")
 _PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}
@@ -155,7 +155,7 @@ class FolderSource(Source):
         Whether broken files are left out and noted in ``skipped``, or raised (FormatError);
         None: left out if it is watched.
     read
-        Reads a file; by default :func:`heliotrope.imaging.reading.read_image`.
+        Reads a file; by default :func:`heliotrope.imaging.files.read_image`.
     wait
         Waits for seconds; by default until ``stop`` is set.
     """

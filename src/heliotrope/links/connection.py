@@ -8,9 +8,10 @@ import secrets
 from collections.abc import Coroutine
 from typing import Protocol
 
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.conversation import Conversation
-from heliotrope.control.link import (
+from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.envelope import Conversation
+from heliotrope.links.link import (
     Backoff,
     Heartbeat,
     Inbox,
@@ -22,7 +23,6 @@ from heliotrope.control.link import (
     Statistics,
     until_closed,
 )
-from heliotrope.errors import InputError
 
 
 class Carrier(Protocol):

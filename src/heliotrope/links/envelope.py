@@ -18,8 +18,8 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import LinkSettings, Statistics
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import LinkSettings, Statistics
 
 _BEAT, _DATA = 0x11, 0x12
 #: Kind; sender's session; the session it has heard; count; sender's time; the time it has heard

@@ -11,10 +11,10 @@ import itertools
 import random
 from dataclasses import dataclass
 
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import LinkError, LinkLostError, LinkSettings
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,8 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from heliotrope.control.clock import Clock
 from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.links.clock import Clock
 
 
 class LinkError(HeliotropeError):

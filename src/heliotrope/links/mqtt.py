@@ -33,10 +33,10 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import LinkError, LinkLostError, LinkSettings, Statistics
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
 
 #: Messages in a row that the broker may leave unconfirmed before the connection is given up.
 #: Below the 20 from which on paho would keep messages back, to send them later.
@@ -62,7 +62,7 @@ class Broker:
     username, password
         None: the broker asks for none.
     tls
-        None: in clear; `heliotrope.control.tcp.client_tls` makes one from files.
+        None: in clear; `heliotrope.links.tcp.client_tls` makes one from files.
     keepalive_s
         MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clear up.
     """

@@ -26,11 +26,11 @@ from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import Clock
-from heliotrope.control.conversation import OVERHEAD
-from heliotrope.control.link import LinkError, LinkLostError, LinkSettings
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.envelope import OVERHEAD
+from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
 
 _NONCE, _PROOF = 32, 32
 _LONGEST_NAME = 64

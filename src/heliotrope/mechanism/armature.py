@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors, normalize, rotation
-from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism.kernels import slots as slot
 
 
 @dataclass(frozen=True)

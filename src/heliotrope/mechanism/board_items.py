@@ -14,9 +14,9 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import drives
 from heliotrope.lcu.config import MOST_POINTS, Config
 from heliotrope.lcu.journal import CODES_OF, SIZE_OF
-from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.kernels import slots as slot
 
 #: The ten numbers of a drive, in the order of the local controller.
 _ORDER = (

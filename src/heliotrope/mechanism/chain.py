@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism import parameters as parameter_table
-from heliotrope.mechanism._chain_kernels import armature_block, jacobian_block, pose_block
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.mechanism.kernels.chain import armature_block, jacobian_block, pose_block
 from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
 

@@ -25,8 +25,8 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import TAU, FloatArray, as_float
-from heliotrope.mechanism import _slots as slot
-from heliotrope.mechanism._drive_kernels import angles_block, counts_block, slopes_block
+from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.mechanism.kernels.drives import angles_block, counts_block, slopes_block
 from heliotrope.parallel import run_blocks
 
 

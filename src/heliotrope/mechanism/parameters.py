@@ -8,7 +8,7 @@ how far installation and survey let it stray (the prior's standard deviation).
 from dataclasses import dataclass, replace
 
 from heliotrope.errors import UnknownNameError
-from heliotrope.mechanism import _slots as slot
+from heliotrope.mechanism.kernels import slots as slot
 
 
 @dataclass(frozen=True)

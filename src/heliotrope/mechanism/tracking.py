@@ -14,18 +14,18 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors
-from heliotrope.mechanism import _slots as slot
-from heliotrope.mechanism._track_block import track_block
-from heliotrope.mechanism._track_kernels import (
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.drives import Drive, direct
+from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.mechanism.kernels.block import track_block
+from heliotrope.mechanism.kernels.track import (
     DEGENERATE,
     NOT_CONVERGED,
     OK,
     STOPPED,
     UNREACHABLE,
 )
-from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.drives import Drive, direct
 from heliotrope.parallel import run_blocks
 
 Branch = Literal["both", 0, 1]

@@ -21,8 +21,8 @@ import math
 
 from numba import njit
 
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._vectors import about, across, add, cross, dot, minus, norm, times
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.vectors import about, across, add, cross, dot, minus, norm, times
 
 SPHERE, BOX, CYLINDER, PRISM = range(4)
 #: Kind, bounding centre (3) and radius, and then:

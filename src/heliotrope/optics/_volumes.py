@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heliotrope.control import _beam_kernels as kernels
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, as_float
+from heliotrope.optics import _keep_out_kernels as kernels
 
 
 def packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:

@@ -161,7 +161,7 @@ def concentration(
     From a point at distance x the part of the mirror within √(area/π) and within
     x β / |1 − x/b| of its centre shows the sun, at the sun's radiance, so C is the square of
     min(√(area/π) / (x β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's section,
-    which is less everywhere (:func:`heliotrope.control.eye.mean_concentration`). An oblique
+    which is less everywhere (:func:`heliotrope.optics.glare.mean_concentration`). An oblique
     mirror may be up to that much stronger near its line foci as the radiance allows: the
     first of the two terms bounds it.
 
@@ -238,6 +238,7 @@ def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
+    """Check the reach of each beam, m: one number, or one for each of `count` beams."""
     given = as_float(reach)
     if not (np.isfinite(given) & (given > 0.0)).all() or given.shape not in ((), (1,), (count,)):
         raise InputError(f"reach {reach!r} m: give numbers above 0, one or one for each beam")

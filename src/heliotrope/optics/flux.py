@@ -1,7 +1,7 @@
 r"""The light that a field is expected to bring to a receiver: a map, its power, the intercept.
 
 A beam is a Gaussian about its aim. Its width follows from sun, mirror, and how well the mirror
-is calibrated (:func:`heliotrope.field.intercept.beam_sigma`). Across the ray it is round; on the
+is calibrated (:func:`heliotrope.optics.intercept.beam_sigma`). Across the ray it is round; on the
 aperture, which the ray with components :math:`d_r, d_u` meets under the cosine c, its variances are
 
 .. math:: σ_r^2 = σ^2 (1 + (d_r / c)^2), \qquad σ_u^2 = σ^2 (1 + (d_u / c)^2),
@@ -17,19 +17,49 @@ neighbours are left out, and so is the shape of the sun's limb. A receiver that 
 shown by the plane of its aperture.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_views import FluxView
 from heliotrope.errors import InputError
-from heliotrope.field.intercept import beam_sigma
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+from heliotrope.optics.intercept import beam_sigma
 
 #: Cells across and up.
 CELLS = (24, 24)
 #: The map is wider than the aperture by this factor: what misses it is to be seen.
 MARGIN = 1.5
+
+
+@dataclass(frozen=True)
+class FluxView:
+    """Predicted light on a receiver.
+
+    Attributes
+    ----------
+    receiver
+        Name.
+    right, up
+        Middles of the cells, m from the centre of the aperture as seen from the field, (W,), (H,).
+    flux
+        W/m², (H, W), lowest row first.
+    power
+        Into the aperture, W.
+    intercept
+        Share of the reflected light that falls into the aperture; NaN without beams.
+    heliostats
+        Whose beams are counted.
+    """
+
+    receiver: str
+    right: FloatArray
+    up: FloatArray
+    flux: FloatArray
+    power: float
+    intercept: float
+    heliostats: int
 
 
 def air_loss(distance: npt.ArrayLike) -> FloatArray:

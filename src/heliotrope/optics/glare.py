@@ -19,9 +19,9 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._beams import SUN, SUN_HALF_ANGLE, Beams, crossing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
+from heliotrope.optics.beam import SUN, SUN_HALF_ANGLE, Beams, crossing
 
 #: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and
 #: the angle from which on the irradiance alone counts, rad; 1 W/cm² there.
@@ -217,7 +217,7 @@ def mean_concentration(
     Parameters
     ----------
     distance, area, focus, half_angle
-        As of :func:`heliotrope.control.beam_paths.concentration`.
+        As of :func:`heliotrope.optics.keep_out.concentration`.
     """
     x = as_float(distance)
     radius = np.sqrt(as_float(area) / np.pi)

@@ -16,8 +16,15 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control import _beam_kernels as kernels
-from heliotrope.control._beams import (
+from heliotrope.errors import InputError
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
+from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import Status, track
+from heliotrope.optics import _keep_out_kernels as kernels
+from heliotrope.optics._volumes import packed
+from heliotrope.optics.beam import (
     REACH,
     SUN,
     SUN_HALF_ANGLE,
@@ -29,13 +36,6 @@ from heliotrope.control._beams import (
     crossing,
     reaches,
 )
-from heliotrope.control._volumes import packed
-from heliotrope.errors import InputError
-from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
-from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
-from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.drives import Drive
-from heliotrope.mechanism.tracking import Status, track
 
 __all__ = [
     "SUN_HALF_ANGLE", "Beams", "Box", "Crossing", "Cylinder", "Entries", "Mirrors", "Motion",

@@ -18,7 +18,7 @@ from heliotrope.geometry import (
     reflect,
     tangent_axes,
 )
-from heliotrope.imaging._render_kernels import coverage
+from heliotrope.optics.render_kernels import coverage
 
 #: Angular radius of the sun's disk, and where Buie's aureole ends, rad.
 SUN_RADIUS, AUREOLE_RADIUS = 4.65e-3, 43.6e-3

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from numba import njit
 
 from heliotrope.geometry import FloatArray
-from heliotrope.mechanism._jit import INLINED, OPTIONS
+from heliotrope.jit import INLINED, OPTIONS
 
 Image = npt.NDArray[np.float32]
 

@@ -5,15 +5,15 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control.aims import BeamCheck
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.safety import Reading
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status
+from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.field_state import FieldState
+from heliotrope.safety.evaluation import Reading
 
 Rows = npt.NDArray[np.intp]
 

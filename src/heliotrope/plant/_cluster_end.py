@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import Link, LinkClosedError, Outcome
-from heliotrope.control.protocol import Message, encode
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link, LinkClosedError, Outcome
+from heliotrope.links.messages import Message, encode
 
 
 @dataclass(frozen=True)

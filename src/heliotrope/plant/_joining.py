@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliotrope.control._emergency import JoinLimiter
-from heliotrope.control._plant_orders import PlantOrders
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.aims import BeamCheck
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.protocol import Stage
 from heliotrope.geometry import FloatArray
+from heliotrope.links.messages import Stage
+from heliotrope.plant.aims import BeamCheck
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.proof import JoinLimiter
 
 
 @dataclass

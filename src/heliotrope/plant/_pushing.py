@@ -3,13 +3,13 @@
 import math
 from collections.abc import Callable, Mapping
 
-from heliotrope.control._plant_orders import PlantOrders
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.audit import AuditError
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.parameters import CALIBRATION_ITEMS, Wanted, checksums
-from heliotrope.control.protocol import Answer, ProtocolError
 from heliotrope.lcu import states
+from heliotrope.links.messages import Answer, ProtocolError
+from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, Wanted, checksums
+from heliotrope.plant.audit import AuditError
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.tickets import Ticket
 
 #: States in which a controller takes items of its calibration, and items of its machine.
 TAKES_CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT,

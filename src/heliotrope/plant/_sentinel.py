@@ -5,23 +5,23 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from heliotrope.control._cluster_end import ClusterEnd
-from heliotrope.control._emergency import Reading, proof_readings
-from heliotrope.control._joining import JoinQueue
-from heliotrope.control._plant_orders import PlantOrders
-from heliotrope.control._plant_watch import PlantWatch
-from heliotrope.control._sun_line import sun_now
-from heliotrope.control._tickets import Ticket
-from heliotrope.control._ways import Lookout
-from heliotrope.control.authority import Authority
-from heliotrope.control.clock import Clock
-from heliotrope.control.emergency import EmergencyOrder
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.protocol import Alarm, Progress
-from heliotrope.control.safety import Act
 from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock
+from heliotrope.links.messages import Alarm, Progress
 from heliotrope.mechanism.drives import Drive
+from heliotrope.plant._beam_watch import Lookout
+from heliotrope.plant._cluster_end import ClusterEnd
+from heliotrope.plant._joining import JoinQueue
+from heliotrope.plant._watch import PlantWatch
+from heliotrope.plant.authority import Authority
+from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.orders import PlantOrders
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.evaluation import Act
+from heliotrope.safety.proof import Reading, proof_readings
 from heliotrope.sun import Site
+from heliotrope.sun.line import sun_now
 
 #: Who was sent off the receiver shows it after this time at the latest, s.
 OFF_SHOWS = 10.0

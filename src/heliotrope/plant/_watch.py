@@ -2,8 +2,9 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from heliotrope.control.protocol import Alarm
-from heliotrope.control.safety import (
+from heliotrope.errors import InputError
+from heliotrope.links.messages import Alarm
+from heliotrope.safety.evaluation import (
     Act,
     Action,
     Condition,
@@ -17,7 +18,6 @@ from heliotrope.control.safety import (
     start,
     watched_by,
 )
-from heliotrope.errors import InputError
 
 #: Readings that the plant makes itself; all others must be fed by somebody.
 OWN_READINGS = frozenset(

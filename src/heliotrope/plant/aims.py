@@ -5,9 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._beams import crossing
-from heliotrope.control.beam_paths import Mirrors, beams, enter, move
-from heliotrope.control.eye import Hazard, glare_at
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
@@ -15,6 +12,9 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, Tracking, track
+from heliotrope.optics.beam import crossing
+from heliotrope.optics.glare import Hazard, glare_at
+from heliotrope.optics.keep_out import Mirrors, beams, enter, move
 
 #: How far a beam that nothing stops is followed, m.
 FAR = 3000.0

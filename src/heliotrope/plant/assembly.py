@@ -13,29 +13,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_book import CalibrationBook
-from heliotrope.control._operations_cycle import CentringCycle
-from heliotrope.control._operations_log import Logbook
-from heliotrope.control._operations_views import CalibrationEntry, Planned
-from heliotrope.control._operations_work import LeastKnown, Scheduling, WorkSettings
-from heliotrope.control._schedule_live import PlantSchedule, settings_for
-from heliotrope.control.assigned import Assigned, rest_on
-from heliotrope.control.audit import Audit
-from heliotrope.control.calibration_cycle import CycleSettings
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.link import running
-from heliotrope.control.operations import Operations
-from heliotrope.control.parameters import Machine, items_of
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import Alarm
-from heliotrope.control.real_camera import RealCameras
-from heliotrope.control.real_links import PlantLinks
-from heliotrope.control.schedule import Scheduler
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
+from heliotrope.links.clock import SystemClock
+from heliotrope.links.link import running
+from heliotrope.links.messages import Alarm
+from heliotrope.mechanism.board_items import Machine, items_of
 from heliotrope.mechanism.parameters import MODELS
+from heliotrope.plant.assigned import Assigned, rest_on
+from heliotrope.plant.audit import Audit
+from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.links_file import PlantLinks
+from heliotrope.plant.operations.book import CalibrationBook
+from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.operations.work import LeastKnown, Scheduling, WorkSettings
+from heliotrope.plant.schedule.live import PlantSchedule, settings_for
+from heliotrope.plant.schedule.schedule import Scheduler
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.visits.calibration_cycle import CycleSettings
+from heliotrope.plant.visits.centring import CentringCycle
 from heliotrope.store.records import Records
 
 #: Of calibrations: what a quick installation leaves, and what a photograph is worth.

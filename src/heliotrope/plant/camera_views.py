@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_views import CameraView
-from heliotrope.control.calibration_cycle import Shot
 from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.photograph import Photograph
+from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.visits.calibration_cycle import Shot
 
 #: Quality of the pictures for people, 0 to 100.
 _JPEG = 80

@@ -18,11 +18,6 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from heliotrope.control._operations_views import CameraView
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.clock import Clock
-from heliotrope.control.protocol import Alarm
-from heliotrope.control.real_views import Views, picture_of, shot_of
 from heliotrope.errors import FetchError, HeliotropeError, InputError, UnknownNameError
 from heliotrope.field.camera import Camera
 from heliotrope.field.plant import Plant
@@ -31,7 +26,12 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
 from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
-from heliotrope.imaging.teaching import read_pictures
+from heliotrope.imaging.targets.teaching import read_pictures
+from heliotrope.links.clock import Clock
+from heliotrope.links.messages import Alarm
+from heliotrope.plant.camera_views import Views, picture_of, shot_of
+from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.visits.calibration_cycle import Shot
 
 #: A photograph is awaited for so long, and its frame looked for so often, s.
 PATIENCE, _LOOK = 15.0, 0.05

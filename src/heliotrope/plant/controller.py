@@ -20,26 +20,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._cluster_end import ClusterEnd
-from heliotrope.control._joining import Job, Joiner, JoinQueue
-from heliotrope.control._plant_orders import PlantOrders, whole
-from heliotrope.control._plant_watch import PlantWatch
-from heliotrope.control._pushing import Pusher, stored_items
-from heliotrope.control._sentinel import Sentinel
-from heliotrope.control._sun_line import sun_now
-from heliotrope.control._tickets import Ticket
-from heliotrope.control._ways import Lookout, Ways
-from heliotrope.control.aims import BeamCheck, default_aims
-from heliotrope.control.assigned import Assigned, Points, grouped, points_of
-from heliotrope.control.audit import Audit, AuditError
-from heliotrope.control.authority import Authority, Grant, Person, RefusedError, Role
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.emergency import EmergencyOrder
-from heliotrope.control.field_state import FieldState
-from heliotrope.control.link import Link, messages
-from heliotrope.control.parameters import Wanted, checksums
-from heliotrope.control.plant_settings import Counters, PlantSettings, clusters_of
-from heliotrope.control.protocol import (
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.field.volumes import Volume
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import messages as wire
+from heliotrope.lcu import states
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import Link, messages
+from heliotrope.links.messages import (
     Acknowledge,
     Alarm,
     Answer,
@@ -51,13 +40,24 @@ from heliotrope.control.protocol import (
     Status,
     decode,
 )
-from heliotrope.control.safety import Act, Condition, conditions
-from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.plant import Plant
-from heliotrope.field.volumes import Volume
-from heliotrope.geometry import FloatArray
-from heliotrope.lcu import messages as wire
-from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import Wanted, checksums
+from heliotrope.plant._beam_watch import Lookout, Ways
+from heliotrope.plant._cluster_end import ClusterEnd
+from heliotrope.plant._joining import Job, Joiner, JoinQueue
+from heliotrope.plant._pushing import Pusher, stored_items
+from heliotrope.plant._sentinel import Sentinel
+from heliotrope.plant._watch import PlantWatch
+from heliotrope.plant.aims import BeamCheck, default_aims
+from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
+from heliotrope.plant.audit import Audit, AuditError
+from heliotrope.plant.authority import Authority, Grant, Person, RefusedError, Role
+from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.orders import PlantOrders, whole
+from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.evaluation import Act, Condition, conditions
+from heliotrope.sun.line import sun_now
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})

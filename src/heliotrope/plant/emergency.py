@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._emergency import Proof, ProofReport
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.protocol import Stage
-from heliotrope.control.safety import Act
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.links.messages import Stage
 from heliotrope.mechanism.drives import Drive
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.evaluation import Act
+from heliotrope.safety.proof import Proof, ProofReport
 
 #: A mirror this close (rad) to the goal of its defocus is off the receiver.
 NEAR = 5e-3

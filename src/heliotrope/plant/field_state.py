@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control.protocol import NEVER, NODE, Status
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
+from heliotrope.links.messages import NEVER, NODE, Status
 
 #: Age from which a row is stale, s: three polls were missed.
 STALE = 3.0

@@ -16,9 +16,9 @@ from typing import TypeVar
 
 from sqlalchemy import Connection
 
-from heliotrope.control.assigned import AssignedError, Places
-from heliotrope.control.audit import LEAST_FREE, STOPPED, AuditError, Record
-from heliotrope.control.clock import Clock
+from heliotrope.links.clock import Clock
+from heliotrope.plant.assigned import AssignedError, Places
+from heliotrope.plant.audit import LEAST_FREE, STOPPED, AuditError, Record
 from heliotrope.store import audit
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import AuditEntry, StoreError

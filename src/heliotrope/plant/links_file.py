@@ -14,15 +14,15 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.cluster_file import Keys, Table, url_parts
-from heliotrope.control.link import Link
-from heliotrope.control.mqtt import Broker, mqtt_link
-from heliotrope.control.real_cluster import LocalCluster
-from heliotrope.control.real_sensors import FED, SensorFiles
-from heliotrope.control.tcp import TcpServer, client_tls, server_tls
+from heliotrope.cluster.config_file import Keys, Table, url_parts
+from heliotrope.cluster.program import LocalCluster
 from heliotrope.errors import FormatError
-from heliotrope.field.formats._documents import read_document
+from heliotrope.files.documents import read_document
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link
+from heliotrope.links.mqtt import Broker, mqtt_link
+from heliotrope.links.tcp import TcpServer, client_tls, server_tls
+from heliotrope.plant.sensors import FED, SensorFiles
 
 
 class TcpTable(Table):

@@ -4,14 +4,14 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from heliotrope.control._cluster_end import ClusterEnd
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.audit import Audit, AuditError, Record
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import Outcome
-from heliotrope.control.protocol import Command, Emergency, Parameters, Progress, Stage
-from heliotrope.control.safety import Act
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Outcome
+from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
+from heliotrope.plant._cluster_end import ClusterEnd
+from heliotrope.plant.audit import Audit, AuditError, Record
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.evaluation import Act
 
 #: Commands that are taken from anybody.
 SAFE = ("DEFOCUS", "STOW")

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from heliotrope.control._plant_watch import OWN_READINGS
-from heliotrope.control.safety import CONDITIONS, Watcher, watched_by
+from heliotrope.plant._watch import OWN_READINGS
+from heliotrope.safety.evaluation import CONDITIONS, Watcher, watched_by
 
 #: Readings that have to come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS

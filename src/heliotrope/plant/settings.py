@@ -4,9 +4,9 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from heliotrope.control.field_state import STALE
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
+from heliotrope.plant.field_state import STALE
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.protocol import Stage
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.messages import Stage
 
 #: Waiting in the plant, then the stages in their order; from FINAL on nothing changes any more.
 WAITING = 0

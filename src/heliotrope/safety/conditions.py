@@ -6,8 +6,8 @@ wind are common for heliostats of tens of square metres and must be replaced by 
 
 import math
 
-from heliotrope.control._condition import Act, Condition, Role, Scope, Severity, Watcher
 from heliotrope.errors import InputError
+from heliotrope.safety.condition import Act, Condition, Role, Scope, Severity, Watcher
 
 _PLANT, _CLUSTER, _NODE = Watcher.PLANT, Watcher.CLUSTER, Watcher.NODE
 _ALARM, _REFUSE, _HOLD, _DEFOCUS, _STOW = Act

@@ -20,9 +20,10 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-from heliotrope.control._condition import Act, Condition, Role, Scope, Severity, Watcher
-from heliotrope.control._conditions import CONDITIONS, conditions
-from heliotrope.control._emergency import (
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.safety.condition import Act, Condition, Role, Scope, Severity, Watcher
+from heliotrope.safety.conditions import CONDITIONS, conditions
+from heliotrope.safety.proof import (
     DEFOCUS_BUDGET,
     ORDER_BUDGET,
     STOW_BUDGET,
@@ -32,7 +33,6 @@ from heliotrope.control._emergency import (
     Reading,
     proof_readings,
 )
-from heliotrope.errors import InputError, UnknownNameError
 
 __all__ = [
     "CONDITIONS", "DEFOCUS_BUDGET", "ORDER_BUDGET", "STOW_BUDGET", "Act", "Action", "Condition",

@@ -15,10 +15,10 @@ from urllib.parse import quote
 import numpy as np
 from sqlalchemy import Connection, select
 
-from heliotrope.calibration._cells import format_time
 from heliotrope.calibration.sighting_table import KINDS, write_sightings
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.formats._textfile import write_text
+from heliotrope.files.cells import format_time
+from heliotrope.files.text import write_text
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import __version__
-from heliotrope.calibration.estimator import Calibration, Outcome
 from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.fit.estimator import Calibration, Outcome
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.geometry import FloatArray

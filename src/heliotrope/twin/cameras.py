@@ -12,17 +12,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.clock import Clock, sleep_until
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
-from heliotrope.imaging.beams import reflected_beam
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Reading, Settings, read_photograph
-from heliotrope.imaging.rendering import render
-from heliotrope.imaging.scenes import Scene, Thrown, exposed
-from heliotrope.twin.board import Board
+from heliotrope.imaging.synthetic.rendering import render
+from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.optics.mirror_image import reflected_beam
+from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.twin.boards.board import Board
 
 #: Light further from the middle of a target than this many of its half diagonals is left out.
 NEAR = 2.0

@@ -12,19 +12,19 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.drift import NINETY
-from heliotrope.calibration.estimator import fit
 from heliotrope.calibration.evaluation import errors
-from heliotrope.calibration.planning import Limits, aim_at
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.learn.drift import NINETY
+from heliotrope.calibration.plan.planning import Limits, aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
 from heliotrope.calibration.uncertainty import expected
-from heliotrope.control.schedule import Assignment, Scheduler, Visited, Weather
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.lcu import states
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
+from heliotrope.plant.schedule.schedule import Assignment, Scheduler, Visited, Weather
 from heliotrope.sun import vector
 
 #: Before the end of a visit, its photographs are so far apart, s.

@@ -2,7 +2,7 @@ r"""A night without moon: nothing is seen of the mirrors but the lamp on them.
 
 *Which is which.* From the told position a mirror that stands as it was commanded shows the lamp
 at the foot of the perpendicular from the drone. These feet stand for the mirrors' middles, and
-:func:`heliotrope.airborne.identification.identify` lays them over the spots.
+:func:`heliotrope.airborne.evaluate.identification.identify` lays them over the spots.
 
 *How the camera was turned.* A reflection on a flat mirror is seen along the mirror's normal,
 wherever it stands on it. So the spots of all photographs tell how mirrors and photographs stand
@@ -21,13 +21,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.detection import Picture, Spots, find_spots
-from heliotrope.airborne.identification import FEWEST, Identified, identify
+from heliotrope.airborne.evaluate.detection import Picture, Spots, find_spots
+from heliotrope.airborne.evaluate.identification import FEWEST, Identified, identify
+from heliotrope.airborne.evaluate.orientation import differences, turned
+from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape, measured_normal
-from heliotrope.airborne.orientation import differences, turned
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.pinhole import undistort
-from heliotrope.airborne.reflections import Reflections
 from heliotrope.airborne.standing import Standing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, rotation

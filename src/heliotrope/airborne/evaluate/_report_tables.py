@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.budget import Budget
-from heliotrope.airborne.orientation import Orientation, Orientations
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
 from heliotrope.geometry import FloatArray, as_float
 
 _AXES = ("x", "y")
@@ -31,7 +31,7 @@ def orientation_rows(
     flight
         Its name, for a column of that name; none if "".
     places
-        As :func:`heliotrope.airborne.orientation.measure_field` had them, (N, 3, 3).
+        As :func:`heliotrope.airborne.evaluate.orientation.measure_field` had them, (N, 3, 3).
     """
     known = None if places is None else as_float(places)
     return [

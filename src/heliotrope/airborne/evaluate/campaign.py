@@ -1,7 +1,7 @@
 """A campaign: flights over the same heliostats in other poses, evaluated together.
 
 The survey errors of the heliostats and RTK's common offset are the same in all flights. From
-one place the images hardly tell them apart (:mod:`heliotrope.airborne.bundle`), so flights that
+one place the images hardly tell them apart (`bundle`), so flights that
 share heliostats go through one adjustment, in groups that fit into memory.
 """
 
@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.bundle import Priors
-from heliotrope.airborne.evaluation import Evaluation, evaluate
+from heliotrope.airborne.evaluate.bundle import Priors
+from heliotrope.airborne.evaluate.evaluation import Evaluation, evaluate
+from heliotrope.airborne.evaluate.reading import Seen
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.reading import Seen
 from heliotrope.airborne.standing import Standing, join_standing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float

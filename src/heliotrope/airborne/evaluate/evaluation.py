@@ -1,13 +1,13 @@
 """A flight evaluated: photographs read, many at once; laid over each other; reflections out.
 
-1. Each photograph is read by itself (:mod:`heliotrope.airborne.reading`), on as many processes
+1. Each photograph is read by itself (`reading`), on as many processes
    as there are, or on a dask scheduler. What was read is kept in a folder, so that a campaign
    that was interrupted goes on where it stopped.
 2. All together give the exterior orientation of each and RTK's common offset
-   (:mod:`heliotrope.airborne.bundle`).
+   (`bundle`).
 3. The ray of each spot is cut with its mirror's surface: the rows of the reflections.
 
-In a night without moon no corner is seen: :mod:`heliotrope.airborne._dark` takes the place of 2.
+In a night without moon no corner is seen: `_dark` takes the place of 2.
 """
 
 import hashlib
@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne._dark import BESIDE, turn_together
-from heliotrope.airborne.bundle import Adjusted, Corners, Priors, State, adjust, residuals
+from heliotrope.airborne.evaluate._dark import BESIDE, turn_together
+from heliotrope.airborne.evaluate.bundle import Adjusted, Corners, Priors, State, adjust, residuals
+from heliotrope.airborne.evaluate.reading import Seen, read_photo
+from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.reading import Seen, read_photo
-from heliotrope.airborne.reflections import Reflections, join, reflections
 from heliotrope.airborne.standing import Standing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
@@ -227,7 +227,7 @@ def evaluate(
         Of the bundle adjustment.
     owner
         Row of the heliostat that each mirror is of, if some stand in several poses
-        (:func:`heliotrope.airborne.bundle.adjust`).
+        (:func:`heliotrope.airborne.evaluate.bundle.adjust`).
 
     Raises
     ------

@@ -19,10 +19,16 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.budget import Budget
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.reflections import Reflections
+from heliotrope.airborne.evaluate.statistics import (
+    ALPHA,
+    normality,
+    plain_sigma,
+    rosner,
+    spread_mean,
+)
 from heliotrope.airborne.mirror import MirrorShape, measured_normal
-from heliotrope.airborne.reflections import Reflections
-from heliotrope.airborne.statistics import ALPHA, normality, plain_sigma, rosner, spread_mean
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
 
@@ -255,7 +261,7 @@ def measure(
         Of what all points share; the default one if None.
     place
         Covariance of the mirror's place as seen from the drone, m², (3, 3), see
-        :meth:`~heliotrope.airborne.budget.Budget.covariance`.
+        :meth:`~heliotrope.airborne.evaluate.budget.Budget.covariance`.
     mean
         "area", weighted for the whole mirror, or "plain", all points alike, as in the paper.
         Without slope map that is worse: points crowd where the surface looks alike.

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne._report_drawing import Panel, around, drawing, round_below
+from heliotrope.airborne.evaluate._report_drawing import Panel, around, drawing, round_below
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.airborne.orientation import Orientation, Orientations
-from heliotrope.calibration.pictures import AFTER, OUTLIER, TESTED, figure_of
+from heliotrope.calibration.report.pictures import AFTER, OUTLIER, TESTED, figure_of
 from heliotrope.geometry import FloatArray, as_float
 
 if TYPE_CHECKING:

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne._dark import find_lights, is_dark
-from heliotrope.airborne.detection import (
+from heliotrope.airborne.evaluate._dark import find_lights, is_dark
+from heliotrope.airborne.evaluate.detection import (
     Picture,
     decode,
     find_outlines,
     find_patches,
     find_spots,
 )
-from heliotrope.airborne.identification import Identified, expected_size, identify
+from heliotrope.airborne.evaluate.identification import Identified, expected_size, identify
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.pinhole import project, undistort
 from heliotrope.airborne.standing import Standing
@@ -88,7 +88,7 @@ class Seen:
 
     def save(self, path: Path) -> None:
         """Write it as ``.npz``, whole or not at all."""
-        from heliotrope.field.formats._textfile import write_file
+        from heliotrope.files.text import write_file
 
         values = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
         write_file(path, lambda stream: np.savez_compressed(stream, allow_pickle=False, **values))

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration._cells import Rows, find_heliostats, read_parquet, read_rows
-from heliotrope.calibration.report import write_beside
+from heliotrope.calibration.report.page import write_beside
 from heliotrope.errors import FormatError, InputError
+from heliotrope.files.cells import Rows, find_heliostats, read_parquet, read_rows
 from heliotrope.geometry import FloatArray, as_float
 
 _VECTORS = ("camera", "led")

@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne import flight_pictures as pictures
-from heliotrope.airborne._report_tables import (
+from heliotrope.airborne.evaluate import pictures
+from heliotrope.airborne.evaluate._report_tables import (
     difference_rows,
     facet_rows,
     flight_row,
     orientation_rows,
     systematic_parts,
 )
-from heliotrope.airborne.budget import Budget
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
+from heliotrope.airborne.evaluate.reflections import join, write_reflections
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.airborne.orientation import Orientation, Orientations
-from heliotrope.airborne.reflections import join, write_reflections
-from heliotrope.calibration import report
-from heliotrope.calibration.report import STYLE, picture, write_beside
+from heliotrope.calibration.report import page as report
+from heliotrope.calibration.report.page import STYLE, picture, write_beside
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 

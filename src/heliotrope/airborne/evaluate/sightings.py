@@ -17,10 +17,10 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne.evaluate.orientation import FEWEST, Orientation, Orientations, turned
 from heliotrope.airborne.mirror import measured_normal, orientation
-from heliotrope.airborne.orientation import FEWEST, Orientation, Orientations, turned
-from heliotrope.calibration.estimator import Calibration, fit
-from heliotrope.calibration.residuals import linearise, whitening
+from heliotrope.calibration.fit.estimator import Calibration, fit
+from heliotrope.calibration.fit.residuals import linearise, whitening
 from heliotrope.calibration.sightings import Sightings, drone, join, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, normalize, rotation
@@ -182,7 +182,7 @@ def fit_together(
     flights
         One of each orientation (``per="orientation"``), without the systematic part.
     model, priors
-        As :func:`heliotrope.calibration.estimator.fit`.
+        As :func:`heliotrope.calibration.fit.estimator.fit`.
 
     Raises
     ------
@@ -193,7 +193,7 @@ def fit_together(
     -----
     Simulated (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors):
     normals elsewhere are predicted to 0.77 mrad from the first alone, 0.16 from the second,
-    0.16 from both in :func:`~heliotrope.calibration.estimator.fit`, and 0.08 from this.
+    0.16 from both in :func:`~heliotrope.calibration.fit.estimator.fit`, and 0.08 from this.
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)

@@ -63,7 +63,7 @@ def rosner(
     Notes
     -----
     Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are the values' own;
-    :func:`heliotrope.calibration.outliers.generalised_esd` is the test where the covariance
+    :func:`heliotrope.calibration.learn.outliers.generalised_esd` is the test where the covariance
     is known.
     """
     for name, value in (("alpha", alpha), ("share", share)):

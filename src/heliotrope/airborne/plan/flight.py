@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.airspace import Airspace
-from heliotrope.airborne.hover import Pattern
+from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.hover import Pattern
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, azimuth_elevation
 from heliotrope.sun import Site, position

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from heliotrope.airborne import waypoints
-from heliotrope.airborne.airspace import Airspace, KeepOut
-from heliotrope.airborne.flight import Sortie
-from heliotrope.airborne.flight_plan import FlightPlan
-from heliotrope.airborne.waypoints import Circle, Fence, Mission
+from heliotrope.airborne.plan import waypoints
+from heliotrope.airborne.plan.airspace import Airspace, KeepOut
+from heliotrope.airborne.plan.flight import Sortie
+from heliotrope.airborne.plan.flight_plan import FlightPlan
+from heliotrope.airborne.plan.waypoints import Circle, Fence, Mission
 from heliotrope.errors import InputError
-from heliotrope.field.formats._json import Node, read_json
-from heliotrope.field.formats._textfile import write_file, write_text
+from heliotrope.files.json import Node, read_json
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, enu_to_geodetic
 from heliotrope.sun import Site
 
@@ -113,7 +113,7 @@ def write_plan(
     formats
         Of :data:`FORMATS`.
     aircraft
-        Of DJI's files, see :data:`~heliotrope.airborne.waypoints.AIRCRAFT`.
+        Of DJI's files, see :data:`~heliotrope.airborne.plan.waypoints.AIRCRAFT`.
     progress
         Called with (done, all) sorties.
 

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliotrope.airborne.flight import timeline
-from heliotrope.airborne.flight_plan import FlightPlan
+from heliotrope.airborne.plan.flight import timeline
+from heliotrope.airborne.plan.flight_plan import FlightPlan
 from heliotrope.geometry import azimuth_elevation
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne import flight
-from heliotrope.airborne.airspace import Airspace
-from heliotrope.airborne.clusters import Clusters, clusters, tour
-from heliotrope.airborne.flight import CameraTarget, Craft, Sortie, Station
-from heliotrope.airborne.hover import Mirrors, Sampling, mirrors, pattern
-from heliotrope.airborne.look_points import Choosing, LookPoints, look_points
+from heliotrope.airborne.plan import flight
+from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.clusters import Clusters, clusters, tour
+from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station
+from heliotrope.airborne.plan.hover import Mirrors, Sampling, mirrors, pattern
+from heliotrope.airborne.plan.look_points import Choosing, LookPoints, look_points
 from heliotrope.calibration.information import suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.airspace import Airspace
-from heliotrope.airborne.clusters import tour
-from heliotrope.airborne.hover import Facing, Mirrors, Sampling, face
+from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.clusters import tour
+from heliotrope.airborne.plan.hover import Facing, Mirrors, Sampling, face
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.information import expectation, precision
-from heliotrope.calibration.planning import Candidates, Criterion, Plan, plan
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.plan.planning import Candidates, Criterion, Plan, plan
 from heliotrope.calibration.sightings import drone
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, direction, tangent_axes

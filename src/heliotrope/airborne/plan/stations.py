@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import UnknownNameError
-from heliotrope.field.formats._json import Node, read_json
+from heliotrope.files.json import Node, read_json
 from heliotrope.geometry import FloatArray, as_float
 
 

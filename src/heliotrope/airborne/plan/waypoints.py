@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.formats._json import read_json
-from heliotrope.field.formats._textfile import check_file, read_text
+from heliotrope.files.json import read_json
+from heliotrope.files.text import check_file, read_text
 from heliotrope.geometry import FloatArray
 
 #: Drone, its variant, payload and the photographs it keeps, as WPML numbers and names them.

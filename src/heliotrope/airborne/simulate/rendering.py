@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import Metadata, exif_and_xmp
+from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, write_camera
 from heliotrope.airborne.pinhole import local_pixels, project, undistort
-from heliotrope.airborne.reflections import Reflections
-from heliotrope.airborne.simulation import Flight, exact_reflections
+from heliotrope.airborne.simulate.simulation import Flight, exact_reflections
 from heliotrope.airborne.standing import Standing, write_commands
 from heliotrope.errors import InputError
-from heliotrope.field.formats._textfile import write_file
+from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray, as_float, direction, enu_to_geodetic, normalize
 
 Light = npt.NDArray[np.float32]
@@ -412,7 +412,7 @@ def render_flight(
     Parameters
     ----------
     flight
-        Of :func:`heliotrope.airborne.simulation.fly`.
+        Of :func:`heliotrope.airborne.simulate.simulation.fly`.
     folder
         Where to; it is made if need be.
     origin

@@ -4,7 +4,8 @@ A flight holds two pictures of the same thing. What is *true*: mechanisms with i
 surveyed positions that are off, facets with slope errors, where the camera really was. What is
 *told*: the plant file, the commands, and for each photograph a position from RTK and the
 angles of a gimbal. :func:`fly` makes both; :func:`reflections_of` gives the reflections that
-an image evaluation would find, without images; :mod:`heliotrope.airborne.rendering` draws them.
+an image evaluation would find, without images; `heliotrope.airborne.simulate.rendering` draws
+them.
 """
 
 from collections.abc import Mapping
@@ -14,9 +15,9 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.mirror import MirrorShape, ideal, reflection_points
 from heliotrope.airborne.photo import LedCamera, Photo, look_at
-from heliotrope.airborne.reflections import Reflections, join, reflections
 from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.airborne.standing import Standing, standing
 from heliotrope.errors import InputError

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from heliotrope.airborne.budget import Budget
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.orientation import Mean, measure, rotation_between, turned
+from heliotrope.airborne.evaluate.reflections import Reflections, reflections
 from heliotrope.airborne.mirror import MirrorShape, reflection_points, tiled
-from heliotrope.airborne.orientation import Mean, measure, rotation_between, turned
-from heliotrope.airborne.reflections import Reflections, reflections
 from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, direction, normalize
@@ -179,7 +179,7 @@ def trials(
     map_known
         Whether the evaluation has the mirror's slope map.
     mean
-        As :func:`heliotrope.airborne.orientation.measure`.
+        As :func:`heliotrope.airborne.evaluate.orientation.measure`.
     seed
         Of the first; the others follow.
 

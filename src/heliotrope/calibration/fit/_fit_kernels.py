@@ -11,13 +11,13 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.calibration._residual_kernels import (
+from heliotrope.calibration.fit._residual_kernels import (
     place_mechanism,
     residual_jacobian,
     scratch_mechanism,
     sighting_residual,
 )
-from heliotrope.mechanism._jit import OPTIONS
+from heliotrope.jit import OPTIONS
 
 CONVERGED = 0
 NOT_CONVERGED = 1

@@ -16,10 +16,10 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._chain_kernels import chain_pose
-from heliotrope.mechanism._drive_kernels import angle_per_slot, drive_angle, load_drive
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._slots import (
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.chain import chain_pose
+from heliotrope.mechanism.kernels.drives import angle_per_slot, drive_angle, load_drive
+from heliotrope.mechanism.kernels.slots import (
     MOVES_ALONG_NORMAL,
     MOVES_DRIVE,
     MOVES_JOINT,
@@ -27,14 +27,14 @@ from heliotrope.mechanism._slots import (
     MOVES_POSITION,
     MOVES_VERTEX,
 )
-from heliotrope.mechanism._track_kernels import (
+from heliotrope.mechanism.kernels.track import (
     axis_1,
     axis_2,
     is_single,
     place_vertex,
     turned,
 )
-from heliotrope.mechanism._vectors import about, across, add, cross, dot, minus, times
+from heliotrope.mechanism.kernels.vectors import about, across, add, cross, dot, minus, times
 
 
 @njit(**OPTIONS)

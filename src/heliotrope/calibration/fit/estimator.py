@@ -17,8 +17,8 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import _fit_kernels as kernels
-from heliotrope.calibration.residuals import whitening
+from heliotrope.calibration.fit import _fit_kernels as kernels
+from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.sightings import Sightings, ray_directions
 from heliotrope.errors import InputError
 from heliotrope.geometry import (

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._jit import OPTIONS
+from heliotrope.jit import OPTIONS
 
 
 @njit(**OPTIONS)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._jit import OPTIONS
+from heliotrope.jit import OPTIONS
 
 #: A squared residual counts no more than this, in units of the noise: one bad sighting
 #: does not make a regime.

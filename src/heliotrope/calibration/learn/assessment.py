@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import Summary, summary
-from heliotrope.calibration.learning import Learned, Prediction
+from heliotrope.calibration.learn.learning import Learned, Prediction
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
 from heliotrope.mechanism.azel import AxisAccuracy, axis_accuracy

@@ -19,8 +19,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from heliotrope.calibration import _drift_kernels as kernels
-from heliotrope.calibration.outliers import ALPHA, critical, generalised_esd
+from heliotrope.calibration.learn import _drift_kernels as kernels
+from heliotrope.calibration.learn.outliers import ALPHA, critical, generalised_esd
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.parallel import run_blocks

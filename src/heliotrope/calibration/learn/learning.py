@@ -17,12 +17,12 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from heliotrope.calibration import drift
-from heliotrope.calibration.drift import DAY, Hyperparameters, Linear, Posterior
-from heliotrope.calibration.estimator import Calibration, Loss, canonical_order, fit
 from heliotrope.calibration.evaluation import Errors, errors
-from heliotrope.calibration.regimes import find_regimes, regime_at
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.fit.estimator import Calibration, Loss, canonical_order, fit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.learn import drift
+from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
+from heliotrope.calibration.learn.regimes import find_regimes, regime_at
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
@@ -409,7 +409,7 @@ def learn(
         Of expectation and maximisation over the population.
     runner, chunk
         Who learns chunks of so many heliostats, for example
-        :func:`heliotrope.calibration.cluster.runner`; by default this process, with the
+        :func:`heliotrope.calibration.learn.on_dask.runner`; by default this process, with the
         same results bit for bit.
     progress
         Called with (done, all) heliostats.
@@ -417,7 +417,7 @@ def learn(
     Raises
     ------
     InputError
-        As of :func:`heliotrope.calibration.estimator.fit`.
+        As of :func:`heliotrope.calibration.fit.estimator.fit`.
     """
     constant = (
         parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import learning
+from heliotrope.calibration.learn import learning
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray

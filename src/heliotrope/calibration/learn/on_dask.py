@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from heliotrope.calibration.learning import Part, Progress, Runner, learn_part
+from heliotrope.calibration.learn.learning import Part, Progress, Runner, learn_part
 from heliotrope.errors import InputError
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ alike do not hide each other. What is measured is a squared distance in two comp
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import _drift_kernels as kernels
+from heliotrope.calibration.learn import _drift_kernels as kernels
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 

@@ -5,13 +5,13 @@ zeros or on zeros of its own, so that the truncated squares of the residuals plu
 price for each cut and each new pair of zeros are least (optimal partitioning: Jackson et
 al. 2005, IEEE Signal Processing Letters 12; truncated loss: Fearnhead & Rigaill 2019, J.
 Am. Stat. Assoc. 114). Slow creep is not for here: it is a process of its own
-(:mod:`heliotrope.calibration.drift`).
+(:mod:`heliotrope.calibration.learn.drift`).
 """
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration._regime_kernels import FEWEST, partition
+from heliotrope.calibration.learn._regime_kernels import FEWEST, partition
 from heliotrope.geometry import FloatArray
 
 #: Cuts are looked for at no more places than this: the longest gaps.

@@ -17,9 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration import _allocation, _gain
 from heliotrope.calibration.information import CHUNK
-from heliotrope.calibration.planning import Limits, aim_at, sighting_jacobian
+from heliotrope.calibration.plan import _allocation
+from heliotrope.calibration.plan import gain as _gain
+from heliotrope.calibration.plan.planning import Limits, aim_at, sighting_jacobian
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors
@@ -183,7 +184,7 @@ def campaign(
     start, stop
         Unix seconds (UTC).
     timing, limits
-        By default :class:`Timing` and :class:`~heliotrope.calibration.planning.Limits`.
+        By default :class:`Timing` and :class:`~heliotrope.calibration.plan.planning.Limits`.
     every
         Gains are found anew for the whole field at this interval, s; what is chosen is
         computed for its own time.

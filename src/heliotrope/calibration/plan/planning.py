@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration import _gain
+from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.information import CHUNK, LOWEST
-from heliotrope.calibration.residuals import linearise
+from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.sightings import sightings
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target

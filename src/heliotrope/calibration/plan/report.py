@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from heliotrope.calibration.campaign import Campaign
-from heliotrope.calibration.planning import Candidates, Plan
+from heliotrope.calibration.plan.campaign import Campaign
+from heliotrope.calibration.plan.planning import Candidates, Plan
 from heliotrope.errors import InputError
-from heliotrope.field.formats._textfile import write_file, write_text
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, azimuth_elevation
 
 if TYPE_CHECKING:

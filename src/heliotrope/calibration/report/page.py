@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliotrope.calibration import pictures
-from heliotrope.calibration.assessment import Assessment
-from heliotrope.calibration.estimator import Outcome
 from heliotrope.calibration.evaluation import Errors, Summary, errors, summary
-from heliotrope.calibration.learning import Learned, left_out_errors
-from heliotrope.calibration.results import (
+from heliotrope.calibration.fit.estimator import Outcome
+from heliotrope.calibration.learn.assessment import Assessment
+from heliotrope.calibration.learn.learning import Learned, left_out_errors
+from heliotrope.calibration.report import pictures
+from heliotrope.calibration.report.results import (
     Results,
     at_moment,
     calibrated_plant,

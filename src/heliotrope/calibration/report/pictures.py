@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.drift import DAY
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.uncertainty import year_map
 from heliotrope.geometry import FloatArray, azimuth_elevation
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from heliotrope.calibration.report import Result
+    from heliotrope.calibration.report.page import Result
 
 #: Grey, blue, orange and vermilion of Okabe and Ito, told apart by the colour-blind too.
 BEFORE, AFTER, TESTED, OUTLIER = "#999999", "#0072b2", "#e69f00", "#d55e00"

@@ -16,14 +16,14 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import __version__
-from heliotrope.calibration.drift import DAY
-from heliotrope.calibration.estimator import Outcome
-from heliotrope.calibration.learning import Learned
+from heliotrope.calibration.fit.estimator import Outcome
+from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.learn.learning import Learned
 from heliotrope.errors import InputError
-from heliotrope.field.formats import _json
-from heliotrope.field.formats._textfile import write_file, write_text
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.files import json as _json
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray
 
 KIND = "heliotrope calibration"

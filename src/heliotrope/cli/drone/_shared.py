@@ -14,9 +14,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from heliotrope.airborne.evaluate.reading import Seen
     from heliotrope.airborne.mirror import MirrorShape
     from heliotrope.airborne.photo import LedCamera, Photo
-    from heliotrope.airborne.reading import Seen
     from heliotrope.airborne.standing import Standing
     from heliotrope.field.plant import Plant
     from heliotrope.geometry import FloatArray
@@ -199,7 +199,7 @@ def read_flight(
     flight: FlightFolder, keep: Path | None, processes: int, scheduler: str | None, quiet: bool
 ) -> "tuple[Seen, ...]":
     """Read all photographs behind a progress bar; what was read before is not read again."""
-    from heliotrope.airborne.evaluation import read_many
+    from heliotrope.airborne.evaluate.evaluation import read_many
 
     what = f"reading {flight.name}".strip()
     with shared.connected(scheduler) as client, shared.progress(what, quiet) as advance:

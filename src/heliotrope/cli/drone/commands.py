@@ -2,10 +2,10 @@
 
 import typer
 
-from heliotrope.cli._drone_evaluate import evaluate
-from heliotrope.cli._drone_plan import plan
-from heliotrope.cli._drone_rtk import rtk
-from heliotrope.cli._drone_simulate import simulate
+from heliotrope.cli.drone.evaluate import evaluate
+from heliotrope.cli.drone.plan import plan
+from heliotrope.cli.drone.rtk import rtk
+from heliotrope.cli.drone.simulate import simulate
 
 app = typer.Typer(help="Measure a field with a drone, its lamp and its camera.",
                   no_args_is_help=True)  # fmt: skip

@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from heliotrope.cli import _calibration as calibration
-from heliotrope.cli import _drone_shared as shared
 from heliotrope.cli._common import print_json, print_table
+from heliotrope.cli.drone import _shared as shared
 
 if TYPE_CHECKING:
-    from heliotrope.airborne.budget import Budget
-    from heliotrope.airborne.campaign import Campaign
-    from heliotrope.airborne.evaluation import Evaluation
+    from heliotrope.airborne.evaluate.budget import Budget
+    from heliotrope.airborne.evaluate.campaign import Campaign
+    from heliotrope.airborne.evaluate.evaluation import Evaluation
+    from heliotrope.airborne.evaluate.orientation import Orientations
     from heliotrope.airborne.mirror import MirrorShape
-    from heliotrope.airborne.orientation import Orientations
     from heliotrope.calibration.sightings import Sightings
 
 
@@ -34,7 +34,7 @@ class _Measured:
 
     def rows(self) -> list[dict[str, Any]]:
         """Return one record an orientation, the systematic part told by its causes."""
-        from heliotrope.airborne.flight_report import orientation_rows
+        from heliotrope.airborne.evaluate.report import orientation_rows
 
         return orientation_rows(
             self.orientations, self.budget, self.flight.name, self.found.place_covariance
@@ -64,9 +64,9 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Find mirrors and lamp in a drone's photographs: orientations with their accuracy."""
-    from heliotrope.airborne.budget import Budget
-    from heliotrope.airborne.bundle import Priors
-    from heliotrope.airborne.campaign import Pose, evaluate_campaign
+    from heliotrope.airborne.evaluate.budget import Budget
+    from heliotrope.airborne.evaluate.bundle import Priors
+    from heliotrope.airborne.evaluate.campaign import Pose, evaluate_campaign
 
     flights, problems = shared.open_campaign(folder, field, camera, commands, cluster, point, focal)
     flights.sort(key=lambda flight: _natural(flight.name))
@@ -127,7 +127,7 @@ def _measure(
     flights: list[shared.FlightFolder], surfaces: "list[list[MirrorShape]]", found: "Campaign",
     budget: "Budget",
 ) -> list[_Measured]:  # fmt: skip
-    from heliotrope.airborne.orientation import measure_field
+    from heliotrope.airborne.evaluate.orientation import measure_field
 
     measured = []
     for flight, shapes, one in zip(flights, surfaces, found.flights, strict=True):
@@ -178,7 +178,7 @@ def _surfaces(
 
 
 def _write(out: Path, measured: list[_Measured]) -> None:
-    from heliotrope.airborne.reflections import write_reflections
+    from heliotrope.airborne.evaluate.reflections import write_reflections
     from heliotrope.calibration.sighting_table import write_sightings
     from heliotrope.calibration.sightings import join
 
@@ -197,7 +197,7 @@ def _write_orientations(out: Path, measured: list[_Measured]) -> None:
     """Write the table that the report has too."""
     import pandas as pd
 
-    from heliotrope.calibration.report import write_beside
+    from heliotrope.calibration.report.page import write_beside
 
     table = pd.DataFrame([row for one in measured for row in one.rows()])
     write_beside(out / "orientations.csv", lambda part: table.to_csv(part, index=False))
@@ -207,7 +207,7 @@ def _sightings(one: _Measured) -> "Sightings":
     """Return a flight's orientations as sightings, heliostats as the plant counts them."""
     import numpy as np
 
-    from heliotrope.airborne.sightings import to_sightings
+    from heliotrope.airborne.evaluate.sightings import to_sightings
 
     times = [p.time.timestamp() for p in one.found.photos if p.time is not None]
     made = to_sightings(
@@ -220,7 +220,7 @@ def _sightings(one: _Measured) -> "Sightings":
 def _report(
     out: Path, measured: list[_Measured], found: "Campaign", not_used: list[str], quiet: bool
 ) -> None:
-    from heliotrope.airborne.flight_report import Flown, write_campaign_report
+    from heliotrope.airborne.evaluate.report import Flown, write_campaign_report
 
     notes = (f"{_offset(found)}.", *not_used)
     flown = [
@@ -307,7 +307,7 @@ def _show(measured: list[_Measured], found: "Campaign", out: Path, given: int) -
 
 
 def _show_orientations(measured: list[_Measured], out: Path) -> None:
-    from heliotrope.airborne.flight_report import orientation_rows
+    from heliotrope.airborne.evaluate.report import orientation_rows
 
     rows = [(_full(m, r["heliostat"]), r) for m in measured
             for r in orientation_rows(m.orientations)]  # fmt: skip

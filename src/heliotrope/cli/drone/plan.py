@@ -9,7 +9,7 @@ from heliotrope.cli._calibration import progress
 from heliotrope.cli._common import open_plant, parse_duration, parse_point, print_json, print_table
 
 if TYPE_CHECKING:
-    from heliotrope.airborne.airspace import Airspace
+    from heliotrope.airborne.plan.airspace import Airspace
     from heliotrope.field.plant import Plant
     from heliotrope.geometry import FloatArray
 
@@ -74,13 +74,13 @@ def plan(
     """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
     import numpy as np
 
-    from heliotrope.airborne.flight import Craft
-    from heliotrope.airborne.flight_files import write_plan
-    from heliotrope.airborne.flight_map import flight_map
-    from heliotrope.airborne.flight_plan import Wishes, plan_flight
-    from heliotrope.airborne.hover import Sampling
-    from heliotrope.airborne.look_points import Choosing
-    from heliotrope.calibration.planning_report import write_picture
+    from heliotrope.airborne.plan.flight import Craft
+    from heliotrope.airborne.plan.flight_files import write_plan
+    from heliotrope.airborne.plan.flight_map import flight_map
+    from heliotrope.airborne.plan.flight_plan import Wishes, plan_flight
+    from heliotrope.airborne.plan.hover import Sampling
+    from heliotrope.airborne.plan.look_points import Choosing
+    from heliotrope.calibration.plan.report import write_picture
 
     plant = open_plant(field)
     air, place = _airspace(plant, airspace, tower, (min_height, max_height))
@@ -124,7 +124,7 @@ def plan(
 
 
 def _check_aircraft(aircraft: str) -> None:
-    from heliotrope.airborne.waypoints import AIRCRAFT
+    from heliotrope.airborne.plan.waypoints import AIRCRAFT
     from heliotrope.errors import UnknownNameError
 
     if aircraft not in AIRCRAFT:
@@ -132,7 +132,7 @@ def _check_aircraft(aircraft: str) -> None:
 
 
 def _formats(text: str) -> tuple[str, ...]:
-    from heliotrope.airborne.flight_files import FORMATS
+    from heliotrope.airborne.plan.flight_files import FORMATS
     from heliotrope.errors import InputError
 
     names = tuple(dict.fromkeys(part.strip() for part in text.split(",")))
@@ -161,9 +161,9 @@ def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
 def _airspace(
     plant: "Plant", path: Path | None, tower: bool, heights: tuple[float, float]
 ) -> "tuple[Airspace, FloatArray | None]":
-    from heliotrope.airborne.airspace import Airspace
-    from heliotrope.airborne.airspace import tower as keep_from_tower
-    from heliotrope.airborne.flight_files import read_airspace
+    from heliotrope.airborne.plan.airspace import Airspace
+    from heliotrope.airborne.plan.airspace import tower as keep_from_tower
+    from heliotrope.airborne.plan.flight_files import read_airspace
 
     base = Airspace(keep_from_tower(plant) if tower else (), None, *heights, ground=plant.position)
     return (base, None) if path is None else read_airspace(path, base)

@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from heliotrope.cli import _calibration as calibration
-from heliotrope.cli import _drone_shared as shared
 from heliotrope.cli._common import print_json, print_table
+from heliotrope.cli.drone import _shared as shared
 
 
 def rtk(
@@ -27,8 +27,8 @@ def rtk(
     """Compare RTK's positions with those that the photographs themselves give."""
     import numpy as np
 
-    from heliotrope.airborne.bundle import Priors
-    from heliotrope.airborne.evaluation import check_rtk
+    from heliotrope.airborne.evaluate.bundle import Priors
+    from heliotrope.airborne.evaluate.evaluation import check_rtk
 
     flight = shared.open_flight(folder, field, camera, commands, cluster, point, None)
     seen = shared.read_flight(flight, out / "photographs", processes, scheduler, as_json)

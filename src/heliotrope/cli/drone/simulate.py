@@ -12,8 +12,8 @@ from heliotrope.cli._common import open_plant, parse_point
 
 if TYPE_CHECKING:
     from heliotrope.airborne.photo import LedCamera
-    from heliotrope.airborne.rendering import Conditions
-    from heliotrope.airborne.simulation import Errors, Flight, Installed
+    from heliotrope.airborne.simulate.rendering import Conditions
+    from heliotrope.airborne.simulate.simulation import Errors, Flight, Installed
     from heliotrope.field.heliostats import Heliostats
     from heliotrope.geometry import FloatArray
     from heliotrope.sun import Site
@@ -63,8 +63,8 @@ def simulate(
     """Render a flight: photographs as a drone of DJI writes them, commands, camera, truth."""
     import numpy as np
 
-    from heliotrope.airborne import rendering
-    from heliotrope.airborne.simulation import Errors, hover_grid, look_counts
+    from heliotrope.airborne.simulate import rendering
+    from heliotrope.airborne.simulate.simulation import Errors, hover_grid, look_counts
 
     plant = open_plant(field)
     mirrors = plant.groups[_group(group, tuple(plant.groups))]
@@ -112,8 +112,8 @@ class _Drawing:
         """Render one flight into a folder; returns the number of photographs."""
         from datetime import UTC, datetime, timedelta
 
-        from heliotrope.airborne.rendering import render_flight
-        from heliotrope.airborne.simulation import fly
+        from heliotrope.airborne.simulate.rendering import render_flight
+        from heliotrope.airborne.simulate.simulation import fly
 
         flown = fly(
             mirrors, self.camera, counts, pattern, middle, errors=self.errors, focal=self.focal,
@@ -134,8 +134,8 @@ def _campaign(
     drawing: _Drawing, plan: Path, wanted: str, mirrors: "Heliostats", folder: Path
 ) -> None:
     """Render the stations of a plan, each into its folder CLUSTER-POINT."""
-    from heliotrope.airborne._stations import read_stations
-    from heliotrope.airborne.simulation import install
+    from heliotrope.airborne.plan.stations import read_stations
+    from heliotrope.airborne.simulate.simulation import install
     from heliotrope.errors import UnknownNameError
 
     stations = read_stations(plan, mirrors.names)
@@ -196,7 +196,7 @@ def _write_truth(folder: Path, flight: "Flight") -> None:
     import numpy as np
 
     from heliotrope.airborne.slopes import write_slopes
-    from heliotrope.field.formats._textfile import write_text
+    from heliotrope.files.text import write_text
     from heliotrope.geometry import azimuth_elevation
 
     (folder / "slopes").mkdir(parents=True, exist_ok=True)

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.operations import Operations
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
+from heliotrope.links.clock import Clock
+from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
@@ -73,7 +73,7 @@ class Shown:
                 "run: --database is no postgresql://user@host/name; SQLite needs --data alone"
             )
         if self.certificate is not None and self.key is not None:
-            from heliotrope.control.tcp import server_tls
+            from heliotrope.links.tcp import server_tls
 
             server_tls(self.certificate, self.key)
         if self.console:

@@ -169,7 +169,7 @@ def run(
     heliostat after the other, and what was learnt is pushed to its controller. The console shows
     it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
     """
-    from heliotrope.cli._run_shared import Shown
+    from heliotrope.cli.run._shared import Shown
     from heliotrope.errors import InputError
 
     if not 0.0 < speed <= 1000.0:
@@ -187,7 +187,7 @@ def run(
         if configure or check:
             raise InputError("run: --configure and --check need a real plant; give --clusters")
         design = _design(field, heliostats, prototype=prototype)
-        from heliotrope.cli._run_plant import Choice, run_plant
+        from heliotrope.cli.run.simulated import Choice, run_plant
 
         choice = Choice(
             speed=speed, start=_start(start, design), seed=seed, exact=exact, idle=bool(idle),
@@ -203,7 +203,7 @@ def run(
             "--clusters"
         )
     design = open_plant(field)
-    from heliotrope.cli._run_real import RealChoice, run_real
+    from heliotrope.cli.run.real import RealChoice, run_real
 
     folder = field if field.is_dir() else field.parent
     real = RealChoice(folder, clusters, idle is not False, gain, configure, check)
@@ -214,7 +214,7 @@ def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "
     if field is not None:
         return open_plant(field)
     if prototype:
-        from heliotrope.twin.live import prototype_plant
+        from heliotrope.twin.live.live import prototype_plant
 
         return prototype_plant()
     from heliotrope.field.layouts import malan_plant

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliotrope.cli._run_shared import (
+from heliotrope.cli.run._shared import (
     Shown,
     archive,
     console,
@@ -17,18 +17,18 @@ from heliotrope.cli._run_shared import (
     stow,
     watch,
 )
-from heliotrope.control.clock import SystemClock
-from heliotrope.control.kept_audit import KeptAudit, KeptPoints
-from heliotrope.control.operations import WorkSettings
-from heliotrope.control.plant_settings import clusters_of
-from heliotrope.control.real_camera import RealCameras
-from heliotrope.control.real_plant import RealPlant
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
+from heliotrope.links.clock import SystemClock
+from heliotrope.plant.assembly import RealPlant
+from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.settings import clusters_of
 
 if TYPE_CHECKING:
-    from heliotrope.control.parameters import Machine
-    from heliotrope.control.real_links import PlantLinks
+    from heliotrope.mechanism.board_items import Machine
+    from heliotrope.plant.links_file import PlantLinks
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def _links(
     choice: RealChoice, homes: dict[str, tuple[str, ...]], clock: SystemClock
 ) -> "PlantLinks":
     try:
-        from heliotrope.control.real_links import read_links
+        from heliotrope.plant.links_file import read_links
     except ImportError as error:
         raise InputError(
             f"run: {error.name} is not installed; say pip install 'heliotrope[control]'"
@@ -94,7 +94,7 @@ def _cameras(
 
 
 def _machine(design: Plant) -> "Machine":
-    from heliotrope.twin.live import machine_of
+    from heliotrope.twin.live.live import machine_of
 
     if len(design.groups) != 1:
         raise InputError(

@@ -4,7 +4,7 @@ import asyncio
 from dataclasses import dataclass
 from datetime import datetime
 
-from heliotrope.cli._run_shared import (
+from heliotrope.cli.run._shared import (
     Shown,
     archive,
     console,
@@ -16,12 +16,12 @@ from heliotrope.cli._run_shared import (
     stow,
     watch,
 )
-from heliotrope.control.clock import SystemClock, VirtualClock
-from heliotrope.control.kept_audit import KeptAudit, KeptPoints
-from heliotrope.control.operations import WorkSettings
 from heliotrope.field.plant import Plant
-from heliotrope.twin._live_loop import PacedLoop
-from heliotrope.twin.live import LiveOptions, LivePlant
+from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
+from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.twin.live.live import LiveOptions, LivePlant
+from heliotrope.twin.live.loop import PacedLoop
 
 
 @dataclass(frozen=True)

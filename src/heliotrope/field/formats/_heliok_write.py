@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from heliotrope.errors import InputError
-from heliotrope.field.formats._frames import euler_angles, mirror_frame
 from heliotrope.field.formats._heliok_values import ANGLES
-from heliotrope.field.formats._tree import Document, Element
+from heliotrope.field.formats.frames import euler_angles, mirror_frame
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
+from heliotrope.files.xml import Document, Element
 from heliotrope.geometry import TAU, FloatArray, as_float, normalize
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import SLOTS, Drive

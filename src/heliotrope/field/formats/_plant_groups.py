@@ -17,11 +17,11 @@ from heliotrope.field.formats._plant_models import (
 from heliotrope.field.formats._plant_table import HeliostatTable
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import FloatArray
-from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism import drives as drive_kinds
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
+from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.sun import Site
 
 # Numbers of a drive as the writer names them; "rate" and its like have no unit in the

@@ -28,19 +28,19 @@ from pathlib import Path
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.formats._frames import euler_matrix, mirror_frame
 from heliotrope.field.formats._heliok_values import Values
 from heliotrope.field.formats._heliok_write import from_plant
-from heliotrope.field.formats._tree import (
+from heliotrope.field.formats.frames import euler_matrix, mirror_frame
+from heliotrope.field.heliostats import Facets, Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.field.target import Receiver, Target
+from heliotrope.files.xml import (
     Document,
     Element,
     Remark,
     read_document,
     write_document,
 )
-from heliotrope.field.heliostats import Facets, Heliostats
-from heliotrope.field.plant import Plant
-from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, angle_between, as_float, direction, normalize
 from heliotrope.mechanism.armature import check_axes
 from heliotrope.mechanism.drives import Drive, direct

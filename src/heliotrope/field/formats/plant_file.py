@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._documents import read_document
 from heliotrope.field.formats._plant_cameras import (
     build_camera,
     build_mark,
@@ -25,9 +24,10 @@ from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
-from heliotrope.field.formats._textfile import write_text
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
+from heliotrope.files.documents import read_document
+from heliotrope.files.text import write_text
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.sun import Site
 

@@ -30,9 +30,9 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import read_text, write_text
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
+from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site

@@ -6,7 +6,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.rectify import Mask, Rectified
+from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 #: Rays from the centroid.
 _RAYS = 120

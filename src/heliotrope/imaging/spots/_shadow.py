@@ -10,7 +10,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.rectify import Mask
+from heliotrope.imaging.targets.rectify import Mask
 
 #: Brightness is compared across a line over so many cells to either side.
 _ARM = 2.0

@@ -5,7 +5,7 @@
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._jit import OPTIONS
+from heliotrope.jit import OPTIONS
 
 
 @njit(**OPTIONS)

@@ -9,12 +9,12 @@ from zipfile import BadZipFile
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.field.formats._textfile import check_file, write_file
+from heliotrope.files.text import check_file, write_file
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging._shadow import Edge, border, find_edges, places
-from heliotrope.imaging._shadow import prior as edge_prior
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.rectify import Mask, Rectified
+from heliotrope.imaging.spots._shadow import Edge, border, find_edges, places
+from heliotrope.imaging.spots._shadow import prior as edge_prior
+from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 #: The fit looks at every so-many-th pixel.
 _STRIDE = 6

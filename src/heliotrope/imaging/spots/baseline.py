@@ -1,13 +1,13 @@
 """Simple ways to find a beam's centroid, to compare with.
 
-Neither gives a covariance or says that it is wrong; :mod:`heliotrope.imaging.spot` does.
+Neither gives a covariance or says that it is wrong; :mod:`heliotrope.imaging.spots.spot` does.
 """
 
 import numpy as np
 
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.background import Background
-from heliotrope.imaging.rectify import Rectified
+from heliotrope.imaging.spots.background import Background
+from heliotrope.imaging.targets.rectify import Rectified
 
 
 def threshold_centroid(

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.finding import FoundTarget
-from heliotrope.imaging.spot import Spot
+from heliotrope.imaging.spots.spot import Spot
+from heliotrope.imaging.targets.finding import FoundTarget
 
 #: Reasons, each with what it means.
 REASONS: dict[str, str] = {
@@ -96,7 +96,7 @@ class Expectation:
     Attributes
     ----------
     power
-        As :class:`heliotrope.imaging.spot.Spot` has it, over the ambient light, m²; NaN if
+        As :class:`heliotrope.imaging.spots.spot.Spot` has it, over the ambient light, m²; NaN if
         unknown.
     flux
         As :class:`heliotrope.imaging.photograph.PlacedSpot` has it, full scales m²/s at gain

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging._border import NOTHING, beyond
-from heliotrope.imaging._top_kernels import number_tops
-from heliotrope.imaging.background import Background, smooth
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.rectify import Mask, Rectified
+from heliotrope.imaging.spots._border import NOTHING, beyond
+from heliotrope.imaging.spots._top_kernels import number_tops
+from heliotrope.imaging.spots.background import Background, smooth
+from heliotrope.imaging.targets.rectify import Mask, Rectified
 
 #: A beam rises by this many deviations of the background's remains, and this much of it.
 _SEED, _SEED_PART = 8.0, 0.06

@@ -11,10 +11,10 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.imaging._render_kernels import coverage, sample_plane
-from heliotrope.imaging.marks import polygons
 from heliotrope.imaging.projection import project, undistort
-from heliotrope.imaging.scenes import Paint, Scene, Surroundings
+from heliotrope.imaging.synthetic.scenes import Paint, Scene, Surroundings
+from heliotrope.imaging.targets.marks import polygons
+from heliotrope.optics.render_kernels import coverage, sample_plane
 
 Image = npt.NDArray[np.float32]
 

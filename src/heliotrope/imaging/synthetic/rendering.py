@@ -14,12 +14,10 @@ from heliotrope.errors import InputError
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.imaging._painting import Image, Plane, background, mark_shapes
-from heliotrope.imaging._render_kernels import ambient_field, coverage, expose, sample_plane
-from heliotrope.imaging.beams import deposit
 from heliotrope.imaging.frame import Frame, Pixels
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.scenes import (
+from heliotrope.imaging.synthetic._painting import Image, Plane, background, mark_shapes
+from heliotrope.imaging.synthetic.scenes import (
     Lens,
     Paint,
     Scene,
@@ -31,6 +29,8 @@ from heliotrope.imaging.scenes import (
     example_target,
     exposed,
 )
+from heliotrope.optics.mirror_image import deposit
+from heliotrope.optics.render_kernels import ambient_field, coverage, expose, sample_plane
 
 __all__ = [
     "BeamTruth",

@@ -10,8 +10,8 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import as_float, rotation
-from heliotrope.imaging.beams import Beam
 from heliotrope.imaging.projection import look_at
+from heliotrope.optics.mirror_image import Beam
 
 
 @dataclass(frozen=True)

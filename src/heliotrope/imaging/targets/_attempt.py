@@ -11,10 +11,10 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging import detection
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.refinement import Refined, locate, refine
-from heliotrope.imaging.view import Face, View, fit_view, homography, unknown_lens
+from heliotrope.imaging.targets import detection
+from heliotrope.imaging.targets.refinement import Refined, locate, refine
+from heliotrope.imaging.targets.view import Face, View, fit_view, homography, unknown_lens
 
 Pictures = Mapping[str, FloatArray]
 

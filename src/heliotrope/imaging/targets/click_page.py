@@ -19,7 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.teaching import known_points
+from heliotrope.imaging.targets.teaching import known_points
 
 #: An answer is a few hundred bytes for each point.
 _LONGEST = 1 << 20

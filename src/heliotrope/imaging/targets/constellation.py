@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.detection import Candidates, Drawing
-from heliotrope.imaging.view import homography
+from heliotrope.imaging.targets.detection import Candidates, Drawing
+from heliotrope.imaging.targets.view import homography
 
 Places = npt.NDArray[np.intp]
 

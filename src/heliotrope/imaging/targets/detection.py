@@ -16,8 +16,8 @@ import numpy.typing as npt
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.marks import polygons, tag_dictionary
-from heliotrope.imaging.refinement import coverage
+from heliotrope.imaging.targets.marks import polygons, tag_dictionary
+from heliotrope.imaging.targets.refinement import coverage
 
 #: Least correlation of a candidate's shape with a drawing.
 _ALIKE = 0.72

@@ -9,11 +9,11 @@ from heliotrope.field.camera import Camera
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging import constellation, detection
-from heliotrope.imaging._attempt import FEWEST, SURVEY, Attempt, Look, Pictures, Search
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.projection import project
-from heliotrope.imaging.view import Face, View, faces
+from heliotrope.imaging.targets import constellation, detection
+from heliotrope.imaging.targets._attempt import FEWEST, SURVEY, Attempt, Look, Pictures, Search
+from heliotrope.imaging.targets.view import Face, View, faces
 
 __all__ = [
     "SURVEY", "FoundMark", "FoundTarget", "Pictures", "face_marks", "find_targets",

@@ -8,10 +8,10 @@ import numpy.typing as npt
 
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.finding import face_marks
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.marks import polygons
-from heliotrope.imaging.view import Face, View, faces
+from heliotrope.imaging.targets.finding import face_marks
+from heliotrope.imaging.targets.marks import polygons
+from heliotrope.imaging.targets.view import Face, View, faces
 
 Mask = npt.NDArray[np.bool_]
 

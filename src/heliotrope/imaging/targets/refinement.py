@@ -14,7 +14,7 @@ import numpy.typing as npt
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.marks import polygons
+from heliotrope.imaging.targets.marks import polygons
 
 Values = npt.NDArray[np.float32]
 

@@ -215,7 +215,7 @@ def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = N
 
     Names of pictures depend on what they show, so that an older plant file keeps its own.
     """
-    from heliotrope.imaging.reading import write_image
+    from heliotrope.imaging.files import write_image
 
     for name, picture in taught.pictures.items():
         write_image(picture, Path(path).with_name(name))
@@ -230,8 +230,8 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
     import tomllib
     from operator import methodcaller
 
-    from heliotrope.field.formats._textfile import write_file
     from heliotrope.field.formats.plant_file import write_plant
+    from heliotrope.files.text import write_file
 
     place = Path(path)
     table = ""
@@ -256,7 +256,7 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
     FormatError
         If one is missing or is no square picture.
     """
-    from heliotrope.imaging.reading import read_image
+    from heliotrope.imaging.files import read_image
 
     found = {}
     for mark in (mark for target in targets for mark in target.marks if mark.kind == "picture"):
@@ -365,7 +365,7 @@ def _refine(
     frame: Frame, here: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
 ) -> TaughtPoint:
     """Lay a mark's drawing over the picture, at whichever quarter turn explains most."""
-    from heliotrope.imaging.refinement import Refined, refine
+    from heliotrope.imaging.targets.refinement import Refined, refine
 
     scale = _scale(*view)
     search = reach / (mark.size * _per_metre(*view))
@@ -466,7 +466,7 @@ def _fit(
     frame: Frame, known: Camera | None, name: str, anew: bool, points: FloatArray,
     found: Sequence[TaughtPoint], H: FloatArray, plane: FloatArray,
 ) -> CameraFit:  # fmt: skip
-    from heliotrope.imaging.finding import SURVEY
+    from heliotrope.imaging.targets.finding import SURVEY
 
     pixels = np.array([p.pixel for p in found])
     survey = np.array([(SURVEY * _per_metre(H, place)) ** 2 for place in plane])
@@ -538,7 +538,7 @@ def see_marks(
     InputError
         If no target has marks, or none is found.
     """
-    from heliotrope.imaging.finding import SURVEY, FoundMark, find_targets
+    from heliotrope.imaging.targets.finding import SURVEY, FoundMark, find_targets
 
     targets = [t for t in plant.targets if t.marks]
     if camera is not None and camera.targets:

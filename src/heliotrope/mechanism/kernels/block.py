@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._drive_kernels import drive_angle, drive_counts, load_drive
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._slots import (
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.drives import drive_angle, drive_counts, load_drive
+from heliotrope.mechanism.kernels.slots import (
     BIAS,
     KIND,
     MAX_ANGLE,
@@ -23,7 +23,7 @@ from heliotrope.mechanism._slots import (
     WORM_SIN,
     ZERO,
 )
-from heliotrope.mechanism._track_kernels import (
+from heliotrope.mechanism.kernels.track import (
     DEGENERATE,
     OK,
     STOPPED,
@@ -42,8 +42,8 @@ from heliotrope.mechanism._track_kernels import (
     turned,
     wanted_normal,
 )
-from heliotrope.mechanism._vectors import about, turn_between
-from heliotrope.mechanism._warm_kernels import LANES, STEPS, warm_start
+from heliotrope.mechanism.kernels.vectors import about, turn_between
+from heliotrope.mechanism.kernels.warm import LANES, STEPS, warm_start
 
 #: Angles this far (rad) beyond a stop count as on it.
 STOP_SLACK = 1e-9

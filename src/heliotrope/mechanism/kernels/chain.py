@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._drive_kernels import angle_per_count, angle_per_slot, drive_angle
-from heliotrope.mechanism._jit import OPTIONS
-from heliotrope.mechanism._slots import (
+from heliotrope.jit import OPTIONS
+from heliotrope.mechanism.kernels.drives import angle_per_count, angle_per_slot, drive_angle
+from heliotrope.mechanism.kernels.slots import (
     MOVES_ALONG_NORMAL,
     MOVES_DRIVE,
     MOVES_JOINT,

@@ -4,8 +4,8 @@ import math
 
 from numba import njit
 
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._slots import (
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.slots import (
     BIAS,
     KIND,
     LINEAR,

@@ -16,8 +16,8 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._vectors import (
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.vectors import (
     about,
     across,
     add,

@@ -4,7 +4,7 @@ import math
 
 from numba import njit
 
-from heliotrope.mechanism._jit import INLINED
+from heliotrope.jit import INLINED
 
 
 @njit(**INLINED)

@@ -3,7 +3,7 @@
 One step is a chain of four square roots and as many divisions that wait for each other;
 one heliostat at a time leaves the processor idle. Here the lanes of a small table hold
 several heliostats, and the same step runs over them side by side. What comes out is only
-a vertex to start from: :func:`~heliotrope.mechanism._track_kernels.solve_aim` goes on
+a vertex to start from: :func:`~heliotrope.mechanism.kernels.track.solve_aim` goes on
 from there and decides.
 """
 
@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numba import njit
 
-from heliotrope.mechanism._jit import INLINED, OPTIONS
-from heliotrope.mechanism._track_kernels import axis_1, axis_2, constants, load_armature
-from heliotrope.mechanism._vectors import across, add, cross, dot, minus, times
+from heliotrope.jit import INLINED, OPTIONS
+from heliotrope.mechanism.kernels.track import axis_1, axis_2, constants, load_armature
+from heliotrope.mechanism.kernels.vectors import across, add, cross, dot, minus, times
 
 #: Heliostats side by side, and steps taken with them.
 LANES = 8

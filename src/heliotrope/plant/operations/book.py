@@ -10,11 +10,11 @@ from heliotrope.calibration.evaluation import errors
 from heliotrope.calibration.information import precision
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.uncertainty import expected
-from heliotrope.control._operations_views import CalibrationEntry, QualityPoint, SightingView
-from heliotrope.control.plant import PlantController
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
 
 #: Points of the quality over time, and results, that are held.
 _POINTS, _RESULTS = 4000, 2000

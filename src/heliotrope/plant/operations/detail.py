@@ -4,18 +4,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliotrope.control._operations_field import FrameMaker
-from heliotrope.control._operations_views import (
+from heliotrope.mechanism.drives import Drive
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.field import FrameMaker
+from heliotrope.plant.operations.views import (
     DriveView,
     EmergencyView,
     HeliostatView,
     ParameterView,
 )
-from heliotrope.control.plant import PlantController
-from heliotrope.mechanism.drives import Drive
 
 if TYPE_CHECKING:
-    from heliotrope.control._operations_work import Automat
+    from heliotrope.plant.operations.work import Automat
 
 #: Supply and temperature of a board that has not told them.
 _UNTOLD = 0

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_views import STALE_STATE, FieldFrame
-from heliotrope.control.plant import PlantController
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.views import STALE_STATE, FieldFrame
 
 if TYPE_CHECKING:
-    from heliotrope.control._operations_work import Automat
+    from heliotrope.plant.operations.work import Automat
 
 #: A frame is good for so long, s of the plant's clock.
 _EVERY = 1.0

@@ -5,13 +5,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from heliotrope.calibration.estimator import fit
-from heliotrope.control._operations_book import CalibrationBook
-from heliotrope.control._operations_cycle import CentringCycle
-from heliotrope.control._operations_views import CalibrationEntry, Hold
-from heliotrope.control.calibration_cycle import CycleResult
-from heliotrope.control.parameters import items_of
-from heliotrope.control.plant import PlantController
+from heliotrope.calibration.fit.estimator import fit
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.book import CalibrationBook
+from heliotrope.plant.operations.views import CalibrationEntry, Hold
+from heliotrope.plant.visits.calibration_cycle import CycleResult
+from heliotrope.plant.visits.centring import CentringCycle
 from heliotrope.store.records import Records, StoreError, VisitEntry, version_of
 
 #: Old events are looked for so often, s.

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from heliotrope.control._operations_views import AlarmRow, ClusterRow, EventRow, PacketRow
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import Link, Outcome, Statistics
-from heliotrope.control.plant import PlantController
-from heliotrope.control.protocol import Alarm, ProtocolError, Status, decode
 from heliotrope.errors import HeliotropeError
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link, Outcome, Statistics
+from heliotrope.links.messages import Alarm, ProtocolError, Status, decode
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
 from heliotrope.store.records import Event, Records
 
 #: Come each second: only the last of each cluster is kept.

@@ -17,11 +17,17 @@ from typing import Any
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.control._operations_cycle import CentringCycle
-from heliotrope.control._operations_detail import detail, emergency_view
-from heliotrope.control._operations_field import FrameMaker
-from heliotrope.control._operations_log import Logbook
-from heliotrope.control._operations_views import (
+from heliotrope.errors import UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.optics.flux import FluxView, predicted
+from heliotrope.plant.authority import Grant, Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.operations.detail import detail, emergency_view
+from heliotrope.plant.operations.field import FrameMaker
+from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.views import (
     AlarmRow,
     CalibrationView,
     CameraView,
@@ -29,7 +35,6 @@ from heliotrope.control._operations_views import (
     EmergencyView,
     EventRow,
     FieldFrame,
-    FluxView,
     HeliostatView,
     Hold,
     PacketRow,
@@ -37,16 +42,10 @@ from heliotrope.control._operations_views import (
     Summary,
     SunView,
 )
-from heliotrope.control._operations_work import Automat, Photographer, Scheduling, WorkSettings
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.authority import Grant, Person, RefusedError
-from heliotrope.control.emergency import EmergencyOrder
-from heliotrope.control.flux import predicted
-from heliotrope.control.plant import PlantController
-from heliotrope.control.safety import Act
-from heliotrope.errors import UnknownNameError
-from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray
+from heliotrope.plant.operations.work import Automat, Photographer, Scheduling, WorkSettings
+from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.safety.evaluation import Act
 from heliotrope.store.records import Records
 
 __all__ = ["Logbook", "Operations", "WorkSettings"]
@@ -504,7 +503,7 @@ def _act(name: str) -> Act:
 
 
 def _operator(person: Person, what: str) -> None:
-    from heliotrope.control.authority import Role
+    from heliotrope.plant.authority import Role
 
     if person.role < Role.OPERATOR:
         raise RefusedError(f"{what}: {person.name} is viewer; it needs operator")

@@ -79,35 +79,6 @@ class SunView:
 
 
 @dataclass(frozen=True)
-class FluxView:
-    """Predicted light on a receiver.
-
-    Attributes
-    ----------
-    receiver
-        Name.
-    right, up
-        Middles of the cells, m from the centre of the aperture as seen from the field, (W,), (H,).
-    flux
-        W/m², (H, W), lowest row first.
-    power
-        Into the aperture, W.
-    intercept
-        Share of the reflected light that falls into the aperture; NaN without beams.
-    heliostats
-        Whose beams are counted.
-    """
-
-    receiver: str
-    right: FloatArray
-    up: FloatArray
-    flux: FloatArray
-    power: float
-    intercept: float
-    heliostats: int
-
-
-@dataclass(frozen=True)
 class ParameterView:
     """One parameter of a mechanism, SI and rad, with its standard deviation and nominal value."""
 

@@ -16,11 +16,18 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_book import CalibrationBook
-from heliotrope.control._operations_cycle import CentringCycle
-from heliotrope.control._operations_keep import Keeper
-from heliotrope.control._operations_log import Logbook
-from heliotrope.control._operations_views import (
+from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.links.messages import Alarm
+from heliotrope.plant._beam_watch import BeamError
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.book import CalibrationBook
+from heliotrope.plant.operations.keep import Keeper
+from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.views import (
     CalibrationEntry,
     CalibrationView,
     CameraView,
@@ -28,16 +35,9 @@ from heliotrope.control._operations_views import (
     Planned,
     Running,
 )
-from heliotrope.control._tickets import Ticket
-from heliotrope.control._ways import BeamError
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.calibration_cycle import CycleResult
-from heliotrope.control.clock import sleep_until
-from heliotrope.control.plant import PlantController
-from heliotrope.control.protocol import Alarm
-from heliotrope.errors import HeliotropeError, InputError
-from heliotrope.geometry import FloatArray
-from heliotrope.lcu import states
+from heliotrope.plant.tickets import Ticket
+from heliotrope.plant.visits.calibration_cycle import CycleResult
+from heliotrope.plant.visits.centring import CentringCycle
 from heliotrope.store.records import Records
 
 #: Who it is.

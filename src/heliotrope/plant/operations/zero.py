@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 
-from heliotrope.control._plant_orders import whole
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.authority import Person, RefusedError
-from heliotrope.control.plant import PlantController
 from heliotrope.lcu import messages
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.orders import whole
+from heliotrope.plant.tickets import Ticket
 
 
 def zero(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.control.calibration_cycle import CycleResult
+from heliotrope.plant.visits.calibration_cycle import CycleResult
 
 #: A beam that was so many times as far off as expected says that its heliostat has changed.
 SURPRISE = 3.0

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.drift import DAY
-from heliotrope.control._schedule_account import Assignment
-from heliotrope.control._schedule_field import FieldKnowledge
-from heliotrope.control._schedule_knowledge import Look
-from heliotrope.control._schedule_settings import Settings, Weather
-from heliotrope.control._schedule_sight import Sight, hidden
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.schedule.account import Assignment
+from heliotrope.plant.schedule.field import FieldKnowledge
+from heliotrope.plant.schedule.knowledge import Look
+from heliotrope.plant.schedule.settings import Settings, Weather
+from heliotrope.plant.schedule.sight import Sight, hidden
 
 #: Heliostats that are judged exactly at a time; how often at most in a decision once one was found,
 #: and while none was.

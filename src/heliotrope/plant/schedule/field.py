@@ -7,13 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.control._schedule_knowledge import Knowledge, Look
-from heliotrope.control._schedule_settings import Settings
-from heliotrope.control._schedule_sight import neighbours
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.schedule.knowledge import Knowledge, Look
+from heliotrope.plant.schedule.settings import Settings
+from heliotrope.plant.schedule.sight import neighbours
 
 
 class FieldKnowledge:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration import _gain
-from heliotrope.calibration.drift import DAY, zeros
 from heliotrope.calibration.information import expectation, precision, suns_of_year
-from heliotrope.calibration.planning import Aimed, Limits, aim_at, sighting_jacobian
+from heliotrope.calibration.learn.drift import DAY, zeros
+from heliotrope.calibration.plan import gain as _gain
+from heliotrope.calibration.plan.planning import Aimed, Limits, aim_at, sighting_jacobian
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Target

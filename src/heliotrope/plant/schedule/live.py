@@ -11,12 +11,12 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._operations_book import CalibrationBook
-from heliotrope.control._operations_views import CalibrationEntry, Planned
-from heliotrope.control.calibration_cycle import CalibrationCycle, CycleSettings
-from heliotrope.control.plant import PlantController
-from heliotrope.control.schedule import Assignment, Scheduler, Settings, Visited, Weather
 from heliotrope.lcu import states
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.book import CalibrationBook
+from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.schedule.schedule import Assignment, Scheduler, Settings, Visited, Weather
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings
 
 #: A plan is made anew when it is so old, s; it looks so far ahead.
 REPLAN, HORIZON = 120.0, timedelta(hours=16)

@@ -19,9 +19,13 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration.drift import DAY
+from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.control._schedule_account import (
+from heliotrope.errors import InputError, TimeError, UnknownNameError
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.lcu import states as lcu_states
+from heliotrope.plant.schedule.account import (
     SURPRISE,
     Assignment,
     Comparison,
@@ -29,13 +33,9 @@ from heliotrope.control._schedule_account import (
     Visited,
     compare,
 )
-from heliotrope.control._schedule_choice import Judge, Mask
-from heliotrope.control._schedule_field import FieldKnowledge
-from heliotrope.control._schedule_settings import Settings, Weather
-from heliotrope.errors import InputError, TimeError, UnknownNameError
-from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray, as_vectors
-from heliotrope.lcu import states as lcu_states
+from heliotrope.plant.schedule.choice import Judge, Mask
+from heliotrope.plant.schedule.field import FieldKnowledge
+from heliotrope.plant.schedule.settings import Settings, Weather
 
 __all__ = ["Assignment", "Comparison", "Finished", "Scheduler", "Settings", "States", "Visited",
            "Weather", "compare"]  # fmt: skip

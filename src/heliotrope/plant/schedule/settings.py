@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from heliotrope.calibration.drift import DAY, START_DAYS, START_RAD
-from heliotrope.calibration.planning import Limits
+from heliotrope.calibration.learn.drift import DAY, START_DAYS, START_RAD
+from heliotrope.calibration.plan.planning import Limits
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from heliotrope.calibration.planning import Limits
+from heliotrope.calibration.plan.planning import Limits
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, tangent_axes

@@ -16,18 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.calibration.estimator import Calibration, Outcome, fit
 from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.fit.estimator import Calibration, Outcome, fit
 from heliotrope.calibration.sightings import Sightings, camera_target, join
-from heliotrope.control._visit import Visit
-from heliotrope.control.authority import Person, RefusedError
-from heliotrope.control.parameters import CALIBRATION_ITEMS, differing, items_of
-from heliotrope.control.plant import PlantController
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, differing, items_of
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.visit import Visit
 
 
 @dataclass(frozen=True)

@@ -13,19 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.control._visit import Visit
-from heliotrope.control.authority import RefusedError
-from heliotrope.control.calibration_cycle import (
+from heliotrope.errors import InputError
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.calibration_cycle import (
     CalibrationCycle,
     Camera,
     CycleSettings,
     Shot,
 )
-from heliotrope.control.plant import PlantController
-from heliotrope.errors import InputError
-from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray
-from heliotrope.lcu import states
+from heliotrope.plant.visits.visit import Visit
 
 
 @dataclass(frozen=True)

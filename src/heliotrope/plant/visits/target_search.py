@@ -11,10 +11,6 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control._visit import Visit
-from heliotrope.control.authority import Person, RefusedError
-from heliotrope.control.clock import sleep_until
-from heliotrope.control.plant import PlantController
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.motion import (
@@ -25,6 +21,10 @@ from heliotrope.imaging.motion import (
     MotionState,
 )
 from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.visits.visit import Visit
 
 #: Frames that the detector looks at before the beam may come.
 WARM_UP = 5

@@ -5,14 +5,14 @@ from bisect import bisect_right
 
 import numpy as np
 
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.authority import Person, RefusedError
-from heliotrope.control.clock import sleep_until
-from heliotrope.control.plant import PlantController
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
 from heliotrope.mechanism.drives import Drive
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.tickets import Ticket
 
 #: A mirror has arrived when both axes are this close (rad) to where they go, in two rows running.
 ARRIVED = 3e-4

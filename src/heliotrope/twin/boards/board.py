@@ -17,10 +17,10 @@ from heliotrope.lcu import states
 from heliotrope.lcu.controller import Controller
 from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.node import Node
-from heliotrope.twin.clocks import TickCounter
-from heliotrope.twin.flash import NorFlash, PowerCutError
-from heliotrope.twin.motors import Axis
-from heliotrope.twin.outfit import STOW, Outfit, sha256
+from heliotrope.twin.boards.clocks import TickCounter
+from heliotrope.twin.boards.flash import NorFlash, PowerCutError
+from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.outfit import STOW, Outfit, sha256
 from heliotrope.twin.wind import Wind
 
 #: Longest pauses between two looks of the main loop: while steps are made; while the sun is

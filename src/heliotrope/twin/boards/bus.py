@@ -11,10 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import LinkClosedError, Outcome
-from heliotrope.control.turns import Turns
+from heliotrope.cluster.turns import Turns
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import LinkClosedError, Outcome
 
 #: Start, eight data bits, stop.
 _BITS = 10

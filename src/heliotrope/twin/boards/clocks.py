@@ -4,10 +4,10 @@ import asyncio
 from collections.abc import Callable
 from datetime import datetime
 
-from heliotrope.control.clock import Clock, VirtualClock, gps_seconds, utc_of_gps
-from heliotrope.control.timekeeping import Quality, Time
+from heliotrope.cluster.timekeeping import Quality, Time
 from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
+from heliotrope.links.clock import Clock, VirtualClock, gps_seconds, utc_of_gps
 
 #: How long a jump is told, s.
 SETTLE = 5.0

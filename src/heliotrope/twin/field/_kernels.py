@@ -2,7 +2,7 @@
 
 from numba import njit
 
-from heliotrope.mechanism._jit import OPTIONS
+from heliotrope.jit import OPTIONS
 
 SCALE = 1024
 BOTH, PRIMARY_FIRST, SECONDARY_FIRST = 0, 1, 2

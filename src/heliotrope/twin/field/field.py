@@ -34,10 +34,10 @@ from heliotrope.lcu.motion import (
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, track
-from heliotrope.twin import _field_kernels as kernels
-from heliotrope.twin._among import among
-from heliotrope.twin._field_drives import Drives
-from heliotrope.twin._field_ways import pieces
+from heliotrope.twin.field import _kernels as kernels
+from heliotrope.twin.field._among import among
+from heliotrope.twin.field._drives import Drives
+from heliotrope.twin.field._ways import pieces
 from heliotrope.twin.wind import Wind
 
 Rows = npt.NDArray[np.intp]

@@ -13,10 +13,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from heliotrope.control.link import LinkClosedError, Outcome
 from heliotrope.errors import InputError
 from heliotrope.lcu import messages, states, wire
-from heliotrope.twin.field import LEASE_MS, Field
+from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.twin.field.field import LEASE_MS, Field
 
 _HEADER = struct.Struct(wire.HEADER)
 _SUN, _AIM = struct.Struct("<Iiiihhh"), struct.Struct("<fff")

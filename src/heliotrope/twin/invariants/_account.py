@@ -5,9 +5,9 @@ from typing import Any
 
 from heliotrope.lcu import messages, motion, states, wire
 from heliotrope.lcu.journal import items_of
-from heliotrope.twin.board import Board
-from heliotrope.twin.ledger import Sent
-from heliotrope.twin.outfit import LIMITS, STOW
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import LIMITS, STOW
+from heliotrope.twin.invariants.ledger import Sent
 
 #: A timer may be given so much more than its rate allows until now, s: what is emitted ahead.
 AHEAD = 0.2

@@ -31,14 +31,12 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from heliotrope.control.protocol import NEVER, Progress, Stage, Status
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states, wire
-from heliotrope.twin._account import Account, fingerprint
-from heliotrope.twin.board import Board
-from heliotrope.twin.ledger import FrameLedger, Order, OrderLedger, Sent
-from heliotrope.twin.outfit import (
+from heliotrope.links.messages import NEVER, Progress, Stage, Status
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import (
     KEEP_OUT,
     KEEP_OUT_RADIUS,
     LIMITS,
@@ -46,6 +44,8 @@ from heliotrope.twin.outfit import (
     RECEIVER,
     STOW,
 )
+from heliotrope.twin.invariants._account import Account, fingerprint
+from heliotrope.twin.invariants.ledger import FrameLedger, Order, OrderLedger, Sent
 
 #: Gives the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]

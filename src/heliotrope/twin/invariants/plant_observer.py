@@ -11,14 +11,14 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from itertools import islice
 
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.authority import OPERATOR_COMMANDS, Person, Role
-from heliotrope.control.plant import JOINING, PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.protocol import Command, Emergency, Message, Parameters
 from heliotrope.lcu import states
-from heliotrope.twin.invariants import InvariantError, Observer, Violation
-from heliotrope.twin.records import RecordsDisk
+from heliotrope.links.messages import Command, Emergency, Message, Parameters
+from heliotrope.plant.authority import OPERATOR_COMMANDS, Person, Role
+from heliotrope.plant.controller import JOINING, PlantController
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.tickets import Ticket
+from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
+from heliotrope.twin.world.records import RecordsDisk
 
 #: A status waits for up to a second, may be under way for one more, and ages are rounded: a value
 #: may be taken for so much younger than it is, s.

@@ -8,17 +8,17 @@ import struct
 
 import numpy as np
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.parameters import Machine, items_of
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import states
+from heliotrope.links.clock import Clock
+from heliotrope.mechanism.board_items import Machine, items_of
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.twin._live_field import key_of, near
-from heliotrope.twin.board import Board
-from heliotrope.twin.bus import TwinBus
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.bus import TwinBus
+from heliotrope.twin.boards.outfit import STOW, Outfit
 from heliotrope.twin.cameras import Mirror
-from heliotrope.twin.outfit import STOW, Outfit
+from heliotrope.twin.live._field import key_of, near
 
 #: More boards than this are too much for one process.
 MOST = 64

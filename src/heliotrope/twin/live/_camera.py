@@ -10,16 +10,16 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
-from heliotrope.control._operations_views import CameraView
-from heliotrope.control.calibration_cycle import Shot
-from heliotrope.control.real_views import Views, picture_of, shot_of
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import Photograph, read_photograph
-from heliotrope.imaging.rendering import render
-from heliotrope.imaging.scenes import Scene, Thrown, exposed
+from heliotrope.imaging.synthetic.rendering import render
+from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
+from heliotrope.plant.camera_views import Views, picture_of, shot_of
+from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.visits.calibration_cycle import Shot
 from heliotrope.twin.cameras import PEAK, ExactCamera, Mirror, Optics, RenderedCamera, Sight
 
 

@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.control.parameters import Machine, items_of
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import journal, messages, states, wire
-from heliotrope.mechanism import _slots as slot
 from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.board_items import Machine, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.tracking import Status, track
 from heliotrope.twin.cameras import Mirror
-from heliotrope.twin.field import Bools, Field, Rows
-from heliotrope.twin.field_bus import FieldBus
+from heliotrope.twin.field.field import Bools, Field, Rows
+from heliotrope.twin.field.field_bus import FieldBus
 
 #: States in which calibration is taken, and those in which all is.
 _TAKES = (states.STOWED, states.LOCKED, states.FAULT, states.IDLE, states.DEFOCUSED)

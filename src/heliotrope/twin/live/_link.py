@@ -7,8 +7,8 @@ all the rest. What a line may do to messages is shown by `control.memory`.
 import asyncio
 from collections import deque
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import LinkClosedError, Outcome, Statistics
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import LinkClosedError, Outcome, Statistics
 
 #: Messages that may wait at an end; beyond it the oldest is dropped, as at any link.
 _CAPACITY = 256

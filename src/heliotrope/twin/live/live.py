@@ -17,41 +17,41 @@ from typing import Any
 import numpy as np
 
 from heliotrope import sun
-from heliotrope.control._operations_cycle import CentringCycle
-from heliotrope.control._schedule_live import PlantSchedule, settings_for
-from heliotrope.control.assigned import Assigned, rest_on
-from heliotrope.control.audit import Audit, Record
-from heliotrope.control.calibration_cycle import CycleSettings
-from heliotrope.control.clock import VirtualClock
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member, spread_phase
-from heliotrope.control.link import Bus, running
-from heliotrope.control.operations import Logbook, Operations, WorkSettings
-from heliotrope.control.parameters import Axis, Machine
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings, clusters_of
-from heliotrope.control.schedule import Scheduler
-from heliotrope.control.timekeeping import SystemTime
+from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.errors import InputError
 from heliotrope.field import example, layouts
-from heliotrope.field._layout_tower import square_target, watching_camera
 from heliotrope.field.example import roughly_installed
+from heliotrope.field.layout_tower import square_target, watching_camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.scenes import Scene
+from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.lcu import states
-from heliotrope.mechanism import _slots as slot
+from heliotrope.links.clock import VirtualClock
+from heliotrope.links.link import Bus, running
+from heliotrope.mechanism.board_items import Axis, Machine
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.parameters import MODELS
+from heliotrope.plant.assigned import Assigned, rest_on
+from heliotrope.plant.audit import Audit, Record
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.operations import Logbook, Operations, WorkSettings
+from heliotrope.plant.schedule.live import PlantSchedule, settings_for
+from heliotrope.plant.schedule.schedule import Scheduler
+from heliotrope.plant.settings import PlantSettings, clusters_of
+from heliotrope.plant.visits.calibration_cycle import CycleSettings
+from heliotrope.plant.visits.centring import CentringCycle
 from heliotrope.store.records import Records
-from heliotrope.twin import outfit
-from heliotrope.twin._live_boards import BoardField
-from heliotrope.twin._live_camera import LiveCamera, SeenExactly
-from heliotrope.twin._live_field import LiveField, key_of, ranges_of
-from heliotrope.twin._live_link import NearLink, near_pair
+from heliotrope.twin.boards import outfit
 from heliotrope.twin.cameras import NEAR, Optics, Sight
+from heliotrope.twin.live._boards import BoardField
+from heliotrope.twin.live._camera import LiveCamera, SeenExactly
+from heliotrope.twin.live._field import LiveField, key_of, ranges_of
+from heliotrope.twin.live._link import NearLink, near_pair
 
 #: The field goes on in ticks of so long, s; the true sun is computed so often, s.
 _TICK, _SUN_EVERY = 0.05, 5.0

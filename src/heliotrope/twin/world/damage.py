@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from heliotrope.control.memory import Faults
-from heliotrope.twin import faults as kinds
-from heliotrope.twin.bus import BusFaults
-from heliotrope.twin.faults import Fault
-from heliotrope.twin.pod import Pod
+from heliotrope.links.in_process import Faults
+from heliotrope.twin.boards.bus import BusFaults
+from heliotrope.twin.world import faults as kinds
+from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.pod import Pod
 
 if TYPE_CHECKING:
-    from heliotrope.twin.simulation import Simulation
+    from heliotrope.twin.world.simulation import Simulation
 
 #: While one of these lasts, an order need not be carried out.
 _HINDERS = ("line", "bus", "plant")

@@ -8,8 +8,8 @@ time.
 import random
 
 from heliotrope.lcu import messages, wire
-from heliotrope.twin.ledger import FrameLedger
-from heliotrope.twin.outfit import sha256
+from heliotrope.twin.boards.outfit import sha256
+from heliotrope.twin.invariants.ledger import FrameLedger
 
 #: What he would like to command.
 WANTED = ("TRACK", "APPROACH", "REFOCUS", "IDLE", "AIM", "UNLOCK", "CLEAR_FAULT", "LOCK", "GOTO",

@@ -13,16 +13,16 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from heliotrope.control._tickets import Ticket
-from heliotrope.control.authority import Person, RefusedError, Role
-from heliotrope.control.clock import Clock, sleep_until
-from heliotrope.control.link import LinkClosedError
-from heliotrope.control.plant import PlantController
-from heliotrope.control.protocol import Command, encode
-from heliotrope.control.safety import Act
-from heliotrope.twin.outfit import KEEP_OUT, RECEIVER, STANDBY
-from heliotrope.twin.plant_observer import VOID_WITHIN, PlantObserver
-from heliotrope.twin.pod import PlantEar, Pod
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import LinkClosedError
+from heliotrope.links.messages import Command, encode
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety.evaluation import Act
+from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
+from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
+from heliotrope.twin.world.pod import PlantEar, Pod
 
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)

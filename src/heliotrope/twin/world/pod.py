@@ -5,13 +5,15 @@ import random
 from collections import Counter
 from datetime import datetime
 
-from heliotrope.control._kept import Kept
-from heliotrope.control.carried import CarriedLink
-from heliotrope.control.clock import VirtualClock
-from heliotrope.control.cluster import Cluster
-from heliotrope.control.cluster_config import ClusterConfig, Member
-from heliotrope.control.memory import MemoryLine
-from heliotrope.control.protocol import (
+from heliotrope.cluster.config import ClusterConfig, Member
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.timekeeping import SystemTime
+from heliotrope.lcu import wire
+from heliotrope.links.clock import VirtualClock
+from heliotrope.links.connection import CarriedLink
+from heliotrope.links.in_process import MemoryLine
+from heliotrope.links.messages import (
     Alarm,
     Command,
     Emergency,
@@ -22,17 +24,15 @@ from heliotrope.control.protocol import (
     Status,
     decode,
 )
-from heliotrope.control.timekeeping import SystemTime
-from heliotrope.lcu import wire
 from heliotrope.sun import Site
-from heliotrope.twin.board import Board
-from heliotrope.twin.bus import TwinBus
-from heliotrope.twin.clocks import DriftingClock, SimulatedTime
-from heliotrope.twin.intruder import Intruder
-from heliotrope.twin.invariants import Observer
-from heliotrope.twin.ledger import Order
-from heliotrope.twin.plant_observer import PlantObserver
-from heliotrope.twin.tapped import TappedLink
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.bus import TwinBus
+from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
+from heliotrope.twin.invariants.invariants import Observer
+from heliotrope.twin.invariants.ledger import Order
+from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.world.intruder import Intruder
+from heliotrope.twin.world.tapped import TappedLink
 
 #: A cluster counts a command's life from when it comes: so long it may have been under way, s.
 UNDER_WAY = 0.8

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import replace
 
-from heliotrope.control.assigned import Places
-from heliotrope.control.audit import STOPPED, AuditError, Record
 from heliotrope.errors import InputError
+from heliotrope.plant.assigned import Places
+from heliotrope.plant.audit import STOPPED, AuditError, Record
 
 
 class RecordsDisk:

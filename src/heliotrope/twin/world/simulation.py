@@ -17,11 +17,6 @@ from pathlib import Path
 
 import numpy as np
 
-from heliotrope.control.clock import VirtualClock, VirtualLoop
-from heliotrope.control.parameters import Wanted
-from heliotrope.control.plant import PlantController
-from heliotrope.control.plant_settings import PlantSettings
-from heliotrope.control.safety import conditions
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
@@ -29,15 +24,15 @@ from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
+from heliotrope.links.clock import VirtualClock, VirtualLoop
+from heliotrope.mechanism.board_items import Wanted
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.safety.evaluation import conditions
 from heliotrope.sun import Site, vector
-from heliotrope.twin import faults as kinds
-from heliotrope.twin.board import Board
-from heliotrope.twin.clocks import TickCounter
-from heliotrope.twin.damage import Damage
-from heliotrope.twin.faults import Fault
-from heliotrope.twin.invariants import OFF, InvariantError, Observer, Violation
-from heliotrope.twin.operator import Operator
-from heliotrope.twin.outfit import (
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.clocks import TickCounter
+from heliotrope.twin.boards.outfit import (
     KEEP_OUT,
     KEEP_OUT_RADIUS,
     RECEIVER,
@@ -46,10 +41,15 @@ from heliotrope.twin.outfit import (
     mechanisms,
     outfits,
 )
-from heliotrope.twin.plant_observer import PlantObserver
-from heliotrope.twin.pod import PlantEar, Pod
-from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
-from heliotrope.twin.tapped import TappedLink
+from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.world import faults as kinds
+from heliotrope.twin.world.damage import Damage
+from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.operator import Operator
+from heliotrope.twin.world.pod import PlantEar, Pod
+from heliotrope.twin.world.records import AssignedDisk, RecordsDisk, SimulatedAudit
+from heliotrope.twin.world.tapped import TappedLink
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
 START = datetime(2026, 6, 21, 9, tzinfo=UTC)

@@ -10,9 +10,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from heliotrope.control.clock import Clock, SystemClock
 from heliotrope.errors import FormatError, InputError
-from heliotrope.twin.simulation import Outcome, Plan, run
+from heliotrope.links.clock import Clock, SystemClock
+from heliotrope.twin.world.simulation import Outcome, Plan, run
 
 
 @dataclass

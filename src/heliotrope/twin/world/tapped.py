@@ -3,8 +3,8 @@
 import asyncio
 from typing import Protocol
 
-from heliotrope.control.clock import Clock
-from heliotrope.control.link import Link, Outcome, Statistics
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link, Outcome, Statistics
 
 
 class Listener(Protocol):

@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pvlib import solarposition
 
-import data
 from heliotrope import sun
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.geometry import MRAD, angle_between, direction
+from heliotrope.sun import ephemeris
+from support import data
 
 NOON = datetime(2024, 6, 21, 12, 0, tzinfo=UTC)
 JUELICH = sun.Site(50.913421122592574, 6.387824755874856, 87.0, name="Jülich")
@@ -105,7 +106,7 @@ def test_shape_follows_the_times() -> None:
 def test_neither_chunks_nor_threads_change_a_digit(monkeypatch: pytest.MonkeyPatch) -> None:
     times = NOON.timestamp() + 1234.5 * np.arange(1000)
     whole = sun.position(times, JUELICH)
-    monkeypatch.setattr(sun, "_CHUNK", 96)
+    monkeypatch.setattr(ephemeris, "_CHUNK", 96)
     for threads in ("1", "2", "5"):
         monkeypatch.setenv("HELIOTROPE_THREADS", threads)
         parts = sun.position(times, JUELICH)

@@ -1,0 +1,1 @@
+"""A flight evaluated: photographs read, reflections identified, mirrors orientated, the report."""

@@ -1,0 +1,1 @@
+"""Plans of a drone campaign: clusters, hover patterns, flights, airspace and waypoint files."""

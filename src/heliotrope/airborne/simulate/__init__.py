@@ -1,0 +1,1 @@
+"""Simulated flights: rendered photographs with exact truth."""

@@ -1,0 +1,1 @@
+"""The fit of one heliostat: residuals and the maximum a posteriori estimate."""

@@ -1,0 +1,1 @@
+"""Learning a field: regimes, drift, outliers, and the choice of a model."""

@@ -1,0 +1,1 @@
+"""``heliotrope drone``: plan, evaluate, check and simulate flights of a drone with a lamp."""

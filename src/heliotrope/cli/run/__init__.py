@@ -1,0 +1,1 @@
+"""``heliotrope run``: a plant at work with its console."""

@@ -1,0 +1,1 @@
+"""Targets in photographs: marks found, views fitted, faces rectified, known points taught."""

@@ -1,0 +1,1 @@
+"""Compiled kernels of mechanisms and tracking, for every package that compiles its own."""

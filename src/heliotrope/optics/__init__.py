@@ -1,0 +1,1 @@
+"""Light: beams, their images and flux, keep-out volumes, glare."""

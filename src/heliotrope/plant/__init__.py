@@ -1,0 +1,1 @@
+"""The plant controller: the one program that commands all clusters of a field."""

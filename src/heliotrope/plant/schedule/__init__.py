@@ -1,0 +1,1 @@
+"""The calibration schedule: which heliostat is measured next, on which target."""

@@ -1,0 +1,1 @@
+"""Simulated local controllers, true to the firmware, and their bus."""

@@ -1,0 +1,1 @@
+"""A whole field of local controllers as arrays."""

@@ -1,0 +1,1 @@
+"""The observer that checks the safety invariants."""

@@ -1,0 +1,1 @@
+"""A simulated field for a live plant."""

@@ -1,0 +1,1 @@
+"""Deterministic simulation: plant, clusters and boards in virtual time, with seeded faults."""
