@@ -57,9 +57,11 @@ def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
     for column in rows[0]:
         words, left = column.split("_"), isinstance(rows[0][column], str)
         table.add_column(
-            " ".join(words), justify="left" if left else "right", no_wrap=left,
+            " ".join(words),
+            justify="left" if left else "right",
+            no_wrap=left,
             min_width=max(map(len, words)),
-        )  # fmt: skip
+        )
     for row in rows:
         table.add_row(*map(_text, row.values()))
     Console(width=None if sys.stdout.isatty() else WIDTH).print(table)

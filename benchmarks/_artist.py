@@ -46,9 +46,12 @@ def seconds_per_heliostat() -> float:
     device, path = torch.device("cpu"), Path(os.environ[SCENARIO])
     names = os.environ[HELIOSTATS].split(",")
     mapping = paint_scenario_parser.build_heliostat_data_mapping(
-        base_path=os.environ[DATA], heliostat_names=names, number_of_measurements=SIGHTINGS,
-        image_variant="flux", randomize=False,
-    )  # fmt: skip
+        base_path=os.environ[DATA],
+        heliostat_names=names,
+        number_of_measurements=SIGHTINGS,
+        image_variant="flux",
+        randomize=False,
+    )
     optimiser = {
         key.initial_learning_rate: 5e-4, key.tolerance: 0.0, key.batch_size: 50,
         key.max_epoch: int(os.environ.get(EPOCHS, "100")), key.log_step: 0,

@@ -100,8 +100,10 @@ def _revision() -> str | None:
         # The results are left out: `all` writes them while it runs.
         changed = subprocess.run(
             [*git, "status", "--porcelain", "--", ":/", f":(exclude){RESULTS}"],
-            capture_output=True, text=True, check=True,
-        ).stdout  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
     except (OSError, subprocess.CalledProcessError):
         return None
     return commit + ("+" if changed else "")

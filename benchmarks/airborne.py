@@ -46,9 +46,12 @@ def _heliostats() -> Heliostats:
     center[..., 1] = np.array([-0.25, -0.25, 0.25, 0.25]) * 2.0
     half_width[..., 0], half_height[..., 1] = 0.615, 0.49
     return Heliostats(
-        tuple(f"H{k}" for k in range(n)), azimuth_elevation(places), np.full(n, 2.5),
-        np.full(n, 2.0), Facets(center, half_width, half_height),
-    )  # fmt: skip
+        tuple(f"H{k}" for k in range(n)),
+        azimuth_elevation(places),
+        np.full(n, 2.5),
+        np.full(n, 2.0),
+        Facets(center, half_width, half_height),
+    )
 
 
 def _flight(size: tuple[int, int]) -> Flight:
@@ -116,15 +119,25 @@ def run(quick: bool) -> Result:
     total = times["decoding (JPEG)"].best + times["mirrors and reflections"].best
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     rows: list[Row] = [
-        {"work": work, "best_ms": 1e3 * one.best, "median_ms": 1e3 * one.median,
-         "ratio_to_decoding": one.best / decoding, "per_second": None}
+        {
+            "work": work,
+            "best_ms": 1e3 * one.best,
+            "median_ms": 1e3 * one.median,
+            "ratio_to_decoding": one.best / decoding,
+            "per_second": None,
+        }
         for work, one in times.items()
-    ]  # fmt: skip
+    ]
     rows += [
-        {"work": f"file to reflections, {n} process{'es' if n > 1 else ''}", "best_ms": 1e3 / rate,
-         "median_ms": 1e3 / rate, "ratio_to_decoding": 1.0 / (rate * decoding), "per_second": rate}
+        {
+            "work": f"file to reflections, {n} process{'es' if n > 1 else ''}",
+            "best_ms": 1e3 / rate,
+            "median_ms": 1e3 / rate,
+            "ratio_to_decoding": 1.0 / (rate * decoding),
+            "per_second": rate,
+        }
         for n, rate in rates.items()
-    ]  # fmt: skip
+    ]
     ratio = times["mirrors and reflections"].best / decoding
     best = max(rates.values(), default=1.0 / total)
     return Result(

@@ -36,8 +36,11 @@ def _nodes(port: str, given: tuple[int, ...] = ()) -> Iterator[None]:
     """Run the local controllers at a port."""
     with subprocess.Popen(
         [sys.executable, "-m", "benchmarks._bus_nodes", port],
-        cwd=ROOT, pass_fds=given, stdout=subprocess.PIPE, text=True,
-    ) as nodes:  # fmt: skip
+        cwd=ROOT,
+        pass_fds=given,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as nodes:
         assert nodes.stdout is not None
         try:
             if nodes.stdout.readline() != "ready\n":

@@ -84,8 +84,13 @@ def _least_squares(nominal: Any, seen: Any, sample: int) -> np.ndarray:
 
 def _nelder_mead(nominal: Any, seen: Any, sample: int, evaluations: int) -> np.ndarray:
     """Return parameters over their priors, (sample, P), after so many evaluations at most."""
-    options = {"maxfev": evaluations, "maxiter": evaluations, "adaptive": True,
-               "xatol": 1e-6, "fatol": 1e-9}  # fmt: skip
+    options = {
+        "maxfev": evaluations,
+        "maxiter": evaluations,
+        "adaptive": True,
+        "xatol": 1e-6,
+        "fatol": 1e-9,
+    }
     found = []
     for i in range(sample):
         residual = _residuals(nominal, seen, i)
@@ -100,10 +105,17 @@ def _nelder_mead(nominal: Any, seen: Any, sample: int, evaluations: int) -> np.n
 
 def _row(contender: str, size: int, best: float, median: float) -> dict[str, Any]:
     return {
-        "contender": contender, "heliostats": size, "seconds": best, "median_seconds": median,
-        "ms_per_heliostat": 1e3 * best / size, "scipy_ratio": None, "nelder_mead_ratio": None,
-        "growth_exponent": None, "peak_bytes_per_heliostat": None, "differs_sigma": None,
-    }  # fmt: skip
+        "contender": contender,
+        "heliostats": size,
+        "seconds": best,
+        "median_seconds": median,
+        "ms_per_heliostat": 1e3 * best / size,
+        "scipy_ratio": None,
+        "nelder_mead_ratio": None,
+        "growth_exponent": None,
+        "peak_bytes_per_heliostat": None,
+        "differs_sigma": None,
+    }
 
 
 def _peers(quick: bool, size: int) -> list[dict[str, Any]]:

@@ -59,9 +59,14 @@ class ReadyBus:
         return Outcome.SENT
 
     async def transact(
-        self, frame: bytes, timeout: float, *, expires: float | None = None,
-        urgent: bool = False, complete: object = None,
-    ) -> bytes:  # fmt: skip
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
+        complete: object = None,
+    ) -> bytes:
         """Answer a question."""
         del timeout, expires, urgent, complete
         self.frames += 1

@@ -80,12 +80,16 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     keeper, heard = Keeper(folder / "store.sqlite"), Heard(heliostats)
     now, people = time.time(), keeper.people
     people.add(NAME, _secrets.hash_password(PASSWORD), "engineer", now)
-    tokens = [people.add_token(NAME, f"load {i}", "operator", now)[1]
-              for i in range(VIEWERS + OPERATORS)]  # fmt: skip
+    tokens = [
+        people.add_token(NAME, f"load {i}", "operator", now)[1] for i in range(VIEWERS + OPERATORS)
+    ]
     live = LivePlant(
-        malan_plant(heliostats), VirtualClock(loop.time), LiveOptions(), records=keeper,
+        malan_plant(heliostats),
+        VirtualClock(loop.time),
+        LiveOptions(),
+        records=keeper,
         extra=lambda: {"speed": 1.0},
-    )  # fmt: skip
+    )
     for part in live._parts:
         if isinstance(part, FieldBus):
             part._took = heard.took
@@ -160,10 +164,14 @@ async def _look(pipe: Connection, address: str, tokens: list[str], viewers: int)
     came: list[list[tuple[int, float, int]]] = [[] for _ in tokens]
     answers: list[float] = []
     async with asyncio.TaskGroup() as group:
-        works = [group.create_task(_view(address, token, mine))
-                 for token, mine in zip(tokens, came, strict=True)]  # fmt: skip
-        works += [group.create_task(_ask(address, token, answers, i, operator=i >= viewers))
-                  for i, token in enumerate(tokens)]  # fmt: skip
+        works = [
+            group.create_task(_view(address, token, mine))
+            for token, mine in zip(tokens, came, strict=True)
+        ]
+        works += [
+            group.create_task(_ask(address, token, answers, i, operator=i >= viewers))
+            for i, token in enumerate(tokens)
+        ]
         while (question := await asyncio.to_thread(pipe.recv)) != "end":
             if question == "begin":
                 answers.clear()
@@ -200,9 +208,12 @@ async def _ask(
     due = time.monotonic() + every * rng.random()
     headers = {"Authorization": f"Bearer {token}"}
     async with httpx.AsyncClient(
-        base_url=f"{address}api/v1/", headers=headers, trust_env=False, timeout=60.0,
+        base_url=f"{address}api/v1/",
+        headers=headers,
+        trust_env=False,
+        timeout=60.0,
         verify=False,
-    ) as client:  # fmt: skip
+    ) as client:
         names = (await client.get("field")).json()["names"] if operator else []
         at = time.monotonic() + 5.0 * rng.random()
         while True:
@@ -259,8 +270,11 @@ def _page(playwright: Any, address: str, span: float) -> tuple[Any, Row]:
             page.wait_for_timeout(50)
         ready.append(page.evaluate(marks) / 1e3)
     frames = page.evaluate(PAN, 1e3 * span)
-    row: Row = {"page_first_ready_s": ready[0], "page_ready_s": float(np.median(ready[1:])),
-                "frames_panning": frames}  # fmt: skip
+    row: Row = {
+        "page_first_ready_s": ready[0],
+        "page_ready_s": float(np.median(ready[1:])),
+        "frames_panning": frames,
+    }
     return page, row
 
 
@@ -287,13 +301,18 @@ def _load(plant: Connection, people: Connection, page: Any, span: float) -> Row:
     if not (heard and acknowledged):
         raise BenchmarkError("an emergency was not heard and acknowledged by all in a minute")
     return {
-        "messages_a_second_least": min(rates), "messages_a_second": float(np.mean(rates)),
-        "delay_s": float(np.median(delays)), "delay_99_s": float(np.quantile(delays, 0.99)),
+        "messages_a_second_least": min(rates),
+        "messages_a_second": float(np.mean(rates)),
+        "delay_s": float(np.median(delays)),
+        "delay_99_s": float(np.quantile(delays, 0.99)),
         "message_kib": float(np.mean(sizes)) / 1024.0,
-        "answer_s": float(np.median(answers)), "answer_99_s": float(np.quantile(answers, 0.99)),
-        "plant_cores": (busy - cpu) / over, "loop_held_s": held,
-        "emergency_heard_s": heard - clicked, "emergency_acknowledged_s": acknowledged - clicked,
-    }  # fmt: skip
+        "answer_s": float(np.median(answers)),
+        "answer_99_s": float(np.quantile(answers, 0.99)),
+        "plant_cores": (busy - cpu) / over,
+        "loop_held_s": held,
+        "emergency_heard_s": heard - clicked,
+        "emergency_acknowledged_s": acknowledged - clicked,
+    }
 
 
 def _measure(heliostats: int, people: int, span: float) -> Row:
@@ -334,7 +353,11 @@ def run(quick: bool) -> Result:
         f"{row['page_first_ready_s']:.1f} s, {row['frames_panning']:.0f} frames/s, "
         f"{row['messages_a_second_least']:.2f} messages/s, all have heard EMERGENCY after "
         f"{row['emergency_heard_s']:.2f} s",
-        {"limit_ready_s": READY_S, "limit_frames": FRAMES, "limit_messages": MESSAGES,
-         "limit_emergency_s": EMERGENCY_S},
+        {
+            "limit_ready_s": READY_S,
+            "limit_frames": FRAMES,
+            "limit_messages": MESSAGES,
+            "limit_emergency_s": EMERGENCY_S,
+        },
         None if quick else all(share <= 1.05 for share in shares.values()),
-    )  # fmt: skip
+    )

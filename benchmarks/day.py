@@ -64,12 +64,25 @@ def _day(count: int, hours: float) -> tuple[list[Row], str]:
     untouched = Days(plant, scheduler, begin).look(times, chosen)
     share = {"simulated_h": hours, "calibrated": len(days.values), "visits": len(days.made)}
     rows = [
-        _row("as installed", count, median_mrad=float(np.median(untouched.error)) / MRAD,
-             rms_mrad=_rms(untouched.error), **share),
-        _row("calibrated", count, median_mrad=float(np.median(after.error)) / MRAD,
-             rms_mrad=_rms(after.error), predicted_mrad=_rms(after.predicted),
-             within_90=after.within, cpu_s_per_h=work / hours, memory_mib=_memory(), **share),
-    ]  # fmt: skip
+        _row(
+            "as installed",
+            count,
+            median_mrad=float(np.median(untouched.error)) / MRAD,
+            rms_mrad=_rms(untouched.error),
+            **share,
+        ),
+        _row(
+            "calibrated",
+            count,
+            median_mrad=float(np.median(after.error)) / MRAD,
+            rms_mrad=_rms(after.error),
+            predicted_mrad=_rms(after.predicted),
+            within_90=after.within,
+            cpu_s_per_h=work / hours,
+            memory_mib=_memory(),
+            **share,
+        ),
+    ]
     text = (
         f"{count:,} heliostats, {hours:g} h: {len(days.values):,} calibrated, "
         f"{rows[0]['median_mrad']:.1f} to {rows[1]['median_mrad']:.2f} mrad, "
@@ -94,11 +107,17 @@ async def _live(count: int, minutes: float, looks: int) -> list[Row]:
             now, summary = time.process_time(), live.operations.calibration()
             hours = minutes / looks / 60.0
             last = summary.quality[-1].truth_median if summary.quality else float("nan")
-            rows.append(_row(
-                "whole program", count, simulated_h=look * hours, calibrated=summary.done,
-                cpu_s_per_h=(now - before) / hours, memory_mib=_memory(),
-                median_mrad=last / MRAD if np.isfinite(last) else None,
-            ))  # fmt: skip
+            rows.append(
+                _row(
+                    "whole program",
+                    count,
+                    simulated_h=look * hours,
+                    calibrated=summary.done,
+                    cpu_s_per_h=(now - before) / hours,
+                    memory_mib=_memory(),
+                    median_mrad=last / MRAD if np.isfinite(last) else None,
+                )
+            )
             before = now
         await live.end()
     return rows
@@ -119,4 +138,4 @@ def run(quick: bool) -> Result:
         f"{whole[-1]['simulated_h']:.3g} h: memory {100 * growth:+.1f} %",
         figures,
         None if quick else growth < GROWTH,
-    )  # fmt: skip
+    )

@@ -70,6 +70,8 @@ def run(quick: bool) -> Result:
                     }
                 )
             found.append((table, times["Heliotrope reads"].best, times["Heliotrope writes"].best))
-    texts = [f"{table} read in {read:.3g} s, written in {write:.3g} s"
-             for table, read, write in found[-2:]]  # fmt: skip
+    texts = [
+        f"{table} read in {read:.3g} s, written in {write:.3g} s"
+        for table, read, write in found[-2:]
+    ]
     return Result(rows, f"{size:,} heliostats: {'; '.join(texts)}")

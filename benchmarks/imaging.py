@@ -46,9 +46,11 @@ def _rendered(folder: Path, size: tuple[int, int]) -> tuple[Path, tuple[Target, 
     target = example_target()
     beam = gaussian_beam(TRUTH, 0.7, 0.5, 0.4)
     scene = Scene(
-        example_camera(target, size=size), (target,), (("target", beam, 700.0),),
+        example_camera(target, size=size),
+        (target,),
+        (("target", beam, 700.0),),
         sensor=Sensor(colour=True),
-    )  # fmt: skip
+    )
     path = folder / "rendered.png"
     write_image(render_scene(exposed(scene), 1).frame, path)
     return path, (target,)

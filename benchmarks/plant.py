@@ -82,24 +82,41 @@ def _design(clusters: int) -> Plant:
     rng = np.random.default_rng(0)
     places = rng.uniform((-800.0, 100.0, 0.0), (800.0, 1200.0, 0.0), (count, 3))
     return Plant(
-        "large", Site(37.09, -2.36, 500.0),
-        {"all": Heliostats(
-            tuple(f"H{i:05d}" for i in range(count)), azimuth_elevation(places),
-            np.full(count, 3.0), np.full(count, 2.0),
-            cluster=tuple(f"K{i // MEMBERS:03d}" for i in range(count)),
-        )},
-        receivers=(Receiver("receiver", "planar", np.array([0.0, 0.0, 200.0]),
-                            np.array([0.0, 1.0, 0.0]), 10.0, 10.0),),
-    )  # fmt: skip
+        "large",
+        Site(37.09, -2.36, 500.0),
+        {
+            "all": Heliostats(
+                tuple(f"H{i:05d}" for i in range(count)),
+                azimuth_elevation(places),
+                np.full(count, 3.0),
+                np.full(count, 2.0),
+                cluster=tuple(f"K{i // MEMBERS:03d}" for i in range(count)),
+            )
+        },
+        receivers=(
+            Receiver(
+                "receiver",
+                "planar",
+                np.array([0.0, 0.0, 200.0]),
+                np.array([0.0, 1.0, 0.0]),
+                10.0,
+                10.0,
+            ),
+        ),
+    )
 
 
 class _Run:
     """One plant, and what its parts took, s of CPU."""
 
     def __init__(
-        self, clock: VirtualClock, clusters: int, seconds: int, folder: Path,
+        self,
+        clock: VirtualClock,
+        clusters: int,
+        seconds: int,
+        folder: Path,
         volumes: Sequence[Volume] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.clock, self.seconds = clock, seconds
         design = _design(clusters)
         self.names = design.names
@@ -125,9 +142,16 @@ class _Run:
         for k, link in enumerate(self.links):
             names = self._members(k) if greet else ()
             status = Status(
-                link.name, MEMBERS, 0.0, "gps", 1e-3, 3.0, 0.2, names=names,
+                link.name,
+                MEMBERS,
+                0.0,
+                "gps",
+                1e-3,
+                3.0,
+                0.2,
+                names=names,
                 block=self.rows[k * MEMBERS : (k + 1) * MEMBERS].tobytes(),
-            )  # fmt: skip
+            )
             link.arrived.put_nowait(encode(status))
 
     async def steady(self) -> float:

@@ -16,9 +16,13 @@ PRESSURE_PA, TEMPERATURE_C, DELTA_T_S = 100_000.0, 20.0, 69.2
 def run(quick: bool) -> Result:
     """Return the figures."""
     site = sun.Site(
-        LATITUDE_DEG, LONGITUDE_DEG, HEIGHT_M, pressure=PRESSURE_PA,
-        temperature_c=TEMPERATURE_C, delta_t=DELTA_T_S,
-    )  # fmt: skip
+        LATITUDE_DEG,
+        LONGITUDE_DEG,
+        HEIGHT_M,
+        pressure=PRESSURE_PA,
+        temperature_c=TEMPERATURE_C,
+        delta_t=DELTA_T_S,
+    )
     rows: list[Row] = []
     for size in (1, 1000) if quick else (1, 1000, 100_000, 1_000_000):
         seconds = 1.7e9 + np.arange(size) * 30.0
@@ -29,9 +33,14 @@ def run(quick: bool) -> Result:
 
         def theirs(i: pd.DatetimeIndex = index) -> Any:
             return pvlib.solarposition.get_solarposition(
-                i, LATITUDE_DEG, LONGITUDE_DEG, altitude=HEIGHT_M, pressure=PRESSURE_PA,
-                temperature=TEMPERATURE_C, delta_t=DELTA_T_S,
-            )  # fmt: skip
+                i,
+                LATITUDE_DEG,
+                LONGITUDE_DEG,
+                altitude=HEIGHT_M,
+                pressure=PRESSURE_PA,
+                temperature=TEMPERATURE_C,
+                delta_t=DELTA_T_S,
+            )
 
         gap = np.degrees(ours().elevation) - theirs()["apparent_elevation"].to_numpy()
         apart = agree("elevation", float(np.radians(np.abs(gap).max())), 1e-7, "rad")

@@ -52,9 +52,14 @@ def field(rows: int, arbitrary: bool = False) -> Mechanism:
     if arbitrary:
         skew = rng.normal(0, 0.1, (rows, 3))
         return kinds.two_axis(
-            place, skew + [0, 0, 1], skew[:, ::-1] + [1, 0, 0], [0.05, 1, 0.02],
-            origin_1=(0, 0, 3), origin_2=(0.1, 0, 0.1), vertex=(0.02, 0.3, 0.0),
-        )  # fmt: skip
+            place,
+            skew + [0, 0, 1],
+            skew[:, ::-1] + [1, 0, 0],
+            [0.05, 1, 0.02],
+            origin_1=(0, 0, 3),
+            origin_2=(0.1, 0, 0.1),
+            vertex=(0.02, 0.3, 0.0),
+        )
     perfect = kinds.azimuth_elevation(place, pivot_height=3.0, pivot_offset=0.3)
     sizes = {"tilt_north": 5e-3, "tilt_east": 5e-3, "canting": 3e-3, "non_orthogonality": 3e-3}
     return perfect.with_parameters({n: rng.normal(0, s, rows) for n, s in sizes.items()})

@@ -22,17 +22,27 @@ from heliotrope.optics.intercept import beam_sigma, intercept_circle
 
 SITE = sun.Site(-33.93, 18.87, 120.0)
 AIM = np.array([0.0, 0.0, 13.0])
-PLACES = {"50 m south": (0, -50, 1), "50 m east": (50, 0, 1), "50 m west": (-50, 0, 1),
-          "50 m north": (0, 50, 1)}  # fmt: skip
-DAYS = {"equinox": (date(2026, 3, 20), "#0072b2"), "December": (date(2026, 12, 21), "#d55e00"),
-        "June": (date(2026, 6, 21), "#009e73")}  # fmt: skip
+PLACES = {
+    "50 m south": (0, -50, 1),
+    "50 m east": (50, 0, 1),
+    "50 m west": (-50, 0, 1),
+    "50 m north": (0, 50, 1),
+}
+DAYS = {
+    "equinox": (date(2026, 3, 20), "#0072b2"),
+    "December": (date(2026, 12, 21), "#d55e00"),
+    "June": (date(2026, 6, 21), "#009e73"),
+}
 FIGURES = {
     "4.6": ("pedestal tilt of 1 mrad", {"tilt_north": 1e-3}, {"tilt_east": 1e-3}),
     "4.7": ("zero of an axis off by 1 mrad", {"azimuth_bias": 1e-3}, {"elevation_bias": 1e-3}),
-    "4.8": ("axes not perpendicular by 1 mrad", {"non_orthogonality": 1e-3},
-            {"non_orthogonality": -1e-3}),
+    "4.8": (
+        "axes not perpendicular by 1 mrad",
+        {"non_orthogonality": 1e-3},
+        {"non_orthogonality": -1e-3},
+    ),
     "4.9": ("survey wrong by 50 mm", {"position_east": 0.05}, {"position_north": 0.05}),
-}  # fmt: skip
+}
 
 
 def _figure(columns: int, rows: int, size: tuple[float, float]) -> tuple[Figure, np.ndarray]:
@@ -64,8 +74,11 @@ def paths(number: str) -> Figure:
                 ax.plot(1e3 * x[whole], 1e3 * y[whole], ".", color=colour, ms=5)
                 ax.plot(1e3 * x[:1], 1e3 * y[:1], "o", color=colour, ms=5, mfc="white")
             (parameter, value), *_ = error.items()
-            ax.set_title(f"{name}\n{parameter} {value * 1e3:+g} "
-                         f"{'mm' if 'position' in parameter else 'mrad'}", fontsize=9)  # fmt: skip
+            ax.set_title(
+                f"{name}\n{parameter} {value * 1e3:+g} "
+                f"{'mm' if 'position' in parameter else 'mrad'}",
+                fontsize=9,
+            )
             ax.plot(0, 0, "k+", ms=10)
             ax.set_aspect("equal", adjustable="datalim")
             ax.margins(0.15)
@@ -75,9 +88,13 @@ def paths(number: str) -> Figure:
             if column == 0:
                 ax.set_ylabel("above the aim, mm")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, [f"{x} (circle: first, dots: every 2 h UTC)" if x == "equinox" else x
-                            for x in labels], loc="outside lower center", ncols=3,
-                  frameon=False)  # fmt: skip
+    figure.legend(
+        handles,
+        [f"{x} (circle: first, dots: every 2 h UTC)" if x == "equinox" else x for x in labels],
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+    )
     return figure
 
 
@@ -88,8 +105,9 @@ def intercept() -> Figure:
     tracking = np.linspace(0.0, 10e-3, 200)
     for slant, colour in ((50, "#0072b2"), (100, "#009e73"), (150, "#e69f00"), (200, "#d55e00")):
         sigma = beam_sigma(slant, tracking=tracking, slope=1e-3)
-        ax.plot(1e3 * tracking, 100 * intercept_circle(1.5, sigma), color=colour,
-                label=f"{slant} m")  # fmt: skip
+        ax.plot(
+            1e3 * tracking, 100 * intercept_circle(1.5, sigma), color=colour, label=f"{slant} m"
+        )
     ax.set_title("Figure 3.5: intercept of a receiver 3 m across")
     ax.set_xlabel("tracking error of the normal (standard deviation), mrad")
     ax.set_ylabel("intercept, %")

@@ -78,9 +78,13 @@ def measure(drawn: Mechanism, truth: Mechanism, noise: float, seed: int) -> Sigh
     # A centroid is known on the target's plane: along its normal it is exact.
     spread = noise**2 * np.diag([1.0, 1e-6, 1.0])
     return sightings(
-        np.concatenate(rows), np.concatenate(counts), np.concatenate(sources), seen,
-        sigma=1e-7, destination_covariance=spread,
-    )  # fmt: skip
+        np.concatenate(rows),
+        np.concatenate(counts),
+        np.concatenate(sources),
+        seen,
+        sigma=1e-7,
+        destination_covariance=spread,
+    )
 
 
 @dataclass(frozen=True)
@@ -94,9 +98,12 @@ class Study:
 
 
 def study(
-    noise: float, mirrors: int = 200, seed: int = 0, worm: float = 0.0,
+    noise: float,
+    mirrors: int = 200,
+    seed: int = 0,
+    worm: float = 0.0,
     model: tuple[str, ...] = MODEL,
-) -> Study:  # fmt: skip
+) -> Study:
     """Calibrate many mirrors drawn from the priors, and command them on the three days.
 
     Parameters
@@ -155,8 +162,10 @@ def main(folder: Path) -> Path:
         ax.plot(1e3 * noises, actual, marker, color=colour, label=f"{label}, actual")
         ax.plot(1e3 * noises, predicted, "-", color=colour, lw=1, label=f"{label}, predicted")
         for noise, s in zip(noises, studies, strict=True):
-            print(f"{1e3 * noise:5.0f} mm  {label:16} actual {1e3 * s.actual[label]:6.3f} mrad, "
-                  f"predicted {1e3 * s.predicted[label]:6.3f} mrad")  # fmt: skip
+            print(
+                f"{1e3 * noise:5.0f} mm  {label:16} actual {1e3 * s.actual[label]:6.3f} mrad, "
+                f"predicted {1e3 * s.predicted[label]:6.3f} mrad"
+            )
     ax.set_xscale("log")
     ax.set_xticks(1e3 * noises, [f"{1e3 * n:.0f}" for n in noises])
     ax.set_xticks([], minor=True)

@@ -53,9 +53,13 @@ def main() -> dict[str, float]:
         table.add_row(name, formula, f"{number:,.4g}", unit)
     Console(width=100).print(table)
     return {
-        "thermal_power": thermal, "collector_area": area, "heliostats": float(count),
-        "sun_rate": sun_rate, "normal_rate": normal_rate, "control_interval": interval,
-    }  # fmt: skip
+        "thermal_power": thermal,
+        "collector_area": area,
+        "heliostats": float(count),
+        "sun_rate": sun_rate,
+        "normal_rate": normal_rate,
+        "control_interval": interval,
+    }
 
 
 if __name__ == "__main__":

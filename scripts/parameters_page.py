@@ -6,11 +6,31 @@ from heliotrope.mechanism.parameters import MODELS, table
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "parameters.md"
 KINDS = {
-    "Azimuth-elevation": (("tilt_north", "tilt_east", "azimuth", "non_orthogonality", "elevation",
-                           "canting", "canting_secondary"), (False, False)),
-    "Two jacks (Jülich)": (("tilt_up", "tilt_north", "elevation", "non_orthogonality", "azimuth",
-                            "canting", "canting_secondary"), (True, True)),
-}  # fmt: skip
+    "Azimuth-elevation": (
+        (
+            "tilt_north",
+            "tilt_east",
+            "azimuth",
+            "non_orthogonality",
+            "elevation",
+            "canting",
+            "canting_secondary",
+        ),
+        (False, False),
+    ),
+    "Two jacks (Jülich)": (
+        (
+            "tilt_up",
+            "tilt_north",
+            "elevation",
+            "non_orthogonality",
+            "azimuth",
+            "canting",
+            "canting_secondary",
+        ),
+        (True, True),
+    ),
+}
 
 
 def page() -> str:

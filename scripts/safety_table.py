@@ -86,8 +86,17 @@ def page() -> str:
     """Return the page's text."""
     lines = [_INTRO, "| action | meaning |", "|---|---|"]
     lines += [f"| {act.name} | {act.text} |" for act in Act]
-    head = ("condition", "trips at", "delay", "missing for", "action", "severity", "latches for",
-            "release", "budget")  # fmt: skip
+    head = (
+        "condition",
+        "trips at",
+        "delay",
+        "missing for",
+        "action",
+        "severity",
+        "latches for",
+        "release",
+        "budget",
+    )
     for tier in Watcher:
         lines += ["", f"## Watched by the {tier.value}", ""]
         lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]

@@ -57,9 +57,12 @@ class Shown:
         for name, role in (("desk-1", "operator"), ("desk-2", "operator"), ("visitors", "viewer")):
             keeper.people.add(name, kept, role, now)
         live = LivePlant(
-            malan_plant(heliostats), clock, LiveOptions(), records=keeper,
+            malan_plant(heliostats),
+            clock,
+            LiveOptions(),
+            records=keeper,
             extra=lambda: {"speed": speed},
-        )  # fmt: skip
+        )
         async with live.running():
             server = ConsoleServer(live.operations, keeper.people, ConsoleSettings(port=0))
             async with running(server):

@@ -71,9 +71,11 @@ def _defined(node: ast.stmt) -> list[str]:
     if isinstance(node, (ast.Assign, ast.AnnAssign)):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
         return [
-            inner.id for target in targets for inner in ast.walk(target)
+            inner.id
+            for target in targets
+            for inner in ast.walk(target)
             if isinstance(inner, ast.Name) and isinstance(inner.ctx, ast.Store)
-        ]  # fmt: skip
+        ]
     return []
 
 
@@ -171,9 +173,10 @@ class _Reach:
             root = modules[key[0]].definitions[key[1]]
             if isinstance(root, ast.ClassDef):
                 self.words |= {
-                    node.name for node in root.body
+                    node.name
+                    for node in root.body
                     if isinstance(node, ast.FunctionDef) and not node.name.startswith("_")
-                }  # fmt: skip
+                }
         size = -1
         while size != len(self._seen):
             size = len(self._seen)
@@ -258,8 +261,9 @@ def shrink(roots: Iterable[Key], folder: Path = CORE, package: str = PACKAGE) ->
     """
     modules = {
         path.stem: Module(path.stem, path.read_text(encoding="utf-8"))
-        for path in sorted(folder.glob("*.py")) if path.stem != "__init__"
-    }  # fmt: skip
+        for path in sorted(folder.glob("*.py"))
+        if path.stem != "__init__"
+    }
     loaded = {name: importlib.import_module(f"{package}.{name}") for name in modules}
     numbers = constants(modules, loaded)
     for module in modules.values():

@@ -170,21 +170,33 @@ def world(number: int, seed: int, size: tuple[int, int] = (1600, 1200)) -> World
     rng = np.random.default_rng([seed, number])
     kind = ("even", "stained", "jointed", "patched")[number % 4]
     camera = example_camera(
-        TARGET, 200.0, size, side=rng.uniform(-0.35, 0.35), below=rng.uniform(0.05, 0.3),
-        roll=rng.normal(0.0, 0.02), fill=rng.uniform(0.55, 0.8), distortion=rng.uniform(0.0, 0.01),
-    )  # fmt: skip
+        TARGET,
+        200.0,
+        size,
+        side=rng.uniform(-0.35, 0.35),
+        below=rng.uniform(0.05, 0.3),
+        roll=rng.normal(0.0, 0.02),
+        fill=rng.uniform(0.55, 0.8),
+        distortion=rng.uniform(0.0, 0.01),
+    )
     known = (camera, replace(camera, position=None, R_camera_enu=None), None)[number % 3]
     paint = Paint(
-        wear=rng.uniform(0.003, 0.012), stains=0, panels=(1, 1),
-        seam_width=rng.uniform(0.004, 0.012), seed=int(rng.integers(1_000_000)),
-    )  # fmt: skip
+        wear=rng.uniform(0.003, 0.012),
+        stains=0,
+        panels=(1, 1),
+        seam_width=rng.uniform(0.004, 0.012),
+        seed=int(rng.integers(1_000_000)),
+    )
     if kind == "stained":
         paint = replace(paint, stains=int(rng.integers(3, 9)), stain=rng.uniform(0.04, 0.15))
     if kind == "jointed":
         paint = replace(
-            paint, panels=(int(rng.integers(2, 7)), int(rng.integers(2, 7))),
-            seam=rng.uniform(0.3, 0.7), stains=3, stain=0.05,
-        )  # fmt: skip
+            paint,
+            panels=(int(rng.integers(2, 7)), int(rng.integers(2, 7))),
+            seam=rng.uniform(0.3, 0.7),
+            stains=3,
+            stain=0.05,
+        )
     if kind == "patched":
         paint = replace(paint, patch=rng.uniform(0.7, 0.84), stains=3, stain=0.05)
     around = Surroundings(sky=rng.uniform(80.0, 400.0), seed=int(rng.integers(1_000_000)))
@@ -208,13 +220,20 @@ def stored_beam(number: int) -> Beam:
         width, height = rng.uniform(1.2, 3.6, 2)
         focal = slant * np.exp(rng.normal(0.0, 0.2)) if rng.random() < 0.7 else np.inf
         beam = reflected_beam(
-            TARGET, mirror, sun, width, height,
-            facets=tuple(rng.integers(1, 4, 2).tolist()), focal=focal,
+            TARGET,
+            mirror,
+            sun,
+            width,
+            height,
+            facets=tuple(rng.integers(1, 4, 2).tolist()),
+            focal=focal,
             facet_focal=focal if rng.random() < 0.5 else np.inf,
             slope_error=rng.uniform(0.4e-3, 1.8e-3),
             sun_shape=("limb", "pillbox", "buie")[rng.integers(3)],
-            circumsolar=rng.uniform(0.01, 0.05), step=0.04, elements=10,
-        )  # fmt: skip
+            circumsolar=rng.uniform(0.01, 0.05),
+            step=0.04,
+            elements=10,
+        )
         beam = beam.shifted(-beam.centroid)
         if beam.on_target(TARGET)[0] > 0.995:
             return beam
@@ -259,16 +278,24 @@ def plain(rng: Rng, place: World) -> Case:
     """One beam on a target under even light."""
     thrown = lit(placed(rng, draw_beam(rng)), float(np.exp(rng.uniform(np.log(0.25), np.log(3.0)))))
     sensor = Sensor(
-        electrons=rng.uniform(5e3, 2e4), read_noise=rng.uniform(3.0, 12.0),
-        offset=rng.uniform(0.0, 0.02), bits=int(rng.choice([8, 12])),
+        electrons=rng.uniform(5e3, 2e4),
+        read_noise=rng.uniform(3.0, 12.0),
+        offset=rng.uniform(0.0, 0.02),
+        bits=int(rng.choice([8, 12])),
         colour=bool(rng.random() < 0.3),
-    )  # fmt: skip
+    )
     lens = Lens(defocus=rng.uniform(0.6, 1.5), veil=rng.uniform(0.0, 0.04))
     scene = Scene(
-        place.camera, (TARGET,), (thrown,), ambient=AMBIENT,
-        gradient=tuple(rng.normal(0.0, 0.006, 2).tolist()), paint=place.paint,
-        surroundings=place.surroundings, lens=lens, sensor=sensor,
-    )  # fmt: skip
+        place.camera,
+        (TARGET,),
+        (thrown,),
+        ambient=AMBIENT,
+        gradient=tuple(rng.normal(0.0, 0.006, 2).tolist()),
+        paint=place.paint,
+        surroundings=place.surroundings,
+        lens=lens,
+        sensor=sensor,
+    )
     scene = exposed(scene, rng.uniform(0.35, 0.8))
     told = expectation(rng, thrown, place, scene.sensor) if rng.random() < 0.6 else Expectation()
     return Case("plain: " + place.paint_kind, scene, 0, expected=told)
@@ -298,10 +325,11 @@ def shadow(rng: Rng, place: World) -> Case:
     """An edge of shadow across the target."""
     base = plain(rng, place)
     edge = Shadow(
-        tuple(rng.uniform(-3.5, 3.5, 2).tolist()), rng.uniform(0.0, 2.0 * np.pi),
+        tuple(rng.uniform(-3.5, 3.5, 2).tolist()),
+        rng.uniform(0.0, 2.0 * np.pi),
         softness=float(np.exp(rng.uniform(np.log(0.05), np.log(1.5)))),
         left=rng.uniform(0.3, 0.9),
-    )  # fmt: skip
+    )
     scene = replace(base.scene, shadow=edge)
     return replace(base, condition="shadow", scene=scene, expected=Expectation())
 
@@ -314,9 +342,12 @@ def soft(rng: Rng, place: World) -> Case:
     scene = replace(base.scene, lens=replace(base.scene.lens, defocus=max(defocus, 0.6)))
     blurred = defocus / per_metre
     return replace(
-        base, condition="out of focus", scene=scene, clean=blurred < 0.08,
+        base,
+        condition="out of focus",
+        scene=scene,
+        clean=blurred < 0.08,
         fault=("out of focus", "target not found") if blurred > 0.18 else (),
-    )  # fmt: skip
+    )
 
 
 def shaken(rng: Rng, place: World) -> Case:
@@ -344,9 +375,13 @@ def moving(rng: Rng, place: World) -> Case:
     longer = float(np.sqrt(np.linalg.eigvalsh(moments)[-1])) / told.length
     scene = replace(base.scene, beams=(thrown,))
     return replace(
-        base, condition="beam moved", scene=scene, expected=told, clean=longer < 1.3,
+        base,
+        condition="beam moved",
+        scene=scene,
+        expected=told,
+        clean=longer < 1.3,
         fault=("smeared", "cloud", "cut at the edge", "several spots") if longer > 1.7 else (),
-    )  # fmt: skip
+    )
 
 
 def flare(rng: Rng, place: World) -> Case:
@@ -362,9 +397,11 @@ def ghost(rng: Rng, place: World) -> Case:
     base = plain(rng, place)
     size = np.array(place.camera.size)
     lens = replace(
-        base.scene.lens, ghost=rng.uniform(0.05, 0.4), ghost_at=tuple(rng.uniform(0, 1, 2) * size),
+        base.scene.lens,
+        ghost=rng.uniform(0.05, 0.4),
+        ghost_at=tuple(rng.uniform(0, 1, 2) * size),
         ghost_radius=rng.uniform(0.2, 2.0) * pixels_per_metre(place.camera),
-    )  # fmt: skip
+    )
     return replace(base, condition="ghost", scene=replace(base.scene, lens=lens), clean=False)
 
 
@@ -376,9 +413,13 @@ def cloud(rng: Rng, place: World) -> Case:
     scene = exposed(replace(base.scene, cloud=left), rng.uniform(0.35, 0.8))
     contrast = left * base.scene.beams[0].strength * base.scene.beams[0].beam.peak / AMBIENT
     return replace(
-        base, condition="cloud", scene=scene, expected=told, clean=left > 0.75 and contrast >= 0.25,
+        base,
+        condition="cloud",
+        scene=scene,
+        expected=told,
+        clean=left > 0.75 and contrast >= 0.25,
         fault=("cloud", "no spot") if left < 0.35 else (),
-    )  # fmt: skip
+    )
 
 
 def clipped(rng: Rng, place: World) -> Case:
@@ -421,9 +462,12 @@ def _with_second(rng: Rng, place: World, base: Case, beam: Beam, second: Beam) -
     other = Thrown("target", second.of_power(share * beam.power), first.strength)
     scene = exposed(replace(base.scene, beams=(first, other)), rng.uniform(0.35, 0.8))
     return replace(
-        base, scene=scene, expected=expectation(rng, first, place, scene.sensor), clean=False,
+        base,
+        scene=scene,
+        expected=expectation(rng, first, place, scene.sensor),
+        clean=False,
         fault=("several spots", "lopsided", "smeared"),
-    )  # fmt: skip
+    )
 
 
 def beside(rng: Rng, place: World) -> Case:
@@ -465,9 +509,10 @@ def dark(rng: Rng, place: World) -> Case:
     (thrown,) = base.scene.beams
     with_beam = rng.random() < 0.6
     scene = replace(
-        base.scene, beams=(replace(thrown, strength=5.0 * thrown.strength),) if with_beam else (),
+        base.scene,
+        beams=(replace(thrown, strength=5.0 * thrown.strength),) if with_beam else (),
         ambient=float(np.exp(rng.uniform(np.log(0.05), np.log(50.0)))),
-    )  # fmt: skip
+    )
     scene = exposed(scene, rng.uniform(0.35, 0.8)) if with_beam else scene
     fault = () if with_beam else ("no spot", "target not found")
     return Case("dark", scene, 0 if with_beam else None, clean=False, fault=fault)
@@ -560,14 +605,18 @@ def before(drawn: Case, seed: tuple[int, int, int]) -> Frame:
 
 
 def look(
-    place: World, drawn: Case, rendered: Rendered, model: EmptyTarget | None = None,
+    place: World,
+    drawn: Case,
+    rendered: Rendered,
+    model: EmptyTarget | None = None,
     without: Frame | None = None,
-) -> Photograph:  # fmt: skip
+) -> Photograph:
     """Read a frame."""
     settings = Settings(
-        expectations={"target": drawn.expected}, gamma=drawn.gamma,
+        expectations={"target": drawn.expected},
+        gamma=drawn.gamma,
         empty={} if model is None else {"target": model},
-    )  # fmt: skip
+    )
     return read_photograph(
         rendered.frame, [TARGET], place.known, settings=settings, without=without
     )
@@ -590,9 +639,16 @@ def judge(
             square = float(error @ np.linalg.solve(spot.covariance, error))
     names = tuple(reason.name for reason in reading.reasons)
     return Outcome(
-        drawn.condition, seed, clean, reading.good, any(n in drawn.fault for n in names),
-        (float(error[0]), float(error[1])), square, names, bool(drawn.fault),
-    )  # fmt: skip
+        drawn.condition,
+        seed,
+        clean,
+        reading.good,
+        any(n in drawn.fault for n in names),
+        (float(error[0]), float(error[1])),
+        square,
+        names,
+        bool(drawn.fault),
+    )
 
 
 def run(task: tuple[int, int, int, tuple[int, int]]) -> list[tuple[Outcome, ...]]:
@@ -614,9 +670,13 @@ def run(task: tuple[int, int, int, tuple[int, int]]) -> list[tuple[Outcome, ...]
 
 
 def _outcome(
-    place: World, drawn: Case, key: tuple[int, int, int], rendered: Rendered,
-    model: EmptyTarget | None, without: Frame | None,
-) -> Outcome:  # fmt: skip
+    place: World,
+    drawn: Case,
+    key: tuple[int, int, int],
+    rendered: Rendered,
+    model: EmptyTarget | None,
+    without: Frame | None,
+) -> Outcome:
     try:
         photograph = look(place, drawn, rendered, model, without)
     except InputError:
@@ -628,14 +688,19 @@ def _outcome(
 
 
 WAYS = (
-    "with a frame without the beam", "with a model of the empty target", "from each frame alone",
-)  # fmt: skip
+    "with a frame without the beam",
+    "with a model of the empty target",
+    "from each frame alone",
+)
 
 
 def measure(
-    frames: int, seed: int, processes: int = 2, size: tuple[int, int] = (1600, 1200),
+    frames: int,
+    seed: int,
+    processes: int = 2,
+    size: tuple[int, int] = (1600, 1200),
     worlds: int = WORLDS,
-) -> list[list[Outcome]]:  # fmt: skip
+) -> list[list[Outcome]]:
     """Return what comes of so many frames, for each of `WAYS`."""
     tasks = [(n, seed, -(-frames // worlds), size) for n in range(worlds)]
     if processes == 1:
@@ -696,8 +761,9 @@ def summary(outcomes: Sequence[Outcome]) -> str:
     clean = sum(o.clean for o in outcomes)
     taken = sum(o.accepted for o in outcomes)
     accepts, rejects = (
-        sum(o.wrong_accept for o in outcomes), sum(o.wrong_reject for o in outcomes)
-    )  # fmt: skip
+        sum(o.wrong_accept for o in outcomes),
+        sum(o.wrong_reject for o in outcomes),
+    )
     return (
         f"without merged beams: wrong accepts {accepts} of {len(outcomes)} frames "
         f"({100 * accepts / max(len(outcomes), 1):.2f} %; {taken} accepted); wrong rejects "

@@ -41,9 +41,13 @@ def robust(group: Heliostats, seen: Sightings, train: FloatArray, model: tuple[s
     beam = evaluation.errors(group.mechanism.with_parameters(found.parameters), seen).beam
     counts = np.bincount(seen.heliostat, minlength=len(group))
     return 1e3 * float(
-        np.median([np.median(beam[(seen.heliostat == i) & ~train])
-                   for i in np.flatnonzero(counts >= ENOUGH)])
-    )  # fmt: skip
+        np.median(
+            [
+                np.median(beam[(seen.heliostat == i) & ~train])
+                for i in np.flatnonzero(counts >= ENOUGH)
+            ]
+        )
+    )
 
 
 def ladder(group: Heliostats, seen: Sightings) -> list[tuple[str, list[str]]]:
@@ -63,9 +67,11 @@ def ladder(group: Heliostats, seen: Sightings) -> list[tuple[str, list[str]]]:
     def plain(model: tuple[str, ...]) -> Callable[..., tuple[float, float]]:
         return lambda train: (robust(group, seen, train, model), np.nan)
 
-    slow = [("slow tilts too", ("tilt_north", "tilt_up")),
-            ("slow strokes too", ("elevation_stroke_offset", "azimuth_stroke_offset")),
-            ("slow canting too", ("canting",))]  # fmt: skip
+    slow = [
+        ("slow tilts too", ("tilt_north", "tilt_up")),
+        ("slow strokes too", ("elevation_stroke_offset", "azimuth_stroke_offset")),
+        ("slow canting too", ("canting",)),
+    ]
     trials: list[tuple[str, Callable[..., object]]] = [
         ("two jacks and tilts, robust fit", plain(PUBLIC)),
         ("with the mirror's canting", plain(JACKS)),
@@ -122,9 +128,10 @@ def explained(found: Learned, group: Heliostats) -> None:
             r = r[np.argsort(seen.time[r])]
             if len(r) < 50:
                 continue
-            gains.append(_gain(columns(r), rest[r]) - np.mean(
-                [_gain(rng.permutation(columns(r)), rest[r]) for _ in range(20)]
-            ))  # fmt: skip
+            gains.append(
+                _gain(columns(r), rest[r])
+                - np.mean([_gain(rng.permutation(columns(r)), rest[r]) for _ in range(20)])
+            )
         print(f"| {name} | {100 * np.median(gains):.1f} % | {100 * np.max(gains):.1f} % |")
     _spindle(found, rest)
 
@@ -153,9 +160,11 @@ def _spindle(found: Learned, rest: FloatArray) -> None:
                 phase = 2.0 * np.pi * stroke / period
                 power[k] += _gain(np.c_[np.cos(phase), np.sin(phase)], rest[r])
         best = int(np.argmax(power))
-        print(f"| periodic error of the {name} spindle | best period {1e3 * periods[best]:.2f} mm: "
-              f"{100 * power[best] / total:.1f} %, mean over all periods "
-              f"{100 * power.mean() / total:.1f} % |")  # fmt: skip
+        print(
+            f"| periodic error of the {name} spindle | best period {1e3 * periods[best]:.2f} mm: "
+            f"{100 * power[best] / total:.1f} %, mean over all periods "
+            f"{100 * power.mean() / total:.1f} % |"
+        )
 
 
 def in_time(found: Learned, still: Learned, folder: Path) -> None:
@@ -165,8 +174,9 @@ def in_time(found: Learned, still: Learned, folder: Path) -> None:
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
     ax = figure.subplots()
     for label, source, colour in (
-        ("constant parameters", still, "#999999"), ("with all that wanders", found, "#0072b2")
-    ):  # fmt: skip
+        ("constant parameters", still, "#999999"),
+        ("with all that wanders", found, "#0072b2"),
+    ):
         rest = 1e3 * left_out_errors(source)
         lags, squares = [], []
         for rows in source.rows:
@@ -201,8 +211,10 @@ def history(found: Learned, group: Heliostats, folder: Path) -> None:
         times = np.linspace(np.nanmin(seen), np.nanmax(seen), 600)
         values, spread = found.parameters_at(np.full(600, i), times)
         dates = (times * 1e6).astype("datetime64[us]")
-        for name, colour in (("elevation_initial_angle", "#0072b2"),
-                             ("azimuth_initial_angle", "#d55e00")):  # fmt: skip
+        for name, colour in (
+            ("elevation_initial_angle", "#0072b2"),
+            ("azimuth_initial_angle", "#d55e00"),
+        ):
             p = names.index(name)
             middle = 1e3 * (values[:, p] - np.median(values[:, p]))
             sigma = 1e3 * np.sqrt(spread[:, p, p] - spread[:, p, p].min())
@@ -210,8 +222,9 @@ def history(found: Learned, group: Heliostats, folder: Path) -> None:
             ax.fill_between(dates, middle - sigma, middle + sigma, color=colour, alpha=0.2, lw=0)
         for day in found.members[i].data.steps:
             ax.axvline(np.datetime64(int(day * DAY), "s").astype("datetime64[us]"), ls=":", c="k")
-        ax.plot((seen * 1e6).astype("datetime64[us]"), np.full(len(seen), ax.get_ylim()[0]), "|k",
-                ms=6)  # fmt: skip
+        ax.plot(
+            (seen * 1e6).astype("datetime64[us]"), np.full(len(seen), ax.get_ylim()[0]), "|k", ms=6
+        )
         ax.set_ylabel(f"{heliostat}, mrad")
         ax.grid(alpha=0.3)
     axes[0].legend(frameon=False, ncols=2)

@@ -98,8 +98,9 @@ def picture() -> str:
         ]
         lines = [
             (what, _label("rp2", known[key] if place < 0 else known[key][place]))
-            for key, place, what, _ in ROWS if key in keys
-        ]  # fmt: skip
+            for key, place, what, _ in ROWS
+            if key in keys
+        ]
         for i, (what, pin) in enumerate(lines):
             y = top + 12 + i * min(22, 88 / len(lines))
             ends = (240, 370) if side == "left" else (530, 660)

@@ -60,8 +60,11 @@ MACHINE = {
 def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "benchmarks", *arguments],
-        cwd=ROOT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def _module(monkeypatch: pytest.MonkeyPatch, name: str) -> ModuleType:
@@ -129,9 +132,11 @@ def test_a_plant_runs_and_is_defocused() -> None:
     result = _quick("plant")
     assert result["heliostats"] == 32 * result["clusters"] == 640
     assert [row["work"] for row in result["rows"]] == [
-        "a second of operation", "the same, two keep-out volumes", "order to all links",
+        "a second of operation",
+        "the same, two keep-out volumes",
+        "order to all links",
         "all answers to it",
-    ]  # fmt: skip
+    ]
     assert all(row["cpu_s"] > 0.0 for row in result["rows"])
 
 

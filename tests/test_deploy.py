@@ -23,8 +23,12 @@ from heliotrope.safety.evaluation import CONDITIONS, Watcher
 ROOT = Path(__file__).parents[1]
 DEPLOY = ROOT / "deploy"
 HANDBOOK = (ROOT / "docs" / "how-to" / "handbook.md").read_text(encoding="utf-8")
-UNITS = ("heliotrope-plant.service", "heliotrope-cluster@.service", "heliotrope-backup.service",
-         "heliotrope-backup.timer")  # fmt: skip
+UNITS = (
+    "heliotrope-plant.service",
+    "heliotrope-cluster@.service",
+    "heliotrope-backup.service",
+    "heliotrope-backup.timer",
+)
 
 
 # -- the handbook --------------------------------------------------------------------------
@@ -94,9 +98,12 @@ def test_every_alarm_is_in_the_handbook() -> None:
 
 @pytest.mark.parametrize(
     ("title", "watcher"),
-    [("### Of the plant", Watcher.PLANT), ("### Of a cluster", Watcher.CLUSTER),
-     ("### Of a local controller", Watcher.NODE)],
-)  # fmt: skip
+    [
+        ("### Of the plant", Watcher.PLANT),
+        ("### Of a cluster", Watcher.CLUSTER),
+        ("### Of a local controller", Watcher.NODE),
+    ],
+)
 def test_alarms_stand_where_they_come_from(title: str, watcher: Watcher) -> None:
     assert {row.name for row in CONDITIONS if row.watcher is watcher} <= rows(title)
 
@@ -251,9 +258,13 @@ def test_the_guide_names_every_setting_of_the_links_file() -> None:
 
 def test_the_packages_are_pinned_and_have_a_licence() -> None:
     done = subprocess.run(
-        [sys.executable, "scripts/audit.py"], cwd=ROOT, capture_output=True, text=True, check=False,
+        [sys.executable, "scripts/audit.py"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
         env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "known vulnerabilities were not looked up" in done.stdout
 
@@ -275,10 +286,15 @@ def test_the_audit_can_fail() -> None:
 
 @pytest.mark.parametrize(
     ("licence", "good"),
-    [("GNU Lesser General Public License v3 (LGPLv3)", True), ("GPL-2.0 OR MIT", True),
-     ("GNU Affero General Public License v3", False), ("AGPL-3.0", False), ("Permit", False),
-     ("MPL-2.0 AND (Apache-2.0 OR MIT)", True)],
-)  # fmt: skip
+    [
+        ("GNU Lesser General Public License v3 (LGPLv3)", True),
+        ("GPL-2.0 OR MIT", True),
+        ("GNU Affero General Public License v3", False),
+        ("AGPL-3.0", False),
+        ("Permit", False),
+        ("MPL-2.0 AND (Apache-2.0 OR MIT)", True),
+    ],
+)
 def test_licences(licence: str, good: bool) -> None:
     audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
     assert audit["allowed"](licence) is good

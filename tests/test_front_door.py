@@ -47,9 +47,13 @@ def test_setup_refuses_an_old_python(tmp_path: Path) -> None:
     old.write_text('#!/bin/sh\n[ "$1" = --version ] && echo "Python 3.9.2" && exit 0\nexit 1\n')
     old.chmod(0o755)
     done = subprocess.run(
-        ["bash", "scripts/setup.sh"], cwd=ROOT, capture_output=True, text=True, check=False,
+        ["bash", "scripts/setup.sh"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
         env={**os.environ, "PYTHON": str(old), "VENV": str(tmp_path / "venv")},
-    )  # fmt: skip
+    )
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert "Python 3.9.2 is too old" in done.stderr

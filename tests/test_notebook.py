@@ -20,18 +20,22 @@ def test_tracking_notebook() -> None:
     client.execute()
     texts = [
         output.get("text", "")
-        for cell in notebook.cells if cell.cell_type == "code"
+        for cell in notebook.cells
+        if cell.cell_type == "code"
         for output in cell.outputs
-    ]  # fmt: skip
+    ]
     shown = "\n".join(texts)
     # Grigoriev's notebook prints these for HeliostatA after two steps (to 1e-4°, 1 cm).
     assert "-36.876" in shown
     assert "143.05" in shown
     assert "→ take 0" in shown
     pictures = [
-        output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs
+        output
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
         if any("plotly" in kind for kind in output.get("data", {}))
-    ]  # fmt: skip
+    ]
     assert len(pictures) == 2
     stored = nbformat.read(EXAMPLES / "tracking.ipynb", as_version=4)
     assert all(not c.get("outputs") for c in stored.cells), "commit the notebook without outputs"

@@ -59,8 +59,11 @@ def run(flown: Flight, corners: Corners, survey: float, seed: int = 0) -> Adjust
     return adjust(
         np.array([p.position for p in flown.told]),
         np.array([p.sigma_position for p in flown.told]),
-        turns, standing(flown.heliostats, flown.counts), corners, Priors(position=survey),
-    )  # fmt: skip
+        turns,
+        standing(flown.heliostats, flown.counts),
+        corners,
+        Priors(position=survey),
+    )
 
 
 def test_derivatives_against_finite_differences() -> None:
@@ -68,9 +71,13 @@ def test_derivatives_against_finite_differences() -> None:
     corners = corners_of(flown, 1)
     stand = standing(flown.heliostats, flown.counts)
     state = State(
-        np.array([p.position for p in flown.told]), np.array([p.rotation for p in flown.told]),
-        np.zeros((2, 3)), np.zeros(3), stand, np.zeros((len(stand), 3)),
-    )  # fmt: skip
+        np.array([p.position for p in flown.told]),
+        np.array([p.rotation for p in flown.told]),
+        np.zeros((2, 3)),
+        np.zeros(3),
+        stand,
+        np.zeros((len(stand), 3)),
+    )
     gap, parts = residuals(state, corners)
     # Mirrors 7 and 8 are taken for one heliostat's in two poses.
     owner = np.arange(len(stand))
@@ -170,11 +177,18 @@ def several(
     installed = install(mirrors, range(len(mirrors)), errors, seed=seed)
     return [
         fly(
-            mirrors, camera(), look_counts(mirrors, place), hover_grid(place, middle, 3, 3, 0.7),
-            middle, errors=errors, seed=seed, installed=installed, flight=k,
+            mirrors,
+            camera(),
+            look_counts(mirrors, place),
+            hover_grid(place, middle, 3, 3, 0.7),
+            middle,
+            errors=errors,
+            seed=seed,
+            installed=installed,
+            flight=k,
         )
         for k, place in enumerate(hovers)
-    ]  # fmt: skip
+    ]
 
 
 def together(flown: list[Flight], survey: float, seed: int) -> Adjusted:
@@ -188,11 +202,14 @@ def together(flown: list[Flight], survey: float, seed: int) -> Adjusted:
     )
     told = [p for f in flown for p in f.told]
     return adjust(
-        np.array([p.position for p in told]), np.array([p.sigma_position for p in told]),
+        np.array([p.position for p in told]),
+        np.array([p.sigma_position for p in told]),
         np.array([p.rotation for f in flown for p in f.taken]),
-        join_standing([standing(f.heliostats, f.counts) for f in flown]), corners,
-        Priors(position=survey, kinematics=2e-4), owner=np.tile(np.arange(count), len(flown)),
-    )  # fmt: skip
+        join_standing([standing(f.heliostats, f.counts) for f in flown]),
+        corners,
+        Priors(position=survey, kinematics=2e-4),
+        owner=np.tile(np.arange(count), len(flown)),
+    )
 
 
 def test_flights_from_several_sides_find_the_offset_better() -> None:

@@ -50,12 +50,16 @@ def plan() -> dict:
         "format": "heliotrope flight plan 1",
         "clusters": [{"name": "C1", "center_m": middle.tolist(), "heliostats": [*MIRRORS.names]}],
         "stations": [
-            {"cluster": "C1", "point": k + 1, "counts": look_counts(MIRRORS, side).tolist(),
-             "unreachable": [5] if k == 1 else []}
+            {
+                "cluster": "C1",
+                "point": k + 1,
+                "counts": look_counts(MIRRORS, side).tolist(),
+                "unreachable": [5] if k == 1 else [],
+            }
             for k, side in enumerate(SIDES)
         ],
         "sorties": [{"visits": visits[:3]}, {"visits": visits[3:]}],
-    }  # fmt: skip
+    }
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -70,9 +74,20 @@ def flown(tmp_path_factory) -> Path:
     plant_file.write_plant(plant(MIRRORS), place / "plant.toml")
     (place / "plan.json").write_text(json.dumps(plan()))
     done = run(
-        "simulate", place / "plant.toml", place / "shot", "--plan", place / "plan.json",
-        "--stations", "C1-1,C1-2", "--size", "640x480", "--focal-px", 620, "--survey-mm", 2,
-    )  # fmt: skip
+        "simulate",
+        place / "plant.toml",
+        place / "shot",
+        "--plan",
+        place / "plan.json",
+        "--stations",
+        "C1-1,C1-2",
+        "--size",
+        "640x480",
+        "--focal-px",
+        620,
+        "--survey-mm",
+        2,
+    )
     assert done.exit_code == 0, done.output
     assert "8 photographs in 2 flights" in done.stdout
     return place
@@ -108,8 +123,19 @@ def test_a_heliostat_is_the_same_in_all_flights() -> None:
 
 
 def test_campaign_gives_one_table(flown: Path, tmp_path) -> None:
-    common = ("--field", flown / "plant.toml", "--survey-mm", 2, "--kinematics-mm", 2,
-              "--processes", 1, "--no-report", "--out", tmp_path)  # fmt: skip
+    common = (
+        "--field",
+        flown / "plant.toml",
+        "--survey-mm",
+        2,
+        "--kinematics-mm",
+        2,
+        "--processes",
+        1,
+        "--no-report",
+        "--out",
+        tmp_path,
+    )
     done = run("evaluate", flown / "shot", *common)
     assert done.exit_code == 0, done.output
     assert done.stdout.startswith("2 of 2 flights, 8 of 8 photographs used")
@@ -119,9 +145,7 @@ def test_campaign_gives_one_table(flown: Path, tmp_path) -> None:
     sightings = rows(tmp_path / "sightings.csv")
     assert len(sightings) == len(table)
     for flight in ("C1-1", "C1-2"):
-        truth = {
-            r["heliostat"]: r for r in rows(flown / f"shot/{flight}/truth/orientations.csv")
-        }  # fmt: skip
+        truth = {r["heliostat"]: r for r in rows(flown / f"shot/{flight}/truth/orientations.csv")}
         off = [
             float(r["elevation_deg"]) - float(truth[r["heliostat"]]["elevation_deg"])
             for r in table
@@ -219,8 +243,18 @@ def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> N
         return read(photo, *rest)
 
     monkeypatch.setattr(evaluation, "read_photo", counted)
-    common = ("evaluate", flown / "shot", "--field", flown / "plant.toml", "--processes", 1,
-              "--no-report", "--json", "--out", tmp_path)  # fmt: skip
+    common = (
+        "evaluate",
+        flown / "shot",
+        "--field",
+        flown / "plant.toml",
+        "--processes",
+        1,
+        "--no-report",
+        "--json",
+        "--out",
+        tmp_path,
+    )
     stopped = run(*common)
     assert stopped.exit_code != 0
     assert not (tmp_path / "orientations.csv").exists()
@@ -239,8 +273,9 @@ def bare(name: str, heliostats: list[int], lens: LedCamera) -> Pose:
     """A flight whose one photograph shows all corners of its heliostats."""
     count = len(heliostats)
     seen = Seen(name, mirror=np.arange(count), corners=np.zeros((count, 4, 2)))
-    stand = Standing(("",) * count, np.zeros((count, 3)), np.zeros((count, 3, 3)),
-                     np.zeros((count, 4, 3)))  # fmt: skip
+    stand = Standing(
+        ("",) * count, np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 4, 3))
+    )
     return Pose(name, (), (seen,), lens, stand, np.array(heliostats), lambda _: ideal(MIRRORS, 0))
 
 

@@ -69,16 +69,22 @@ def test_orientations_at_night_are_as_good_as_they_say(night: Night) -> None:
     flown = night.flown
     found = evaluate(flown.told, night.seen, flown.camera, night.stand, night.shape, priors=PRIORS)
     measured = measure_field(
-        found.reflections, night.stand.names, flown.shapes.__getitem__, night.stand.rotation,
-        found.stand.vertex, places=found.place_covariance,
-    )  # fmt: skip
+        found.reflections,
+        night.stand.names,
+        flown.shapes.__getitem__,
+        night.stand.rotation,
+        found.stand.vertex,
+        places=found.place_covariance,
+    )
     good = [o for o in measured.found if o.count >= 3]
     rows = [o.heliostat for o in good]
-    off = np.array([rotation_between(flown.truth.rotation[o.heliostat], o.rotation)[:2]
-                    for o in good])  # fmt: skip
+    off = np.array(
+        [rotation_between(flown.truth.rotation[o.heliostat], o.rotation)[:2] for o in good]
+    )
     told = np.array([o.sigma_total for o in good])
-    asked = np.array([rotation_between(flown.truth.rotation[r], night.stand.rotation[r])[:2]
-                      for r in rows])  # fmt: skip
+    asked = np.array(
+        [rotation_between(flown.truth.rotation[r], night.stand.rotation[r])[:2] for r in rows]
+    )
     assert len(good) >= 15
     # The commands were off by 2 to 3 mrad; what is left is what all share.
     assert np.sqrt(np.mean(asked**2)) > 1.8 * MRAD

@@ -98,8 +98,12 @@ def test_spots_belong_to_their_mirrors(case: Case) -> None:
         true = true_spots(case, k)
         local = np.concatenate([seen.spot, np.ones((len(seen.spot), 1))], axis=-1)
         taken = case.flown.taken[k]
-        pixels = project(case.flown.camera, taken.position, taken.rotation,
-                         taken.position + 10.0 * local @ taken.rotation.T)  # fmt: skip
+        pixels = project(
+            case.flown.camera,
+            taken.position,
+            taken.rotation,
+            taken.position + 10.0 * local @ taken.rotation.T,
+        )
         for row, pixel in zip(seen.spot_mirror.tolist(), pixels, strict=True):
             off = np.linalg.norm(true.get(row, np.full((1, 2), 1e9)) - pixel, axis=-1).min()
             right, wrong = right + (off < 3.0), wrong + (off >= 3.0)
@@ -114,16 +118,24 @@ def test_spots_belong_to_their_mirrors(case: Case) -> None:
 def test_orientations_are_those_of_the_truth(case: Case) -> None:
     flown = case.flown
     found = evaluation.evaluate(
-        case.photos, case.seen, flown.camera, case.stand,
-        lambda i: ideal(flown.heliostats, i), priors=Priors(position=0.001),
-    )  # fmt: skip
+        case.photos,
+        case.seen,
+        flown.camera,
+        case.stand,
+        lambda i: ideal(flown.heliostats, i),
+        priors=Priors(position=0.001),
+    )
     error = found.adjusted.state.offset - OFFSET
     assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.adjusted.offset_covariance))).all()
     for slopes, limit in ((False, 0.30), (True, 0.20)):
         measured = measure_field(
-            found.reflections, case.stand.names, flown.shapes.__getitem__, case.stand.rotation,
-            found.stand.vertex, slopes=slopes,
-        )  # fmt: skip
+            found.reflections,
+            case.stand.names,
+            flown.shapes.__getitem__,
+            case.stand.rotation,
+            found.stand.vertex,
+            slopes=slopes,
+        )
         off = [
             rotation_between(o.rotation, flown.truth.rotation[o.heliostat])[:2]
             for o in measured.found
@@ -203,10 +215,11 @@ def test_regular_field_without_edges_is_ambiguous() -> None:
     grid = np.stack(np.meshgrid(np.arange(-18, 19), np.arange(-18, 19)), -1).reshape(-1, 2) * 3.0
     n = len(grid)
     many = Standing(
-        tuple(str(i) for i in range(n)), np.pad(grid, ((0, 0), (0, 1))),
+        tuple(str(i) for i in range(n)),
+        np.pad(grid, ((0, 0), (0, 1))),
         np.repeat(np.eye(3)[None], n, 0),
         np.repeat([[[-1.0, 1, 0], [1.0, 1, 0], [1.0, -1, 0], [-1.0, -1, 0]]], n, 0),
-    )  # fmt: skip
+    )
     seen = project(lens, photo.position, photo.rotation, many.vertex)
     inside = (seen > 0).all(axis=1) & (seen < np.array(lens.size) - 1).all(axis=1)
     assert identify(lens, photo, many, seen[inside]).reason.startswith("ambiguous")
@@ -218,8 +231,10 @@ def test_regular_field_without_edges_is_ambiguous() -> None:
 
 
 def test_without_lamp_the_campaign_says_so(case: Case) -> None:
-    dark = [replace(s, spot_mirror=s.spot_mirror[:0], spot=s.spot[:0], spot_sigma=s.spot_sigma[:0])
-            for s in case.seen]  # fmt: skip
+    dark = [
+        replace(s, spot_mirror=s.spot_mirror[:0], spot=s.spot[:0], spot_sigma=s.spot_sigma[:0])
+        for s in case.seen
+    ]
     shape = [ideal(case.flown.heliostats, i) for i in range(20)].__getitem__
     with pytest.raises(InputError, match="no reflection on the mirrors of 16 photographs"):
         evaluation.evaluate(case.photos, dark, case.flown.camera, case.stand, shape)
@@ -268,8 +283,9 @@ def test_outline_of_a_plain_rectangle(angle: float, place: tuple[float, float]) 
     true = rectangle(place, angle, (50.0, 36.0))
     image = np.full((90, 120, 3), 0.1, np.float32)
     rendering._cover(image, true, np.full(3, 0.6), 1.0)
-    picture = rendering._expose(rendering._blurred(image, rendering.Conditions()),
-                                rendering.Conditions(), 1)  # fmt: skip
+    picture = rendering._expose(
+        rendering._blurred(image, rendering.Conditions()), rendering.Conditions(), 1
+    )
     found = find_outlines(picture, (true + [1.3, -0.9])[None], 4.0)
     assert found.found.tolist() == [True]
     assert np.abs(found.corners[0] - true).max() < 0.08
@@ -429,8 +445,21 @@ def test_evaluate_command(case: Case, tmp_path) -> None:
 
 def test_simulate_command(tmp_path) -> None:
     plant_file.write_plant(plant(field(2, 3)), tmp_path / "plant.toml")
-    done = run("simulate", tmp_path / "plant.toml", tmp_path / "out", "--columns", 2, "--rows", 1,
-               "--size", "400x300", "--distance", 40, "--heliostats", 5)  # fmt: skip
+    done = run(
+        "simulate",
+        tmp_path / "plant.toml",
+        tmp_path / "out",
+        "--columns",
+        2,
+        "--rows",
+        1,
+        "--size",
+        "400x300",
+        "--distance",
+        40,
+        "--heliostats",
+        5,
+    )
     assert done.exit_code == 0, done.output
     assert "2 photographs of 5 heliostats" in done.stdout
     photos, problems = read_photos(tmp_path / "out", ORIGIN)

@@ -15,9 +15,7 @@ from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.geometry import angle_between, normalize
 from support.drone_case import HOVER, field, flight
 
-EXACT = Errors(
-    rtk=(1e-9,) * 3, gimbal=0.0, survey=0.0, slope=0.0, reflection=0.0, mechanism={}
-)  # fmt: skip
+EXACT = Errors(rtk=(1e-9,) * 3, gimbal=0.0, survey=0.0, slope=0.0, reflection=0.0, mechanism={})
 
 
 def test_mirrors_look_at_the_point() -> None:
@@ -50,8 +48,12 @@ def test_same_seed_same_flight() -> None:
 
 def test_errors_come_out_as_large_as_given() -> None:
     offset = np.array([0.03, -0.02, 0.01])
-    flown = flight(Errors(rtk=(0.01, 0.01, 0.02), rtk_offset=tuple(offset), slope=0.0),
-                   columns=20, rows=20, step=0.1)  # fmt: skip
+    flown = flight(
+        Errors(rtk=(0.01, 0.01, 0.02), rtk_offset=tuple(offset), slope=0.0),
+        columns=20,
+        rows=20,
+        step=0.1,
+    )
     off = np.array([p.position for p in flown.told]) - [p.position for p in flown.taken]
     np.testing.assert_allclose(off.mean(axis=0), offset, atol=0.004)
     np.testing.assert_allclose(off.std(axis=0), [0.01, 0.01, 0.02], rtol=0.15)

@@ -60,9 +60,14 @@ def test_the_page_and_its_tables(field: tuple[Orientations, np.ndarray], tmp_pat
     found, places = field
     done: list[tuple[int, int]] = []
     page = write_flight_report(
-        found, lambda _: SHAPE, places, tmp_path / "report", notes=("photograph 7: a & b",),
-        progress=lambda a, b: done.append((a, b)), budget=BUDGET,
-    )  # fmt: skip
+        found,
+        lambda _: SHAPE,
+        places,
+        tmp_path / "report",
+        notes=("photograph 7: a & b",),
+        progress=lambda a, b: done.append((a, b)),
+        budget=BUDGET,
+    )
     assert done == [(1, 2), (2, 2)]
     text = page.read_text(encoding="utf-8")
     assert text.count("<img") == 1
@@ -73,9 +78,11 @@ def test_the_page_and_its_tables(field: tuple[Orientations, np.ndarray], tmp_pat
     assert "photograph 7: a &amp; b" in text
     assert "<td>C</td><td>no reflection in any photograph</td>" in text
     for name, rows in (
-        ("orientations", orientation_rows(found, BUDGET)), ("facets", facet_rows(found)),
-        ("differences", difference_rows(found)), ("flights", [flight_row(found)]),
-    ):  # fmt: skip
+        ("orientations", orientation_rows(found, BUDGET)),
+        ("facets", facet_rows(found)),
+        ("differences", difference_rows(found)),
+        ("flights", [flight_row(found)]),
+    ):
         wanted = pd.DataFrame(rows)
         kept = pd.read_parquet(page.parent / f"{name}.parquet")
         pd.testing.assert_frame_equal(kept, wanted, check_dtype=False)
@@ -189,8 +196,9 @@ def test_several_flights_in_one_report(
     table = pd.read_csv(tmp_path / "orientations.csv", dtype={"flight": str})
     assert list(table["flight"]) == ["1/2", "1/2", "3", "3"]
     assert sorted(p.name for p in tmp_path.glob("reflections*")) == [
-        "reflections-1-2.parquet", "reflections-3.parquet",
-    ]  # fmt: skip
+        "reflections-1-2.parquet",
+        "reflections-3.parquet",
+    ]
     with pytest.raises(InputError, match=r"give one or more with different names"):
         write_campaign_report([flights[0], flights[0]], tmp_path)
 
@@ -228,9 +236,11 @@ def test_bad_rows_are_named_and_left_out(tmp_path: Path) -> None:
     kept, left_out = read_reflections(file, ("H",))
     assert len(kept) == 1
     assert [line.split(": ")[1] for line in left_out] == [
-        "line 2, heliostat X, column heliostat", "line 3, heliostat H, column facet",
-        "line 4, heliostat H, column sigma_m", "line 5, heliostat H, column x_m",
-    ]  # fmt: skip
+        "line 2, heliostat X, column heliostat",
+        "line 3, heliostat H, column facet",
+        "line 4, heliostat H, column sigma_m",
+        "line 5, heliostat H, column x_m",
+    ]
     file.write_text(lines[0].replace("led_up_m", "up"))
     with pytest.raises(FormatError, match="there is no column led_up_m"):
         read_reflections(file, ("H",))
@@ -240,8 +250,15 @@ def test_bad_rows_are_named_and_left_out(tmp_path: Path) -> None:
 
 def test_impossible_reflections_are_refused() -> None:
     def one(**changes: object) -> object:
-        given = {"photo": 0, "heliostat": 0, "facet": 0, "xy": [[0.0, 0.0]], "camera": [0.0, 0, 9],
-                 "led": [0.1, 0, 9], "sigma": 0.01}  # fmt: skip
+        given = {
+            "photo": 0,
+            "heliostat": 0,
+            "facet": 0,
+            "xy": [[0.0, 0.0]],
+            "camera": [0.0, 0, 9],
+            "led": [0.1, 0, 9],
+            "sigma": 0.01,
+        }
         return reflections(**{**given, **changes})  # type: ignore[arg-type]
 
     assert one()

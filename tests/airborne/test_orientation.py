@@ -132,9 +132,12 @@ def test_a_field_goes_on_where_one_heliostat_fails() -> None:
     strange = replace(one, heliostat=one.heliostat + 2, facet=one.facet + 4)
     both = join([one, strange])
     found = measure_field(
-        both, ("A", "B", "C"), lambda _: SHAPE, np.tile(s.told_rotation, (3, 1, 1)),
+        both,
+        ("A", "B", "C"),
+        lambda _: SHAPE,
+        np.tile(s.told_rotation, (3, 1, 1)),
         np.tile(s.told_vertex, (3, 1)),
-    )  # fmt: skip
+    )
     assert [o.heliostat for o in found.found] == [0]
     assert found.left_out["B"] == "no reflection in any photograph"
     assert "the mirror has 4 facets" in found.left_out["C"]
@@ -253,9 +256,14 @@ def flown(
     off = 0.008 * rng.standard_normal(camera.shape)
     noisy = seen.xy + 0.015 * rng.standard_normal(seen.xy.shape)
     found = reflections(
-        seen.position, 0, seen.facet, noisy, (camera + off)[seen.position],
-        (led + off)[seen.position], 0.015,
-    )  # fmt: skip
+        seen.position,
+        0,
+        seen.facet,
+        noisy,
+        (camera + off)[seen.position],
+        (led + off)[seen.position],
+        0.015,
+    )
     return measure_field(found, ("A",), lambda _: shape, told_R[None], told_v[None])
 
 
@@ -318,19 +326,26 @@ def test_both_together_predict_better_than_either_alone() -> None:
         true = mechanism.with_parameters(values)
         slopes = scene(SHAPE, Conditions(), 50 + seed).shape
         poses = np.stack([rng.uniform(2.2, 4.4, 15), rng.uniform(0.4, 1.3, 15)], axis=-1)
-        flights = kinds.join([
-            to_sightings(
-                flown(mechanism, true, p, slopes, 99 * seed + k), p[None], per="orientation",
-                time=0.0, systematic=False,
-            )
-            for k, p in enumerate(poses)
-        ])  # fmt: skip
+        flights = kinds.join(
+            [
+                to_sightings(
+                    flown(mechanism, true, p, slopes, 99 * seed + k),
+                    p[None],
+                    per="orientation",
+                    time=0.0,
+                    systematic=False,
+                )
+                for k, p in enumerate(poses)
+            ]
+        )
         ground = targets(mechanism, true, 5, seed)
         held = targets(mechanism, true, 40, 1000 + seed)
         later = np.stack([rng.uniform(2.0, 4.6, 40), rng.uniform(0.3, 1.4, 40)], axis=-1)
         for name, used in (
-            ("target", ground), ("drone", flights), ("both", kinds.join([ground, flights])),
-        ):  # fmt: skip
+            ("target", ground),
+            ("drone", flights),
+            ("both", kinds.join([ground, flights])),
+        ):
             told = fit(mechanism[None], used, "malan8", loss="square", adapt_scale=False)
             model = mechanism.with_parameters(
                 {n: told.values[0, p] for p, n in enumerate(told.names)}

@@ -153,10 +153,12 @@ def test_folder_without_photographs(tmp_path) -> None:
     ("text", "match"),
     [
         ("name,yaw_deg\na,1\n", "needs the columns"),
-        ("name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg\na.jpg,1,x,3,0,0,0\n",
-         "column north_m: 'x' is no number"),
+        (
+            "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg\na.jpg,1,x,3,0,0,0\n",
+            "column north_m: 'x' is no number",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_table(tmp_path, text: str, match: str) -> None:
     write_photo(tmp_path / "a.jpg", PICTURE, photo("a.jpg"), ORIGIN)
     (tmp_path / "photos.csv").write_text(text)

@@ -58,8 +58,9 @@ def test_straight_where_it_is_free_and_short_where_it_is_not() -> None:
 
 
 def test_over_what_is_low() -> None:
-    wall = KeepOut("wall", as_float([[-1.0, -400.0], [1.0, -400.0], [1.0, 400.0], [-1.0, 400.0]]),
-                   top=60.0)  # fmt: skip
+    wall = KeepOut(
+        "wall", as_float([[-1.0, -400.0], [1.0, -400.0], [1.0, 400.0], [-1.0, 400.0]]), top=60.0
+    )
     air = Airspace((wall,))
     a, b = np.array([-30.0, 0.0, 30.0]), np.array([30.0, 0.0, 30.0])
     places = _way(air, a, b)
@@ -90,8 +91,15 @@ def test_a_bent_fence_is_kept() -> None:
 def test_points_in_the_air() -> None:
     hill = np.array([[0.0, 0.0, 50.0], [100.0, 0.0, 0.0]])
     air = Airspace((KeepOut("mast", as_float([[60.0, 60.0]]), 2.0),), ground=hill)
-    points = [[0.0, 0.0, 60.0], [0.0, 0.0, 70.0], [100.0, 0.0, 60.0], [60.0, 66.0, 60.0],
-              [60.0, 68.0, 60.0], [100.0, 0.0, 130.0], [0.0, 0.0, 169.0]]  # fmt: skip
+    points = [
+        [0.0, 0.0, 60.0],
+        [0.0, 0.0, 70.0],
+        [100.0, 0.0, 60.0],
+        [60.0, 66.0, 60.0],
+        [60.0, 68.0, 60.0],
+        [100.0, 0.0, 130.0],
+        [0.0, 0.0, 169.0],
+    ]
     assert air.free(points).tolist() == [False, True, True, False, True, False, True]
 
 

@@ -52,8 +52,22 @@ def test_table_and_airspace_file(
     air = tmp_path / "air.json"
     air.write_text('{"max_height_m": 100, "home": [0, -80, 0]}')
     into = tmp_path / "flight"
-    _run(str(field), "--into", str(into), "--points", "10", "--airspace", str(air), "--no-tower",
-         "--formats", "none", "--distance", "100", "--drones", "1")  # fmt: skip
+    _run(
+        str(field),
+        "--into",
+        str(into),
+        "--points",
+        "10",
+        "--airspace",
+        str(air),
+        "--no-tower",
+        "--formats",
+        "none",
+        "--distance",
+        "100",
+        "--drones",
+        "1",
+    )
     shown = capsys.readouterr().out
     assert "camera and target, days" in shown
     assert "waypoints of" not in shown

@@ -226,9 +226,11 @@ def test_patterns_outside_the_limits(flown: FlightPlan) -> None:
 def test_single_axis_trackers_are_refused(plant: Plant) -> None:
     group = plant.groups["azel"]
     trough = Heliostats(
-        ("T1",), kinds.single_axis(np.zeros((1, 3)), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
-        np.ones(1), np.ones(1),
-    )  # fmt: skip
+        ("T1",),
+        kinds.single_axis(np.zeros((1, 3)), [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]),
+        np.ones(1),
+        np.ones(1),
+    )
     both = plant.with_groups({"azel": group, "trough": trough})
     with pytest.raises(InputError, match="group trough: its mechanism has 1 drive"):
         mirrors(both)

@@ -185,10 +185,17 @@ def _chosen(choosing: Choosing, airspace: Airspace | None = None) -> LookPoints:
     plant = staggered(80)
     middle = plant.groups["azel"].calibrated[np.array([40])]
     return look_points(
-        mirrors(plant), np.arange(80), middle, plant.receivers[0].center, NAMES,
-        suns_of_year(plant.site, 2026), airspace or Airspace(ground=plant.position), Sampling(),
-        choosing, "C1",
-    )  # fmt: skip
+        mirrors(plant),
+        np.arange(80),
+        middle,
+        plant.receivers[0].center,
+        NAMES,
+        suns_of_year(plant.site, 2026),
+        airspace or Airspace(ground=plant.position),
+        Sampling(),
+        choosing,
+        "C1",
+    )
 
 
 def test_directions_are_apart_and_within_their_elevations() -> None:
@@ -272,9 +279,14 @@ def test_pattern_keeps_off_the_limits() -> None:
     all_mirrors = mirrors(plant)
     for k in range(len(found)):
         one = pattern(
-            found.facing.vertex[k], all_mirrors.corners, all_mirrors.slopes,
-            all_mirrors.facet_area, found.point[k], found.direction[k], Sampling(),
-        )  # fmt: skip
+            found.facing.vertex[k],
+            all_mirrors.corners,
+            all_mirrors.slopes,
+            all_mirrors.facet_area,
+            found.point[k],
+            found.direction[k],
+            Sampling(),
+        )
         assert air.free(one.camera).all()
 
 
@@ -321,9 +333,12 @@ def test_by_the_exact_law_every_quarter_of_every_facet_is_sampled(
     """With the lamp where it is, mirrors that point wrong, and the law solved on the surface."""
     rng = np.random.default_rng(5)
     sampling = Sampling(
-        pointing=5.0 * MRAD, focal=focal, led_offset=(0.15, 0.05, 0.0), samples=16.0,
+        pointing=5.0 * MRAD,
+        focal=focal,
+        led_offset=(0.15, 0.05, 0.0),
+        samples=16.0,
         least_spacing=0.05,
-    )  # fmt: skip
+    )
     plant = staggered(120, canting)
     some, vertex, point = _faced(plant)
     found = _pattern(some, vertex, point, sampling)

@@ -63,9 +63,13 @@ Read = Callable[[Path], Mission]
     ],
 )
 def test_read_back(
-    flown: Mission, tmp_path: Path, suffix: str, write: Callable[[Mission], bytes], read: Read,
+    flown: Mission,
+    tmp_path: Path,
+    suffix: str,
+    write: Callable[[Mission], bytes],
+    read: Read,
     yaw: float,
-) -> None:  # fmt: skip
+) -> None:
     path = tmp_path / f"one{suffix}"
     path.write_bytes(write(flown))
     found = read(path)
@@ -98,9 +102,11 @@ def test_places_and_view_are_those_of_the_plan(plan: FlightPlan, flown: Mission)
     yaw, pitch = np.radians(flown.yaw_deg), np.radians(flown.pitch_deg)
     view = np.stack([np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch), np.sin(pitch)], -1)
     axes = np.concatenate(
-        [np.tile(-plan.stations[v.station].pattern.direction, (v.last - v.first, 1))
-         for v in sortie.visits]
-    )  # fmt: skip
+        [
+            np.tile(-plan.stations[v.station].pattern.direction, (v.last - v.first, 1))
+            for v in sortie.visits
+        ]
+    )
     assert angle_between(view[flown.photo], axes).max() < 1e-9
     # And there is the cluster: the line of sight meets it.
     k = plan.stations[sortie.visits[0].station].cluster
@@ -114,9 +120,15 @@ def test_litchi_as_published(flown: Mission) -> None:
     header = rows[0]
     assert len(header) == 46
     assert header[:8] == [
-        "latitude", "longitude", "altitude(m)", "heading(deg)", "curvesize(m)", "rotationdir",
-        "gimbalmode", "gimbalpitchangle",
-    ]  # fmt: skip
+        "latitude",
+        "longitude",
+        "altitude(m)",
+        "heading(deg)",
+        "curvesize(m)",
+        "rotationdir",
+        "gimbalmode",
+        "gimbalpitchangle",
+    ]
     assert header[8:12] == ["actiontype1", "actionparam1", "actiontype2", "actionparam2"]
     assert header[36:40] == ["actiontype15", "actionparam15", "altitudemode", "speed(m/s)"]
     assert header[-2:] == ["photo_timeinterval", "photo_distinterval"]
@@ -154,17 +166,31 @@ TEMPLATE_MARK = ["index", "useGlobalHeight", "ellipsoidHeight", "height", "useGl
                  "useGlobalHeadingParam", "waypointHeadingParam", "useGlobalTurnParam",
                  "gimbalPitchAngle"]  # fmt: skip
 WAYLINE = ["templateId", "waylineId", "autoFlightSpeed", "executeHeightMode"]
-WAYLINE_MARK = ["index", "executeHeight", "waypointSpeed", "waypointHeadingParam",
-                "waypointTurnParam"]  # fmt: skip
+WAYLINE_MARK = [
+    "index",
+    "executeHeight",
+    "waypointSpeed",
+    "waypointHeadingParam",
+    "waypointTurnParam",
+]
 HEADING = ["waypointHeadingMode", "waypointHeadingAngle", "waypointHeadingPathMode"]
 ACTIONS = {
-    "gimbalRotate": ["payloadPositionIndex", "gimbalHeadingYawBase", "gimbalRotateMode",
-                     "gimbalPitchRotateEnable", "gimbalPitchRotateAngle", "gimbalRollRotateEnable",
-                     "gimbalRollRotateAngle", "gimbalYawRotateEnable", "gimbalYawRotateAngle",
-                     "gimbalRotateTimeEnable", "gimbalRotateTime"],
+    "gimbalRotate": [
+        "payloadPositionIndex",
+        "gimbalHeadingYawBase",
+        "gimbalRotateMode",
+        "gimbalPitchRotateEnable",
+        "gimbalPitchRotateAngle",
+        "gimbalRollRotateEnable",
+        "gimbalRollRotateAngle",
+        "gimbalYawRotateEnable",
+        "gimbalYawRotateAngle",
+        "gimbalRotateTimeEnable",
+        "gimbalRotateTime",
+    ],
     "hover": ["hoverTime"],
     "takePhoto": ["payloadPositionIndex", "fileSuffix", "useGlobalPayloadLensIndex"],
-}  # fmt: skip
+}
 
 
 def _has(node: Any, names: list[str]) -> None:
@@ -216,12 +242,24 @@ def test_wpml_as_published(flown: Mission) -> None:
 
 def test_qgc_as_published(plan: FlightPlan, flown: Mission) -> None:
     root = json.loads(qgc(flown, fence(plan)))
-    assert set(root) == {"fileType", "geoFence", "groundStation", "mission", "rallyPoints",
-                         "version"}  # fmt: skip
+    assert set(root) == {
+        "fileType",
+        "geoFence",
+        "groundStation",
+        "mission",
+        "rallyPoints",
+        "version",
+    }
     assert set(root["mission"]) == {
-        "cruiseSpeed", "firmwareType", "globalPlanAltitudeMode", "hoverSpeed", "items",
-        "plannedHomePosition", "vehicleType", "version",
-    }  # fmt: skip
+        "cruiseSpeed",
+        "firmwareType",
+        "globalPlanAltitudeMode",
+        "hoverSpeed",
+        "items",
+        "plannedHomePosition",
+        "vehicleType",
+        "version",
+    }
     assert (root["version"], root["mission"]["version"], root["geoFence"]["version"]) == (1, 2, 2)
     items = root["mission"]["items"]
     assert [i["doJumpId"] for i in items] == list(range(1, len(items) + 1))
@@ -336,8 +374,11 @@ def test_refusals(plan: FlightPlan, flown: Mission, tmp_path: Path) -> None:
         wpml(flown, "M3")
     with pytest.raises(InputError, match=r"drones accept 500 m"):
         _moved(flown, flown.height + 450.0)
-    near = replace(flown, latitude_deg=flown.latitude_deg[:1].repeat(len(flown)),
-                   longitude_deg=flown.longitude_deg[:1].repeat(len(flown)))  # fmt: skip
+    near = replace(
+        flown,
+        latitude_deg=flown.latitude_deg[:1].repeat(len(flown)),
+        longitude_deg=flown.longitude_deg[:1].repeat(len(flown)),
+    )
     with pytest.raises(InputError, match=r"Litchi asks for 0.6 m"):
         litchi(near)
     with pytest.raises(InputError, match="format 'kml': give some of dji, qgc, litchi"):

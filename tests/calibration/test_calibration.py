@@ -43,8 +43,9 @@ def _seen(nominal: Mechanism, truth: Mechanism, noise: float, seed: int = 1) -> 
             length = np.linalg.norm(way, axis=-1, keepdims=True)
             spot = pose.vertex + length * ray / np.sum(ray * way / length, axis=-1, keepdims=True)
             across = rng.normal(0.0, noise, spot.shape) * length
-            parts.append((np.arange(len(truth)), counts, np.tile(sun, (len(truth), 1)),
-                          spot + across))  # fmt: skip
+            parts.append(
+                (np.arange(len(truth)), counts, np.tile(sun, (len(truth), 1)), spot + across)
+            )
     rows, counts, source, spot = (np.concatenate(p) for p in zip(*parts, strict=True))
     return sightings(rows, counts, source, spot, sigma=max(noise, 1e-6))
 
@@ -110,8 +111,12 @@ def test_far_zeros_are_found() -> None:
 
 def test_far_strokes_of_jacks_are_found() -> None:
     one = every_kind()["two_jacks"]
-    names = ("elevation_initial_angle", "azimuth_initial_angle", "elevation_stroke_offset",
-             "azimuth_stroke_offset")  # fmt: skip
+    names = (
+        "elevation_initial_angle",
+        "azimuth_initial_angle",
+        "elevation_stroke_offset",
+        "azimuth_stroke_offset",
+    )
     far = dict(zip(names, (0.25, 0.55, 0.02, 0.018), strict=True))
     truth = one.with_parameters(far)
     sun = direction(np.linspace(2.0, 4.0, 25), 0.8 - 0.1 * np.linspace(-1, 1, 25) ** 2)
@@ -194,8 +199,12 @@ def test_guards(change: dict, text: str) -> None:
     ],
 )
 def test_sighting_guards(change: dict, text: str) -> None:
-    good = {"heliostat": [0], "counts": [[0.0, 0.0]], "source": [[0.0, 0.0, 1.0]],
-            "destination": [[0.0, 0.0, 9.0]]}  # fmt: skip
+    good = {
+        "heliostat": [0],
+        "counts": [[0.0, 0.0]],
+        "source": [[0.0, 0.0, 1.0]],
+        "destination": [[0.0, 0.0, 9.0]],
+    }
     with pytest.raises(InputError, match=text):
         sightings(**{**good, **change})
 

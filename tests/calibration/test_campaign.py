@@ -30,9 +30,11 @@ def _jack_plant() -> Mechanism:
         for c in (0, 1)
     ]
     return kinds.azimuth_elevation(
-        np.array([[20.0, -60.0, 0.0]]), pivot_height=1.7, pivot_offset=0.17,
+        np.array([[20.0, -60.0, 0.0]]),
+        pivot_height=1.7,
+        pivot_offset=0.17,
         drives=(azimuth_elevation(np.zeros((1, 3))).drives[0], jacks[1]),
-    )  # fmt: skip
+    )
 
 
 def _fleet(mechanism: Mechanism, names: tuple[str, ...], aim: Any = AIM) -> Fleet:
@@ -79,9 +81,14 @@ def mixed(request: Any) -> tuple[list[Fleet], Campaign]:
     """Two kinds of heliostats with models of different sizes, two targets, two days."""
     fleets = [_fleet(FIELD, NAMES), _fleet(_jack_plant(), (*MODELS["guo6"], "pivot_offset"))]
     return fleets, campaign(
-        fleets, PLANT.site, TARGETS, START, START + 1.3 * DAY, timing=Timing(10.0, 3.0, 7.0),
+        fleets,
+        PLANT.site,
+        TARGETS,
+        START,
+        START + 1.3 * DAY,
+        timing=Timing(10.0, 3.0, 7.0),
         ahead=request.param,
-    )  # fmt: skip
+    )
 
 
 def test_a_campaign_has_no_conflicts(mixed: tuple[list[Fleet], Campaign]) -> None:
@@ -127,8 +134,9 @@ def test_a_campaign_against_taking_turns() -> None:
         rms = Expectation(NAMES, fleet.form, np.ones(18, dtype=np.int64)).rms(covariance)
         return float(np.sqrt(np.mean(rms**2)))
 
-    full = campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY,
-                    timing=Timing(200.0, 60.0, 40.0))  # fmt: skip
+    full = campaign(
+        [fleet], PLANT.site, PLANT.targets, START, START + DAY, timing=Timing(200.0, 60.0, 40.0)
+    )
     assert full.error[-1] < 1.03 * turns(full.time)
     some = campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY)
     assert len(some) < 0.12 * some.slots
@@ -161,8 +169,15 @@ def test_looking_ahead_ends_lower_with_as_many_measurements() -> None:
 def test_a_campaign_ends_at_its_count_and_tells_of_progress() -> None:
     told: list[tuple[int, int]] = []
     fleet = _fleet(FIELD, NAMES)
-    found = campaign([fleet], PLANT.site, TARGETS, START, START + DAY, count=7,
-                     progress=lambda a, b: told.append((a, b)))  # fmt: skip
+    found = campaign(
+        [fleet],
+        PLANT.site,
+        TARGETS,
+        START,
+        START + DAY,
+        count=7,
+        progress=lambda a, b: told.append((a, b)),
+    )
     assert len(found) == 7
     assert told[-1][0] == told[-1][1] > 0
     assert [a for a, _ in told] == sorted(a for a, _ in told)

@@ -36,9 +36,14 @@ def field(rows: int, seed: int = 0) -> Mechanism:
 
 
 def measured(
-    nominal: Mechanism, seed: int, *, days: int = 10, each: int = 4, noise: float = 2e-4,
+    nominal: Mechanism,
+    seed: int,
+    *,
+    days: int = 10,
+    each: int = 4,
+    noise: float = 2e-4,
     moved: dict[tuple[int, str], FloatArray] | None = None,
-) -> tuple[Sightings, dict[str, FloatArray]]:  # fmt: skip
+) -> tuple[Sightings, dict[str, FloatArray]]:
     """Sightings over a year, ``each`` a day; ``moved`` shifts a parameter by row and day."""
     rng = np.random.default_rng(seed)
     count = len(nominal)
@@ -61,8 +66,9 @@ def measured(
             spot = pose.vertex + length * ray / np.sum(ray * way / length, axis=-1, keepdims=True)
             spot += rng.normal(0.0, noise, spot.shape) * length
             time = START + DAY * (36.0 * day) + 3600.0 * hour
-            parts.append((np.arange(count), counts, np.tile(sun, (count, 1)), spot,
-                          np.full(count, time)))  # fmt: skip
+            parts.append(
+                (np.arange(count), counts, np.tile(sun, (count, 1)), spot, np.full(count, time))
+            )
     rows, counts, source, spot, time = (np.concatenate(p) for p in zip(*parts, strict=True))
     return sightings(rows, counts, source, spot, time=time, sigma=2e-4), truth
 
@@ -73,8 +79,11 @@ def troubled() -> tuple[Learned, Sightings, np.ndarray]:
     nominal = field(10)
     late, between, small = np.zeros(10), np.zeros(10), np.zeros(10)
     late[6:], between[3:5], small[5:] = 12e-3, -9e-3, 1.2e-3
-    moved = {(0, "azimuth_bias"): late, (1, "elevation_bias"): between,
-             (2, "elevation_bias"): small}  # fmt: skip
+    moved = {
+        (0, "azimuth_bias"): late,
+        (1, "elevation_bias"): between,
+        (2, "elevation_bias"): small,
+    }
     seen, _ = measured(nominal, 5, moved=moved)
     rows = np.flatnonzero(seen.heliostat == 3)
     spoilt = rows[[4, 5, 21, 30]]
@@ -262,9 +271,20 @@ def test_gradient_of_the_evidence() -> None:
     def value(vector: FloatArray) -> tuple[float, FloatArray]:
         h = first.with_vector(vector)
         return kernels.cost_and_gradient(
-            data.jacobian, data.time, data.regime, data.epoch, data.rest(h), data.spread(h) ** 2,
-            h.regime**2, h.step**2, h.part, h.group, h.amplitude, h.tau, h.noise,
-        )  # fmt: skip
+            data.jacobian,
+            data.time,
+            data.regime,
+            data.epoch,
+            data.rest(h),
+            data.spread(h) ** 2,
+            h.regime**2,
+            h.step**2,
+            h.part,
+            h.group,
+            h.amplitude,
+            h.tau,
+            h.noise,
+        )
 
     at = first.vector + 0.3
     _, gradient = value(at)

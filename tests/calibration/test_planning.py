@@ -96,8 +96,9 @@ def test_limits_narrow_the_choice(possible: Candidates) -> None:
 def test_jacobian_against_finite_differences(names: tuple[str, ...]) -> None:
     """Whitened normal minus bisector, the bisector moving with the vertex."""
     mechanism, sigma = FIELD[3:6], 4e-4
-    found = candidates(mechanism, PLANT.site, TARGETS, grid(START, START + DAY, 7200.0), names,
-                       sigma=sigma)  # fmt: skip
+    found = candidates(
+        mechanism, PLANT.site, TARGETS, grid(START, START + DAY, 7200.0), names, sigma=sigma
+    )
     assert len(found) > 20
     whole = mechanism[found.heliostat]
     centers = np.array([t.center for t in TARGETS])[found.target]
@@ -153,8 +154,9 @@ def _log_det(found: Candidates, rows: Any, information: FloatArray) -> float:
     slope = found.jacobian[list(rows)].reshape(-1, information.shape[-1])
     scale = 1.0 / np.sqrt(np.diagonal(information))
     total = (information + slope.T @ slope) * scale[:, None] * scale
-    return float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(
-        information * scale[:, None] * scale)[1])  # fmt: skip
+    return float(
+        np.linalg.slogdet(total)[1] - np.linalg.slogdet(information * scale[:, None] * scale)[1]
+    )
 
 
 def _square(found: Candidates, rows: Any, information: FloatArray, form: FloatArray) -> float:
@@ -257,8 +259,9 @@ def test_what_is_known_already_counts(possible: Candidates, year: Expectation) -
     centers = np.array([t.center for t in TARGETS])[c.target]
     made = camera_target(np.full(5, 9), c.counts, c.sun, centers, time=c.time)
     information = precision(FIELD, NAMES, made)
-    np.testing.assert_allclose(np.linalg.inv(information[9]), first.covariance,
-                               rtol=1e-6, atol=1e-14)  # fmt: skip
+    np.testing.assert_allclose(
+        np.linalg.inv(information[9]), first.covariance, rtol=1e-6, atol=1e-14
+    )
     np.testing.assert_array_equal(information[8], precision(FIELD, NAMES)[8])
     second = plan(possible.of(9), 5, information[9], year.form[9])
     assert second.before == pytest.approx(first.error[-1], rel=1e-8)
@@ -283,9 +286,11 @@ def test_the_expected_error_comes_true(possible: Candidates, year: Expectation) 
     spot = pose.vertex + ray * np.linalg.norm(centers[:, None] - pose.vertex, axis=-1)[..., None]
     heliostat = np.broadcast_to(np.arange(draws), (len(c), draws)).ravel()
     seen = camera_target(
-        heliostat, np.repeat(c.counts, draws, axis=0), np.repeat(c.sun, draws, axis=0),
+        heliostat,
+        np.repeat(c.counts, draws, axis=0),
+        np.repeat(c.sun, draws, axis=0),
         spot.reshape(-1, 3),
-    )  # fmt: skip
+    )
     learnt = fit(nominal, seen, NAMES, loss="square", adapt_scale=False)
     moved = nominal.with_parameters(learnt.parameters)
     suns = suns_of_year(PLANT.site, 2026)
@@ -386,19 +391,32 @@ def test_command(run: Any, plant_file: Path, tmp_path: Path) -> None:
     assert out.count("2026-09-0") == 6
     assert f"{errors[-1]:.2f} mrad after" in out
     assert {p.name for p in tmp_path.iterdir()} == {
-        "plant.toml", "plan.csv", "plan.png", *(p.name for p in tmp_path.glob("*plant*.csv")),
+        "plant.toml",
+        "plan.csv",
+        "plan.png",
+        *(p.name for p in tmp_path.glob("*plant*.csv")),
         *(p.name for p in tmp_path.glob("heliostats*")),
-    }  # fmt: skip
+    }
 
 
 def test_command_for_several_keeps_them_apart(run: Any, plant_file: Path, tmp_path: Path) -> None:
-    code, out, _ = run(plant_file, *WEEK, "--count", "4", "--criterion", "v", "--json",
-                       "--picture", tmp_path / "all.svg")  # fmt: skip
+    code, out, _ = run(
+        plant_file,
+        *WEEK,
+        "--count",
+        "4",
+        "--criterion",
+        "v",
+        "--json",
+        "--picture",
+        tmp_path / "all.svg",
+    )
     assert code == 0
     found = json.loads(out)["heliostats"]
     assert list(found) == list(PLANT.names)
-    times = sorted(sun.vector(m["time"], PLANT.site)[0] for h in found.values()
-                   for m in h["measurements"])  # fmt: skip
+    times = sorted(
+        sun.vector(m["time"], PLANT.site)[0] for h in found.values() for m in h["measurements"]
+    )
     assert len(set(times)) == len(times) == 72
     assert "svg" in (tmp_path / "all.svg").read_text(encoding="utf-8")[:400]
 
@@ -408,12 +426,25 @@ def test_command_knows_what_was_measured(run: Any, plant_file: Path, tmp_path: P
     first = json.loads(out)["heliostats"]["P2B"]
     ms = first["measurements"]
     made: Sightings = camera_target(
-        np.full(5, PLANT.names.index("P2B")), [[m["count_1"], m["count_2"]] for m in ms],
-        np.array([sun.vector(m["time"], PLANT.site) for m in ms]), PLANT.targets[0].center,
-    )  # fmt: skip
+        np.full(5, PLANT.names.index("P2B")),
+        [[m["count_1"], m["count_2"]] for m in ms],
+        np.array([sun.vector(m["time"], PLANT.site) for m in ms]),
+        PLANT.targets[0].center,
+    )
     write_sightings(tmp_path / "made.csv", made, PLANT.names)
-    code, out, err = run(plant_file, "--heliostat", "P2A", "--heliostat", "P2B", *WEEK, "--count",
-                         "2", "--json", "--sightings", tmp_path / "made.csv")  # fmt: skip
+    code, out, err = run(
+        plant_file,
+        "--heliostat",
+        "P2A",
+        "--heliostat",
+        "P2B",
+        *WEEK,
+        "--count",
+        "2",
+        "--json",
+        "--sightings",
+        tmp_path / "made.csv",
+    )
     assert (code, err) == (0, "")
     second = json.loads(out)["heliostats"]
     before = second["P2B"]["before_expected_beam_rms_mrad"]
@@ -423,8 +454,18 @@ def test_command_knows_what_was_measured(run: Any, plant_file: Path, tmp_path: P
 
 def test_command_campaign(run: Any, plant_file: Path, tmp_path: Path) -> None:
     table, picture = tmp_path / "c.csv", tmp_path / "c.pdf"
-    arguments = (plant_file, "--campaign", "--from", "2026-09-02T00:00Z", "--days", "1",
-                 "--settle", "60s", "--clear", "30s")  # fmt: skip
+    arguments = (
+        plant_file,
+        "--campaign",
+        "--from",
+        "2026-09-02T00:00Z",
+        "--days",
+        "1",
+        "--settle",
+        "60s",
+        "--clear",
+        "30s",
+    )
     code, out, err = run(*arguments, "--csv", table, "--picture", picture, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
@@ -470,8 +511,9 @@ REFUSED: list[tuple[list[str], str]] = [
 def test_command_refuses_in_one_line(
     arguments: list[str], says: str, run: Any, plant_file: Path
 ) -> None:
-    code, out, err = run(plant_file, *(["--days", "7"] if "--every" in arguments else []),
-                         *arguments)  # fmt: skip
+    code, out, err = run(
+        plant_file, *(["--days", "7"] if "--every" in arguments else []), *arguments
+    )
     assert code == 2
     assert out == ""
     assert says in err

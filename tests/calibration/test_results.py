@@ -12,7 +12,8 @@ from heliotrope.calibration import evaluation
 from heliotrope.calibration.learn import learning, models
 from heliotrope.calibration.learn import on_dask as cluster
 from heliotrope.calibration.learn.assessment import assess
-from heliotrope.calibration.report.page import Result, blind_spots, results, write_report
+from heliotrope.calibration.report import results
+from heliotrope.calibration.report.page import Result, blind_spots, write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
@@ -156,9 +157,13 @@ def test_a_cluster_gives_the_same_bits(learnt: learning.Learned) -> None:
     done: list[tuple[int, int]] = []
     try:
         found = learning.learn(
-            learnt.mechanism, learnt.sightings, "guo6", runner=cluster.runner(client), chunk=2,
+            learnt.mechanism,
+            learnt.sightings,
+            "guo6",
+            runner=cluster.runner(client),
+            chunk=2,
             progress=lambda a, b: done.append((a, b)),
-        )  # fmt: skip
+        )
     finally:
         cluster.disconnect(client)
     assert done[-1] == (6, 6)
@@ -183,9 +188,11 @@ def test_a_cluster_that_is_not_there(address: str) -> None:
 def real() -> tuple[Plant, Sightings]:
     plant = paint.read_plant(juelich())
     seen, _ = of_measurements(
-        measurements.read_measurements(juelich()), plant.groups["heliostats"]
-        if "heliostats" in plant.groups else next(iter(plant.groups.values())),
-    )  # fmt: skip
+        measurements.read_measurements(juelich()),
+        plant.groups["heliostats"]
+        if "heliostats" in plant.groups
+        else next(iter(plant.groups.values())),
+    )
     return plant, seen
 
 

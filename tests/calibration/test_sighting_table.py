@@ -90,11 +90,17 @@ def _awkward(drives: int = 2) -> tuple[Sightings, tuple[str, ...]]:
     spread = [_matrices(rng, rows, 10.0**e) for e in (-3.0, -2.0)]
     spread[0][5:50] = 0.0
     seen = sightings(
-        rng.integers(0, 3, rows), counts, points[0], points[1], time=time,
-        source_at_infinity=far[:, 0], destination_at_infinity=far[:, 1],
+        rng.integers(0, 3, rows),
+        counts,
+        points[0],
+        points[1],
+        time=time,
+        source_at_infinity=far[:, 0],
+        destination_at_infinity=far[:, 1],
         sigma=10.0 ** rng.uniform(-7, 0, rows),
-        source_covariance=spread[0], destination_covariance=spread[1],
-    )  # fmt: skip
+        source_covariance=spread[0],
+        destination_covariance=spread[1],
+    )
     return seen, tuple(np.repeat(list(sighting_table.KINDS), rows // 4).tolist())
 
 
@@ -178,14 +184,20 @@ def test_whitening_is_that_of_finite_differences() -> None:
     plain, _ = _every_kind(plant, 6)
     rng = np.random.default_rng(1)
     spread = {
-        "source": _matrices(rng, len(plain), 0.01), "destination": _matrices(rng, len(plain), 0.02)
-    }  # fmt: skip
+        "source": _matrices(rng, len(plain), 0.01),
+        "destination": _matrices(rng, len(plain), 0.02),
+    }
     seen = sightings(
-        plain.heliostat, plain.counts, plain.source, plain.destination, sigma=1e-6,
+        plain.heliostat,
+        plain.counts,
+        plain.source,
+        plain.destination,
+        sigma=1e-6,
         source_at_infinity=plain.source_at_infinity,
         destination_at_infinity=plain.destination_at_infinity,
-        source_covariance=spread["source"], destination_covariance=spread["destination"],
-    )  # fmt: skip
+        source_covariance=spread["source"],
+        destination_covariance=spread["destination"],
+    )
     vertex = plant[seen.heliostat].pose(seen.counts).vertex
     ways = dict(zip(("source", "destination"), ray_directions(seen, vertex), strict=True))
     axes = tangent_axes(bisector(ways["source"], ways["destination"]))
@@ -259,9 +271,13 @@ def test_anisotropic_noise_gives_the_stated_uncertainty() -> None:
     errors = []
     for given in (told, untold):
         found = fit(
-            nominal, given, "guo6", priors=dict.fromkeys(TRUTH, 5e-3), adapt_scale=False,
+            nominal,
+            given,
+            "guo6",
+            priors=dict.fromkeys(TRUTH, 5e-3),
+            adapt_scale=False,
             loss="square",
-        )  # fmt: skip
+        )
         gaps = found.values - np.stack([truth[n] for n in found.names], axis=-1)
         errors.append(np.sqrt(np.mean(gaps**2, axis=0)))
         if given is told:
@@ -305,9 +321,13 @@ def test_an_empty_table_is_no_sightings(suffix: str, tmp_path: Path) -> None:
 
 def test_times_to_the_last_bit() -> None:
     rng = np.random.default_rng(3)
-    times = np.concatenate([
-        rng.uniform(-6e10, 2.5e11, 300), rng.uniform(-10, 10, 300), 10.0 ** rng.uniform(-30, 0, 99)
-    ])  # fmt: skip
+    times = np.concatenate(
+        [
+            rng.uniform(-6e10, 2.5e11, 300),
+            rng.uniform(-10, 10, 300),
+            10.0 ** rng.uniform(-30, 0, 99),
+        ]
+    )
     for t in times.tolist():
         assert parse_time(format_time(t)) == t
     assert format_time(1782043200.25) == "2026-06-21T12:00:00.25Z"

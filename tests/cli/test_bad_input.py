@@ -53,15 +53,20 @@ PAINT: dict[str, Any] = {
     "kinematics_properties": {
         "actuators": [
             {
-                "type_axis": "linear", "min_increment": 0, "max_increment": 68745,
-                "increment": 154166.6667, "initial_stroke_length": 0.0774, "offset": 0.335,
-                "pivot_radius": 0.338, "clockwise_axis_movement": clockwise,
+                "type_axis": "linear",
+                "min_increment": 0,
+                "max_increment": 68745,
+                "increment": 154166.6667,
+                "initial_stroke_length": 0.0774,
+                "offset": 0.335,
+                "pivot_radius": 0.338,
+                "clockwise_axis_movement": clockwise,
                 "initial_angle": 0.04,
             }
             for clockwise in (0, 1)
         ]
     },
-}  # fmt: skip
+}
 TOWER: dict[str, Any] = {
     "power_plant_properties": {"coordinates": [50.9134, 6.3878, 87.0]},
     "target": {
@@ -387,9 +392,11 @@ def test_arguments(arguments, says, tmp_path, capsys, monkeypatch) -> None:  # t
     write_plant(prototype(), tmp_path / "plant.toml")
     _paint_folder(tmp_path / "paint", json.dumps(PAINT), json.dumps(TOWER), MEASURED)
     places = {
-        "PLANT": str(tmp_path / "plant.toml"), "NOWHERE": str(tmp_path / "nowhere"),
-        "EMPTY": str(tmp_path / "empty"), "PAINT": str(tmp_path / "paint"),
-    }  # fmt: skip
+        "PLANT": str(tmp_path / "plant.toml"),
+        "NOWHERE": str(tmp_path / "nowhere"),
+        "EMPTY": str(tmp_path / "empty"),
+        "PAINT": str(tmp_path / "paint"),
+    }
     monkeypatch.chdir(tmp_path)
     assert _run([places.get(a, a) for a in arguments], monkeypatch) == 2
     captured = capsys.readouterr()

@@ -75,15 +75,31 @@ def test_sun(call: Any) -> None:
 
 def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
     found = json.loads(
-        call("track", plant_file, "--heliostat", "P6A", "--aim", "0,0,13", "--time",
-             "2026-09-02T10:00:00Z", "--json")
-    )  # fmt: skip
+        call(
+            "track",
+            plant_file,
+            "--heliostat",
+            "P6A",
+            "--aim",
+            "0,0,13",
+            "--time",
+            "2026-09-02T10:00:00Z",
+            "--json",
+        )
+    )
     assert len(found["branches"]) == 2
     plant = prototype()
     mechanism = plant.heliostat("P6A")
     vector = sun.vector("2026-09-02T10:00:00Z", plant.site)
-    keys = {"azimuth_deg", "elevation_deg", "angles_rad", "counts", "reachable", "residual_mrad",
-            "iterations"}  # fmt: skip
+    keys = {
+        "azimuth_deg",
+        "elevation_deg",
+        "angles_rad",
+        "counts",
+        "reachable",
+        "residual_mrad",
+        "iterations",
+    }
     for branch in found["branches"]:
         assert keys <= set(branch)
         pose = mechanism.pose(branch["counts"])
@@ -101,8 +117,16 @@ def test_track_gives_both_branches(call: Any, plant_file: Path) -> None:
 
 
 def test_track_a_day(call: Any, plant_file: Path) -> None:
-    arguments = ("track", plant_file, "--heliostat", "P1A", "--time", "2026-09-02T10:00Z",
-                 "--every", "30min")  # fmt: skip
+    arguments = (
+        "track",
+        plant_file,
+        "--heliostat",
+        "P1A",
+        "--time",
+        "2026-09-02T10:00Z",
+        "--every",
+        "30min",
+    )
     found = json.loads(call(*arguments, "--json"))
     assert 20 < len(found["day"]) < 25
     assert sum(row["reachable"] for row in found["day"]) > 18
@@ -120,8 +144,19 @@ def test_field_check(call: Any, plant_file: Path) -> None:
 
 def test_track_reads_heliok(call: Any) -> None:
     scene = Path(__file__).parents[1] / "files" / "heliok-scene.xml"
-    found = json.loads(call("track", scene, "--heliostat", "HeliostatA", "--aim", "0,0,20",
-                            "--sun", "0.6123724,-0.3535534,0.7071068", "--json"))  # fmt: skip
+    found = json.loads(
+        call(
+            "track",
+            scene,
+            "--heliostat",
+            "HeliostatA",
+            "--aim",
+            "0,0,20",
+            "--sun",
+            "0.6123724,-0.3535534,0.7071068",
+            "--json",
+        )
+    )
     angles = np.degrees(found["branches"][0]["angles_rad"])
     np.testing.assert_allclose(angles, [-36.8761, 40.6415], rtol=0, atol=2e-3)
 
@@ -140,8 +175,15 @@ def test_fetch(call: Any, tmp_path: Path) -> None:
             {"assets": {"tower-measurements": {"href": href}}},
         )
         database.put(f"{PLANT}-tower-measurements.json", {"tower": 1})
-        arguments = ("fetch", "juelich", "AA39", "--into", tmp_path / "j", "--base-url",
-                     database.base)  # fmt: skip
+        arguments = (
+            "fetch",
+            "juelich",
+            "AA39",
+            "--into",
+            tmp_path / "j",
+            "--base-url",
+            database.base,
+        )
         found = json.loads(call(*arguments, "--json"))
         assert len(found["files"]) == found["new"] == 4
         assert all(Path(file).is_file() for file in found["files"])
@@ -216,9 +258,20 @@ def test_calibrate_a_plant_with_a_table(call: Any, plant_file: Path, tmp_path: P
     table = tmp_path / "seen.csv"
     write_sightings(table, join(seen), group.names)
     found = json.loads(
-        call("calibrate", plant_file, "--sightings", table, "--report", tmp_path / "out",
-             "--model", "guo6", "--prior", "tilt_north=0.01", "--json")
-    )  # fmt: skip
+        call(
+            "calibrate",
+            plant_file,
+            "--sightings",
+            table,
+            "--report",
+            tmp_path / "out",
+            "--model",
+            "guo6",
+            "--prior",
+            "tilt_north=0.01",
+            "--json",
+        )
+    )
     values = [h["parameters"]["tilt_north"] for h in found["heliostats"].values()]
     np.testing.assert_allclose(np.median(values), 5e-3, atol=2e-4)
     # The field takes it back: as a plant, and as a calibration beside the old one.

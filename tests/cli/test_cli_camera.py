@@ -31,8 +31,20 @@ from imaging.test_teaching import (
     photograph,
 )
 
-TAUGHT = ("--kind", "corner", "--size", "0.4", "--stroke", "0.09", "--kind", "middle=tee",
-          "--kind", "dot=disc", "--size", "dot=0.3")  # fmt: skip
+TAUGHT = (
+    "--kind",
+    "corner",
+    "--size",
+    "0.4",
+    "--stroke",
+    "0.09",
+    "--kind",
+    "middle=tee",
+    "--kind",
+    "dot=disc",
+    "--size",
+    "dot=0.3",
+)
 
 
 @pytest.fixture
@@ -95,8 +107,17 @@ def points(names: Any = ALL) -> list[str]:
 
 def test_teach_writes_marks_and_camera(call: Any, shelf: Path, place: Path) -> None:
     plant = place / "bare.toml"
-    text = call("teach", plant, shelf / "south.png", "--target", "target", *points(), *TAUGHT,
-                "--camera", "south")  # fmt: skip
+    text = call(
+        "teach",
+        plant,
+        shelf / "south.png",
+        "--target",
+        "target",
+        *points(),
+        *TAUGHT,
+        "--camera",
+        "south",
+    )
     assert text.count("refined") == 6
     assert re.search(r"^camera at \(-?\d+\.\d\d ± \d+\.\d\d, ", text, re.MULTILINE)
     assert re.search(r"pixels on their plane good to \d+\.\d mm", text)
@@ -108,10 +129,19 @@ def test_teach_writes_marks_and_camera(call: Any, shelf: Path, place: Path) -> N
 
 
 def test_teach_as_json(call: Any, shelf: Path, place: Path) -> None:
-    found = json.loads(call("teach", place / "plain.toml", shelf / "blots.png", "--target",
-                            "target", *[w for n, (x, y) in at(BLOTS).items()
-                                        for w in ("--at", f"{n}={x},{y}")],
-                            "--out", place / "new.toml", "--json"))  # fmt: skip
+    found = json.loads(
+        call(
+            "teach",
+            place / "plain.toml",
+            shelf / "blots.png",
+            "--target",
+            "target",
+            *[w for n, (x, y) in at(BLOTS).items() for w in ("--at", f"{n}={x},{y}")],
+            "--out",
+            place / "new.toml",
+            "--json",
+        )
+    )
     assert [p["mark"] for p in found["points"]] == ["picture"] * 5
     assert [p["sigma_px"] for p in found["points"]] == [1.0] * 5
     assert found["sigma"].keys() >= {"east", "north", "up", "log_focal", "k1"}
@@ -121,8 +151,9 @@ def test_teach_as_json(call: Any, shelf: Path, place: Path) -> None:
     # The plant that was read is as it was.
     assert (place / "plain.toml").read_bytes() == (shelf / "plain.toml").read_bytes()
     # And the plant that was written, with its pictures, is good for the next command.
-    placed = json.loads(call("calibrate", place / "new.toml", shelf / "blots.png", "--camera",
-                             "camera", "--json"))  # fmt: skip
+    placed = json.loads(
+        call("calibrate", place / "new.toml", shelf / "blots.png", "--camera", "camera", "--json")
+    )
     assert placed["marks"] == 5
 
 
@@ -143,8 +174,16 @@ def test_teach_by_clicks(call: Any, shelf: Path, place: Path, monkeypatch: Any) 
     monkeypatch.setattr(
         camera, "_announcer", lambda quiet: lambda a: (printed(quiet)(a), answer(a))
     )
-    text = call("teach", place / "bare.toml", shelf / "south.png", "--target", "target", "--click",
-                *points(ALL[:1]), *TAUGHT)  # fmt: skip
+    text = call(
+        "teach",
+        place / "bare.toml",
+        shelf / "south.png",
+        "--target",
+        "target",
+        "--click",
+        *points(ALL[:1]),
+        *TAUGHT,
+    )
     assert f"click the points at {told[0]}\n" in text
     assert len(read_plant(place / "bare.toml").target("target").marks) == 6
 
@@ -155,8 +194,18 @@ def test_teach_by_clicks(call: Any, shelf: Path, place: Path, monkeypatch: Any) 
 def test_calibrate_with_a_chessboard(call: Any, shelf: Path, place: Path) -> None:
     plant = place / "seen.toml"
     boards = [shelf / f"board{k}.png" for k in range(4)]
-    arguments = ("calibrate", plant, *boards, shelf / "board0.png", "--camera", "south",
-                 "--chessboard", "9x6", "--square", "0.03")  # fmt: skip
+    arguments = (
+        "calibrate",
+        plant,
+        *boards,
+        shelf / "board0.png",
+        "--camera",
+        "south",
+        "--chessboard",
+        "9x6",
+        "--square",
+        "0.03",
+    )
     text = call(*arguments)
     assert re.search(r"^focal length 5\d\d\.\d ± \d+\.\d, 5\d\d\.\d ± ", text, re.MULTILINE)
     assert re.search(r"board3\.png: 0\.\d\d px", text)
@@ -187,8 +236,9 @@ def test_calibrate_with_marks(call: Any, shelf: Path, place: Path) -> None:
     found = json.loads(call("calibrate", plant, shelf / "south.png", "--camera", "south", "--json"))
     assert "log_focal" not in found["sigma"]
     assert read_plant(plant).camera("south").matrix.tolist() == camera.matrix.tolist()
-    free = json.loads(call("calibrate", plant, shelf / "south.png", "--camera", "south", "--anew",
-                           "--json"))  # fmt: skip
+    free = json.loads(
+        call("calibrate", plant, shelf / "south.png", "--camera", "south", "--anew", "--json")
+    )
     assert "log_focal" in free["sigma"]
 
 
@@ -245,35 +295,123 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--sigma-px", "0"), "sigma 0.0 px; give a standard deviation above 0"),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
         ((*TEACH, *points(), "--out", "no/plant.toml"), "there is no folder no; make it first"),
-        (("teach", "tower-measurements.json", "south.png", "--target", "t"),
-         "tower-measurements.json: a tower alone is no plant; give the folder"),
+        (
+            ("teach", "tower-measurements.json", "south.png", "--target", "t"),
+            "tower-measurements.json: a tower alone is no plant; give the folder",
+        ),
         (("teach", ".", "south.png", "--target", "t"), "add --out plant.toml"),
-        (("teach", "seen.toml", "small.png", "--target", "target", "--camera", "south",
-          "--at", "dot=1,2", "--at", "middle=9,2", "--at", "upper_left=1,20", "--at",
-          "upper_right=100,120"), "south: its frames have 640 × 480 px, the picture 320 × 240"),
-        (("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--chessboard", "9x6"),
-         "--chessboard and --square go together"),
-        (("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--square", "0.1"),
-         "--chessboard and --square go together"),
-        (("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--chessboard", "9-6", "--square",
-          "0.1"), "--chessboard '9-6': write the inner corners as 9x6"),
-        (("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--chessboard", "9x6", "--square",
-          "-1"), "squares of -1.0 m; give their side in metres, above 0"),
-        (("calibrate", "bare.toml", *BOARDS[:2], "--camera", "c", "--chessboard", "9x6", "--square",
-          "0.03"), "2 pictures of a chessboard; give three or more"),
-        (("calibrate", "bare.toml", *["grey.png"] * 3, "--camera", "c", "--chessboard", "7x6",
-          "--square", "0.03"), "the pattern of 7 × 6 inner corners is found in none of 3 pictures"),
-        (("calibrate", "bare.toml", *BOARDS[:2], "small.png", "--camera", "c", "--chessboard",
-          "9x6", "--square", "0.03"), "small.png: 320 × 240 px, but "),
+        (
+            (
+                "teach",
+                "seen.toml",
+                "small.png",
+                "--target",
+                "target",
+                "--camera",
+                "south",
+                "--at",
+                "dot=1,2",
+                "--at",
+                "middle=9,2",
+                "--at",
+                "upper_left=1,20",
+                "--at",
+                "upper_right=100,120",
+            ),
+            "south: its frames have 640 × 480 px, the picture 320 × 240",
+        ),
+        (
+            ("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--chessboard", "9x6"),
+            "--chessboard and --square go together",
+        ),
+        (
+            ("calibrate", "bare.toml", *BOARDS, "--camera", "c", "--square", "0.1"),
+            "--chessboard and --square go together",
+        ),
+        (
+            (
+                "calibrate",
+                "bare.toml",
+                *BOARDS,
+                "--camera",
+                "c",
+                "--chessboard",
+                "9-6",
+                "--square",
+                "0.1",
+            ),
+            "--chessboard '9-6': write the inner corners as 9x6",
+        ),
+        (
+            (
+                "calibrate",
+                "bare.toml",
+                *BOARDS,
+                "--camera",
+                "c",
+                "--chessboard",
+                "9x6",
+                "--square",
+                "-1",
+            ),
+            "squares of -1.0 m; give their side in metres, above 0",
+        ),
+        (
+            (
+                "calibrate",
+                "bare.toml",
+                *BOARDS[:2],
+                "--camera",
+                "c",
+                "--chessboard",
+                "9x6",
+                "--square",
+                "0.03",
+            ),
+            "2 pictures of a chessboard; give three or more",
+        ),
+        (
+            (
+                "calibrate",
+                "bare.toml",
+                *["grey.png"] * 3,
+                "--camera",
+                "c",
+                "--chessboard",
+                "7x6",
+                "--square",
+                "0.03",
+            ),
+            "the pattern of 7 × 6 inner corners is found in none of 3 pictures",
+        ),
+        (
+            (
+                "calibrate",
+                "bare.toml",
+                *BOARDS[:2],
+                "small.png",
+                "--camera",
+                "c",
+                "--chessboard",
+                "9x6",
+                "--square",
+                "0.03",
+            ),
+            "small.png: 320 × 240 px, but ",
+        ),
         (("calibrate", "bare.toml", "south.png", "--camera", "c"), "has marks; teach them first"),
-        (("calibrate", "marked.toml", "south.png", "small.png", "--camera", "c"),
-         "camera c: frames of 320 × 240, 640 × 480 px; give pictures of one size"),
-        (("calibrate", "seen.toml", "small.png", "--camera", "south"),
-         "camera south: frames of 320 × 240, 640 × 480 px"),
+        (
+            ("calibrate", "marked.toml", "south.png", "small.png", "--camera", "c"),
+            "camera c: frames of 320 × 240, 640 × 480 px; give pictures of one size",
+        ),
+        (
+            ("calibrate", "seen.toml", "small.png", "--camera", "south"),
+            "camera south: frames of 320 × 240, 640 × 480 px",
+        ),
         (("calibrate", "marked.toml", "grey.png", "--camera", "c"), "no target was found: "),
         (("show", "none.toml"), "none.toml: there is no such file"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_one_line_and_changes_nothing(
     call: Any, shelf: Path, place: Path, monkeypatch: Any, arguments: tuple[str, ...], text: str
 ) -> None:

@@ -83,9 +83,13 @@ def call(capsys: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_json_gives_position_covariance_and_quality(folder: Path, call: Any) -> None:
     code, out, err = call(
-        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
-        "--annotated", folder / "seen",
-    )  # fmt: skip
+        folder / "photographs" / "p0.png",
+        "--plant",
+        folder / "plant.toml",
+        "--json",
+        "--annotated",
+        folder / "seen",
+    )
     assert code == 0, err
     (image,) = json.loads(out)["images"]
     (reading,) = image["targets"]
@@ -121,9 +125,15 @@ def test_screen_names_spots_and_reasons(folder: Path, call: Any) -> None:
 def test_sightings_of_a_folder(folder: Path, call: Any) -> None:
     table = folder / "sightings.csv"
     code, out, err = call(
-        folder / "photographs", "--plant", folder / "plant.toml", "--to-sightings", table,
-        "--log", folder / "log.csv", "--no-pictures",
-    )  # fmt: skip
+        folder / "photographs",
+        "--plant",
+        folder / "plant.toml",
+        "--to-sightings",
+        table,
+        "--log",
+        folder / "log.csv",
+        "--no-pictures",
+    )
     assert code == 0, err
     assert "3 sightings of 3 photographs" in out
     seen, kinds, left = read_sightings(table, ("H0", "H1"))
@@ -151,9 +161,18 @@ def test_sightings_name_what_is_left_out(folder: Path, call: Any) -> None:
         log.write("p4.png,H9,2026-06-21T13:00:00Z,target,1,2\n")
         log.write("p6.png,H0,2026-06-21T13:00:00Z,target,1,2\n")
     code, out, err = call(
-        photographs, "--plant", folder / "plant.toml", "--to-sightings", folder / "s.parquet",
-        "--log", folder / "log.csv", "--no-pictures", "--json", "--processes", 1,
-    )  # fmt: skip
+        photographs,
+        "--plant",
+        folder / "plant.toml",
+        "--to-sightings",
+        folder / "s.parquet",
+        "--log",
+        folder / "log.csv",
+        "--no-pictures",
+        "--json",
+        "--processes",
+        1,
+    )
     found = json.loads(out)
     assert code == 2, "a file could not be read"
     assert err.count("\n") == 1
@@ -188,9 +207,14 @@ def test_dask_changes_nothing(folder: Path, call: Any) -> None:
 def test_an_empty_frame_serves_as_background(folder: Path, call: Any) -> None:
     write_image(_photograph((0.0, 0.0), 8, beams=0).frame, folder / "empty.png")
     code, out, err = call(
-        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
-        "--empty", folder / "empty.png", "--no-pictures",
-    )  # fmt: skip
+        folder / "photographs" / "p0.png",
+        "--plant",
+        folder / "plant.toml",
+        "--json",
+        "--empty",
+        folder / "empty.png",
+        "--no-pictures",
+    )
     assert code == 0, err
     spot = json.loads(out)["images"][0]["targets"][0]["spots"][0]
     truth = np.array(json.loads((folder / "truth.json").read_text())[0])
@@ -206,16 +230,24 @@ def test_a_log_names_the_empty_frame_of_each_photograph(folder: Path, call: Any)
     both = []
     for given in (["--log", log], ["--empty", folder / "empty.png"]):
         code, out, err = call(
-            folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--json",
-            "--no-pictures", *given,
-        )  # fmt: skip
+            folder / "photographs" / "p0.png",
+            "--plant",
+            folder / "plant.toml",
+            "--json",
+            "--no-pictures",
+            *given,
+        )
         assert code == 0, err
         both.append(json.loads(out)["images"][0]["targets"][0]["spots"][0])
     assert both[0] == both[1]
     log.write_text(log.read_text().replace("empty.png", "missing.png"))
     code, _, err = call(
-        folder / "photographs" / "p0.png", "--plant", folder / "plant.toml", "--log", log,
-    )  # fmt: skip
+        folder / "photographs" / "p0.png",
+        "--plant",
+        folder / "plant.toml",
+        "--log",
+        log,
+    )
     assert code == 2
     assert "missing.png: there is no such file" in err
 
@@ -250,17 +282,27 @@ def test_a_tower_file_is_plant_enough(folder: Path, call: Any) -> None:
     tower = juelich() / "tower-measurements.json"
     image = juelich() / "images" / "target-camera" / "213508-raw.png"
     code, out, err = call(
-        image, "--plant", tower, "--json", "--no-pictures", "--heliostat", "AB12",
-        "--to-sightings", folder / "s.csv",
-    )  # fmt: skip
+        image,
+        "--plant",
+        tower,
+        "--json",
+        "--no-pictures",
+        "--heliostat",
+        "AB12",
+        "--to-sightings",
+        folder / "s.csv",
+    )
     assert code == 0, err
     assert json.loads(out)["sightings"]["count"] == 1
     seen, _, _ = read_sightings(folder / "s.csv", ("AB12",))
     # The file beside the photograph gives motors and sun.
     assert seen.counts.tolist() == [[22170.0, 11616.0]]
     azimuth, elevation = np.radians([36.9225463959062, 57.351935820685455])
-    sun = [np.cos(elevation) * np.sin(azimuth), -np.cos(elevation) * np.cos(azimuth),
-           np.sin(elevation)]  # fmt: skip
+    sun = [
+        np.cos(elevation) * np.sin(azimuth),
+        -np.cos(elevation) * np.cos(azimuth),
+        np.sin(elevation),
+    ]
     assert seen.source[0] == pytest.approx(sun, abs=1e-12)
 
 
@@ -288,9 +330,13 @@ BAD: list[tuple[str, list[str], str]] = [
 
 @pytest.mark.parametrize(("file", "options", "text"), BAD)
 def test_bad_input_is_one_line(
-    folder: Path, call: Any, monkeypatch: pytest.MonkeyPatch, file: str, options: list[str],
+    folder: Path,
+    call: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    file: str,
+    options: list[str],
     text: str,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.chdir(folder)
     (folder / "nothing").mkdir()
     (folder / "bad.csv").write_text("file,axis_1_motor_position\np0.png,1\n")
@@ -314,9 +360,16 @@ def test_plant_without_targets_is_refused(tmp_path: Path, call: Any) -> None:
 
 def test_live_folder_is_read_and_kept(folder: Path, call: Any) -> None:
     code, out, err = call(
-        folder / "photographs", "--plant", folder / "plant.toml", "--live", "--limit", 3,
-        "--keep", folder / "kept", "--json",
-    )  # fmt: skip
+        folder / "photographs",
+        "--plant",
+        folder / "plant.toml",
+        "--live",
+        "--limit",
+        3,
+        "--keep",
+        folder / "kept",
+        "--json",
+    )
     assert code == 0, err
     lines = [json.loads(line) for line in out.splitlines()]
     truth = json.loads((folder / "truth.json").read_text())
@@ -338,9 +391,16 @@ def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
     for k in range(4):
         (folder / f"burst-{k}.png").rename(folder / "burst" / f"{k}.png")
     code, out, err = call(
-        folder / "burst", "--plant", folder / "plant.toml", "--live", "--limit", 1, "--burst", 4,
+        folder / "burst",
+        "--plant",
+        folder / "plant.toml",
+        "--live",
+        "--limit",
+        1,
+        "--burst",
+        4,
         "--json",
-    )  # fmt: skip
+    )
     assert code == 0, err
     (line,) = [json.loads(text) for text in out.splitlines()]
     assert line["targets"][0]["good"]

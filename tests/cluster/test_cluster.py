@@ -148,8 +148,13 @@ def test_a_clock_that_jumps_defocuses_until_somebody_acknowledges() -> None:
         # The jumped time is not passed on while it settles.
         assert field.boards[0].node.controller.clock.second == second + 5
         await field.order("soon", "TRACK")
-        await field.until(lambda: bool(field.plant.stages("soon", "A1") or "soon" in [
-            each.identity for each in field.plant.heard if hasattr(each, "identity")]))  # fmt: skip
+        await field.until(
+            lambda: bool(
+                field.plant.stages("soon", "A1")
+                or "soon"
+                in [each.identity for each in field.plant.heard if hasattr(each, "identity")]
+            )
+        )
         assert "clock_jump" in field.plant.text("soon")
         await field.plant.send(Acknowledge("early", "clock_jump", "Ada", "operator"))
         await asyncio.sleep(1.5)

@@ -95,8 +95,11 @@ def test_a_file_that_is_wrong_ends_in_one_line(tmp_path: Path) -> None:
     config.write_text(config.read_text().replace("latitude_deg = 20.0", "latitude_deg = 120.0"))
     found = subprocess.run(
         [*COMMAND, str(config)],
-        capture_output=True, text=True, timeout=PATIENCE, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
     assert found.returncode == 2
     assert found.stderr.count("\n") == 1
     assert "site.latitude_deg: 120.0: input should be less than or equal to 90" in found.stderr

@@ -108,7 +108,7 @@ def test_what_is_wrong_in_the_file_is_named(folder: Path, old: str, new: str, te
         ("[heliostats]\n", "", "'AA1' is not known"),
         ("[heliostats]\n", "heliostats = 3\n[password]\n", "password must be a text, and"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_in_the_keys_is_named_without_the_key(
     folder: Path, old: str, new: str, text: str
 ) -> None:
@@ -247,8 +247,17 @@ def test_the_quick_reading_reads_what_the_slow_one_does() -> None:
     chance = np.random.default_rng(3)
     for _ in range(300):
         raw = [int(x) for x in chance.integers(0, 2, 9) * chance.integers(0, 2**31, 9)]
-        values = (raw[0] % 256, raw[1], raw[2] % 256, raw[3], raw[4], raw[5] % 65536,
-                  raw[6] % 256 - 128, raw[7], raw[8] % 65536)  # fmt: skip
+        values = (
+            raw[0] % 256,
+            raw[1],
+            raw[2] % 256,
+            raw[3],
+            raw[4],
+            raw[5] % 65536,
+            raw[6] % 256 - 128,
+            raw[7],
+            raw[8] % 65536,
+        )
         sender, sequence = int(chance.integers(1, 65535)), int(chance.integers(0, 5))
         data = answer("STATUS", values, sender, sequence)
         assert STATUS.read(data, sender, sequence) == values
@@ -292,8 +301,16 @@ def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
     nodes[0].steps_at = 98.0
     assert np.frombuffer(rows(nodes, 100.5), dtype=NODE)["steps_ms"].tolist() == [2500, 2**32 - 1]
     first = table[0]
-    named = ("state", "flags", "fault", "sun_age_ms", "supply_mv", "temperature_degc",
-             "armature_crc", "boots")  # fmt: skip
+    named = (
+        "state",
+        "flags",
+        "fault",
+        "sun_age_ms",
+        "supply_mv",
+        "temperature_degc",
+        "armature_crc",
+        "boots",
+    )
     assert tuple(first[list(named)].item()) == STATUS_VALUES[:3] + STATUS_VALUES[4:]
     steps = ("primary", "secondary", "primary_goal", "secondary_goal")
     assert tuple(first[list(steps)].item()) == (1, -2, 3, -4)
@@ -361,8 +378,9 @@ def test_an_oscillator_drifts_as_the_file_says(folder: Path) -> None:
     before = spoken(keeper, clock).error
     clock.advance(1000.0)
     assert (keeper.time().quality, keeper.time().error) == (
-        "holdover", pytest.approx(before + 0.2, abs=1e-6),
-    )  # fmt: skip
+        "holdover",
+        pytest.approx(before + 0.2, abs=1e-6),
+    )
 
 
 def test_with_ntp_the_kernel_is_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,8 +43,13 @@ def interrupted(clock: object, boards: list[Board]) -> Interrupted:
 async def final(field: Field, identity: str, name: str = "A1", limit: float = 15.0) -> Stage:
     """Wait for the last stage of a command."""
     ends = (Stage.DONE, Stage.REFUSED, Stage.FAILED)
-    await field.until(lambda: field.plant.stages(identity, name)[-1:] and
-                      field.plant.stages(identity, name)[-1] in ends, limit)  # fmt: skip
+    await field.until(
+        lambda: (
+            field.plant.stages(identity, name)[-1:]
+            and field.plant.stages(identity, name)[-1] in ends
+        ),
+        limit,
+    )
     return field.plant.stages(identity, name)[-1]
 
 

@@ -102,13 +102,14 @@ def test_other_sentences_do_as_well(talk) -> None:  # type: ignore[no-untyped-de
 
 @given(
     st.lists(
-        st.tuples(st.sampled_from(["quick", "late", "silent", "no fix", "rubbish"]),
-                  st.floats(0.0, 1.0)),
+        st.tuples(
+            st.sampled_from(["quick", "late", "silent", "no fix", "rubbish"]), st.floats(0.0, 1.0)
+        ),
         max_size=60,
     ),
     st.floats(-100.0, 100.0),
     st.floats(0.0, 0.45),
-)  # fmt: skip
+)
 @settings(max_examples=120, deadline=None)
 def test_the_bound_holds_whatever_comes_late_or_not_at_all(
     events: list[tuple[str, float]], ppm: float, quickest: float

@@ -42,12 +42,22 @@ def test_sentences_of_the_standard_as_receivers_send_them() -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        rmc(T, "V"), rmc(T, mode="E"), rmc(T, mode="S"), rmc(T, mode="M"), rmc(T, "V", "N"),
-        zda(T), gga(T, 0) + zda(T), gga(T, 6) + zda(T), gga(T, 8) + rmc(T), rmc(T, "V") + zda(T),
-        rmc(T) + zda(T + timedelta(seconds=3)), gga(T) + rmc(T, "V") + zda(T),
-        sentence("GPRMC,,V,,,,,,,,,,N"), sentence("GPGGA,100000.00,,,,,0,00,,,M,,M,,"),
+        rmc(T, "V"),
+        rmc(T, mode="E"),
+        rmc(T, mode="S"),
+        rmc(T, mode="M"),
+        rmc(T, "V", "N"),
+        zda(T),
+        gga(T, 0) + zda(T),
+        gga(T, 6) + zda(T),
+        gga(T, 8) + rmc(T),
+        rmc(T, "V") + zda(T),
+        rmc(T) + zda(T + timedelta(seconds=3)),
+        gga(T) + rmc(T, "V") + zda(T),
+        sentence("GPRMC,,V,,,,,,,,,,N"),
+        sentence("GPGGA,100000.00,,,,,0,00,,,M,,M,,"),
     ],
-)  # fmt: skip
+)
 def test_without_a_fix_there_is_no_time(data: bytes) -> None:
     assert not any(report.fix for report in read(data)[-1:])
 

@@ -91,8 +91,10 @@ class Installation:
                     *part,
                 ],
                 cwd=TESTS,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            )  # fmt: skip
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
             stack.callback(_end, process)
             self.boards.append(process)
         return master
@@ -119,8 +121,9 @@ class Installation:
         log = stack.enter_context((self.folder / f"{name}.log").open("w"))
         process = subprocess.Popen(
             [*CLUSTER, str(self.folder / f"{name}.toml"), "--every", "5"],
-            stdout=log, stderr=subprocess.STDOUT,
-        )  # fmt: skip
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
         stack.callback(_end, process)
 
     # -- running ---------------------------------------------------------------------------
@@ -131,9 +134,13 @@ class Installation:
         server = TcpServer("127.0.0.1", 0, self.keys, self.clock)
         self.audit = JsonLines(self.folder / "audit.jsonl", self.clock.utc())
         self.plant = PlantController(
-            self._design(), server.links, self.clock, self.audit, settings=PlantSettings(),
+            self._design(),
+            server.links,
+            self.clock,
+            self.audit,
+            settings=PlantSettings(),
             wanted=Wanted(dict(zip(self.field.names, self.field.items, strict=True))),
-        )  # fmt: skip
+        )
         with contextlib.ExitStack() as stack:
             async with running(server), running(self.plant):
                 await server.listening()
@@ -158,16 +165,19 @@ class Installation:
         homes = tuple(f"K{i // self.members + 1}" for i in range(count))
         corners = ((3.0, 0.0, 43.0), (-3.0, 0.0, 43.0), (-3.0, 0.0, 37.0), (3.0, 0.0, 37.0))
         mirrors = Heliostats(
-            self.field.names, self.field.perfect, np.full(count, 3.0), np.full(count, 2.0),
+            self.field.names,
+            self.field.perfect,
+            np.full(count, 3.0),
+            np.full(count, 2.0),
             cluster=homes,
-        )  # fmt: skip
+        )
         receiver = Receiver(
             "receiver", "planar", np.array(outfit.RECEIVER), np.array([0.0, 1.0, 0.0]), 4.0, 4.0
         )
         white = Target("white", np.array(corners), np.array([0.0, 0.0, 40.0]))
         return Plant(
             "prototype", self.site, {"all": mirrors}, targets=(white,), receivers=(receiver,)
-        )  # fmt: skip
+        )
 
     async def _stay(self) -> None:
         while True:

@@ -114,8 +114,9 @@ def test_what_a_session_needs(console: LiveConsole, signed_in: httpx.Client) -> 
 def test_the_cookie_is_out_of_reach(console: LiveConsole) -> None:
     answer = httpx.post(
         f"{console.address}api/v1/session",
-        json={"name": "viewer", "password": PASSWORD}, trust_env=False,
-    )  # fmt: skip
+        json={"name": "viewer", "password": PASSWORD},
+        trust_env=False,
+    )
     (cookie,) = answer.headers.get_list("set-cookie")
     assert "HttpOnly" in cookie
     assert "SameSite=strict" in cookie
@@ -185,9 +186,12 @@ def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask) -> No
 
 
 def test_no_secret_is_in_logs_or_files(
-    console: LiveConsole, ask: Ask, tokens: dict[str, str], caplog: pytest.LogCaptureFixture,
+    console: LiveConsole,
+    ask: Ask,
+    tokens: dict[str, str],
+    caplog: pytest.LogCaptureFixture,
     capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     """Log-ins, good and bad, tokens, new passwords: what is logged and kept holds none of it."""
     caplog.set_level(logging.DEBUG)
     given = {"name": "desk-5", "role": "operator", "password": "a very own password"}
@@ -212,8 +216,16 @@ def test_no_secret_is_in_logs_or_files(
     told = "\n".join(ours) + "".join(capfd.readouterr())
     files = [file.read_bytes() for file in console.folder.iterdir() if file.is_file()]
     assert any(b"desk-5" in data for data in files)
-    secrets = (given["password"], wrong["password"], session, csrf, token, made, PASSWORD,
-               *tokens.values())  # fmt: skip
+    secrets = (
+        given["password"],
+        wrong["password"],
+        session,
+        csrf,
+        token,
+        made,
+        PASSWORD,
+        *tokens.values(),
+    )
     for secret in secrets:
         assert secret not in told
         assert not any(secret.encode() in data for data in files)
@@ -436,11 +448,29 @@ def test_tls_by_file(console: LiveConsole, tmp_path: Path) -> None:
     """A certificate and a key in files, really served."""
     certificate, key = tmp_path / "console.pem", tmp_path / "console.key"
     subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
-         "-nodes", "-days", "2", "-subj", "/CN=localhost", "-addext",
-         "subjectAltName=IP:127.0.0.1,DNS:localhost", "-keyout", key, "-out", certificate],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+            "-nodes",
+            "-days",
+            "2",
+            "-subj",
+            "/CN=localhost",
+            "-addext",
+            "subjectAltName=IP:127.0.0.1,DNS:localhost",
+            "-keyout",
+            key,
+            "-out",
+            certificate,
+        ],
+        check=True,
+        capture_output=True,
+    )
     settings = ConsoleSettings(port=0, page=False, certificate=certificate, key=key)
 
     async def begin() -> tuple[ConsoleServer, asyncio.Task[None], str]:

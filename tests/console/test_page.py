@@ -184,8 +184,14 @@ def test_a_tablet_has_all_of_it(field: LiveConsole, enter: Callable[[str], Any])
     page.set_viewport_size({"width": 1024, "height": 768})
     page.wait_for_timeout(300)
     assert page.evaluate("document.documentElement.scrollWidth") <= 1024
-    for what in ("#emergency", ".hx-map-field", ".hx-side", ".hx-orders >> text=Stow",
-                 ".hx-orders >> text=Zero", ".hx-authority button"):  # fmt: skip
+    for what in (
+        "#emergency",
+        ".hx-map-field",
+        ".hx-side",
+        ".hx-orders >> text=Stow",
+        ".hx-orders >> text=Zero",
+        ".hx-authority button",
+    ):
         box = page.locator(what).first.bounding_box()
         assert 0 <= box["x"] <= 1024 - box["width"], what
         assert 0 <= box["y"] <= 768 - box["height"], what

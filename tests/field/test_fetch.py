@@ -106,8 +106,9 @@ def test_several_heliostats_come_once_each(database: Database, tmp_path: Path) -
         ["AA39", "AB40", "AA39"], tmp_path, base_url=database.base + "/", settings=FAST
     )
     assert Counter(path.relative_to(tmp_path).parts[0] for path in fetched.files) == {
-        "AA39": 3, "AB40": 2,
-    }  # fmt: skip
+        "AA39": 3,
+        "AB40": 2,
+    }
 
 
 def test_the_tower_comes(database: Database, tmp_path: Path) -> None:
@@ -268,8 +269,9 @@ def test_giving_up_keeps_what_is_there_for_the_next_run(database: Database, tmp_
     assert re.match(
         r"heliostat AA39: http://127\.0\.0\.1:\d+/WRI1030197/AA39/Properties/AA39-heliostat-properties"
         r"\.json: the server answers 503 Service Unavailable; gave up after 4 attempts, run it "
-        r"again later, what is there is kept$", text,
-    )  # fmt: skip
+        r"again later, what is there is kept$",
+        text,
+    )
     assert not (tmp_path / BIG).exists()
     assert (tmp_path / (BIG + ".part")).stat().st_size == 90_000
     database.asked.clear()

@@ -136,9 +136,10 @@ def test_nested_nodes_add_up() -> None:
 
 def test_rotations_of_nested_nodes_multiply(tmp_path: Path) -> None:
     turned = edited(
-        tmp_path, 'name="Field" translation="0, 50, 0"',
+        tmp_path,
+        'name="Field" translation="0, 50, 0"',
         'name="Field" translation="0, 50, 0" rotation="0, 0, 90"',
-    )  # fmt: skip
+    )
     group = heliok.to_plant(heliok.read(turned), SITE).groups["heliostats"]
     np.testing.assert_allclose(group.position, [[0, 80, 0], [0, 20, 0]], atol=1e-12)
 
@@ -211,8 +212,9 @@ def scaled(text: str, length: float, angle: float) -> str:
     text = re.sub(r'(translation|point|focus|[xy]Width)="([^"]*)"', times(length), text)
     return re.sub(
         r'(rotation|rotationAngles|longitude|latitude|azimuth|elevation)="([^"]*)"',
-        times(angle), text,
-    )  # fmt: skip
+        times(angle),
+        text,
+    )
 
 
 @pytest.mark.parametrize(("length", "per_metre"), [("mm", 1e3), ("cm", 1e2), ("km", 1e-3)])

@@ -82,10 +82,14 @@ def test_clusters_are_neighbours(whole: Plant) -> None:
 
 
 @given(
-    kind=st.sampled_from(sorted(PATTERNS)), count=st.integers(1, 2500),
-    width=st.floats(0.8, 12.0), shape=st.floats(0.5, 1.5), clearance=st.floats(0.0, 1.0),
-    tower=st.floats(20.0, 200.0), north=st.booleans(),
-)  # fmt: skip
+    kind=st.sampled_from(sorted(PATTERNS)),
+    count=st.integers(1, 2500),
+    width=st.floats(0.8, 12.0),
+    shape=st.floats(0.5, 1.5),
+    clearance=st.floats(0.0, 1.0),
+    tower=st.floats(20.0, 200.0),
+    north=st.booleans(),
+)
 @settings(max_examples=40)
 def test_no_two_mirrors_can_touch(
     kind: str, count: int, width: float, shape: float, clearance: float, tower: float, north: bool
@@ -250,8 +254,21 @@ def _call(*arguments: str) -> Any:
 
 def test_the_command_writes_a_plant_and_its_picture(tmp_path: Path) -> None:
     plant, picture = tmp_path / "p.toml", tmp_path / "p.png"
-    done = _call("radial", "--out", str(plant), "--heliostats", "300", "--picture", str(picture),
-                 "--latitude", "37.4", "--longitude", "-6", "--name", "Sevilla")  # fmt: skip
+    done = _call(
+        "radial",
+        "--out",
+        str(plant),
+        "--heliostats",
+        "300",
+        "--picture",
+        str(picture),
+        "--latitude",
+        "37.4",
+        "--longitude",
+        "-6",
+        "--name",
+        "Sevilla",
+    )
     assert done.exit_code == 0, done.output
     assert "300 heliostats of 5 m² in 10 clusters, receiver at 32 m" in done.output
     read = read_plant(plant)
@@ -265,8 +282,20 @@ def test_the_command_writes_a_plant_and_its_picture(tmp_path: Path) -> None:
 def test_the_command_tells_json(tmp_path: Path) -> None:
     import json
 
-    done = _call("rows", "--out", str(tmp_path / "p.toml"), "--heliostats", "64", "--json",
-                 "--width", "3", "--height", "2", "--table", "parquet")  # fmt: skip
+    done = _call(
+        "rows",
+        "--out",
+        str(tmp_path / "p.toml"),
+        "--heliostats",
+        "64",
+        "--json",
+        "--width",
+        "3",
+        "--height",
+        "2",
+        "--table",
+        "parquet",
+    )
     told = json.loads(done.output)
     assert told["heliostats"] == 64
     assert told["clusters"] == 2

@@ -83,9 +83,16 @@ PUBLISHED = {
 def test_published_places_of_facets_are_met() -> None:
     one = np.ones(1, dtype=np.int64)
     table = Field(
-        ("5W1",), np.array([[-4.84, 57.93, 3.89]]), 3 * one, one, 3 * one,
-        np.array([4.02]), np.array([0.1778]), np.array([1.2192]), np.array([1.2192]),
-    )  # fmt: skip
+        ("5W1",),
+        np.array([[-4.84, 57.93, 3.89]]),
+        3 * one,
+        one,
+        3 * one,
+        np.array([4.02]),
+        np.array([0.1778]),
+        np.array([1.2192]),
+        np.array([1.2192]),
+    )
     centroids = Centroids(("1", "13", "25"), np.array(list(PUBLISHED)))
     group = opencsp.to_plant(table, SITE, centroids).groups["heliostats"]
     pose = group.mechanism.pose([[AZIMUTH, ELEVATION]])
@@ -146,10 +153,17 @@ def fields(draw: st.DrawFn) -> Field:
         return draw(nps.arrays(np.float64, count, elements=elements))
 
     return Field(
-        tuple(names), draw(nps.arrays(np.float64, (count, 3), elements=number)),
-        rows * columns, rows, columns, column(number), column(number), column(size), column(size),
+        tuple(names),
+        draw(nps.arrays(np.float64, (count, 3), elements=number)),
+        rows * columns,
+        rows,
+        columns,
+        column(number),
+        column(number),
+        column(size),
+        column(size),
         {"Note": tuple(draw(st.lists(cell, min_size=count, max_size=count)))},
-    )  # fmt: skip
+    )
 
 
 @settings(max_examples=60, deadline=None)
@@ -160,8 +174,16 @@ def test_any_field_survives(tmp_path_factory: pytest.TempPathFactory, table: Fie
     again = opencsp.read_field(path)
     assert again.names == table.names
     assert again.extra == table.extra
-    for name in ("location", "facets", "rows", "columns", "pivot_height", "pivot_offset",
-                 "facet_width", "facet_height"):  # fmt: skip
+    for name in (
+        "location",
+        "facets",
+        "rows",
+        "columns",
+        "pivot_height",
+        "pivot_offset",
+        "facet_width",
+        "facet_height",
+    ):
         np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
 
 
@@ -182,9 +204,11 @@ def test_a_plant_survives(tmp_path: Path) -> None:
 
 def test_a_mirror_without_facets_is_one() -> None:
     group = Heliostats(
-        ("h",), kinds.azimuth_elevation([[1.0, 2, 0.5]], pivot_height=2.0), np.full(1, 3.0),
+        ("h",),
+        kinds.azimuth_elevation([[1.0, 2, 0.5]], pivot_height=2.0),
+        np.full(1, 3.0),
         np.full(1, 2.0),
-    )  # fmt: skip
+    )
     table, centroids = opencsp.from_plant(Plant("p", SITE, {"g": group}))
     assert (table.facets[0], table.rows[0], table.columns[0]) == (1, 1, 1)
     assert (table.facet_width[0], table.facet_height[0]) == (3.0, 2.0)
@@ -196,10 +220,18 @@ def test_facets_in_no_grid_count_as_a_row() -> None:
     scattered = Centroids(("a", "b", "c"), np.array([[0.0, 1, 0], [-1, -1, 0], [1.2, -1, 0]]))
     one = np.ones(1, dtype=np.int64)
     table = replace(
-        opencsp.read_field(FIELD), names=("h",), location=np.zeros((1, 3)), facets=3 * one,
-        rows=one, columns=3 * one, pivot_height=np.ones(1), pivot_offset=np.zeros(1),
-        facet_width=np.ones(1), facet_height=np.ones(1), extra={},
-    )  # fmt: skip
+        opencsp.read_field(FIELD),
+        names=("h",),
+        location=np.zeros((1, 3)),
+        facets=3 * one,
+        rows=one,
+        columns=3 * one,
+        pivot_height=np.ones(1),
+        pivot_offset=np.zeros(1),
+        facet_width=np.ones(1),
+        facet_height=np.ones(1),
+        extra={},
+    )
     again, _ = opencsp.from_plant(opencsp.to_plant(table, SITE, scattered))
     assert (again.rows[0], again.columns[0]) == (1, 3)
 

@@ -68,10 +68,14 @@ def test_every_kind_survives(table: str, tmp_path: Path) -> None:
         field = imperfect(_spread(one, 3), seed=1)
         rng = np.random.default_rng(2)
         groups[kind] = Heliostats(
-            tuple(f"{kind}-{i}" for i in range(3)), field, np.full(3, 1.7), np.full(3, 1.1),
-            parameters={"tilt_north": rng.normal(0, 1e-3, 3)} if "tilt_north" in field.parameters
+            tuple(f"{kind}-{i}" for i in range(3)),
+            field,
+            np.full(3, 1.7),
+            np.full(3, 1.1),
+            parameters={"tilt_north": rng.normal(0, 1e-3, 3)}
+            if "tilt_north" in field.parameters
             else {},
-        )  # fmt: skip
+        )
     plant = Plant("mixed", Site(37.1, -2.3, 500.0), groups)
     plant_file.write_plant(plant, tmp_path / "plant.toml", table)  # type: ignore[arg-type]
     _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
@@ -84,17 +88,22 @@ def _spread(one: Mechanism, count: int) -> Mechanism:
 
 @given(
     st.lists(st.tuples(*[st.floats(-900, 900)] * 3), min_size=1, max_size=5),
-    st.floats(-89, 89), st.floats(-0.2, 0.2), st.floats(-0.05, 0.05),
-)  # fmt: skip
+    st.floats(-89, 89),
+    st.floats(-0.2, 0.2),
+    st.floats(-0.05, 0.05),
+)
 def test_any_field_survives(tmp_path_factory, places, latitude, tilt, offset) -> None:  # type: ignore[no-untyped-def]
     folder = tmp_path_factory.mktemp("plant")
     mechanism = kinds.azimuth_elevation(np.array(places), pivot_offset=offset)
     mechanism = mechanism.with_parameters({"tilt_east": tilt / 7})
     names = tuple(f"H{i}" for i in range(len(places)))
     heliostats = Heliostats(
-        names, mechanism, np.full(len(names), 2.0), np.full(len(names), 1.0),
+        names,
+        mechanism,
+        np.full(len(names), 2.0),
+        np.full(len(names), 1.0),
         parameters={"canting": np.full(len(names), tilt / 3)},
-    )  # fmt: skip
+    )
     plant = Plant("any", Site(latitude, 10.0, 12.5), {"g": heliostats})
     plant_file.write_plant(plant, folder / "p.toml")
     _same(plant, plant_file.read_plant(folder / "p.toml"))
@@ -104,8 +113,9 @@ def test_prototype_and_juelich_survive(tmp_path: Path) -> None:
     for plant in (prototype(), paint.read_plant(juelich())):
         plant_file.write_plant(plant, tmp_path / "plant.toml")
         _same(plant, plant_file.read_plant(tmp_path / "plant.toml"))
-        assert not [f for f in plant_file.check_plant(tmp_path / "plant.toml")
-                    if f.severity == "error"]  # fmt: skip
+        assert not [
+            f for f in plant_file.check_plant(tmp_path / "plant.toml") if f.severity == "error"
+        ]
 
 
 KEEP_OUT = """
@@ -289,8 +299,16 @@ CORNERS = prototype().targets[0].corners
         (lambda: Heliostats(("A", "A"), ONE, np.ones(2), np.ones(2)), "the name occurs twice"),
         (lambda: Heliostats(("A", ""), ONE, np.ones(2), np.ones(2)), "an empty name"),
         (lambda: Heliostats(("A", "B"), ONE, np.zeros(2), np.ones(2)), "heliostat A: width 0.0"),
-        (lambda: Heliostats(("A", "B"), ONE, np.ones(2), np.ones(2),
-                            parameters={"canting": np.array([0, np.nan])}), "B: parameter canting"),
+        (
+            lambda: Heliostats(
+                ("A", "B"),
+                ONE,
+                np.ones(2),
+                np.ones(2),
+                parameters={"canting": np.array([0, np.nan])},
+            ),
+            "B: parameter canting",
+        ),
         (lambda: Target("t", CORNERS[:3], CORNERS[0]), "must have shapes"),
         (lambda: Target("t", CORNERS * [1, 0, 0], CORNERS[0]), "span no area"),
         (lambda: Receiver("r", "flat", CORNERS[0], CORNERS[1], 1.0, 1.0), "kind 'flat'; known"),
@@ -298,7 +316,7 @@ CORNERS = prototype().targets[0].corners
         (lambda: prototype().heliostat("P9Z"), "there is no heliostat 'P9Z'"),
         (lambda: prototype().target("tower"), "there is no target 'tower'"),
     ],
-)  # fmt: skip
+)
 def test_guards(make, text: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(InputError, match=text):
         make()

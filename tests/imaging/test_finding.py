@@ -82,16 +82,28 @@ def off(found: FoundTarget, camera: Camera, part: float = 1.0) -> float:
 
 def with_marks(kind: str, count: int, size: float, code: str = "4X4_50:{}") -> Target:
     half = 3.4
-    places = [(-half, half), (half, half), (half, -half), (-half, -half),
-              (0, half), (half, 0), (0, -half), (-half, 0)]  # fmt: skip
+    places = [
+        (-half, half),
+        (half, half),
+        (half, -half),
+        (-half, -half),
+        (0, half),
+        (half, 0),
+        (0, -half),
+        (-half, 0),
+    ]
     marks = tuple(
         Mark(
-            f"m{k}", kind, TARGET.point(np.array(places[k], dtype=float)), size,
-            0.2 * size if kind == "corner" else 0.0, -0.5 * np.pi * k if kind == "corner" else 0.0,
+            f"m{k}",
+            kind,
+            TARGET.point(np.array(places[k], dtype=float)),
+            size,
+            0.2 * size if kind == "corner" else 0.0,
+            -0.5 * np.pi * k if kind == "corner" else 0.0,
             code.format(k) if kind == "tag" else "",
         )
         for k in range(count)
-    )  # fmt: skip
+    )
     return replace(TARGET, marks=marks)
 
 
@@ -262,11 +274,13 @@ def test_targets_without_enough_marks_are_not_searched() -> None:
 @pytest.mark.parametrize(
     "pose",
     [
-        {"roll": 0.7}, {"roll": -0.5}, {"side": 1.047, "below": 0.1},
+        {"roll": 0.7},
+        {"roll": -0.5},
+        {"side": 1.047, "below": 0.1},
         {"side": -0.8, "below": 0.6, "roll": 0.4},
     ],
     ids=["rolled 40°", "rolled back 29°", "60° to the side", "below and rolled"],
-)  # fmt: skip
+)
 def test_any_side_and_roll(pose: dict[str, float]) -> None:
     camera = example_camera(TARGET, size=SIZE, fill=0.62, **pose)  # type: ignore[arg-type]
     rendered = render(scene(camera=camera), 1)
@@ -311,8 +325,10 @@ def test_a_camera_or_an_earlier_view_need_no_search(monkeypatch: pytest.MonkeyPa
     assert off(only(frame, TARGET, CAMERA), CAMERA) < 3e-3
     np.testing.assert_allclose(
         [m.pixel for m in only(shifted, TARGET, None, view).marks],
-        [m.pixel + [-7, 9] for m in only(frame, TARGET, CAMERA).marks], rtol=0, atol=0.05,
-    )  # fmt: skip
+        [m.pixel + [-7, 9] for m in only(frame, TARGET, CAMERA).marks],
+        rtol=0,
+        atol=0.05,
+    )
 
 
 def test_a_camera_that_moved_is_found_again() -> None:
@@ -355,10 +371,13 @@ def clutter(seed: int) -> Image:
         cv2.line(image, (0, 31 * k), (width, 31 * k), 50.0, 4)
     for _ in range(40 if kind == 4 else 0):
         mark = Mark(
-            "x", str(rng.choice(["corner", "tee", "square", "disc"])), np.zeros(3),
-            float(rng.uniform(14, 34)), 4.0,
+            "x",
+            str(rng.choice(["corner", "tee", "square", "disc"])),
+            np.zeros(3),
+            float(rng.uniform(14, 34)),
+            4.0,
             float(rng.choice(4) * 0.5 * np.pi + rng.normal(0, 0.1)),
-        )  # fmt: skip
+        )
         shapes = _shapes(mark, rng.uniform(20.0, [width - 20.0, height - 20.0]))
         cv2.fillPoly(image, shapes, float(rng.uniform(5, 70)))
     image = cv2.GaussianBlur(image, (0, 0), 0.8) + rng.normal(0.0, 3.0, image.shape)
@@ -388,11 +407,13 @@ def test_other_targets_are_not_taken_for_it(shape: tuple[float, float], size: fl
     wanted = with_marks("corner", 4, 0.6)
     marks = tuple(
         replace(
-            m, point=TARGET.point(TARGET.plane_coordinates(m.point) * shape), size=size,
+            m,
+            point=TARGET.point(TARGET.plane_coordinates(m.point) * shape),
+            size=size,
             stroke=0.2 * size,
         )
         for m in wanted.marks
-    )  # fmt: skip
+    )
     other = replace(wanted, marks=marks)
     frame = render(scene(other), 1).frame
     assert only(frame, other).found
@@ -432,9 +453,10 @@ def test_views_are_as_certain_as_they_say() -> None:
         lit = scene(
             shadow=Shadow((*rng.uniform(-4, 4, 2),), rng.uniform(0, 6.3), left=0.4),
             beams=(Thrown("target", gaussian_beam(rng.uniform(-4, 4, 2), 0.8, power=3e3)),)
-            if seed % 2 else (),
+            if seed % 2
+            else (),
             lens=Lens(veil=rng.uniform(0.0, 0.3)),
-        )  # fmt: skip
+        )
         frame = render(lit, seed).frame
         for _ in range(2):
             marks = tuple(

@@ -383,8 +383,10 @@ def test_any_damage_is_refused_or_read_but_never_worse(
 
 def test_exif_time_with_its_offset(tmp_path: Path) -> None:
     more: dict[str, tuple[int, list[Any]]] = {
-        "t9011": (2, [b"+02:00\0"]), "t829a": (5, [1, 250]), "t8827": (3, [400]),
-    }  # fmt: skip
+        "t9011": (2, [b"+02:00\0"]),
+        "t829a": (5, [1, 250]),
+        "t8827": (3, [400]),
+    }
     path = tmp_path / "20200101_000000Z.jpg"
     for order in "<>":
         path.write_bytes(_with_exif(JPEG, _exif(order, "2023:05:13 15:53:57", **more)))
@@ -495,8 +497,12 @@ def test_pixels_are_written_in_each_format(tmp_path: Path) -> None:
     ]
     assert off[0] < 2.0 < off[1]
     assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "a.TIFF", "a.png", "a.tif", "good.jpg", "poor.jpg",
-    ]  # fmt: skip
+        "a.TIFF",
+        "a.png",
+        "a.tif",
+        "good.jpg",
+        "poor.jpg",
+    ]
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:

@@ -160,9 +160,14 @@ def test_what_stays_broken_is_given_up_after_a_while(tmp_path: Path) -> None:
     for skip in (None, False):
         script = _Script(*[_nothing] * 12)
         source = FolderSource(
-            tmp_path, watch=True, poll=1.0, patience=8.0, stop=script.stop, wait=script,
+            tmp_path,
+            watch=True,
+            poll=1.0,
+            patience=8.0,
+            stop=script.stop,
+            wait=script,
             skip_broken=skip,
-        )  # fmt: skip
+        )
         if skip is None:
             assert list(source) == []
             assert len(source.skipped) == 1
@@ -294,9 +299,13 @@ def test_a_stream_gives_its_newest_frame_with_its_time() -> None:
     camera = _Camera()
     with _server(camera) as port:
         source = StreamSource(
-            f"http://user:secret@127.0.0.1:{port}/video", latency=0.25, latency_deviation=0.05,
-            limit=3, clock=lambda: START, **QUICK,
-        )  # fmt: skip
+            f"http://user:secret@127.0.0.1:{port}/video",
+            latency=0.25,
+            latency_deviation=0.05,
+            limit=3,
+            clock=lambda: START,
+            **QUICK,
+        )
         with source:
             frames = []
             for frame in source:
@@ -392,8 +401,10 @@ for source in (
 """
     ran = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "bad.avi")],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     assert ran.stderr == ""
     assert len(ran.stdout.splitlines()) == 4
 
@@ -653,14 +664,22 @@ def test_a_frame_is_kept_with_its_result(tmp_path: Path) -> None:
     assert (found.time, found.time_deviation, found.gain) == (when, 0.05, 2.0)
     record = json.loads(image.with_suffix(".json").read_text("utf-8"))
     assert record["result"] == {
-        "place_m": [1.5, None], "seen": True, "when": "2023-05-13T17:53:57.250000+02:00", "n": 3,
-        "file": "a/b", "deep": {"list": [1, None, None, "µ"]},
-    }  # fmt: skip
+        "place_m": [1.5, None],
+        "seen": True,
+        "when": "2023-05-13T17:53:57.250000+02:00",
+        "n": 3,
+        "file": "a/b",
+        "deep": {"list": [1, None, None, "µ"]},
+    }
     assert record["frame"] == {
-        "source": "rtsp://10.0.0.5/target one", "time": "2023-05-13T17:53:57.250000+02:00",
-        "time_deviation_s": 0.05, "exposure_s": None, "gain": 2.0, "count": 1,
+        "source": "rtsp://10.0.0.5/target one",
+        "time": "2023-05-13T17:53:57.250000+02:00",
+        "time_deviation_s": 0.05,
+        "exposure_s": None,
+        "gain": 2.0,
+        "count": 1,
         "size_px": [64, 48],
-    }  # fmt: skip
+    }
 
 
 def test_nothing_kept_is_ever_overwritten(tmp_path: Path) -> None:
@@ -668,8 +687,10 @@ def test_nothing_kept_is_ever_overwritten(tmp_path: Path) -> None:
     (tmp_path / "undated_cam-2.json").write_text("of somebody else")
     kept = [keep(frame, {"n": n}, tmp_path) for n, frame in enumerate(frames)]
     assert [path.name for path in kept] == [
-        "undated_cam.png", "undated_cam-3.png", "undated_cam-4.png",
-    ]  # fmt: skip
+        "undated_cam.png",
+        "undated_cam-3.png",
+        "undated_cam-4.png",
+    ]
     for n, path in enumerate(kept):
         assert _level(read_image(path)) == n
         assert json.loads(path.with_suffix(".json").read_text())["result"] == {"n": n}

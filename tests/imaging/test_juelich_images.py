@@ -22,8 +22,14 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 BOTH = ("137608-raw", "213508-raw", "215701-raw", "216331-raw", "99927-raw", "stj_image")
 ONE = ("203718-raw", "mft_image")
 #: How many other spots each frame shows.
-OTHERS = {"137608-raw.png": 1, "203718-raw.png": 0, "213508-raw.png": 1, "215701-raw.png": 1,
-          "216331-raw.png": 3, "99927-raw.png": 2}  # fmt: skip
+OTHERS = {
+    "137608-raw.png": 1,
+    "203718-raw.png": 0,
+    "213508-raw.png": 1,
+    "215701-raw.png": 1,
+    "216331-raw.png": 3,
+    "99927-raw.png": 2,
+}
 
 
 def _script() -> ModuleType:
@@ -76,9 +82,12 @@ def test_the_multi_focus_tower_is_found(name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "target"),
-    [("stj_image", "solar_tower_juelich_upper"), ("stj_image", "solar_tower_juelich_lower"),
-     ("mft_image", "multi_focus_tower")],
-)  # fmt: skip
+    [
+        ("stj_image", "solar_tower_juelich_upper"),
+        ("stj_image", "solar_tower_juelich_lower"),
+        ("mft_image", "multi_focus_tower"),
+    ],
+)
 def test_frames_without_references_give_a_spot(name: str, target: str) -> None:
     reading = _read(name).reading(target)
     assert reading.good, reading.reasons
@@ -146,9 +155,10 @@ def test_annotated_pictures_show_what_was_seen(name: str) -> None:
     height, width = photograph.frame.pixels.shape[:2]
     factor = LONGEST / max(height, width)
     plain = cv2.resize(
-        photograph.frame.pixels, (round(width * factor), round(height * factor)),
+        photograph.frame.pixels,
+        (round(width * factor), round(height * factor)),
         interpolation=cv2.INTER_AREA,
-    )  # fmt: skip
+    )
     changed = np.abs(drawn[: plain.shape[0]].astype(int) - plain.astype(int)).max(axis=-1) > 20
     assert drawn.shape[0] > plain.shape[0], "nothing is said under the picture"
     for reading in photograph.readings:

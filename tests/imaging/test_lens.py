@@ -124,8 +124,9 @@ def test_twelve_bits_in_sixteen_are_read(photographs: list[npt.NDArray[np.uint8]
 
 def seen_corners(seed: int, noise: float, distortion: FloatArray = DISTORTION) -> list[FloatArray]:
     rng = np.random.default_rng(seed)
-    return [c + rng.normal(0.0, noise, c.shape)
-            for c in (corners(*held(*p), distortion) for p in HELD)]  # fmt: skip
+    return [
+        c + rng.normal(0.0, noise, c.shape) for c in (corners(*held(*p), distortion) for p in HELD)
+    ]
 
 
 def names(count: int) -> list[str]:
@@ -210,8 +211,10 @@ def test_three_boards_at_one_tilt_are_one() -> None:
 
 def test_a_lens_says_what_is_weak_about_it() -> None:
     rng = np.random.default_rng(4)
-    views = [corners(*held(tilt, (0.0, 0.0, 1.2))) + rng.normal(0.0, 0.2, (54, 2))
-             for tilt in ((14, 0, 0), (0, 15, 0), (-12, -10, 0), (2, 2, 0))]  # fmt: skip
+    views = [
+        corners(*held(tilt, (0.0, 0.0, 1.2))) + rng.normal(0.0, 0.2, (54, 2))
+        for tilt in ((14, 0, 0), (0, 15, 0), (-12, -10, 0), (2, 2, 0))
+    ]
     lens = calibrate_corners(SIZE, views, PATTERN, SQUARE, names(4))
     text = " | ".join(lens.notes)
     assert re.search(r"focal length is known to \d\.\d %", text)
@@ -229,14 +232,22 @@ GREY = np.full((60, 80), 128, np.uint8)
         ([GREY] * 3, (2, 6), 0.03, r"2 × 6 inner corners; give 3 to 200 each"),
         ([GREY] * 3, PATTERN, 0.0, r"squares of 0.0 m; give their side in metres, above 0"),
         ([GREY] * 3, PATTERN, float("nan"), r"squares of nan m"),
-        ([GREY, GREY, GREY[:, 1:]], PATTERN, 0.03,
-         r"^picture 3: 79 × 60 px, but picture 1 has 80 × 60 px; give pictures of one camera"),
-        ([GREY] * 3, PATTERN, 0.03,
-         r"^the pattern of 9 × 6 inner corners is found in none of 3 pictures; three or more"),
+        (
+            [GREY, GREY, GREY[:, 1:]],
+            PATTERN,
+            0.03,
+            r"^picture 3: 79 × 60 px, but picture 1 has 80 × 60 px; give pictures of one camera",
+        ),
+        (
+            [GREY] * 3,
+            PATTERN,
+            0.03,
+            r"^the pattern of 9 × 6 inner corners is found in none of 3 pictures; three or more",
+        ),
         ([GREY / 2.0] * 3, PATTERN, 0.03, r"of float64; give grey \(H, W\), uint8 or uint16"),
         ([np.dstack([GREY] * 3)] * 3, PATTERN, 0.03, r"picture \(60, 80, 3\) of uint8"),
     ],
-)  # fmt: skip
+)
 def test_boards_that_cannot_be_used(
     pictures: list[FloatArray], pattern: tuple[int, int], square: float, text: str
 ) -> None:
@@ -259,8 +270,9 @@ def camera(
 ) -> Camera:
     matrix = np.array([[focal, 0.0, 799.5 + center[0]], [0.0, focal, 599.5 + center[1]], [0, 0, 1]])
     distortion = np.array([k1, 0.0, 0.0, 0.0, 0.0])
-    return Camera("tower", WIDE, matrix, distortion, np.array(position),
-                  look_at(position, (0.0, 0.0, 40.0)))  # fmt: skip
+    return Camera(
+        "tower", WIDE, matrix, distortion, np.array(position), look_at(position, (0.0, 0.0, 40.0))
+    )
 
 
 def errors(true: Camera, fit: CameraFit) -> FloatArray:
@@ -269,9 +281,11 @@ def errors(true: Camera, fit: CameraFit) -> FloatArray:
     turn = cv2.Rodrigues(np.asarray(found.R_camera_enu) @ np.asarray(true.R_camera_enu).T)[0]
     parts = [turn.ravel(), np.asarray(found.position) - true.position]
     if len(fit.names) > 6:
-        parts += [[np.log(found.matrix[0, 0] / true.matrix[0, 0])],
-                  found.matrix[:2, 2] - true.matrix[:2, 2],
-                  [found.distortion[0] - true.distortion[0]]]  # fmt: skip
+        parts += [
+            [np.log(found.matrix[0, 0] / true.matrix[0, 0])],
+            found.matrix[:2, 2] - true.matrix[:2, 2],
+            [found.distortion[0] - true.distortion[0]],
+        ]
     return np.concatenate(parts)
 
 

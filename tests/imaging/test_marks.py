@@ -33,9 +33,16 @@ def area(polygon: FloatArray) -> float:
 
 
 def drawn(
-    mark: Mark, pixel: FloatArray, scale: FloatArray = SCALE, *, blur: float = 0.7,
-    paint: float = 180.0, print_: float = 25.0, noise: float = 0.0, size: int = 144,
-) -> FloatArray:  # fmt: skip
+    mark: Mark,
+    pixel: FloatArray,
+    scale: FloatArray = SCALE,
+    *,
+    blur: float = 0.7,
+    paint: float = 180.0,
+    print_: float = 25.0,
+    noise: float = 0.0,
+    size: int = 144,
+) -> FloatArray:
     """A mark on paint, by counting 16 × 16 places in each pixel, (144, 144)."""
     fine = 16
     raster = np.zeros((size * fine, size * fine), dtype=np.uint8)
@@ -203,9 +210,11 @@ def test_what_is_not_there_is_not_explained() -> None:
         for kind in ("corner", "tee", "tag", "apriltag"):
             refined = refine(grey, MARKS[kind], place, SCALE, 0.4)
             assert (
-                refined is None or refined.explained < 0.7 or refined.contrast > 0.93
+                refined is None
+                or refined.explained < 0.7
+                or refined.contrast > 0.93
                 or np.abs(refined.shape).max() > 0.2
-            )  # fmt: skip
+            )
 
 
 def test_marks_beyond_the_frame_or_too_small_are_none() -> None:

@@ -341,7 +341,9 @@ def test_a_stream_learns_nothing_from_what_is_unusable() -> None:
     # The camera was turned: after as many frames as it remembers it begins anew.
     turned = [_shoot(SCENES[0], rng, (60.0, 30.0)) for _ in range(6)]
     assert [detector.update(frame)[0] for frame in turned] == [
-        *[MotionState.UNUSABLE] * 3, MotionState.WARMING_UP, *[MotionState.STILL] * 2,
-    ]  # fmt: skip
+        *[MotionState.UNUSABLE] * 3,
+        MotionState.WARMING_UP,
+        *[MotionState.STILL] * 2,
+    ]
     with pytest.raises(InputError, match="cannot be compared"):
         detector.update(turned[0][:, ::2])

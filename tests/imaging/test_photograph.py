@@ -37,9 +37,12 @@ PLACE = (0.9, -0.6)
 
 
 def beam(
-    place: tuple[float, float] = PLACE, length: float = 0.7, width: float = 0.5,
-    strength: float = 200.0, motion: tuple[float, float] = (0.0, 0.0),
-) -> Thrown:  # fmt: skip
+    place: tuple[float, float] = PLACE,
+    length: float = 0.7,
+    width: float = 0.5,
+    strength: float = 200.0,
+    motion: tuple[float, float] = (0.0, 0.0),
+) -> Thrown:
     return Thrown("target", gaussian_beam(place, length, width, angle=0.4), strength, motion)
 
 

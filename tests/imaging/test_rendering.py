@@ -164,9 +164,11 @@ def test_the_border_covers_pixels_by_their_exact_areas() -> None:
     level = light_of(render(scene(ambient=100.0), 0, level=True))
     full = 100.0 * PLAIN.reflectance * Sensor().scale
     border = np.concatenate(
-        [np.linspace(a, b, 200, endpoint=False)
-         for a, b in zip(TARGET.corners, np.roll(TARGET.corners, -1, axis=0), strict=True)]
-    )  # fmt: skip
+        [
+            np.linspace(a, b, 200, endpoint=False)
+            for a, b in zip(TARGET.corners, np.roll(TARGET.corners, -1, axis=0), strict=True)
+        ]
+    )
     x, y = project(CAMERA, border).T
     area = 0.5 * abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
     assert level.sum() / full == pytest.approx(area, rel=2e-6)
@@ -262,9 +264,12 @@ def test_two_targets_on_one_wall() -> None:
     lower = example_target(4.0, (0.0, 0.0, 32.0), "lower")
     camera = example_camera(TARGET, size=(640, 480), fill=0.4)
     s = Scene(
-        camera, (TARGET, lower), (Thrown("lower", gaussian_beam((0.2, 0.1), 0.2, power=500.0)),),
-        lens=SHARP, paint=PLAIN,
-    )  # fmt: skip
+        camera,
+        (TARGET, lower),
+        (Thrown("lower", gaussian_beam((0.2, 0.1), 0.2, power=500.0)),),
+        lens=SHARP,
+        paint=PLAIN,
+    )
     with_beam, without = (light_of(render(x, 0, level=True)) for x in (s, replace(s, beams=())))
     found = centre_of(with_beam - without)
     np.testing.assert_allclose(found, project(camera, lower.point((0.2, 0.1))), atol=0.02)
@@ -444,7 +449,7 @@ def test_the_example_camera_frames_the_target() -> None:
         (lambda: render(scene(), -1), "seed -1"),
         (lambda: example_camera(TARGET, 0.0), "distance 0.0 m"),
     ],
-)  # fmt: skip
+)
 def test_guards(make: object, text: str) -> None:
     with pytest.raises(InputError, match=text):
         make()  # type: ignore[operator]

@@ -47,13 +47,18 @@ TURNS = {"upper_left": 0.0, "upper_right": -0.5, "lower_right": 1.0, "lower_left
 
 
 def corner_marks() -> tuple[Mark, ...]:
-    places = {"upper_left": (-1, 1), "upper_right": (1, 1), "lower_right": (1, -1),
-              "lower_left": (-1, -1)}  # fmt: skip
+    places = {
+        "upper_left": (-1, 1),
+        "upper_right": (1, 1),
+        "lower_right": (1, -1),
+        "lower_left": (-1, -1),
+    }
     return tuple(
-        Mark(name, "corner", np.array([1.3 * x, 0.0, 13.0 + 1.3 * y]), 0.4, 0.09,
-             TURNS[name] * np.pi)
+        Mark(
+            name, "corner", np.array([1.3 * x, 0.0, 13.0 + 1.3 * y]), 0.4, 0.09, TURNS[name] * np.pi
+        )
         for name, (x, y) in places.items()
-    )  # fmt: skip
+    )
 
 
 MARKS = (
@@ -67,17 +72,24 @@ BARE = replace(
     targets=(replace(prototype().targets[0], markers={mark.name: mark.point for mark in MARKS}),),
 )
 CAMERA = Camera(
-    "south", SIZE, np.array([[2600.0, 0.0, 322.0], [0.0, 2600.0, 236.0], [0.0, 0.0, 1.0]]),
-    np.array([-0.08, 0.0, 0.0, 0.0, 0.0]), np.array([9.0, -22.0, 3.0]),
-    look_at((9.0, -22.0, 3.0), (0.0, 0.0, 13.0)), ("target",), "south/*.png",
-)  # fmt: skip
+    "south",
+    SIZE,
+    np.array([[2600.0, 0.0, 322.0], [0.0, 2600.0, 236.0], [0.0, 0.0, 1.0]]),
+    np.array([-0.08, 0.0, 0.0, 0.0, 0.0]),
+    np.array([9.0, -22.0, 3.0]),
+    look_at((9.0, -22.0, 3.0), (0.0, 0.0, 13.0)),
+    ("target",),
+    "south/*.png",
+)
 TRUE = {mark.name: project(CAMERA, mark.point) for mark in MARKS}
 
 
 def photograph(
-    marks: Sequence[Mark] = MARKS, camera: Camera = CAMERA, seed: int = 0,
+    marks: Sequence[Mark] = MARKS,
+    camera: Camera = CAMERA,
+    seed: int = 0,
     leaves: Sequence[tuple[float, float]] = (),
-) -> Frame:  # fmt: skip
+) -> Frame:
     """The target as the camera sees it, each pixel from three times three rays.
 
     ``leaves`` are places, metres right of and above the centre, of figures that are no marks.
@@ -106,8 +118,9 @@ def photograph(
     spots = ((plane * [1.0, -1.0] + half) * fine - 0.5).astype(np.float32)
     maps = cv2.resize(spots, (3 * SIZE[0], 3 * SIZE[1]), interpolation=cv2.INTER_LINEAR)
     light = cv2.remap(face, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderValue=90)
-    seen = cv2.GaussianBlur(cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA).astype(float),
-                            (0, 0), 0.6)  # fmt: skip
+    seen = cv2.GaussianBlur(
+        cv2.resize(light, SIZE, interpolation=cv2.INTER_AREA).astype(float), (0, 0), 0.6
+    )
     noise = np.random.default_rng(seed).normal(0.0, 1.5, seen.shape)
     return Frame(np.clip(np.round(seen + noise), 0, 255).astype(np.uint8), "south.png")
 
@@ -127,8 +140,9 @@ def clicked(
 ALL = [mark.name for mark in MARKS]
 DRAWN = {
     **{name: Wish("corner", 0.4, 0.09) for name in TURNS},
-    "middle": Wish("tee", 0.4, 0.09), "dot": Wish("disc", 0.3),
-}  # fmt: skip
+    "middle": Wish("tee", 0.4, 0.09),
+    "dot": Wish("disc", 0.3),
+}
 
 
 def misses(taught: Taught) -> FloatArray:
@@ -331,16 +345,24 @@ def same(a: Plant, b: Plant) -> None:
         assert len(t.marks) == len(u.marks)
         for m, n in zip(t.marks, u.marks, strict=True):
             assert (m.name, m.kind, m.size, m.stroke, m.code) == (
-                n.name, n.kind, n.size, n.stroke, n.code,
-            )  # fmt: skip
+                n.name,
+                n.kind,
+                n.size,
+                n.stroke,
+                n.code,
+            )
             assert m.turn == pytest.approx(n.turn, abs=1e-15)
             assert (m.point == n.point).all()
     assert len(a.cameras) == len(b.cameras)
     for c, d in zip(a.cameras, b.cameras, strict=True):
         assert (c.name, c.size, c.targets, c.source) == (d.name, d.size, d.targets, d.source)
         assert c.deviation == d.deviation
-        for one, two in ((c.matrix, d.matrix), (c.distortion, d.distortion),
-                         (c.position, d.position), (c.R_camera_enu, d.R_camera_enu)):  # fmt: skip
+        for one, two in (
+            (c.matrix, d.matrix),
+            (c.distortion, d.distortion),
+            (c.position, d.position),
+            (c.R_camera_enu, d.R_camera_enu),
+        ):
             assert np.array_equal(np.asarray(one), np.asarray(two))
 
 
@@ -350,8 +372,13 @@ def test_what_is_written_is_read_again(
 ) -> None:
     place = tmp_path / "plant.toml"
     write_plant(BARE, place, table)
-    taught = teach(read_plant(place), "target", frame, clicked(ALL),
-                   wishes={name: DRAWN[name] for name in TURNS})  # fmt: skip
+    taught = teach(
+        read_plant(place),
+        "target",
+        frame,
+        clicked(ALL),
+        wishes={name: DRAWN[name] for name in TURNS},
+    )
     write_taught(taught, place)
     again = read_plant(place)
     same(taught.plant, again)
@@ -401,10 +428,12 @@ def test_pictures_that_are_missing_or_no_pictures(blotted: Frame, tmp_path: Path
 
 def test_points_have_one_name_each() -> None:
     target = Target(
-        "t", prototype().targets[0].corners, prototype().targets[0].center,
+        "t",
+        prototype().targets[0].corners,
+        prototype().targets[0].center,
         markers={"upper_left": np.array([-1.4, 0.0, 14.4]), "rivet": np.array([0.0, 0.0, 13.5])},
         marks=(Mark("rivet", "disc", np.array([0.0, 0.0, 13.4]), 0.1),),
-    )  # fmt: skip
+    )
     points = known_points(target)
     assert list(points) == ["rivet", "upper_left", "upper_right", "lower_right", "lower_left"]
     assert points["rivet"].tolist() == [0.0, 0.0, 13.4]
@@ -435,19 +464,25 @@ FOUR = list(TURNS)
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        (changed(lambda g: g.update(upper_leff=(10.0, 10.0))),
-         r"there is no point of target target 'upper_leff'; did you mean upper_left"),
+        (
+            changed(lambda g: g.update(upper_leff=(10.0, 10.0))),
+            r"there is no point of target target 'upper_leff'; did you mean upper_left",
+        ),
         ({n: tuple(TRUE[n]) for n in FOUR[:3]}, r"3 points are given; four or more.*it has up"),
-        (changed(lambda g: g.update(dot=(640.0, 10.0))),
-         r"point dot: 640.0, 10.0 is not in the picture of 640 × 480 px"),
+        (
+            changed(lambda g: g.update(dot=(640.0, 10.0))),
+            r"point dot: 640.0, 10.0 is not in the picture of 640 × 480 px",
+        ),
         (changed(lambda g: g.update(dot=(float("nan"), 10.0))), r"point dot: nan, 10.0 is not in"),
         (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are given at one"),
         (changed(mirror), r"lie mirrored in the picture; are left and right exchanged\?"),
-        (changed(lambda g: exchange(g, "upper_left", "upper_right")),
-         r"do not lie in the picture as on the target; are two exchanged\?"),
+        (
+            changed(lambda g: exchange(g, "upper_left", "upper_right")),
+            r"do not lie in the picture as on the target; are two exchanged\?",
+        ),
         (changed(lambda g: exchange(g, "dot", "middle")), r"are two exchanged\?"),
     ],
-)  # fmt: skip
+)
 def test_points_that_cannot_be(frame: Frame, given: dict[str, Any], text: str) -> None:
     with pytest.raises(InputError, match=text):
         teach(BARE, "target", frame, given)
@@ -523,8 +558,12 @@ def test_marks_in_two_frames_calibrate_the_camera(frame: Frame) -> None:
 
 def test_sights_of_a_camera() -> None:
     target = replace(BARE.targets[0], marks=MARKS)
-    far = replace(target, name="far", corners=target.corners + [500.0, 0.0, 0.0],
-                  center=target.center + [500.0, 0.0, 0.0])  # fmt: skip
+    far = replace(
+        target,
+        name="far",
+        corners=target.corners + [500.0, 0.0, 0.0],
+        center=target.center + [500.0, 0.0, 0.0],
+    )
     back = Target("back", target.corners[[1, 0, 3, 2]], target.center)
     seeing = replace(CAMERA, targets=())
     found = sights(seeing, [target, far, back])
@@ -601,8 +640,10 @@ def test_the_page_asks_for_what_is_not_given(asked: Asked, frame: Frame) -> None
     nonce = re.search(r"script-src 'nonce-([\w-]+)'", policy)[1]
     assert reply.text.count(f'nonce="{nonce}"') == 3
     assert not re.search(r"https?://", reply.text)
-    shown = cv2.imdecode(np.frombuffer(httpx.get(asked.address + "picture.png").content, np.uint8),
-                         cv2.IMREAD_UNCHANGED)  # fmt: skip
+    shown = cv2.imdecode(
+        np.frombuffer(httpx.get(asked.address + "picture.png").content, np.uint8),
+        cv2.IMREAD_UNCHANGED,
+    )
     assert shown.shape == (480, 640)
     assert np.corrcoef(shown.ravel()[::7], np.asarray(frame.pixels).ravel()[::7])[0, 1] > 0.999
 
@@ -646,8 +687,14 @@ def test_answers_that_cannot_be_used(asked: Asked, body: bytes, text: str) -> No
 
 def test_nobody_else_gets_in(asked: Asked) -> None:
     root = asked.address.rsplit("/", 2)[0]
-    for method, place in (("GET", "/"), ("GET", "/wrong/"), ("POST", "/wrong/points"), ("GET", ""),
-                          ("POST", "/wrong/cancel"), ("GET", "/é/picture.png")):  # fmt: skip
+    for method, place in (
+        ("GET", "/"),
+        ("GET", "/wrong/"),
+        ("POST", "/wrong/points"),
+        ("GET", ""),
+        ("POST", "/wrong/cancel"),
+        ("GET", "/é/picture.png"),
+    ):
         assert httpx.request(method, root + place).status_code == 404
     # A name that was made to lead here says itself in Host.
     elsewhere = {"Host": "plant.example:80"}
@@ -695,12 +742,28 @@ class Browser:
             "os.dup2(a, 3); os.dup2(b, 4); os.execv(sys.argv[3], sys.argv[3:])"
         )
         self._process = subprocess.Popen(
-            [sys.executable, "-c", launch, str(there), str(back), path, "--headless",
-             "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-             "--disable-component-update", "--no-first-run", f"--user-data-dir={folder}",
-             "--window-size=1200,800", "--remote-debugging-pipe", "about:blank"],
-            pass_fds=(there, back), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-c",
+                launch,
+                str(there),
+                str(back),
+                path,
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                "--disable-background-networking",
+                "--disable-component-update",
+                "--no-first-run",
+                f"--user-data-dir={folder}",
+                "--window-size=1200,800",
+                "--remote-debugging-pipe",
+                "about:blank",
+            ],
+            pass_fds=(there, back),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         os.close(there)
         os.close(back)
         self._rest, self._number, self._session = b"", 0, ""

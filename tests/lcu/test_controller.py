@@ -253,8 +253,18 @@ def test_a_defocused_mirror_that_can_no_longer_go_with_the_sun_stows() -> None:
     assert bench.state == "STOWING"
 
 
-STATES_TO_TRY = ("UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING",
-                 "DEFOCUSED", "LOCKED", "SEARCHING", "FAULT")  # fmt: skip
+STATES_TO_TRY = (
+    "UNCONFIGURED",
+    "STOWED",
+    "STOWING",
+    "APPROACHING",
+    "IDLE",
+    "TRACKING",
+    "DEFOCUSED",
+    "LOCKED",
+    "SEARCHING",
+    "FAULT",
+)
 
 
 def brought_to(state: str) -> Bench:
@@ -540,7 +550,7 @@ def test_a_diagnosis_sees_the_elevation_move() -> None:
     assert tilt == pytest.approx(0.02, rel=0.05)
     bench.answers.clear()
     bench.send("QUERY_DIAGNOSIS")
-    (number, values), = bench.answers  # fmt: skip
+    ((number, values),) = bench.answers
     assert (number, values[:3]) == (0x08, bench.controller.motion.diagnosis[:3])
     assert values[3:] == pytest.approx(bench.controller.motion.diagnosis[3:])
     assert bench.state == "IDLE"
@@ -590,14 +600,17 @@ def settings(bench: Bench) -> list[tuple[str, tuple[object, ...]]]:
     codes = {row[0]: row[1] for row in wire_items()}
     values = {name: struct.unpack("<" + codes[name], data) for name, data in items.items()}
     return [
-        ("SET_ARMATURE", values["armature"]), ("SET_BIAS", values["biases"]),
+        ("SET_ARMATURE", values["armature"]),
+        ("SET_BIAS", values["biases"]),
         ("SET_DRIVES", (0, *values["drive_primary"])),
         ("SET_DRIVES", (1, *values["drive_secondary"])),
         ("SET_LIMITS", (0, *values["limits_primary"])),
         ("SET_LIMITS", (1, *values["limits_secondary"])),
-        ("SET_DEFOCUS", values["defocus"]), ("SET_POSITION", values["location"]),
-        ("ZERO", STOW), ("SET_STOW", STOW),
-    ]  # fmt: skip
+        ("SET_DEFOCUS", values["defocus"]),
+        ("SET_POSITION", values["location"]),
+        ("ZERO", STOW),
+        ("SET_STOW", STOW),
+    ]
 
 
 def wire_items():  # type: ignore[no-untyped-def]
@@ -670,16 +683,25 @@ def test_a_message_that_stores_needs_key_and_edition() -> None:
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("SET_ARMATURE", (0.0,) * 18), ("SET_ARMATURE", (*(0.0, 0.0, 1.0) * 5, 1.0, 0.0, 0.0)),
-        ("SET_BIAS", (9.0, 0.0)), ("SET_DEFOCUS", (0.0, 0.001)), ("SET_DEFOCUS", (3.0, 0.0)),
-        ("SET_POSITION", (1e7, 0.0, 0.0)), ("SET_DRIVES", (0, 0, *(0.0,) * 10)),
-        ("SET_DRIVES", (2, 0, *(1e-6,) * 10)), ("SET_DRIVES", (0, 9, *(1e-6,) * 10)),
+        ("SET_ARMATURE", (0.0,) * 18),
+        ("SET_ARMATURE", (*(0.0, 0.0, 1.0) * 5, 1.0, 0.0, 0.0)),
+        ("SET_BIAS", (9.0, 0.0)),
+        ("SET_DEFOCUS", (0.0, 0.001)),
+        ("SET_DEFOCUS", (3.0, 0.0)),
+        ("SET_POSITION", (1e7, 0.0, 0.0)),
+        ("SET_DRIVES", (0, 0, *(0.0,) * 10)),
+        ("SET_DRIVES", (2, 0, *(1e-6,) * 10)),
+        ("SET_DRIVES", (0, 9, *(1e-6,) * 10)),
         ("SET_LIMITS", (0, 5, 5, 1, 1, 0)),
-        ("SET_LIMITS", (0, 0, 2**20, 10_001, 10, 0)), ("SET_LIMITS", (1, 0, 100, 10, 10, 0)),
-        ("SET_LIMITS", (0, -(2**31), 2**31 - 1, 10, 10, 0)), ("SET_STOW", (0, 2**30)),
-        ("ZERO", (2**31 - 1, 0)), ("SET_ADDRESS", (4711, 0)), ("SET_ADDRESS", (5, 3)),
+        ("SET_LIMITS", (0, 0, 2**20, 10_001, 10, 0)),
+        ("SET_LIMITS", (1, 0, 100, 10, 10, 0)),
+        ("SET_LIMITS", (0, -(2**31), 2**31 - 1, 10, 10, 0)),
+        ("SET_STOW", (0, 2**30)),
+        ("ZERO", (2**31 - 1, 0)),
+        ("SET_ADDRESS", (4711, 0)),
+        ("SET_ADDRESS", (5, 3)),
     ],
-)  # fmt: skip
+)
 def test_settings_out_of_range_change_nothing(name: str, values: tuple[object, ...]) -> None:
     bench = brought_to("LOCKED")
     before, config = dict(bench.journal.items), bench.controller.config
@@ -687,8 +709,12 @@ def test_settings_out_of_range_change_nothing(name: str, values: tuple[object, .
     assert bench.order(name, *values) == BAD_VALUE
     assert bench.journal.items == before
     assert kept == (
-        config.pointing, list(config.drives), list(config.axes), config.stow, config.defocus,
-    )  # fmt: skip
+        config.pointing,
+        list(config.drives),
+        list(config.axes),
+        config.stow,
+        config.defocus,
+    )
 
 
 def test_zero_declares_the_counts_and_asks_for_the_safe_way_again() -> None:
@@ -758,7 +784,7 @@ def test_questions_are_answered() -> None:
     for name in ("QUERY_STEPS", "QUERY_STATUS", "QUERY_POSITION", "QUERY_DIAGNOSIS"):
         bench.answers.clear()
         bench.send(name)
-        (number, values), = bench.answers  # fmt: skip
+        ((number, values),) = bench.answers
         assert messages.name_of(number) == name.replace("QUERY_", "").replace("STEPS", "STEPS")
         if name == "QUERY_STEPS":
             assert values[:2] == tuple(bench.made)

@@ -64,10 +64,11 @@ def script(events: int, measured: bool) -> str:
     call = "    day.event(*event)\n"
     if measured:
         call = (
-            "    kind = event[1] is not None\n    begin = gc.mem_alloc()\n" + call
+            "    kind = event[1] is not None\n    begin = gc.mem_alloc()\n"
+            + call
             + "    taken = gc.mem_alloc() - begin\n    worst[kind] = max(worst[kind], taken)\n"
             "    total[kind] += taken\n    count[kind] += 1\n"
-        )  # fmt: skip
+        )
     else:
         call += "    count[event[1] is not None] += 1\n"
     parts = [

@@ -36,8 +36,15 @@ SETTINGS = [
     ("SET_STOW", lambda r: r.choice([STOW, (2**30, 0)])),
 ]  # fmt: skip
 #: What leads on from a state: tried often, so that all states are seen.
-ONWARDS = {"LOCKED": "UNLOCK", "FAULT": "CLEAR_FAULT", "STOWED": "APPROACH", "IDLE": "TRACK",
-           "DEFOCUSED": "REFOCUS", "TRACKING": "SEARCH", "SEARCHING": "IDLE"}  # fmt: skip
+ONWARDS = {
+    "LOCKED": "UNLOCK",
+    "FAULT": "CLEAR_FAULT",
+    "STOWED": "APPROACH",
+    "IDLE": "TRACK",
+    "DEFOCUSED": "REFOCUS",
+    "TRACKING": "SEARCH",
+    "SEARCHING": "IDLE",
+}
 TABLE = tuple(heliostat().armature.table)
 BIASES = tuple(float(d.table[7]) for d in (heliostat().drives[0], heliostat().drives[1]))
 
@@ -57,17 +64,37 @@ class Fuzz:
         self.bench.tick(0)
         own = self.bench.controller
         way = own.motion
-        return (own.state, way.kind, way.aim, way.ready, way.goal(0), way.goal(1), own.fault,
-                own.config.standby, own.config.stow, own.sun.age_ms(),
-                dict(self.bench.journal.items))  # fmt: skip
+        return (
+            own.state,
+            way.kind,
+            way.aim,
+            way.ready,
+            way.goal(0),
+            way.goal(1),
+            own.fault,
+            own.config.standby,
+            own.config.stow,
+            own.sun.age_ms(),
+            dict(self.bench.journal.items),
+        )
 
     def event(self) -> None:
         """One event."""
         choice = self.random.choices(
-            [self.wait, self.command, self.refused, self.safe, self.setting, self.jump,
-             self.fault, self.noise, self.reset, self.links],
+            [
+                self.wait,
+                self.command,
+                self.refused,
+                self.safe,
+                self.setting,
+                self.jump,
+                self.fault,
+                self.noise,
+                self.reset,
+                self.links,
+            ],
             [30, 30, 12, 4, 5, 2, 1, 5, 1, 3],
-        )[0]  # fmt: skip
+        )[0]
         before = self.bench.state
         choice()
         self.bench.check()
@@ -105,9 +132,10 @@ class Fuzz:
         after = self.moved_by()
         if after[0] != before[0]:
             itself = [
-                new for state, event, new, _ in names.transitions()
+                new
+                for state, event, new, _ in names.transitions()
                 if state == before[0] and names.EVENTS[event][0] == names.INTERNAL
-            ]  # fmt: skip
+            ]
             assert after[0] in itself
         elif self.bench.controller.motion.kind in (motion.APPROACH, motion.RETURN):
             assert after[:4] + after[6:] == before[:4] + before[6:]  # goals go along the path

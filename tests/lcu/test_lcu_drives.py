@@ -76,11 +76,14 @@ def test_a_jack_stops_at_its_end() -> None:
 @pytest.mark.parametrize(
     ("kind", "change", "text"),
     [
-        (7, {}, "kind"), (0, {drives.ZERO: math.nan}, "finite"), (0, {drives.RATE: 0.0}, "still"),
-        (0, {drives.SCALE: -1.0}, "still"), (1, {drives.STROKE: 5.0}, "triangle"),
+        (7, {}, "kind"),
+        (0, {drives.ZERO: math.nan}, "finite"),
+        (0, {drives.RATE: 0.0}, "still"),
+        (0, {drives.SCALE: -1.0}, "still"),
+        (1, {drives.STROKE: 5.0}, "triangle"),
         (0, {drives.WORM_SIN: 0.1, drives.WORM_RATIO: 40.0}, "backwards"),
     ],
-)  # fmt: skip
+)
 def test_drives_that_cannot_work_are_refused(
     kind: int, change: dict[int, float], text: str
 ) -> None:

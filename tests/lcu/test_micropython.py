@@ -51,10 +51,20 @@ def installed(version: str) -> tuple[str, Path]:
         cache.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache) as fresh:
             done = subprocess.run(
-                [npm, "install", "--no-audit", "--no-fund", "--ignore-scripts", "--prefix", fresh,
-                 f"{PACKAGE}@{version}"],
-                capture_output=True, text=True, check=False,
-            )  # fmt: skip
+                [
+                    npm,
+                    "install",
+                    "--no-audit",
+                    "--no-fund",
+                    "--ignore-scripts",
+                    "--prefix",
+                    fresh,
+                    f"{PACKAGE}@{version}",
+                ],
+                capture_output=True,
+                text=True,
+                check=False,
+            )
             if done.returncode:
                 absent(f"npm install {PACKAGE}@{version}: {done.stderr.strip()[-300:]}")
             # Another process may have been quicker; its copy is as good.
@@ -67,8 +77,10 @@ def run(version: str, tree: Path, script: str) -> str:
     node, module = installed(version)
     done = subprocess.run(
         [node, HERE / "micropython.mjs", module, tree, script],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
     return done.stdout
 
@@ -116,25 +128,34 @@ def vectors() -> dict[str, Any]:
             for _ in range(500)
         ],
         "deadline": [
-            (1 << 30) - 300, 5000,
+            (1 << 30) - 300,
+            5000,
             [((1 << 30) - 300 + step) % (1 << 30) for step in (0, 10, 400, 350, 4000, 4900, 9999)],
         ],
         "keep": [
             [name, example(name, rng).hex()]
             for name in ("SET_ARMATURE", "SET_BIAS", "SET_POSITION", "SET_STOW") * 9
         ],
-    }  # fmt: skip
+    }
 
 
 def refusals() -> list[list[Any]]:
     return [
-        ["JOG", [1, 2, 256, 0]], ["JOG", [1, 2, -1, 0]], ["JOG", [1, 2, 0, 2**31]],
-        ["GOTO", [2**32, 2, 0, 0]], ["GOTO", [1, 2, plain(1.5), 0]], ["GOTO", [1, 2, 3]],
-        ["AIM", [1, 2, plain(float("nan")), 0, 0]], ["AIM", [1, 2, plain(float("-inf")), 0, 0]],
-        ["WAVE", []], ["STORED", [1, 2]], ["QUERY_STORED", [-129]],
-        ["GOTO", [2**32 - 1, 0, -(2**31), 2**31 - 1]], ["AIM", [0, 0, 1, -2, 3]],
+        ["JOG", [1, 2, 256, 0]],
+        ["JOG", [1, 2, -1, 0]],
+        ["JOG", [1, 2, 0, 2**31]],
+        ["GOTO", [2**32, 2, 0, 0]],
+        ["GOTO", [1, 2, plain(1.5), 0]],
+        ["GOTO", [1, 2, 3]],
+        ["AIM", [1, 2, plain(float("nan")), 0, 0]],
+        ["AIM", [1, 2, plain(float("-inf")), 0, 0]],
+        ["WAVE", []],
+        ["STORED", [1, 2]],
+        ["QUERY_STORED", [-129]],
+        ["GOTO", [2**32 - 1, 0, -(2**31), 2**31 - 1]],
+        ["AIM", [0, 0, 1, -2, 3]],
         ["STORED", [1, plain(b"abc")]],
-    ]  # fmt: skip
+    ]
 
 
 def gate_traffic() -> list[list[Any]]:
@@ -146,8 +167,10 @@ def gate_traffic() -> list[list[Any]]:
         if turn % 5 == 2:
             raws = [sender.session(7)]
         if turn % 5 == 3:
-            raws = [sender.frame(5, "SET_STOW", 7, NOW + 9, turn - turn % 2, 1, 2, key=KEY),
-                    sender.frame(5, "ZERO", 7, NOW + 9, 99, 1, 2, key=b"wrong")]  # fmt: skip
+            raws = [
+                sender.frame(5, "SET_STOW", 7, NOW + 9, turn - turn % 2, 1, 2, key=KEY),
+                sender.frame(5, "ZERO", 7, NOW + 9, 99, 1, 2, key=b"wrong"),
+            ]
         if turn % 11 == 4:
             raws.append(raws[0])
         out += [[raw.hex(), tick, NOW] for raw in raws]
@@ -256,9 +279,12 @@ def test_the_gate_judges_alike(given: dict[str, Any], answers: dict[str, Any]) -
         expected.append(gate.judge(frame, tick, now_s))
     assert answers["judged"] == expected
     assert set(expected) == {
-        messages.DONE, messages.REFUSED_AUTHORITY, messages.REFUSED_KEY, messages.EXPIRED,
+        messages.DONE,
+        messages.REFUSED_AUTHORITY,
+        messages.REFUSED_KEY,
+        messages.EXPIRED,
         messages.DUPLICATE,
-    }  # fmt: skip
+    }
 
 
 def test_packets_are_alike(given: dict[str, Any], answers: dict[str, Any]) -> None:

@@ -281,8 +281,9 @@ def test_a_way_that_is_none_is_refused(axis: int, count: int, east: float) -> No
     bench.order("LOCK")
     before = dict(bench.journal.items)
     if east != east:
-        payload = bytearray(wire.pack("SET_WAY", TOKEN, bench.gps_ms() // 1000 + 5, 1, 0, 1,
-                                      *[0.0] * 12))  # fmt: skip
+        payload = bytearray(
+            wire.pack("SET_WAY", TOKEN, bench.gps_ms() // 1000 + 5, 1, 0, 1, *[0.0] * 12)
+        )
         payload[14:18] = b"\xff" * 4
         frame = wire.Frame(ADDRESS, 0, (bench.sender.count + 1) & 0xFFFF, 0x59, bytes(payload))
         frame.mac = wire.authenticate(sha256, KEY, frame)

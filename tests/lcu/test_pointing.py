@@ -104,8 +104,9 @@ def test_the_dead_cone_gives_the_nearest_pose_and_says_so() -> None:
     aim = table[12:15] + 100.0 * sun
     known = track(canted.armature, sun, aim)
     for machine in (
-        pointing.Pointing(tuple(map(float, table))), single_pointing().Pointing(f32(table)),
-    ):  # fmt: skip
+        pointing.Pointing(tuple(map(float, table))),
+        single_pointing().Pointing(f32(table)),
+    ):
         pose = machine.solve(f32(sun), f32(aim), FREE, HOME)
         assert pose.status == pointing.UNREACHABLE
         assert pose.residual == pytest.approx(float(known.residual.min()), abs=3e-6)
@@ -123,9 +124,16 @@ def test_stops_choose_the_branch_and_give_the_nearest_pose() -> None:
         stops = [[low, low + rng.uniform(0.5, 4.0)], [0.0, 1.5]]
         near = [float(rng.uniform(*pair)) for pair in stops]
         limited = machine.drives.replace(
-            rate=1.0, zero=0.0, bias=0.0, scale=0.0, worm_cos=0.0, worm_sin=0.0, sag=0.0,
-            min_angle=[stops[0][0], 0.0], max_angle=[stops[0][1], 1.5],
-        )  # fmt: skip
+            rate=1.0,
+            zero=0.0,
+            bias=0.0,
+            scale=0.0,
+            worm_cos=0.0,
+            worm_sin=0.0,
+            sag=0.0,
+            min_angle=[stops[0][0], 0.0],
+            max_angle=[stops[0][1], 1.5],
+        )
         known = track(machine.armature, sun, aim, drives=limited, current=near)
         pose = own.solve(tuple(sun), aim, stops, near)
         best = int(known.best)
@@ -171,10 +179,12 @@ def test_no_mirror_serves_opposite_directions() -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        ({0: math.nan}, "finite"), ({0: 0.5, 2: 0.5}, "length 1"),
-        ({6: 0.0, 7: 0.0, 8: -1.0}, "parallel"), ({15: 1.0, 16: 0.0, 17: 0.0}, "along"),
+        ({0: math.nan}, "finite"),
+        ({0: 0.5, 2: 0.5}, "length 1"),
+        ({6: 0.0, 7: 0.0, 8: -1.0}, "parallel"),
+        ({15: 1.0, 16: 0.0, 17: 0.0}, "along"),
     ],
-)  # fmt: skip
+)
 def test_armatures_that_cannot_point_are_refused(change: dict[int, float], text: str) -> None:
     numbers = [0.0, 0, -1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0]
     for place, value in change.items():

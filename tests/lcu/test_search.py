@@ -38,9 +38,13 @@ def test_no_place_within_the_radius_is_missed() -> None:
 
 @pytest.mark.parametrize(
     ("pitch", "radius", "text"),
-    [(0.0, 1.0, "above 0"), (1.0, math.nan, "finite"), (math.inf, 1.0, "finite"),
-     (1e-5, 0.1, "too many")],
-)  # fmt: skip
+    [
+        (0.0, 1.0, "above 0"),
+        (1.0, math.nan, "finite"),
+        (math.inf, 1.0, "finite"),
+        (1e-5, 0.1, "too many"),
+    ],
+)
 def test_searches_without_end_are_refused(pitch: float, radius: float, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         Spiral(pitch, radius)
@@ -58,6 +62,7 @@ def test_the_aim_moves_right_and_up_as_seen_from_the_mirror(aim: tuple[float, ..
     assert abs(across @ way) < 1e-9
     assert abs(above @ way) < 1e-9
     if np.hypot(way[0], way[1]) > 0.0:
-        np.testing.assert_allclose(across, 3e-3 * slant * np.cross(way, [0, 0, 1]) / np.hypot(
-            way[0], way[1]), atol=1e-12)  # fmt: skip
+        np.testing.assert_allclose(
+            across, 3e-3 * slant * np.cross(way, [0, 0, 1]) / np.hypot(way[0], way[1]), atol=1e-12
+        )
         assert above[2] > 0.0

@@ -61,8 +61,9 @@ def test_defocus_and_stow_are_taken_in_every_state(start: int) -> None:
     """Invariant 4: never refused, never answered by staying on the receiver."""
     on_the_way = {states.APPROACHING, states.TRACKING, states.SEARCHING, states.IDLE}
     for event, motions in (
-        ("DEFOCUS", {"defocus", "stow_directly"}), ("STOW", {"stow", "stow_directly"}),
-    ):  # fmt: skip
+        ("DEFOCUS", {"defocus", "stow_directly"}),
+        ("STOW", {"stow", "stow_directly"}),
+    ):
         step = states.transition(start, event)
         assert step is not None
         assert step[0] not in on_the_way

@@ -97,8 +97,10 @@ def test_steps_are_counted_whatever_happens(seed: int) -> None:
     motors = Motors(stepper)
     for _ in range(60):
         chosen = rng.random()
-        goal = [rng.choice([rng.randint(-40_000, 50_000), count + rng.randint(-50, 50)])
-                for count in motors.made]  # fmt: skip
+        goal = [
+            rng.choice([rng.randint(-40_000, 50_000), count + rng.randint(-50, 50)])
+            for count in motors.made
+        ]
         if chosen < 0.5:
             inside = all(-30_000 <= value <= 40_000 for value in goal)
             assert stepper.go(*goal, rng.choice([BOTH, PRIMARY_FIRST, SECONDARY_FIRST])) == inside
@@ -206,9 +208,13 @@ def test_a_dry_queue_starts_from_rest() -> None:
 
 @pytest.mark.parametrize(
     ("numbers", "text"),
-    [((5, 5, 1, 1, 0), "range is empty"), ((0, 9, 1, 1, 9), "backlash"), ((0, 9, 0, 1, 0), "rate"),
-     ((0, 9, 1, 0, 0), "acceleration")],
-)  # fmt: skip
+    [
+        ((5, 5, 1, 1, 0), "range is empty"),
+        ((0, 9, 1, 1, 9), "backlash"),
+        ((0, 9, 0, 1, 0), "rate"),
+        ((0, 9, 1, 0, 0), "acceleration"),
+    ],
+)
 def test_axes_that_cannot_move_are_refused(numbers: tuple[int, ...], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         Axis(*numbers, SLOT)

@@ -43,8 +43,11 @@ def frame_of(name: str, payload: bytes, sequence: int = 1, to: int = 5) -> wire.
 
 
 def example(name: str, rng: random.Random) -> bytes:
-    made = {"f": lambda: rng.uniform(-1e4, 1e4), "d": lambda: rng.uniform(-1e4, 1e4),
-            "s": lambda: rng.randbytes(rng.randrange(60))}  # fmt: skip
+    made = {
+        "f": lambda: rng.uniform(-1e4, 1e4),
+        "d": lambda: rng.uniform(-1e4, 1e4),
+        "s": lambda: rng.randbytes(rng.randrange(60)),
+    }
     values = [
         rng.randint(*wire.RANGES[code]) if code in wire.RANGES else made[code]()
         for code in codes(name)
@@ -78,8 +81,10 @@ def test_table_is_sound() -> None:
         if not row_codes.endswith("s"):
             size = struct.calcsize("<" + messages.codes_of(number))
             assert size + wire.MAC_SIZE <= wire.PAYLOAD_LIMIT
-        heads = {messages.AUTHORITY: ["token", "expires_s"],
-                 messages.KEY: ["token", "expires_s", "edition"]}  # fmt: skip
+        heads = {
+            messages.AUTHORITY: ["token", "expires_s"],
+            messages.KEY: ["token", "expires_s", "edition"],
+        }
         head = heads.get(who, [])
         assert messages.fields_of(number)[: len(head)] == head
     assert messages.name_of(0xEE) == ""
@@ -400,12 +405,18 @@ def test_an_empty_key_signs_nothing() -> None:
 @pytest.mark.parametrize(
     ("expires_s", "now_s", "void"),
     [
-        (1000, 999, False), (1000, 1000, False), (1000, 1001, True), (1000, None, True),
-        (3, 2**32 - 5, False), (2**32 - 5, 3, True),  # across the wrap
-        (1000 + wire.HORIZON_S, 1000, False), (1001 + wire.HORIZON_S, 1000, True),
-        (1000, 1000 + 2**31, True), (0, 1, True),
+        (1000, 999, False),
+        (1000, 1000, False),
+        (1000, 1001, True),
+        (1000, None, True),
+        (3, 2**32 - 5, False),
+        (2**32 - 5, 3, True),  # across the wrap
+        (1000 + wire.HORIZON_S, 1000, False),
+        (1001 + wire.HORIZON_S, 1000, True),
+        (1000, 1000 + 2**31, True),
+        (0, 1, True),
     ],
-)  # fmt: skip
+)
 def test_expiry(expires_s: int, now_s: int | None, void: bool) -> None:
     assert wire.expired(expires_s, now_s) is void
 

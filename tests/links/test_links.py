@@ -465,9 +465,12 @@ async def _storm(clock: VirtualClock, seed: int) -> dict[str, int]:
     chance = random.Random(seed)
     other = VirtualClock(lambda: 77.0 + clock.monotonic(), rate=chance.uniform(0.9995, 1.0005))
     plant, cluster, line = memory_pair(
-        clock, seed=seed, settings=SETTINGS, clocks=(clock, other),
+        clock,
+        seed=seed,
+        settings=SETTINGS,
+        clocks=(clock, other),
         faults=Faults(0.1, 0.1, 0.1, 0.05, (0.0, 0.3)),
-    )  # fmt: skip
+    )
     sent: list[float] = []  # expiry of each message, whose number is its place here
     got: list[int] = []
 
@@ -503,9 +506,13 @@ async def _storm(clock: VirtualClock, seed: int) -> dict[str, int]:
     assert got[-1] == len(sent) - 1, "not there after the faults were over"
     counts = cluster.statistics
     return {
-        "sent": len(sent), "got": len(got), "late": counts.late, "repeated": counts.repeated,
-        "refused": counts.refused, "reconnects": counts.reconnects,
-    }  # fmt: skip
+        "sent": len(sent),
+        "got": len(got),
+        "late": counts.late,
+        "repeated": counts.repeated,
+        "refused": counts.refused,
+        "reconnects": counts.reconnects,
+    }
 
 
 def test_every_promise_holds_in_a_storm_of_faults() -> None:
@@ -863,11 +870,29 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("tls")
     pem, key = folder / "plant.pem", folder / "plant.key"
     subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
-         "-nodes", "-days", "2", "-subj", "/CN=plant", "-addext", "subjectAltName=IP:127.0.0.1",
-         "-keyout", key, "-out", pem],
-        check=True, capture_output=True,
-    )  # fmt: skip
+        [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "ec",
+            "-pkeyopt",
+            "ec_paramgen_curve:prime256v1",
+            "-nodes",
+            "-days",
+            "2",
+            "-subj",
+            "/CN=plant",
+            "-addext",
+            "subjectAltName=IP:127.0.0.1",
+            "-keyout",
+            key,
+            "-out",
+            pem,
+        ],
+        check=True,
+        capture_output=True,
+    )
     return pem, key
 
 

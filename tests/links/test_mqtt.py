@@ -383,13 +383,43 @@ def papers(tmp_path_factory: pytest.TempPathFactory) -> Path:
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
 
     key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-    run("openssl", "req", "-x509", *key, "-keyout", "ca.key", "-out", "ca.pem", "-days", "2",
-        "-subj", "/CN=the plant's authority")  # fmt: skip
-    run("openssl", "req", *key, "-keyout", "broker.key", "-out", "broker.csr",
-        "-subj", "/CN=broker")  # fmt: skip
+    run(
+        "openssl",
+        "req",
+        "-x509",
+        *key,
+        "-keyout",
+        "ca.key",
+        "-out",
+        "ca.pem",
+        "-days",
+        "2",
+        "-subj",
+        "/CN=the plant's authority",
+    )
+    run(
+        "openssl", "req", *key, "-keyout", "broker.key", "-out", "broker.csr", "-subj", "/CN=broker"
+    )
     (folder / "names").write_text("subjectAltName=IP:127.0.0.1\n")
-    run("openssl", "x509", "-req", "-in", "broker.csr", "-CA", "ca.pem", "-CAkey", "ca.key",
-        "-set_serial", "1", "-days", "2", "-extfile", "names", "-out", "broker.pem")  # fmt: skip
+    run(
+        "openssl",
+        "x509",
+        "-req",
+        "-in",
+        "broker.csr",
+        "-CA",
+        "ca.pem",
+        "-CAkey",
+        "ca.key",
+        "-set_serial",
+        "1",
+        "-days",
+        "2",
+        "-extfile",
+        "names",
+        "-out",
+        "broker.pem",
+    )
     (folder / "passwords").touch()
     for user in ("plant", "north", "south"):
         run("mosquitto_passwd", "-b", "passwords", user, f"{user}'s own")
@@ -412,9 +442,12 @@ def test_the_settings_of_the_page_let_plant_and_clusters_talk(
 ) -> None:
     def link(user: str, cluster: str, password: str = "") -> Link:
         broker = Broker(
-            "127.0.0.1", page_broker.port, username=user, password=password or f"{user}'s own",
+            "127.0.0.1",
+            page_broker.port,
+            username=user,
+            password=password or f"{user}'s own",
             tls=client_tls(papers / "ca.pem"),
-        )  # fmt: skip
+        )
         return mqtt_link(broker, PREFIX, cluster, KEY, CLOCK, CALM, plant=user == "plant")
 
     async def main() -> None:
@@ -444,9 +477,12 @@ def test_the_access_list_of_the_page_keeps_clusters_apart(
 
     def client(user: str) -> aiomqtt.Client:
         return aiomqtt.Client(
-            "127.0.0.1", page_broker.port, username=user, password=f"{user}'s own",
+            "127.0.0.1",
+            page_broker.port,
+            username=user,
+            password=f"{user}'s own",
             tls_context=client_tls(papers / "ca.pem"),
-        )  # fmt: skip
+        )
 
     async def main() -> None:
         async with client("plant") as plant, client("north") as north, client("south") as south:

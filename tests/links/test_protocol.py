@@ -70,16 +70,22 @@ def _with(**changes: object) -> bytes:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"", "does not begin with JSON"), (b"\xff\xfe", "does not begin with JSON"),
-        (b"[" * 100_000, "does not begin with JSON"), (b"[1]", "version None"),
-        (_with(version=2), "version 2"), (_with(kind="dance"), "unknown kind 'dance'"),
-        (_with(token="1"), "token is '1'"), (_with(token=True), "token is True"),
-        (_with(lifetime=1e999), "does not begin with JSON"), (_with(token=None), "token is None"),
-        (b'{"kind":"lease","version":1}', "missing"), (_with(lifetime=10**400), "lifetime is 1000"),
+        (b"", "does not begin with JSON"),
+        (b"\xff\xfe", "does not begin with JSON"),
+        (b"[" * 100_000, "does not begin with JSON"),
+        (b"[1]", "version None"),
+        (_with(version=2), "version 2"),
+        (_with(kind="dance"), "unknown kind 'dance'"),
+        (_with(token="1"), "token is '1'"),
+        (_with(token=True), "token is True"),
+        (_with(lifetime=1e999), "does not begin with JSON"),
+        (_with(token=None), "token is None"),
+        (b'{"kind":"lease","version":1}', "missing"),
+        (_with(lifetime=10**400), "lifetime is 1000"),
         (_with(kind="emergency", identity="e", name="STOW", heliostats="A1"), "heliostats is 'A1'"),
         (_with(kind="progress", identity="e", stage="nearly"), "stage is 'nearly'"),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_message_is_refused(data: bytes, said: str) -> None:
     with pytest.raises(ProtocolError, match=said):
         decode(data)

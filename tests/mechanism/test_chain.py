@@ -57,10 +57,13 @@ def test_jacobian_by_counts(kind: str) -> None:
         step[d] = 15.0
         for which in ("normal", "vertex"):
             wide, narrow = (
-                (getattr(mechanism.pose(counts + h), which)
-                 - getattr(mechanism.pose(counts - h), which)) / (2 * h.max())
+                (
+                    getattr(mechanism.pose(counts + h), which)
+                    - getattr(mechanism.pose(counts - h), which)
+                )
+                / (2 * h.max())
                 for h in (2 * step, step)
-            )  # fmt: skip
+            )
             wanted = (4 * narrow - wide) / 3
             found = getattr(jacobian, f"{which}_counts")[:, d]
             assert np.abs(found - wanted).max() < 1e-6 * np.abs(wanted).max()

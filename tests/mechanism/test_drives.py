@@ -12,15 +12,30 @@ _LIMIT = 1e-9  # rad
 
 
 @given(
-    zero=st.floats(-3, 3), sense=st.sampled_from([-1, 1]), scale=st.floats(-0.05, 0.05),
-    bias=st.floats(-0.5, 0.5), worm=st.floats(-0.012, 0.012), sine=st.floats(-0.012, 0.012),
-    sag=st.floats(-0.01, 0.01), seed=st.integers(0, 99),
-)  # fmt: skip
+    zero=st.floats(-3, 3),
+    sense=st.sampled_from([-1, 1]),
+    scale=st.floats(-0.05, 0.05),
+    bias=st.floats(-0.5, 0.5),
+    worm=st.floats(-0.012, 0.012),
+    sine=st.floats(-0.012, 0.012),
+    sag=st.floats(-0.01, 0.01),
+    seed=st.integers(0, 99),
+)
 def test_rotary_inverse(zero, sense, scale, bias, worm, sine, sag, seed) -> None:  # type: ignore[no-untyped-def]
     drive = drives.rotary(
-        200, 2400, microsteps=16, zero=zero, sense=sense, scale=scale, bias=bias,
-        worm_cos=worm, worm_sin=sine, worm_ratio=40.0, sag=sag, sag_phase=0.3,
-    )  # fmt: skip
+        200,
+        2400,
+        microsteps=16,
+        zero=zero,
+        sense=sense,
+        scale=scale,
+        bias=bias,
+        worm_cos=worm,
+        worm_sin=sine,
+        worm_ratio=40.0,
+        sag=sag,
+        sag_phase=0.3,
+    )
     counts = np.random.default_rng(seed).uniform(-4e6, 4e6, 50)
     angles = drive.angles(counts)
     np.testing.assert_allclose(drive.angles(drive.counts(angles)), angles, rtol=0, atol=_LIMIT)
@@ -29,14 +44,28 @@ def test_rotary_inverse(zero, sense, scale, bias, worm, sine, sag, seed) -> None
 
 
 @given(
-    stroke=st.floats(0.061, 0.12), offset=st.floats(0.30, 0.36), radius=st.floats(0.30, 0.36),
-    clockwise=st.sampled_from([0, 1]), worm=st.floats(-5e-4, 5e-4), sag=st.floats(-0.01, 0.01),
-)  # fmt: skip
+    stroke=st.floats(0.061, 0.12),
+    offset=st.floats(0.30, 0.36),
+    radius=st.floats(0.30, 0.36),
+    clockwise=st.sampled_from([0, 1]),
+    worm=st.floats(-5e-4, 5e-4),
+    sag=st.floats(-0.01, 0.01),
+)
 def test_jack_inverse(stroke, offset, radius, clockwise, worm, sag) -> None:  # type: ignore[no-untyped-def]
     drive = drives.linear_paint(
-        154166.6667, stroke, offset, radius, 0.04, clockwise=clockwise, worm_cos=worm,
-        worm_sin=worm / 3, worm_ratio=500.0, sag=sag, bias=0.01, scale=0.002,
-    )  # fmt: skip
+        154166.6667,
+        stroke,
+        offset,
+        radius,
+        0.04,
+        clockwise=clockwise,
+        worm_cos=worm,
+        worm_sin=worm / 3,
+        worm_ratio=500.0,
+        sag=sag,
+        bias=0.01,
+        scale=0.002,
+    )
     counts = np.linspace(0.0, 70000.0, 41)
     angles = drive.angles(counts)
     np.testing.assert_allclose(drive.angles(drive.counts(angles)), angles, rtol=0, atol=_LIMIT)

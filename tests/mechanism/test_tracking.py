@@ -114,8 +114,9 @@ def test_dead_cone_gives_the_nearest_pose(seed: int) -> None:
 
     best = min(
         minimize(miss, [a, b], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-12}).fun
-        for a in np.linspace(0, 6, 7) for b in (1.3, 1.8)
-    )  # fmt: skip
+        for a in np.linspace(0, 6, 7)
+        for b in (1.3, 1.8)
+    )
     assert found.residual.min() == pytest.approx(best, abs=2e-5)
 
 
@@ -164,9 +165,10 @@ def test_count_stops_and_turns() -> None:
         np.testing.assert_allclose(found.chosen(found.angles), near, rtol=0, atol=1e-8)
     # Counts as stops, running against the angle.
     machine = kinds.azimuth_elevation(
-        (0, 0, 0), pivot_offset=0.3,
+        (0, 0, 0),
+        pivot_offset=0.3,
         drives=(direct(rate=-1.0, min_count=-7.0, max_count=0.5), direct(max_angle=1.6)),
-    )  # fmt: skip
+    )
     found = track(machine, sun, aim)
     best = int(found.best)
     assert found.status[best] == Status.OK
@@ -264,9 +266,12 @@ def test_guo_is_the_special_case() -> None:
     machine = kinds.azimuth_elevation((0, 0, 0), pivot_offset=0.3)
     for _ in range(40):
         guo = azel.GuoParameters(
-            tilt=rng.uniform(0, 0.05), tilt_azimuth=rng.uniform(0, 6), tau_1=rng.normal(0, 0.02),
-            mu=rng.normal(0, 0.02), offset=0.3,
-        )  # fmt: skip
+            tilt=rng.uniform(0, 0.05),
+            tilt_azimuth=rng.uniform(0, 6),
+            tau_1=rng.normal(0, 0.02),
+            mu=rng.normal(0, 0.02),
+            offset=0.3,
+        )
         ours = azel.to_heliotrope(guo)
         assert ours.pop("pivot_offset") == pytest.approx(0.3)
         sun = direction(rng.uniform(0, 6), rng.uniform(0.2, 1.2))

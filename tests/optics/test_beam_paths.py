@@ -65,10 +65,13 @@ def test_clearance_is_a_distance(k: int) -> None:
     points = rng.uniform((-110, -40, -10), (110, 110, 130), (300, 3))
     signed = bp.clearance(points, ZOO)[:, k]
     step = 1e-4
-    slope = np.stack([
-        (bp.clearance(points + step * e, ZOO) - bp.clearance(points - step * e, ZOO))[:, k]
-        for e in np.eye(3)
-    ], axis=-1) / (2 * step)  # fmt: skip
+    slope = np.stack(
+        [
+            (bp.clearance(points + step * e, ZOO) - bp.clearance(points - step * e, ZOO))[:, k]
+            for e in np.eye(3)
+        ],
+        axis=-1,
+    ) / (2 * step)
     steepness = np.linalg.norm(slope, axis=-1)
     assert steepness.max() < 1.0 + 1e-6, "it grows faster than the way: a march would overshoot"
     # Away from the few edges at which the nearest point changes it is exactly 1.
@@ -197,8 +200,9 @@ def test_motion_misses_nothing_that_fine_samples_find() -> None:
     for share in np.linspace(0.0, 1.0, 401):
         normal, vertex = field.armature.pose(start + share * (goal - start))
         cosine = normal @ SUN
-        beam = bp.Beams(vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(80),
-                        np.full(80, 400.0))  # fmt: skip
+        beam = bp.Beams(
+            vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(80), np.full(80, 400.0)
+        )
         now = bp.enter(beam, ZOO).entered & (cosine > 0.0)[:, None]
         first = np.where(now & ~found, share, first)
         found |= now
@@ -225,9 +229,11 @@ def test_a_flash_between_two_samples_is_found() -> None:
         bp.enter(
             bp.Beams(v[None], (2 * (n @ sun) * n - sun)[None], mirror, np.array([3000.0])), [pole]
         ).entered.any()
-        for n, v in (mechanism.armature.pose(angles[0] + s * (angles[1] - angles[0]))
-                     for s in np.linspace(0.0, 1.0, 50))
-    ]  # fmt: skip
+        for n, v in (
+            mechanism.armature.pose(angles[0] + s * (angles[1] - angles[0]))
+            for s in np.linspace(0.0, 1.0, 50)
+        )
+    ]
     assert not any(coarse), "the case must be one that 50 samples miss"
 
 
@@ -271,8 +277,9 @@ def test_a_path_of_one_pose_is_that_pose() -> None:
     motion = bp.move(field.armature, start[:, None], SUN, mirrors, ZOO)
     normal, vertex = field.armature.pose(start)
     cosine = normal @ SUN
-    beam = bp.Beams(vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(40),
-                    np.full(40, 3000.0))  # fmt: skip
+    beam = bp.Beams(
+        vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(40), np.full(40, 3000.0)
+    )
     rest = bp.enter(beam, ZOO)
     lit = cosine > 0.0
     assert lit.sum() > 20
@@ -360,9 +367,15 @@ def test_aims_out_of_reach_are_told() -> None:
     high = direct(min_angle=0.0, max_angle=1.6)
     drives = Drive(np.stack([short.table, high.table]))
     way = bp.safe_way(
-        mechanism.armature, (0.0, 1.57), direction(1.5, 0.6), FOOT, STANDBY, Mirrors.of(2, 2), [],
+        mechanism.armature,
+        (0.0, 1.57),
+        direction(1.5, 0.6),
+        FOOT,
+        STANDBY,
+        Mirrors.of(2, 2),
+        [],
         drives=drives,
-    )  # fmt: skip
+    )
     assert not way.clear
     assert "a stop is in the way" in way.text
 
@@ -370,8 +383,13 @@ def test_aims_out_of_reach_are_told() -> None:
 # Beams that cross
 
 
-def _shining(mirror_radius: float, focus: float, point: FloatArray, rng: np.random.Generator,
-             half_angle: float) -> float:  # fmt: skip
+def _shining(
+    mirror_radius: float,
+    focus: float,
+    point: FloatArray,
+    rng: np.random.Generator,
+    half_angle: float,
+) -> float:
     """Concentration by sampling the mirror disk: light at distance point[1] beside the axis."""
     n = 400_000
     r, a = mirror_radius * np.sqrt(rng.random(n)), rng.uniform(0, 2 * np.pi, n)
@@ -409,8 +427,9 @@ def test_crossing_sums_the_beams_that_are_there() -> None:
     origin = np.array([[0.0, -100.0, 0.0], [20.0, -100.0, 0.0], [-20.0, -100.0, 0.0]])
     aims = np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 40.0], [300.0, 0.0, 40.0]])
     mirrors = Mirrors.of(2.0, 2.0, reflectivity=[1.0, 0.5, 1.0])
-    here = bp.crossing(bp.beams(origin, aims, mirrors), [[0.0, 0.0, 40.0], [0.0, 0.0, 90.0]],
-                       dni=800.0)  # fmt: skip
+    here = bp.crossing(
+        bp.beams(origin, aims, mirrors), [[0.0, 0.0, 40.0], [0.0, 0.0, 90.0]], dni=800.0
+    )
     assert here.count.tolist() == [2, 0]
     slant = math.hypot(100.0, 40.0), math.sqrt(100**2 + 40**2 + 20**2)
     each = [float(bp.concentration(s, 4.0, math.inf)) for s in slant]

@@ -57,7 +57,7 @@ def field_beam(sun_shape: str = "limb", focal: float | None = None, slope: float
         field_beam(),
     ],
     ids=["gaussian", "box", "disc", "picture", "reflected"],
-)  # fmt: skip
+)
 def test_centroid_and_moments_are_those_of_the_surface(beam: Beam) -> None:
     centroid, covariance = numeric_moments(beam)
     np.testing.assert_allclose(beam.centroid, centroid, rtol=0, atol=1e-6)
@@ -156,9 +156,16 @@ def test_the_suns_image_has_the_size_of_the_sun() -> None:
     mirror = TARGET.center + distance * TARGET.normal
     sun = normalize(TARGET.normal + [0.0, 0.0, 0.3])
     beam = reflected_beam(
-        TARGET, mirror, sun, 0.05, 0.05, facets=(1, 1), focal=np.inf, slope_error=0.0,
+        TARGET,
+        mirror,
+        sun,
+        0.05,
+        0.05,
+        facets=(1, 1),
+        focal=np.inf,
+        slope_error=0.0,
         sun_shape="pillbox",
-    )  # fmt: skip
+    )
     lit = beam.flux > 0.5 * beam.peak
     width, height = np.ptp(np.nonzero(lit)[1]) + 1, np.ptp(np.nonzero(lit)[0]) + 1
     assert width * beam.step == pytest.approx(0.0093 * distance, abs=0.06)
@@ -175,11 +182,18 @@ def test_variances_of_sun_and_slopes_add() -> None:
     sun = -np.array([sun[0], sun[1], -sun[2]])
     smooth, rough = (
         reflected_beam(
-            TARGET, mirror, sun, 0.05, 0.05, facets=(1, 1), focal=np.inf, slope_error=s,
+            TARGET,
+            mirror,
+            sun,
+            0.05,
+            0.05,
+            facets=(1, 1),
+            focal=np.inf,
+            slope_error=s,
             sun_shape="pillbox",
         )
         for s in (0.0, slope)
-    )  # fmt: skip
+    )
     normal = bisector(sun, -TARGET.normal)
     sigma_sun = distance * SUN_RADIUS / 2.0
     np.testing.assert_allclose(
@@ -210,9 +224,14 @@ def test_canting_gathers_the_beam() -> None:
     gained = np.trace(flat.second_moments) - np.trace(focused.second_moments)
     assert 0.5 * 2 * 3.2**2 / 12 < gained < 2 * 3.2**2 / 12
     same = reflected_beam(
-        TARGET, MIRROR, SUN, 1.0, 1.0, facets=equal_facets(3.2, 3.2, (2, 2), np.inf),
+        TARGET,
+        MIRROR,
+        SUN,
+        1.0,
+        1.0,
+        facets=equal_facets(3.2, 3.2, (2, 2), np.inf),
         focal=np.inf,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(same.flux, flat.flux, rtol=0, atol=1e-6 * flat.peak)
 
 
@@ -264,7 +283,7 @@ def _reflected(**changes: object) -> Beam:
         (lambda: _reflected(R_enu_mirror=np.ones((3, 3))), "must be a rotation"),
         (lambda: _reflected(aim=np.zeros((2, 3))), r"aim \(2, 3\)"),
     ],
-)  # fmt: skip
+)
 def test_guards(make: object, text: str) -> None:
     with pytest.raises(InputError, match=text):
         make()  # type: ignore[operator]

@@ -157,9 +157,14 @@ def test_the_mean_of_the_paper_is_below_the_axis() -> None:
 
 @pytest.mark.parametrize(
     ("area", "focus", "dni"),
-    [(100.0, 500.0, 1000.0), (2.2, 40.0, 1000.0), (40.0, math.inf, 1000.0), (140.0, 60.0, 1100.0),
-     (20.0, 2000.0, 1000.0)],
-)  # fmt: skip
+    [
+        (100.0, 500.0, 1000.0),
+        (2.2, 40.0, 1000.0),
+        (40.0, math.inf, 1000.0),
+        (140.0, 60.0, 1100.0),
+        (20.0, 2000.0, 1000.0),
+    ],
+)
 def test_the_range_of_a_beam_agrees_with_a_scan_of_it(
     area: float, focus: float, dni: float
 ) -> None:

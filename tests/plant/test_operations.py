@@ -31,8 +31,10 @@ from heliotrope.twin.live.live import LiveOptions, LivePlant
 
 MRAD = 1e-3
 ENGINEER, OPERATOR, VIEWER = (
-    Person("Egon", Role.ENGINEER), Person("Olga", Role.OPERATOR), Person("Vera", Role.VIEWER),
-)  # fmt: skip
+    Person("Egon", Role.ENGINEER),
+    Person("Olga", Role.OPERATOR),
+    Person("Vera", Role.VIEWER),
+)
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 RECEIVER = Receiver("R", "planar", np.array([0.0, 0.0, 60.0]), np.array([0.0, -1.0, 0.0]), 6.0, 5.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -78,10 +80,11 @@ def test_the_map_is_mirrored_with_the_aim(right: float, up: float, error: float)
     light = normalize(np.array([0.0, -0.6, 0.8]))
     vertex = np.array([[0.0, -150.0, 60.0]])
     views = [
-        predicted(RECEIVER, vertex, RECEIVER.center + [[side * right, 0.0, up]], [5.0], [error],
-                  sun=light)
+        predicted(
+            RECEIVER, vertex, RECEIVER.center + [[side * right, 0.0, up]], [5.0], [error], sun=light
+        )
         for side in (1.0, -1.0)
-    ]  # fmt: skip
+    ]
     assert np.allclose(views[0].flux, views[1].flux[:, ::-1], rtol=1e-3, atol=1e-2)
     assert 0.0 <= views[0].intercept <= 1.0
 
@@ -102,9 +105,14 @@ def test_light_that_is_none() -> None:
         predicted(RECEIVER, np.zeros((2, 3)), np.zeros((1, 3)), [1.0], [0.0], sun=UP)
     with pytest.raises(InputError, match=r"a reflectivity of 1\.5"):
         predicted(
-            RECEIVER, [[0.0, -9.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=UP,
+            RECEIVER,
+            [[0.0, -9.0, 2.0]],
+            RECEIVER.center[None],
+            [5.0],
+            [0.0],
+            sun=UP,
             reflectivity=1.5,
-        )  # fmt: skip
+        )
 
 
 # -- searching ---------------------------------------------------------------------------------
@@ -175,8 +183,10 @@ def test_a_book_counts_alarms_until_they_are_over_and_acknowledged() -> None:
     (row,) = book.alarms()
     assert (row.count, row.acknowledged_by, book.open_alarms) == (2, "", 1)
     assert [event.text for event in book.events(9)] == [
-        "wind: again", "wind: over (over)", "wind: too strong"
-    ]  # fmt: skip
+        "wind: again",
+        "wind: over (over)",
+        "wind: too strong",
+    ]
     assert len(book.events(1)) == 1
 
 
@@ -224,9 +234,10 @@ def test_a_store_that_keeps_nothing_is_an_alarm_and_stops_nothing() -> None:
 
 
 def live(
-    work: Callable[[LivePlant], Awaitable[None]], settings: WorkSettings,
+    work: Callable[[LivePlant], Awaitable[None]],
+    settings: WorkSettings,
     keep_out: tuple[int, float] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Run four heliostats on two clusters in virtual time.
 
     ``keep_out``: a volume stands in the way of one of them to the receiver, at a share of it.

@@ -60,8 +60,11 @@ def test_nothing_moves_by_itself_and_everything_is_known(tmp_path: Path) -> None
         assert plant.field.age(now).max() <= 1.5
         one = plant.field.of("P6A", now)
         assert (one.state, one.cluster, one.live, one.text) == (
-            "STOWED", "pod-6", True, "P6A: STOWED"
-        )  # fmt: skip
+            "STOWED",
+            "pod-6",
+            True,
+            "P6A: STOWED",
+        )
 
     bench = play(tmp_path, scene)
     for cluster in bench.clusters.values():
@@ -110,9 +113,7 @@ def test_a_command_comes_through_all_stages(tmp_path: Path) -> None:
         assert not await ticket.end()
         assert 9.0 < bench.clock.monotonic() - begin < 14.0
         assert ticket.counted() == {"done": 2, "refused": 1, "failed": 1}
-        assert ticket.refusals == {
-            "P1A": "not in this state", "P2A": "no answer before it expired"
-        }  # fmt: skip
+        assert ticket.refusals == {"P1A": "not in this state", "P2A": "no answer before it expired"}
         assert "P1A: not in this state" in ticket.text
         assert not ticket.good
 
@@ -182,21 +183,25 @@ def test_defocus_and_stow_are_taken_from_anybody(tmp_path: Path) -> None:
     bench = play(tmp_path, scene)
     records, _ = read(bench.audit.path)
     assert [(r.who, r.what, r.heliostats) for r in records] == [
-        ("a passer-by", "DEFOCUS", ("P1A", "P2A")), ("a passer-by", "STOW", ())
-    ]  # fmt: skip
+        ("a passer-by", "DEFOCUS", ("P1A", "P2A")),
+        ("a passer-by", "STOW", ()),
+    ]
     assert [r.result for r in records] == ["DEFOCUS: 2 done", "STOW: 18 done"]
 
 
 @pytest.mark.parametrize(
     ("name", "values", "said"),
     [
-        ("DANCE", (), "no command"), ("AIM", (1.0, 2.0, 3.0), "given by aim and standby"),
-        ("SET_STOW", (1, 2), "no command"), ("JOG", (0,), "JOG: 1 numbers given; the wire takes 2"),
-        ("JOG", (0, 0.5), "cannot be sent"), ("JOG", (0, 2**31), "cannot be sent"),
+        ("DANCE", (), "no command"),
+        ("AIM", (1.0, 2.0, 3.0), "given by aim and standby"),
+        ("SET_STOW", (1, 2), "no command"),
+        ("JOG", (0,), "JOG: 1 numbers given; the wire takes 2"),
+        ("JOG", (0, 0.5), "cannot be sent"),
+        ("JOG", (0, 2**31), "cannot be sent"),
         ("SEARCH", (float("nan"), 1.0), "give finite numbers"),
         ("SEARCH", (1e300, 1.0), "cannot be sent"),
     ],
-)  # fmt: skip
+)
 def test_what_the_wire_cannot_carry_is_refused(
     tmp_path: Path, name: str, values: tuple[float, ...], said: str
 ) -> None:
@@ -223,9 +228,12 @@ def test_mirrors_join_one_after_the_other(tmp_path: Path) -> None:
 
     bench = play(tmp_path, scene, settings=settings)
     joined = sorted(
-        at for cluster in bench.clusters.values() for at, m in cluster.taken
-        if isinstance(m, Command) and m.name == "TRACK" for _ in m.heliostats or cluster.names
-    )  # fmt: skip
+        at
+        for cluster in bench.clusters.values()
+        for at, m in cluster.taken
+        if isinstance(m, Command) and m.name == "TRACK"
+        for _ in m.heliostats or cluster.names
+    )
     assert len(joined) == 18
     for i, begin in enumerate(joined):
         for j in range(i, len(joined)):
@@ -346,7 +354,7 @@ def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -
         assert not await other.end(5.0)
         assert other.refusals == {
             "P5B": "TRACK: its aim is not known here; give it one (AIM) first"
-        }  # fmt: skip
+        }
 
     bench = play(tmp_path, scene, volumes=(walkway,))
     assert len(bench.cluster_of("P5A").commands("TRACK")) == 1

@@ -73,9 +73,12 @@ async def follow(bench: Bench) -> None:
 
 
 def cycle(
-    folder: Path, scene: Callable[[Bench, CalibrationCycle, Eye, int], Awaitable[None]],
-    settings: CycleSettings | None = None, state: int = HOME, **error: float,
-) -> Bench:  # fmt: skip
+    folder: Path,
+    scene: Callable[[Bench, CalibrationCycle, Eye, int], Awaitable[None]],
+    settings: CycleSettings | None = None,
+    state: int = HOME,
+    **error: float,
+) -> Bench:
     """Play a scene with a heliostat at standby and an engineer who stays."""
     made: list[Bench] = []
 
@@ -144,15 +147,20 @@ def prototype_machine(bench: Bench) -> Any:
         ({"least": 5}, {}, (), "unchanged: 2 sightings, 5 are needed"),
         ({}, {}, ("cloud",), "unchanged: no photograph could be used"),
         (
-            {"gain": 0.5, "model": ("azimuth_bias",)}, {"elevation_bias": 1e-3}, (),
+            {"gain": 0.5, "model": ("azimuth_bias",)},
+            {"elevation_bias": 1e-3},
+            (),
             "the fit misses by .* not below 0.5 times",
         ),
     ],
-)  # fmt: skip
+)
 def test_what_has_not_earned_it_is_not_pushed(
-    tmp_path: Path, settings: dict[str, Any], error: dict[str, float], reasons: tuple[str, ...],
+    tmp_path: Path,
+    settings: dict[str, Any],
+    error: dict[str, float],
+    reasons: tuple[str, ...],
     said: str,
-) -> None:  # fmt: skip
+) -> None:
     results: list[CycleResult] = []
 
     async def scene(bench: Bench, whole: CalibrationCycle, eye: Eye, token: int) -> None:

@@ -128,8 +128,14 @@ def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_pa
     bench = play(tmp_path, scene)
     records, _ = read(bench.audit.path)
     assert [r.what for r in records if r.who == "Olga"] == [
-        "AUTHORITY", "DEFOCUS", "LOCK", "WITHDRAW", "ACKNOWLEDGE", "ACKNOWLEDGE", "APPROACH"
-    ]  # fmt: skip
+        "AUTHORITY",
+        "DEFOCUS",
+        "LOCK",
+        "WITHDRAW",
+        "ACKNOWLEDGE",
+        "ACKNOWLEDGE",
+        "APPROACH",
+    ]
     assert not any(r.what == "STOW" for r in records)
 
 
@@ -247,8 +253,9 @@ def test_who_comes_back_during_an_emergency_is_told(tmp_path: Path) -> None:
     bench = play(tmp_path, scene)
     records, _ = read(bench.audit.path)
     assert [(r.who, r.role, r.what) for r in records] == [
-        ("Olga", "anybody", "STOW"), ("Vera", "anybody", "DEFOCUS")
-    ]  # fmt: skip
+        ("Olga", "anybody", "STOW"),
+        ("Vera", "anybody", "DEFOCUS"),
+    ]
 
 
 def test_defocus_of_some_is_repeated_until_it_is_acknowledged(tmp_path: Path) -> None:

@@ -83,8 +83,11 @@ def test_a_file_cut_at_any_byte_loses_at_most_its_last_line(
     whole = path.read_bytes()
     for cut in range(len(whole)):
         path.write_bytes(whole[:cut])
-        begun = sum('"accepted"' in line for line in whole[:cut].decode(errors="ignore").split("\n")
-                    if line.endswith("}"))  # fmt: skip
+        begun = sum(
+            '"accepted"' in line
+            for line in whole[:cut].decode(errors="ignore").split("\n")
+            if line.endswith("}")
+        )
         audit = JsonLines(path, AT)
         audit.begin(record("new"))
         audit.finish("new", "done", "later")
@@ -315,8 +318,9 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     rows["state"] = (states.IDLE, states.TRACKING, states.FAULT)
 
     def status(count: int, names: tuple[str, ...] = ()) -> Status:
-        return Status("K", count, 0.0, "gps", 0.0, 3.0, 0.1, names=names,
-                      block=rows[:count].tobytes())  # fmt: skip
+        return Status(
+            "K", count, 0.0, "gps", 0.0, 3.0, 0.1, names=names, block=rows[:count].tobytes()
+        )
 
     assert "status without names" in field.take("K", status(3), 10.0)[0]
     problems = field.take("K", status(3, ("B", "A", "C")), 10.0)

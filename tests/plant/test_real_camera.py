@@ -82,8 +82,9 @@ def looked(cameras: RealCameras, name: str) -> Any:
 
 def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) -> None:
     target = plant.targets[0]
-    cameras = RealCameras(plant, tmp_path, SystemClock(), memory=tmp_path / "m",
-                          sources=Scripted(frame))  # fmt: skip
+    cameras = RealCameras(
+        plant, tmp_path, SystemClock(), memory=tmp_path / "m", sources=Scripted(frame)
+    )
     cameras.start()
     try:
         before = SystemClock().monotonic()

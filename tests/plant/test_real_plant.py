@@ -67,10 +67,13 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
         world = LivePlant(design, clock, LiveOptions(seed=0))  # type: ignore[arg-type]
         cameras = RealCameras(design, tmp_path, clock, memory=tmp_path / "m", sources=drawn(world))
         plant = RealPlant(
-            design, PlantLinks(links=dict(world.links)), clock,
-            JsonLines(tmp_path / "audit.jsonl", clock.utc()), cameras=cameras,
+            design,
+            PlantLinks(links=dict(world.links)),
+            clock,
+            JsonLines(tmp_path / "audit.jsonl", clock.utc()),
+            cameras=cameras,
             work=WorkSettings(wanted=True),
-        )  # fmt: skip
+        )
         async with asyncio.TaskGroup() as group:
             turning = group.create_task(world._turn())
             async with running(*world._parts), running(*world._clusters), plant.running():

@@ -58,8 +58,10 @@ TURN = 16_000
 STOW = (TURN // 4, 3_916)
 MACHINE = Machine(
     (Axis(-800, 16_240, 8000, 16_000, 2), Axis(-160, 4_160, 8000, 16_000, 2)),
-    STOW, (12.0, 0.0, 40.0), (0.1, 0.05),
-)  # fmt: skip
+    STOW,
+    (12.0, 0.0, 40.0),
+    (0.1, 0.05),
+)
 #: The machine may be busy, s.
 PATIENCE = 60.0
 
@@ -84,9 +86,12 @@ def design() -> Plant:
     count = 2 * len(WAYS)
     homes = tuple(name for name in WAYS for _ in range(2))
     mirrors = Heliostats(
-        tuple(f"H{i + 1}" for i in range(count)), mechanisms(count), np.full(count, 3.0),
-        np.full(count, 2.0), cluster=homes,
-    )  # fmt: skip
+        tuple(f"H{i + 1}" for i in range(count)),
+        mechanisms(count),
+        np.full(count, 3.0),
+        np.full(count, 2.0),
+        cluster=homes,
+    )
     receiver = Receiver(
         "receiver", "planar", np.array([0.0, 0.0, 50.0]), np.array([0.0, 1.0, 0.0]), 4.0, 4.0
     )
@@ -235,9 +240,18 @@ def test_a_real_plant_over_tcp_mqtt_and_its_own_bus(
     links = links_file(tmp_path, port, mosquitto.port)
     with contextlib.ExitStack() as stack:
         plant = Process(
-            "run", str(tmp_path / "plant.toml"), "--clusters", str(links), "--port", "0",
-            "--data", str(tmp_path / "data"), "--no-browser", "--every", "1",
-        )  # fmt: skip
+            "run",
+            str(tmp_path / "plant.toml"),
+            "--clusters",
+            str(links),
+            "--port",
+            "0",
+            "--data",
+            str(tmp_path / "data"),
+            "--no-browser",
+            "--every",
+            "1",
+        )
         stack.callback(plant.end)
         for name in ("K1", "K2"):
             stack.callback(Process("cluster", str(tmp_path / f"{name}.toml")).end)
@@ -327,7 +341,7 @@ def test_each_cluster_gets_its_way(folder: Path) -> None:
         ("links.keys", "28282828", "2", "links.keys: K1: a key of 57 characters"),
         ("K3.toml", 'name = "K3"', 'name = "K5"', "it is of cluster K5, not of K3"),
     ],
-)  # fmt: skip
+)
 def test_what_a_links_file_may_not_say(
     folder: Path, file: str, old: str, new: str, text: str
 ) -> None:
@@ -374,9 +388,7 @@ def call(*words: object) -> tuple[int, str, str]:
 
 def test_files_are_checked_without_a_plant(folder: Path) -> None:
     done = call(folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
-    assert done == (
-        0, "four ways: 8 heliostats on 4 clusters, 0 of 0 targets with a camera\n", ""
-    )  # fmt: skip
+    assert done == (0, "four ways: 8 heliostats on 4 clusters, 0 of 0 targets with a camera\n", "")
 
 
 @pytest.mark.parametrize(
@@ -398,10 +410,12 @@ def test_files_are_checked_without_a_plant(folder: Path) -> None:
         (("--certificate", "a.pem"), "TLS needs both files, --certificate and --key"),
         (("--certificate", "a.pem", "--key", "b.pem"), "a.pem and key b.pem cannot be used"),
         (("--database", "mysql://x/y"), "no postgresql://user@host/name"),
-        (("--heliostats", 32, "--no-console", "--database", "postgresql://x@127.0.0.1:1/y"),
-         "Connection refused"),
+        (
+            ("--heliostats", 32, "--no-console", "--database", "postgresql://x@127.0.0.1:1/y"),
+            "Connection refused",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_run_is_one_line(
     folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...], text: str
 ) -> None:
@@ -436,8 +450,14 @@ def test_options_stand_under_headings() -> None:
     _, text, _ = call("--help")
     headings = re.findall(r"^(\w[\w ]*):$", text, re.MULTILINE)
     assert headings == [
-        "Arguments", "Simulation", "A real plant", "Work", "Console", "Records", "Options"
-    ]  # fmt: skip
+        "Arguments",
+        "Simulation",
+        "A real plant",
+        "Work",
+        "Console",
+        "Records",
+        "Options",
+    ]
 
 
 # -- the plant -----------------------------------------------------------------------------

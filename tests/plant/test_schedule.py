@@ -430,9 +430,11 @@ def test_predictions_of_days_can_be_believed(days: Days) -> None:
 
 
 @given(
-    azimuth=st.floats(-np.pi, np.pi), elevation=st.floats(-0.2, 1.55),
-    dead=st.sets(st.integers(0, 23)), held=st.sets(st.integers(0, 23)),
-)  # fmt: skip
+    azimuth=st.floats(-np.pi, np.pi),
+    elevation=st.floats(-0.2, 1.55),
+    dead=st.sets(st.integers(0, 23)),
+    held=st.sets(st.integers(0, 23)),
+)
 def test_only_who_may_is_ever_chosen(
     azimuth: float, elevation: float, dead: set[int], held: set[int]
 ) -> None:
@@ -508,8 +510,16 @@ def test_the_form_of_the_nearest_sample_is_good_enough() -> None:
     one = Scheduler(plant, now=MORNING)
     rows = np.arange(3, 1000, 97)
     some = plant.groups["azel"].mechanism[rows]
-    names = ("position_east", "position_north", "position_up", "tilt_north", "tilt_east",
-             "azimuth_bias", "elevation_bias", "non_orthogonality")  # fmt: skip
+    names = (
+        "position_east",
+        "position_north",
+        "position_up",
+        "tilt_north",
+        "tilt_east",
+        "azimuth_bias",
+        "elevation_bias",
+        "non_orthogonality",
+    )
     suns = suns_of_year(plant.site, 2026, days=6)
     form = expectation(some, plant.receivers[0].center, suns, names)
     exact = form.rms(np.linalg.inv(precision(some, names)))

@@ -190,9 +190,10 @@ def test_who_goes_into_a_volume_is_held(commanded: bool, tmp_path: Path) -> None
         cluster = bench.cluster_of("P5A")
         # P5C goes to stow across it, which is never held up; the beam of P5B stands in it.
         for name, state, begin, end in (
-            ("P5A", states.IDLE, west, east), ("P5B", states.TRACKING, inside, inside),
+            ("P5A", states.IDLE, west, east),
+            ("P5B", states.TRACKING, inside, inside),
             ("P5C", states.STOWING, counts(plant, "P5C", WEST), counts(plant, "P5C", EAST)),
-        ):  # fmt: skip
+        ):
             cluster.set(state, name)
             row = cluster.names.index(name)
             for axis, what in enumerate(("primary", "secondary")):

@@ -15,10 +15,14 @@ _LIMIT = 1e-10  # rad
 def _mechanism(inputs: dict) -> Mechanism:
     return kinds.two_axis(
         inputs.get("position", (0.0, 0.0, 0.0)),
-        inputs["axis1_unit"], inputs["axis2_unit"], inputs["n0"],
-        origin_1=inputs["t1"], origin_2=inputs["t2"], vertex=inputs["r0"],
+        inputs["axis1_unit"],
+        inputs["axis2_unit"],
+        inputs["n0"],
+        origin_1=inputs["t1"],
+        origin_2=inputs["t2"],
+        vertex=inputs["r0"],
         orientation=np.array(inputs.get("R_heliostat_rowmajor", np.eye(3))).reshape(3, 3),
-    )  # fmt: skip
+    )
 
 
 def _difference(angles: np.ndarray, wanted: list[float]) -> float:
@@ -67,9 +71,11 @@ def _check_iterations(mechanism, sun, aim, branch, wanted) -> None:  # type: ign
 def _check_single_axis(case: dict) -> None:
     inputs = case["inputs"]
     mechanism = kinds.single_axis(
-        (0.0, 0.0, 0.0), inputs["axis1_unit"], inputs["n0"],
+        (0.0, 0.0, 0.0),
+        inputs["axis1_unit"],
+        inputs["n0"],
         vertex=inputs["r0"],
-    )  # fmt: skip
+    )
     local = "aim_in_mirror_frame" in inputs
     aim = np.array(inputs["aim_in_mirror_frame"] if local else inputs["aim_ENZ"])
     if not local:

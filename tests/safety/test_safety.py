@@ -387,8 +387,27 @@ def test_texts_of_acts_name_what_pre_empts() -> None:
     assert max(Act) is Act.STOW
 
 
-VALUE = st.sampled_from([-math.inf, -1.0, 0.0, 0.05, 0.3, 0.45, 0.55, 0.7, 0.85, 0.95, 1.1, 4.0,
-                         8.0, 11.5, 16.0, 30.0, math.nan])  # fmt: skip
+VALUE = st.sampled_from(
+    [
+        -math.inf,
+        -1.0,
+        0.0,
+        0.05,
+        0.3,
+        0.45,
+        0.55,
+        0.7,
+        0.85,
+        0.95,
+        1.1,
+        4.0,
+        8.0,
+        11.5,
+        16.0,
+        30.0,
+        math.nan,
+    ]
+)
 STEP = st.sampled_from([0.0, 0.5, 1.0, 3.0, 20.0])
 NAMES = sorted({row.reading for row in CONDITIONS})
 
@@ -576,9 +595,14 @@ def test_joining_is_bounded_in_every_span() -> None:
     assert len(joined) == pytest.approx(4.0 * 19.95, abs=1.0), "and it is not bounded to less"
 
 
-@given(st.lists(st.tuples(
-    st.sampled_from([-5.0, 0.0, 0.1, 1.0, 1e9, math.nan, math.inf]),
-    st.integers(-2, 50)), max_size=40))  # fmt: skip
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([-5.0, 0.0, 0.1, 1.0, 1e9, math.nan, math.inf]), st.integers(-2, 50)
+        ),
+        max_size=40,
+    )
+)
 def test_no_clock_lets_more_mirrors_join(steps: list[tuple[float, int]]) -> None:
     limiter, now, total, most = JoinLimiter(2.0, 5), 0.0, 0, 0.0
     for step, wanted in steps:
@@ -620,10 +644,15 @@ def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
     row = next(r for r in CONDITIONS if r.name == "keep_out_predicted")
     state = safety.start([row], 0.0)
     for now, subjects, tripped in (
-        (1.0, (), set()), (2.0, ("A", "B"), {"A", "B"}), (3.0, ("A",), {"A", "B"}),
+        (1.0, (), set()),
+        (2.0, ("A", "B"), {"A", "B"}),
+        (3.0, ("A",), {"A", "B"}),
         # Clear for two seconds.
-        (6.0, ("A",), {"A"}), (7.0, (), {"A"}), (10.0, (), set()), (11.0, (), set()),
-    ):  # fmt: skip
+        (6.0, ("A",), {"A"}),
+        (7.0, (), {"A"}),
+        (10.0, (), set()),
+        (11.0, (), set()),
+    ):
         state = safety.narrowed(state, row.name, subjects)
         readings = {(row.reading, subject): Reading(1.0, now) for subject in subjects}
         readings[row.reading, ""] = Reading(0.0, now)

@@ -48,15 +48,31 @@ def server() -> Iterator[str]:
 
     def run(*command: str) -> None:
         done = subprocess.run(
-            [str(programs / command[0]), *command[1:]], cwd=folder, capture_output=True, text=True,
-            check=False, **as_other,
-        )  # fmt: skip
+            [str(programs / command[0]), *command[1:]],
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+            **as_other,
+        )
         assert done.returncode == 0, done.stdout + done.stderr
 
     data = folder / "data"
     try:
-        run("initdb", "-D", str(data), "-A", "trust", "-U", "plant", "-E", "UTF8",
-            "--locale=C", "--no-sync", "--no-instructions")  # fmt: skip
+        run(
+            "initdb",
+            "-D",
+            str(data),
+            "-A",
+            "trust",
+            "-U",
+            "plant",
+            "-E",
+            "UTF8",
+            "--locale=C",
+            "--no-sync",
+            "--no-instructions",
+        )
         options = f"-c listen_addresses='' -c unix_socket_directories='{folder}' -c fsync=off"
         run("pg_ctl", "-D", str(data), "-w", "-l", str(folder / "log"), "-o", options, "start")
         try:

@@ -41,9 +41,14 @@ def write(place: Path, seed: int, told: int) -> None:
 
 
 async def _write(
-    keeper: Keeper, audit: KeptAudit, points: KeptPoints, telemetry: Telemetry,
-    chance: random.Random, seed: int, told: int,
-) -> None:  # fmt: skip
+    keeper: Keeper,
+    audit: KeptAudit,
+    points: KeptPoints,
+    telemetry: Telemetry,
+    chance: random.Random,
+    seed: int,
+    told: int,
+) -> None:
     places = points.read()
 
     def tell(line: str) -> None:
@@ -55,11 +60,17 @@ async def _write(
         name = chance.choice(NAMES)
         version = keeper.record_parameters(
             ParameterVersion(
-                name, float(k), ("tilt_north",), np.array([k + 0.5]), np.eye(1), np.ones(1),
-                sightings=numbers, residual_before=np.zeros((len(numbers), 2)),
+                name,
+                float(k),
+                ("tilt_north",),
+                np.array([k + 0.5]),
+                np.eye(1),
+                np.ones(1),
+                sightings=numbers,
+                residual_before=np.zeros((len(numbers), 2)),
                 residual_after=np.zeros((len(numbers), 2)),
             )
-        )  # fmt: skip
+        )
         keeper.record_event(Event(float(k), "load", f"{seed}-{k}"))
         telemetry.take(1.8e9 + 1000.0 * seed + k, _look(k))
         if chance.random() < 0.3:
@@ -90,9 +101,12 @@ def _sightings(seed: int, k: int) -> object:
 def _look(k: int) -> Look:
     count = len(NAMES)
     return Look(
-        np.full(count, k % 2, np.uint8), np.zeros(count, np.uint8), np.zeros(count, np.uint16),
-        np.full((count, 2), k, np.int32), np.zeros(count),
-    )  # fmt: skip
+        np.full(count, k % 2, np.uint8),
+        np.zeros(count, np.uint8),
+        np.zeros(count, np.uint16),
+        np.full((count, 2), k, np.int32),
+        np.zeros(count),
+    )
 
 
 def limit(place: Path, told: int) -> None:

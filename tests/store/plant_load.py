@@ -32,14 +32,19 @@ async def _run(place: Path, seed: int, tell: Callable[[str], object]) -> None:
     clock = VirtualClock(asyncio.get_running_loop().time, START)
     keeper, by_hand = Keeper(place), bool(seed % 2)  # the automatic work has the authority
     live = LivePlant(
-        malan_plant(COUNT), clock,
+        malan_plant(COUNT),
+        clock,
         LiveOptions(
-            seed=1, rendered=False, threads=0, plain=True,
+            seed=1,
+            rendered=False,
+            threads=0,
+            plain=True,
             work=WorkSettings(wanted=not by_hand, calibrate=not by_hand),
         ),
-        audit=KeptAudit(keeper, SystemClock(), clock.utc()), assigned=KeptPoints(keeper),
+        audit=KeptAudit(keeper, SystemClock(), clock.utc()),
+        assigned=KeptPoints(keeper),
         records=keeper,
-    )  # fmt: skip
+    )
     async with live.running():
         tell("open")
         await (_command if by_hand else _learn)(live, keeper, seed, tell)
@@ -74,9 +79,12 @@ async def _command(
 
 
 def _one(
-    one: PlantController, person: Person, token: int, chance: random.Random,
+    one: PlantController,
+    person: Person,
+    token: int,
+    chance: random.Random,
     tell: Callable[[str], object],
-) -> None:  # fmt: skip
+) -> None:
     names = chance.sample(one.field.names, chance.randint(1, 3))
     what = chance.choice(("STOW", "DEFOCUS", "TRACK", "APPROACH", "STANDBY", "STANDBY"))
     if what == "STANDBY":

@@ -40,10 +40,17 @@ def fill(keeper: Keeper, seen: Sightings) -> None:
     numbers = keeper.record_sightings(NAMES, seen, target="west")
     keeper.record_parameters(
         ParameterVersion(
-            "A", 1.0, ("tilt_north",), np.array([1 / 3]), np.eye(1), np.ones(1),
-            sightings=numbers[:2], residual_before=np.ones((2, 2)), residual_after=np.zeros((2, 2)),
+            "A",
+            1.0,
+            ("tilt_north",),
+            np.array([1 / 3]),
+            np.eye(1),
+            np.ones(1),
+            sightings=numbers[:2],
+            residual_before=np.ones((2, 2)),
+            residual_after=np.zeros((2, 2)),
         )
-    )  # fmt: skip
+    )
     keeper.record_visit(VisitEntry("A", "west", 1.0, 2.0, good=True))
     keeper.record_plan([PlannedVisit("B", "west", 3.0)])
     keeper.record_campaign(CampaignEntry("spring", 1.0))

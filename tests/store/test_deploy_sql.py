@@ -16,9 +16,24 @@ SQL = Path(__file__).parents[2] / "deploy" / "postgresql.sql"
 def test_the_store_begins_in_the_database_of_the_sql(server: str) -> None:
     host = parse_qs(urlsplit(server).query)["host"][0]
     done = subprocess.run(
-        ["psql", "-h", host, "-U", "plant", "-d", "postgres", "-v", "ON_ERROR_STOP=1", "-q",
-         "-f", str(SQL)], capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        [
+            "psql",
+            "-h",
+            host,
+            "-U",
+            "plant",
+            "-d",
+            "postgres",
+            "-v",
+            "ON_ERROR_STOP=1",
+            "-q",
+            "-f",
+            str(SQL),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     url = f"postgresql://heliotrope@/heliotrope?host={host}"
     engine = create_engine(server.replace("postgresql:", "postgresql+psycopg:"))
@@ -26,9 +41,9 @@ def test_the_store_begins_in_the_database_of_the_sql(server: str) -> None:
         with store(Shown(database=url, console=False)) as keeper:
             assert keeper.people.empty()
         with engine.connect() as connection:
-            owner = connection.execute(text(
-                "SELECT pg_get_userbyid(datdba) FROM pg_database WHERE datname = 'heliotrope'"
-            )).scalar()  # fmt: skip
+            owner = connection.execute(
+                text("SELECT pg_get_userbyid(datdba) FROM pg_database WHERE datname = 'heliotrope'")
+            ).scalar()
         assert owner == "heliotrope"
     finally:
         with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:

@@ -28,12 +28,26 @@ def exported(keeper: Keeper, seen: Sightings, tmp_path: Path) -> Path:
     for k in (1, 2):
         keeper.record_parameters(
             ParameterVersion(
-                "A/1", 1.8e9 + k, ("tilt_north", "azimuth_bias"), np.array([1 / 3, -2e-3]) / k,
-                np.array([[4e-8, 1e-8], [1e-8, 1e-8]]), np.array([0.01, 0.02]), 0.015, 3e-4, 1.2,
-                "converged", mine[: k + 1], np.full((k + 1, 2), [3e-3, 4e-3]),
-                np.full((k + 1, 2), 1e-5 / k), "two", "anna", "spring", "a, note", ("AXES",),
+                "A/1",
+                1.8e9 + k,
+                ("tilt_north", "azimuth_bias"),
+                np.array([1 / 3, -2e-3]) / k,
+                np.array([[4e-8, 1e-8], [1e-8, 1e-8]]),
+                np.array([0.01, 0.02]),
+                0.015,
+                3e-4,
+                1.2,
+                "converged",
+                mine[: k + 1],
+                np.full((k + 1, 2), [3e-3, 4e-3]),
+                np.full((k + 1, 2), 1e-5 / k),
+                "two",
+                "anna",
+                "spring",
+                "a, note",
+                ("AXES",),
             )
-        )  # fmt: skip
+        )
     keeper.writer.confirmed().result(10.0)
     told: list[tuple[int, int]] = []
     written = export(keeper.database, tmp_path / "out", progress=lambda *n: told.append(n))
@@ -65,8 +79,9 @@ def test_residuals_say_what_each_sighting_missed_by(exported: Path) -> None:
 def test_parameters_and_covariance(exported: Path) -> None:
     found = read(exported / "A%2F1" / "parameters.csv")
     assert [(r["version"], r["parameter"]) for r in found[:2]] == [
-        ("1", "tilt_north"), ("1", "azimuth_bias"),
-    ]  # fmt: skip
+        ("1", "tilt_north"),
+        ("1", "azimuth_bias"),
+    ]
     assert float(found[0]["value"]) == 1 / 3
     assert float(found[0]["sigma"]) == pytest.approx(2e-4)
     pairs = read(exported / "A%2F1" / "covariance.csv")
@@ -82,8 +97,10 @@ def test_parameters_and_covariance(exported: Path) -> None:
 def test_heliostats_without_a_version(exported: Path) -> None:
     index = read(exported / "heliostats.csv")
     assert [(r["heliostat"], r["versions"]) for r in index] == [
-        ("A/1", "2"), ("B", "0"), ("C", "0"),
-    ]  # fmt: skip
+        ("A/1", "2"),
+        ("B", "0"),
+        ("C", "0"),
+    ]
     assert index[0]["beam_error_after_rad"] == "0.0003"
     assert read(exported / "B" / "parameters.csv") == []
     assert len(read(exported / "B" / "sightings.csv")) == 3

@@ -169,8 +169,9 @@ class TestPoints:
         points.keep({"AIM": {"A": (7.0, 0.2, 1 / 3)}, "STANDBY": {"C": (1.0, 2.0, 3.0)}})
         first.close()
         assert KeptPoints(opened(place)).read() == {
-            "AIM": {"A": (7.0, 0.2, 1 / 3)}, "STANDBY": {"C": (1.0, 2.0, 3.0)},
-        }  # fmt: skip
+            "AIM": {"A": (7.0, 0.2, 1 / 3)},
+            "STANDBY": {"C": (1.0, 2.0, 3.0)},
+        }
 
     def test_only_what_changes_is_written(self, keeper: Keeper) -> None:
         points = KeptPoints(keeper)
@@ -221,7 +222,7 @@ def test_a_plant_at_work(
 
     async def before(clock: VirtualClock) -> None:
         monkeypatch.setattr(
-            "plant_bench.JsonLines", lambda _, started: KeptAudit(keeper, clock, started)
+            "support.plant_bench.JsonLines", lambda _, started: KeptAudit(keeper, clock, started)
         )
         async with running(Bench(clock, tmp_path, assigned=KeptPoints(keeper))) as bench:
             token = await bench.commanded()

@@ -93,8 +93,12 @@ class TestSessions:
         found = people.session(secret, 259.9)
         assert found is not None
         assert (found.name, found.role, found.since, found.expires, found.note) == (
-            "ben", "operator", 200.0, 260.0, "control room",
-        )  # fmt: skip
+            "ben",
+            "operator",
+            200.0,
+            260.0,
+            "control room",
+        )
         assert people.session(secret, 260.0) is None
         assert people.sessions(259.9) == (found,)
         assert people.sessions(260.0) == ()

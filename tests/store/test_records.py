@@ -50,11 +50,25 @@ def version(
     root = rng.normal(size=(2, 2))
     count = len(numbers)
     whole = ParameterVersion(
-        heliostat, 1.8e9 + seed, ("tilt_north", "tilt_east"), rng.normal(size=2), root @ root.T,
-        np.array([0.01, 0.02]), 0.015, 0.0003, 1.1, "converged", numbers,
-        rng.normal(size=(count, 2)), rng.normal(size=(count, 2)), "two", "anna", "first", "note",
+        heliostat,
+        1.8e9 + seed,
+        ("tilt_north", "tilt_east"),
+        rng.normal(size=2),
+        root @ root.T,
+        np.array([0.01, 0.02]),
+        0.015,
+        0.0003,
+        1.1,
+        "converged",
+        numbers,
+        rng.normal(size=(count, 2)),
+        rng.normal(size=(count, 2)),
+        "two",
+        "anna",
+        "first",
+        "note",
         ("POSITION", "AXES"),
-    )  # fmt: skip
+    )
     return replace(whole, **given)
 
 
@@ -126,8 +140,10 @@ class TestParameters:
             keeper.record_parameters(version(name, none, seed))
         confirm(keeper)
         assert {n: v.version for n, v in keeper.latest_parameters().items()} == {
-            "A": 3, "B": 1, "C": 1,
-        }  # fmt: skip
+            "A": 3,
+            "B": 1,
+            "C": 1,
+        }
         (latest,) = keeper.latest_parameters(["A"]).values()
         np.testing.assert_array_equal(latest.values, version("A", none, 3).values)
         many = [f"x{i}" for i in range(1000)] + ["B"]
@@ -190,8 +206,19 @@ def _small_case() -> tuple[Mechanism, Sightings]:
 
 class TestSchedule:
     def test_visits(self, keeper: Keeper) -> None:
-        first = VisitEntry("A", "west", 10.0, 20.0, good=True, text="calibrated", gain=0.3,
-                           sigma_before=0.01, sightings=3, version=1, campaign="c")  # fmt: skip
+        first = VisitEntry(
+            "A",
+            "west",
+            10.0,
+            20.0,
+            good=True,
+            text="calibrated",
+            gain=0.3,
+            sigma_before=0.01,
+            sightings=3,
+            version=1,
+            campaign="c",
+        )
         second = VisitEntry("B", "east", 11.0, 21.0, good=False, text="no spot")
         for visit in (first, second):
             keeper.record_visit(visit)

@@ -64,9 +64,15 @@ class TestWriting:
         assert made.take(NOON, look([0, 2, STALE], [5, -6, 7], 1, 1.26)) == 3
         first, second, third = rows(tmp_path)
         assert first == {
-            "time": datetime(2026, 6, 21, 12), "heliostat": "A", "state": "STOWED", "fault": 1,  # noqa: DTZ001
-            "flags": 0, "primary": 5, "secondary": 5, "age": pytest.approx(1.3),
-        }  # fmt: skip
+            "time": datetime(2026, 6, 21, 12),  # noqa: DTZ001
+            "heliostat": "A",
+            "state": "STOWED",
+            "fault": 1,
+            "flags": 0,
+            "primary": 5,
+            "secondary": 5,
+            "age": pytest.approx(1.3),
+        }
         assert (second["heliostat"], second["state"], second["primary"]) == ("B'1", "TRACKING", -6)
         assert third["state"] == "STALE"
 
@@ -119,9 +125,10 @@ class TestWriting:
                 st.lists(st.integers(-4, 4), min_size=3, max_size=3),
                 st.integers(1, 1000),
             ),
-            min_size=1, max_size=15,
+            min_size=1,
+            max_size=15,
         )
-    )  # fmt: skip
+    )
     def test_every_instant_can_be_told(self, looks: list[tuple[list[int], list[int], int]]) -> None:
         names = (*STATES, *([""] * 252), "STALE")
         with tempfile.TemporaryDirectory() as folder:
@@ -261,18 +268,30 @@ class TestQueries:
     @pytest.mark.parametrize(
         "sql",
         [
-            "DROP VIEW telemetry", "COPY telemetry TO 'x.csv'", "SELECT 1; SELECT 2", "",
-            "CREATE TABLE t AS SELECT 1", "SET threads = 1", "ATTACH 'x.db'", "INSTALL httpfs",
+            "DROP VIEW telemetry",
+            "COPY telemetry TO 'x.csv'",
+            "SELECT 1; SELECT 2",
+            "",
+            "CREATE TABLE t AS SELECT 1",
+            "SET threads = 1",
+            "ATTACH 'x.db'",
+            "INSTALL httpfs",
         ],
-    )  # fmt: skip
+    )
     def test_only_read(self, folder: Path, sql: str) -> None:
         with pytest.raises(InputError, match="give one SELECT"):
             query(folder, sql)
 
     @pytest.mark.parametrize(
-        "sql", ["SELECT * FROM read_csv('/etc/hostname')", "SELECT * FROM '/etc/hostname'",
-                "SELECT * FROM secret", "SELECT nothing FROM telemetry", "SELEC 1"],
-    )  # fmt: skip
+        "sql",
+        [
+            "SELECT * FROM read_csv('/etc/hostname')",
+            "SELECT * FROM '/etc/hostname'",
+            "SELECT * FROM secret",
+            "SELECT nothing FROM telemetry",
+            "SELEC 1",
+        ],
+    )
     def test_see_nothing_else(self, folder: Path, sql: str) -> None:
         secret = query(folder, "SELECT 1 AS password")
         assert secret.num_rows == 1

@@ -548,23 +548,27 @@ def modules(board: str, world: World) -> dict[str, ModuleType]:
     adc, dog = bound(Adc), bound(Dog)
     return {  # type: ignore[return-value]
         "machine": SimpleNamespace(
-            Pin=pin, UART=bound(Uart, drive=DRIVE[board]), ADC=adc,
-            SPI=bound(Chip, select=SELECT[board]), WDT=dog, mem32=memory,
-            unique_id=lambda: b"\1\2\3\4", disable_irq=lambda: irq(1),
+            Pin=pin,
+            UART=bound(Uart, drive=DRIVE[board]),
+            ADC=adc,
+            SPI=bound(Chip, select=SELECT[board]),
+            WDT=dog,
+            mem32=memory,
+            unique_id=lambda: b"\1\2\3\4",
+            disable_irq=lambda: irq(1),
             enable_irq=lambda state: irq(-1),
         ),
         "rp2": SimpleNamespace(
-            asm_pio=asm_pio, StateMachine=bound(StateMachine),
+            asm_pio=asm_pio,
+            StateMachine=bound(StateMachine),
             PIO=SimpleNamespace(OUT_LOW=0, SHIFT_RIGHT=1),
         ),
-        "esp32": SimpleNamespace(
-            RMT=bound(Rmt), Partition=Partition, mcu_temperature=lambda: 27.4
-        ),
+        "esp32": SimpleNamespace(RMT=bound(Rmt), Partition=Partition, mcu_temperature=lambda: 27.4),
         "pyb": SimpleNamespace(
             Pin=pin, Timer=timer, ADC=adc, ADCAll=lambda bits, mask: adc("chip")
         ),
         "stm": SimpleNamespace(TIM1=BASES[1], TIM8=BASES[8]),
-    }  # fmt: skip
+    }
 
 
 @contextlib.contextmanager
@@ -577,10 +581,11 @@ def board_path(board: str, world: World) -> Iterator[Callable[[str], ModuleType]
     )
     core = importlib.import_module("heliotrope.lcu")
     on_board: dict[str, Any] = {
-        **modules(board, world), "lcu": core,
+        **modules(board, world),
+        "lcu": core,
         "lcu.node": importlib.import_module("heliotrope.lcu.node"),
         "lcu.controller": importlib.import_module("heliotrope.lcu.controller"),
-    }  # fmt: skip
+    }
     kept = {name: sys.modules.pop(name, None) for name in [*names, *on_board]}
     sys.modules.update(on_board)
 

@@ -131,8 +131,10 @@ async def until(holds: Callable[[], bool]) -> None:
 def start(config: Path) -> "subprocess.Popen[str]":
     return subprocess.Popen(
         [*COMMAND, str(config), "--every", "1"],
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
 
 
 def ended(process: "subprocess.Popen[str]") -> str:

@@ -80,9 +80,14 @@ class Board:
 
     def boot(self, now: float) -> None:
         self.node = Node(
-            self.flash, self.timer, self._write, self._tick(now), self.serial,
-            sha256=sha256, key=key_of(self.number),
-        )  # fmt: skip
+            self.flash,
+            self.timer,
+            self._write,
+            self._tick(now),
+            self.serial,
+            sha256=sha256,
+            key=key_of(self.number),
+        )
         self.on = True
 
     def _write(self, data: bytes) -> None:
@@ -178,11 +183,17 @@ class Field:
     """A cluster, its boards, its bus and its plant, in virtual time."""
 
     def __init__(
-        self, clock: VirtualClock, count: int = 2, *, boards: list[Board] | None = None,
-        bus: Callable[[VirtualClock, list[Board]], Bus] | None = None, seed: int = 0,
-        kept: Kept | None = None, line: Callable[[], bool] | None = None,
+        self,
+        clock: VirtualClock,
+        count: int = 2,
+        *,
+        boards: list[Board] | None = None,
+        bus: Callable[[VirtualClock, list[Board]], Bus] | None = None,
+        seed: int = 0,
+        kept: Kept | None = None,
+        line: Callable[[], bool] | None = None,
         **changes: Any,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.clock = clock
         now = clock.monotonic()
         if boards is None:
@@ -291,9 +302,11 @@ def boards_in(state: str) -> list[Board]:
 
 
 def run(
-    main: Callable[["Field"], Coroutine[Any, Any, None]], state: str = "", seed: int = 0,
+    main: Callable[["Field"], Coroutine[Any, Any, None]],
+    state: str = "",
+    seed: int = 0,
     **settings: Any,
-) -> Field:  # fmt: skip
+) -> Field:
     """Run a test in virtual time, on two boards of a state or on new ones, and return its field."""
     boards = boards_in(state) if state else settings.pop("boards", None)
 
@@ -312,9 +325,14 @@ class SlotBus(TwinBus):
     STEP = 0.005
 
     async def transact(
-        self, frame: bytes, timeout: float, *, expires: float | None = None,
-        urgent: bool = False, complete: Callable[[bytes], bool] | None = None,
-    ) -> bytes:  # fmt: skip
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
+        complete: Callable[[bytes], bool] | None = None,
+    ) -> bytes:
         boards: list[Any] = list(self.stations)
         now = self._clock.monotonic()
         heard = bytearray(_at_once([board.hear(frame, now) for board in boards]))

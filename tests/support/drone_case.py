@@ -29,9 +29,12 @@ def field(rings: int = 4, per_ring: int = 5) -> Heliostats:
     center[..., 1] = np.array([-0.25, -0.25, 0.25, 0.25]) * 2.0
     half_width[..., 0], half_height[..., 1] = 0.615, 0.49
     return Heliostats(
-        tuple(names), azimuth_elevation(np.array(positions)), np.full(n, 2.5), np.full(n, 2.0),
+        tuple(names),
+        azimuth_elevation(np.array(positions)),
+        np.full(n, 2.5),
+        np.full(n, 2.0),
         Facets(center, half_width, half_height),
-    )  # fmt: skip
+    )
 
 
 def plant(heliostats: Heliostats) -> Plant:
@@ -50,9 +53,14 @@ def camera(width: int = 1200, height: int = 900) -> LedCamera:
 
 
 def flight(
-    errors: Errors | None = None, columns: int = 3, rows: int = 3, step: float = 0.7, seed: int = 3,
-    heliostats: Heliostats | None = None, lens: LedCamera | None = None,
-) -> Flight:  # fmt: skip
+    errors: Errors | None = None,
+    columns: int = 3,
+    rows: int = 3,
+    step: float = 0.7,
+    seed: int = 3,
+    heliostats: Heliostats | None = None,
+    lens: LedCamera | None = None,
+) -> Flight:
     """A pattern of ``columns`` by ``rows`` over the field, all mirrors on its middle."""
     mirrors = heliostats or field()
     middle = mirrors.position.mean(axis=0) + [0.0, 0.0, 1.2]

@@ -35,9 +35,12 @@ def staggered(count: int, canting: float = np.inf) -> Plant:
     right[:, 2], up[:, 2] = -HALF * slope[:, 0], -HALF * slope[:, 1]
     facets = Facets(*(np.broadcast_to(a, (count, 4, 3)) for a in (centre, right, up)))
     group = Heliostats(
-        tuple(f"H{i:05d}" for i in range(count)), azimuth_elevation(radial(count)),
-        np.full(count, 3.2), np.full(count, 3.2), facets=facets,
-    )  # fmt: skip
+        tuple(f"H{i:05d}" for i in range(count)),
+        azimuth_elevation(radial(count)),
+        np.full(count, 3.2),
+        np.full(count, 3.2),
+        facets=facets,
+    )
     receiver = Receiver(
         "receiver", "planar", np.array([0.0, 0.0, 80.0]), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
     )

@@ -48,16 +48,37 @@ def mixed_plant() -> Plant:
     corners = np.array([[a, b, 0.01] for a in (-0.85, 0.85) for b in (-0.65, 0.65)])[None]
     tip = rotation((0.3, 0.7, 0.0), 0.01)
     facets = Facets(corners, across @ tip.T, up @ tip.T)
-    errors = {"tilt_north": 0.004, "non_orthogonality": -0.003, "canting": 0.002,
-              "position_up": 0.05, "azimuth_bias": 0.01}  # fmt: skip
+    errors = {
+        "tilt_north": 0.004,
+        "non_orthogonality": -0.003,
+        "canting": 0.002,
+        "position_up": 0.05,
+        "azimuth_bias": 0.01,
+    }
     groups = {
-        "a": Heliostats(("a1", "a2", "a3"), azel, np.full(3, 2.0), np.full(3, 1.5),
-                        parameters={n: np.full(3, v) for n, v in errors.items()}),
-        "j": Heliostats(("j1",), jacks, np.array([3.3]), np.array([2.5]), facets,
-                        aim=np.array([[1.0, 2.0, 30.0]])),
-        "p": Heliostats(("p1", "p2"), polar, np.full(2, 1.0), np.full(2, 1.0),
-                        aim=np.array([[0.0, 0.0, 30.0], [np.nan] * 3])),
-    }  # fmt: skip
+        "a": Heliostats(
+            ("a1", "a2", "a3"),
+            azel,
+            np.full(3, 2.0),
+            np.full(3, 1.5),
+            parameters={n: np.full(3, v) for n, v in errors.items()},
+        ),
+        "j": Heliostats(
+            ("j1",),
+            jacks,
+            np.array([3.3]),
+            np.array([2.5]),
+            facets,
+            aim=np.array([[1.0, 2.0, 30.0]]),
+        ),
+        "p": Heliostats(
+            ("p1", "p2"),
+            polar,
+            np.full(2, 1.0),
+            np.full(2, 1.0),
+            aim=np.array([[0.0, 0.0, 30.0], [np.nan] * 3]),
+        ),
+    }
     tower = np.array([[2.0, 0, 45], [-2, 0.1, 45], [-2, 0.1, 40], [2, 0, 40]])
     receiver = Receiver("oven", "planar", (0, 1, 50), (0.1, 1, -0.3), 4.0, 5.0)
     target = Target("white", tower, tower.mean(axis=0))

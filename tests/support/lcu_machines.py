@@ -46,9 +46,13 @@ def single(name: str) -> ModuleType:
 
     rounded = {name: rounding(getattr(math, name)) for name in ("sqrt", "sin", "cos", "atan2")}
     shim = SimpleNamespace(
-        pi=np.float32(math.pi), inf=np.float32(math.inf), floor=math.floor, ceil=math.ceil,
-        isfinite=math.isfinite, **rounded,
-    )  # fmt: skip
+        pi=np.float32(math.pi),
+        inf=np.float32(math.inf),
+        floor=math.floor,
+        ceil=math.ceil,
+        isfinite=math.isfinite,
+        **rounded,
+    )
     for other in ("vectors", name):
         sys.modules[f"{package}.{other}"].math = shim  # type: ignore[attr-defined]
     return module
@@ -119,11 +123,14 @@ def heliostat() -> Mechanism:
     """An imperfect azimuth-elevation heliostat, 90 m from the tower."""
     return imperfect(
         kinds.azimuth_elevation(
-            (40.0, 80.0, 0.0), pivot_height=2.0, pivot_offset=0.2,
+            (40.0, 80.0, 0.0),
+            pivot_height=2.0,
+            pivot_offset=0.2,
             drives=(rotary(**GEAR), rotary(**GEAR)),
         ),
-        seed=3, size=4e-3,
-    )  # fmt: skip
+        seed=3,
+        size=4e-3,
+    )
 
 
 def items_of_heliostat(machine: Mechanism) -> dict[str, bytes]:
@@ -226,9 +233,16 @@ class Bench:
         self.made = counts
         self.motors.node = None
         self.node = Node(
-            flash, self.motors, self.hear, self.now, 4711, sha256=sha256, key=KEY,
-            sensor=self.read_tilt, feed=self.feed,
-        )  # fmt: skip
+            flash,
+            self.motors,
+            self.hear,
+            self.now,
+            4711,
+            sha256=sha256,
+            key=KEY,
+            sensor=self.read_tilt,
+            feed=self.feed,
+        )
         self.motors.node = self.node
         self.journal.zero = self.declare  # type: ignore[method-assign]
         self.check()
@@ -340,8 +354,11 @@ class Bench:
 
     def sun_values(self, second: int) -> tuple[int, ...]:
         here, there = self.sun(second), self.sun(second + 1)
-        return (second, *(round(x * 2**30) for x in here),
-                *(round(x * 2**28) for x in there - here))  # fmt: skip
+        return (
+            second,
+            *(round(x * 2**30) for x in here),
+            *(round(x * 2**28) for x in there - here),
+        )
 
     # Time.
 

@@ -41,9 +41,14 @@ class LiveConsole:
     """
 
     def __init__(
-        self, folder: Path, heliostats: int, *, page: bool = True, speed: float = 1.0,
+        self,
+        folder: Path,
+        heliostats: int,
+        *,
+        page: bool = True,
+        speed: float = 1.0,
         rendered: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.folder, self.address = folder, ""
         self._made = (heliostats, page, speed, rendered)
         self._ready, self._over = threading.Event(), threading.Event()
@@ -73,10 +78,13 @@ class LiveConsole:
             self.keeper.people.add(role, _secrets.hash_password(PASSWORD), role, now)
         design = replace(malan_plant(heliostats), keep_outs=(GATE,))
         self.live = LivePlant(
-            design, clock, LiveOptions(rendered=rendered),
-            audit=JsonLines(self.folder / "audit.jsonl", clock.utc()), records=self.keeper,
+            design,
+            clock,
+            LiveOptions(rendered=rendered),
+            audit=JsonLines(self.folder / "audit.jsonl", clock.utc()),
+            records=self.keeper,
             extra=lambda: {"speed": speed},
-        )  # fmt: skip
+        )
         async with self.live.running():
             settings = ConsoleSettings(port=0, page=page)
             self.server = ConsoleServer(self.live.operations, self.keeper.people, settings)

@@ -17,9 +17,14 @@ def steppers() -> tuple[Drive, Drive]:
 def jacks() -> tuple[Drive, Drive]:
     """Two jacks with the constants of Jülich's AA39."""
     first = linear_paint(
-        154166.6667, 0.077412795, 0.335308, 0.338095, 0.039009536 - np.pi / 2, clockwise=0,
+        154166.6667,
+        0.077412795,
+        0.335308,
+        0.338095,
+        0.039009536 - np.pi / 2,
+        clockwise=0,
         worm_ratio=500.0,
-    )  # fmt: skip
+    )
     second = linear_paint(
         154166.6667, 0.077522286, 0.340771, 0.3191, 0.943922248, clockwise=1, worm_ratio=500.0
     )
@@ -44,18 +49,26 @@ def every_kind() -> dict[str, Mechanism]:
         ),
         "polar": kinds.polar(place, -0.6, pivot_height=1.0, pivot_offset=0.2, drives=steppers()),
         "two_axis": kinds.two_axis(
-            place, (0.1, -0.05, 1.0), (1.0, 0.1, 0.18), (0.02, -0.05, 1.0),
-            origin_1=(0.1, 0.0, 1.2), origin_2=(0.2, -0.1, 0.3), vertex=(0.05, -0.03, 0.4),
+            place,
+            (0.1, -0.05, 1.0),
+            (1.0, 0.1, 0.18),
+            (0.02, -0.05, 1.0),
+            origin_1=(0.1, 0.0, 1.2),
+            origin_2=(0.2, -0.1, 0.3),
+            vertex=(0.05, -0.03, 0.4),
             drives=steppers(),
         ),
         "two_jacks": kinds.two_jacks(
-            place, jacks(), joint_translation_1=(0.01, 0.02, 1.5),
-            joint_translation_2=(0.03, 0.01, 0.02), concentrator_translation=(0.0, 0.175, 0.0),
+            place,
+            jacks(),
+            joint_translation_1=(0.01, 0.02, 1.5),
+            joint_translation_2=(0.03, 0.01, 0.02),
+            concentrator_translation=(0.0, 0.175, 0.0),
         ),
         "single_axis": kinds.single_axis(
             place, (0.1, 1.0, 0.0), pivot_height=0.5, vertex=(0.0, 0.0, 0.2), drive=steppers()[0]
         ),
-    }  # fmt: skip
+    }
 
 
 def imperfect(mechanism: Mechanism, seed: int = 0, size: float = 0.01) -> Mechanism:
@@ -63,10 +76,11 @@ def imperfect(mechanism: Mechanism, seed: int = 0, size: float = 0.01) -> Mechan
     rng = np.random.default_rng(seed)
     scale = {"rad": size, "m": size, "1": size}
     values = {
-        name: rng.uniform(-1.0, 1.0, mechanism.shape) * scale[row.unit]
+        name: rng.uniform(-1.0, 1.0, mechanism.shape)
+        * scale[row.unit]
         * (0.1 if "worm" in name or row.name.endswith(("offset", "radius")) else 1.0)
         for name, row in mechanism.parameters.items()
-    }  # fmt: skip
+    }
     return mechanism.with_parameters(values)
 
 

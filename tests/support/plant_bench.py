@@ -111,9 +111,16 @@ class ScriptedCluster:
                 rows["steps_ms"] = rows["heard_ms"]
                 greet = self.first and self.greets
                 status = Status(
-                    self.name, len(rows), self.clock.utc().timestamp(), "gps", 1e-3, 3.0, 0.2,
-                    names=self.names if greet else (), block=rows.tobytes(),
-                )  # fmt: skip
+                    self.name,
+                    len(rows),
+                    self.clock.utc().timestamp(),
+                    "gps",
+                    1e-3,
+                    3.0,
+                    0.2,
+                    names=self.names if greet else (),
+                    block=rows.tobytes(),
+                )
                 await self.send(status)
                 self.first = False
             await sleep_until(self.clock, due)
@@ -199,10 +206,13 @@ class Bench:
             self.clusters[name] = ScriptedCluster(name, tuple(names), far, clock)
         counter = iter(range(1, 10_000))
         self.plant = PlantController(
-            self.design, links, clock, self.audit,
+            self.design,
+            links,
+            clock,
+            self.audit,
             entropy=lambda n: (next(counter) * 7919).to_bytes(n, "little"),
             **{"settings": PlantSettings(), **options},
-        )  # fmt: skip
+        )
 
     def cluster_of(self, name: str) -> ScriptedCluster:
         """The cluster of a heliostat."""

@@ -82,13 +82,25 @@ class WholePlant:
         perfect = nominal(count)
         self.truth = installed(perfect, seed)
         self.design = Plant(
-            "whole", SITE,
-            {"all": Heliostats(names, perfect, np.full(count, 3.0), np.full(count, 2.0),
-                               cluster=homes)},
+            "whole",
+            SITE,
+            {
+                "all": Heliostats(
+                    names, perfect, np.full(count, 3.0), np.full(count, 2.0), cluster=homes
+                )
+            },
             targets=(target,),
-            receivers=(Receiver("receiver", "planar", np.array(outfit.RECEIVER),
-                                np.array([0.0, 1.0, 0.0]), 4.0, 4.0),),
-        )  # fmt: skip
+            receivers=(
+                Receiver(
+                    "receiver",
+                    "planar",
+                    np.array(outfit.RECEIVER),
+                    np.array([0.0, 1.0, 0.0]),
+                    4.0,
+                    4.0,
+                ),
+            ),
+        )
         wanted = {name: items_of(perfect[i], MACHINE) for i, name in enumerate(names)}
         like = outfit.outfits(1)[0]
         self.boards: dict[str, Board] = {}
@@ -101,9 +113,14 @@ class WholePlant:
                 address = 11 + i
                 items = {**wanted[names[i]], "address": struct.pack("<H", address)}
                 fit = replace(
-                    like, name=names[i], address=address, serial=5000 + i,
-                    key=bytes([address]) * 32, mechanism=self.truth[i], items=items,
-                )  # fmt: skip
+                    like,
+                    name=names[i],
+                    address=address,
+                    serial=5000 + i,
+                    key=bytes([address]) * 32,
+                    mechanism=self.truth[i],
+                    items=items,
+                )
                 board = self.boards[names[i]] = Board(fit, seed=seed + i)
                 stations.append(board)
                 members.append(Member(names[i], address, serial=5000 + i, key=fit.key))
@@ -114,9 +131,14 @@ class WholePlant:
         self.audit = JsonLines(folder / "audit.jsonl", clock.utc())
         chance = random.Random(seed)
         self.plant = PlantController(
-            self.design, links, clock, self.audit, wanted=Wanted(wanted),
-            entropy=chance.randbytes, **{"settings": PlantSettings(), **options},
-        )  # fmt: skip
+            self.design,
+            links,
+            clock,
+            self.audit,
+            wanted=Wanted(wanted),
+            entropy=chance.randbytes,
+            **{"settings": PlantSettings(), **options},
+        )
         self.token = 0
 
     def _cluster(self, config: ClusterConfig, stations: list[Board], link: CarriedLink) -> None:

@@ -22,8 +22,28 @@ from support.twin_defects import DEFECTS
 
 TOKEN, ADDRESS = 5, 11
 #: Around the ends of a slot, a second, the lease, the two silences and the wait for stow, ms.
-WAITS = (1, 49, 50, 51, 999, 1000, 1001, 5949, 5999, 6000, 6001, 6051, 9999, 10_001, 19_999,
-         20_001, 29_999, 30_000, 30_001, 36_001)  # fmt: skip
+WAITS = (
+    1,
+    49,
+    50,
+    51,
+    999,
+    1000,
+    1001,
+    5949,
+    5999,
+    6000,
+    6001,
+    6051,
+    9999,
+    10_001,
+    19_999,
+    20_001,
+    29_999,
+    30_000,
+    30_001,
+    36_001,
+)
 JUMPS = (-1, 1, -6000, 5999, 6001, 30_001, ticks.HALF - 1, -ticks.HALF + 1)
 #: The lease, and how late a board may look, ms.
 LEASE_MS, LOOK_MS = 6000, 60

@@ -36,9 +36,14 @@ TOKEN, COUNT = 0xF1E1D, 3
 
 def field_of(mechanism: Mechanism, **options: Any) -> Field:
     return Field(
-        mechanism, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY, defocus=DEFOCUS,
+        mechanism,
+        stow=STOW,
+        ranges=RANGES,
+        limits=LIMITS,
+        standby=STANDBY,
+        defocus=DEFOCUS,
         **options,
-    )  # fmt: skip
+    )
 
 
 class Both:
@@ -49,15 +54,18 @@ class Both:
         self.boards = [Board(outfit, seed=i, play=play, wind=wind) for i, outfit in enumerate(made)]
         gear = {"steps_per_turn": 200, "gear_ratio": STEPS_PER_TURN / 800, "microsteps": 4}
         perfect = kinds.azimuth_elevation(
-            np.array([outfit.mechanism.position for outfit in made]), pivot_height=2.0,
-            pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear)),
-        )  # fmt: skip
+            np.array([outfit.mechanism.position for outfit in made]),
+            pivot_height=2.0,
+            pivot_offset=0.2,
+            drives=(rotary(**gear), rotary(**gear)),
+        )
         self.field = field_of(
             perfect.with_parameters(
                 {name: np.array([outfit.causes[name] for outfit in made]) for name in CAUSES}
             ),
-            play=play, wind=wind,
-        )  # fmt: skip
+            play=play,
+            wind=wind,
+        )
         for board, row in zip(self.boards, self.field.mechanism.armature.table, strict=True):
             assert np.allclose(board.outfit.mechanism.armature.table, row, atol=1e-12)
         self.ticks = self.compared = 0

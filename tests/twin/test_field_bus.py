@@ -57,8 +57,10 @@ def test_a_cluster_leads_rows_of_a_field() -> None:
                 field.advance(50)
 
         async with (
-            asyncio.TaskGroup() as group, running(plant, mine, bus), running(cluster),
-        ):  # fmt: skip
+            asyncio.TaskGroup() as group,
+            running(plant, mine, bus),
+            running(cluster),
+        ):
             listener = group.create_task(listen())
             await live(4)
             for identity, name, values in (("a", "AIM", RECEIVER), ("b", "APPROACH", ())):

@@ -80,8 +80,10 @@ def test_no_invariant_is_broken_for_long(block: int) -> None:
 def test_a_seed_gives_the_same_run_again() -> None:
     first, second = run(Plan(5, 60.0, 2)), run(Plan(5, 60.0, 2))
     assert (first.checks, first.counts, first.states) == (
-        second.checks, second.counts, second.states
-    )  # fmt: skip
+        second.checks,
+        second.counts,
+        second.states,
+    )
     assert run(Plan(6, 60.0, 2)).counts != first.counts
 
 

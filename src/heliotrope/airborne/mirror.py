@@ -239,9 +239,13 @@ class MirrorShape:
         high = np.stack([lines[0][j + 1], lines[1][i + 1]], axis=-1) * self.half_size[facet]
         n = self.nodes
         return Patch(
-            low, high - low, n[facet, i, j], n[facet, i, j + 1], n[facet, i + 1, j],
+            low,
+            high - low,
+            n[facet, i, j],
+            n[facet, i, j + 1],
+            n[facet, i + 1, j],
             n[facet, i + 1, j + 1],
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -310,15 +314,22 @@ def ideal(heliostats: Heliostats, row: int, focal: npt.ArrayLike = np.inf) -> Mi
 def rectangle(width: float, height: float, focal: npt.ArrayLike = np.inf) -> MirrorShape:
     """Return a mirror of one facet, ``width`` by ``height`` metres."""
     return MirrorShape(
-        np.zeros((1, 3)), np.array([[0.5 * width, 0.0, 0.0]]), np.array([[0.0, 0.5 * height, 0.0]]),
+        np.zeros((1, 3)),
+        np.array([[0.5 * width, 0.0, 0.0]]),
+        np.array([[0.0, 0.5 * height, 0.0]]),
         as_float(focal),
-    )  # fmt: skip
+    )
 
 
 def tiled(
-    columns: int, rows: int, width: float, height: float, *,
-    gap: float = 0.0, focal: float = np.inf,
-) -> MirrorShape:  # fmt: skip
+    columns: int,
+    rows: int,
+    width: float,
+    height: float,
+    *,
+    gap: float = 0.0,
+    focal: float = np.inf,
+) -> MirrorShape:
     """Return a mirror of ``columns`` by ``rows`` facets, canted onto one focus.
 
     Parameters
@@ -337,9 +348,11 @@ def tiled(
     center = np.zeros((rows * columns, 3))
     center[:, 0], center[:, 1] = np.tile(x, rows), np.repeat(y, columns)
     center[:, 2] = np.sum(center[:, :2] ** 2, axis=-1) / (4.0 * focal)
-    out = normalize(np.stack(
-        [-center[:, 0] / (2.0 * focal), -center[:, 1] / (2.0 * focal), np.ones(len(center))], -1
-    ))  # fmt: skip
+    out = normalize(
+        np.stack(
+            [-center[:, 0] / (2.0 * focal), -center[:, 1] / (2.0 * focal), np.ones(len(center))], -1
+        )
+    )
     right = normalize(np.cross((0.0, 1.0, 0.0), out))
     half = 0.5 * width * right, 0.5 * height * np.cross(out, right)
     return MirrorShape(center, *half, as_float(focal))
@@ -513,19 +526,28 @@ def _bilinear_roots(corners: FloatArray) -> FloatArray:
 
 
 def _newton(
-    shape: MirrorShape, facet: IntArray, patch: Patch, ends: tuple[FloatArray, FloatArray],
+    shape: MirrorShape,
+    facet: IntArray,
+    patch: Patch,
+    ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
-) -> tuple[FloatArray, npt.NDArray[np.bool_]]:  # fmt: skip
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Return the shares of the cells (K, 2) at which g is 0, and where that was reached."""
     good = np.zeros(len(st), dtype=np.bool_)
     for _ in range(_ITERATIONS):
         g, slope = _law(shape, facet, patch, ends, st)
         determinant = slope[:, 0, 0] * slope[:, 1, 1] - slope[:, 0, 1] * slope[:, 1, 0]
         with np.errstate(divide="ignore", invalid="ignore"):
-            step = np.stack([
-                slope[:, 0, 1] * g[:, 1] - slope[:, 1, 1] * g[:, 0],
-                slope[:, 1, 0] * g[:, 0] - slope[:, 0, 0] * g[:, 1],
-            ], axis=-1) / determinant[:, None]  # fmt: skip
+            step = (
+                np.stack(
+                    [
+                        slope[:, 0, 1] * g[:, 1] - slope[:, 1, 1] * g[:, 0],
+                        slope[:, 1, 0] * g[:, 0] - slope[:, 0, 0] * g[:, 1],
+                    ],
+                    axis=-1,
+                )
+                / determinant[:, None]
+            )
         usable = np.asarray(np.isfinite(step).all(axis=-1))
         step = np.where(usable[:, None], step, 0.0)
         good = usable & (np.abs(step) < 1e-10).all(axis=-1)
@@ -539,9 +561,12 @@ def _newton(
 
 
 def _law(
-    shape: MirrorShape, facet: IntArray, patch: Patch, ends: tuple[FloatArray, FloatArray],
+    shape: MirrorShape,
+    facet: IntArray,
+    patch: Patch,
+    ends: tuple[FloatArray, FloatArray],
     st: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Return g (K, 2) and its derivatives by metres along the facet's axes, (K, 2, 2)."""
     uv = patch.low + st * patch.size
     point, axes = shape.on_facet(facet, uv), shape.axes[facet]

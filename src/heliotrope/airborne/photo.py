@@ -306,22 +306,27 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
     missing = [
         name
         for name, value in (
-            ("GpsLatitude", found.latitude_deg), ("GpsLongitude", found.longitude_deg),
-            ("AbsoluteAltitude", found.altitude), ("GimbalYawDegree", found.yaw_deg),
-            ("GimbalPitchDegree", found.pitch_deg), ("GimbalRollDegree", found.roll_deg),
+            ("GpsLatitude", found.latitude_deg),
+            ("GpsLongitude", found.longitude_deg),
+            ("AbsoluteAltitude", found.altitude),
+            ("GimbalYawDegree", found.yaw_deg),
+            ("GimbalPitchDegree", found.pitch_deg),
+            ("GimbalRollDegree", found.roll_deg),
         )
         if not math.isfinite(value)
-    ]  # fmt: skip
+    ]
     if missing:
         raise FormatError(
-            file, f"its XMP lacks {', '.join(missing)}; copy the original file from the drone, or "
-            "write the values into photos.csv"
-        )  # fmt: skip
+            file,
+            f"its XMP lacks {', '.join(missing)}; copy the original file from the drone, or "
+            "write the values into photos.csv",
+        )
     if found.rtk_flag is not None and found.rtk_flag != RTK_FIXED:
         raise FormatError(
-            file, f"RtkFlag {found.rtk_flag} is no fixed solution ({RTK_FIXED}): its position is "
-            "known to decimetres at best; leave it out, or correct it and write photos.csv"
-        )  # fmt: skip
+            file,
+            f"RtkFlag {found.rtk_flag} is no fixed solution ({RTK_FIXED}): its position is "
+            "known to decimetres at best; leave it out, or correct it and write photos.csv",
+        )
     position = geodetic_to_enu(found.latitude_deg, found.longitude_deg, found.altitude, origin)
     known = np.isfinite(found.sigma) & (found.sigma > 0.0)
     return Photo(
@@ -341,9 +346,10 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
     needed = {"name", "yaw_deg", "pitch_deg", "roll_deg"}
     if needed - columns or not any(p <= columns for p in places):
         raise FormatError(
-            path, "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
-            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m may be given"
-        )  # fmt: skip
+            path,
+            "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
+            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m may be given",
+        )
     return {row["name"].strip(): row for row in reader}
 
 

@@ -56,16 +56,18 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
     largest = float(np.nanmax(np.abs(slope), initial=0.0))
     if largest > LARGEST:
         raise FormatError(
-            file, f"a slope deviation of {1e3 * largest:.0f} mrad is above "
-            f"{1e3 * LARGEST:.0f} mrad; is it in another unit?"
-        )  # fmt: skip
+            file,
+            f"a slope deviation of {1e3 * largest:.0f} mrad is above "
+            f"{1e3 * LARGEST:.0f} mrad; is it in another unit?",
+        )
     for k in range(facets):
         missing = float(np.mean(~np.isfinite(slope[k]).all(axis=-1)))
         if missing > _MOST_HOLES:
             raise FormatError(
-                file, f"facet {k}: {100 * missing:.0f} % of its map are missing, more than "
-                f"{100 * _MOST_HOLES:.0f} %; measure it again or leave the map out"
-            )  # fmt: skip
+                file,
+                f"facet {k}: {100 * missing:.0f} % of its map are missing, more than "
+                f"{100 * _MOST_HOLES:.0f} %; measure it again or leave the map out",
+            )
     return _filled(slope)
 
 
@@ -164,9 +166,10 @@ def _read_csv(file: Path) -> FloatArray:
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
         raise FormatError(
-            file, f"facet, row, column {index[i].tolist()} are no whole numbers from 0 to 9999",
+            file,
+            f"facet, row, column {index[i].tolist()} are no whole numbers from 0 to 9999",
             rows.places[i],
-        )  # fmt: skip
+        )
     if not len(index):
         raise FormatError(file, "no rows; give one for each cell of the map")
     whole = index.astype(np.intp)

@@ -147,9 +147,11 @@ def read_commands(
             raise UnknownNameError(f"heliostat ({path}, line {line}) in this field:", name, names)
         if index[name] in found:
             raise FormatError(
-                path, f"heliostat {name} stands in it twice; photographs show one pose: give the "
-                "cluster and the point that they are of", f"line {line}",
-            )  # fmt: skip
+                path,
+                f"heliostat {name} stands in it twice; photographs show one pose: give the "
+                "cluster and the point that they are of",
+                f"line {line}",
+            )
         found[index[name]] = _counts(path, line, name, [row[c] for c in counts])
     if not found:
         of = f" of cluster {cluster!r}, point {point!r}" if cluster or point else ""

@@ -197,18 +197,24 @@ def read_malan(
     ]
     counts = [rows.numbers(name, "drive counts") for name in _MALAN[-2:]]
     rows.check(
-        "sun_azimuth_deg", (azimuth < -180.0) | (azimuth > 360.0), azimuth,
+        "sun_azimuth_deg",
+        (azimuth < -180.0) | (azimuth > 360.0),
+        azimuth,
         "° is outside −180° to 360°; give degrees clockwise from north",
-    )  # fmt: skip
+    )
     rows.check(
-        "sun_elevation_deg", (elevation <= -5.0) | (elevation > 90.0), elevation,
+        "sun_elevation_deg",
+        (elevation <= -5.0) | (elevation > 90.0),
+        elevation,
         "° is outside −5° to 90°; give the sun's elevation in degrees",
-    )  # fmt: skip
+    )
     for name, values in zip(_MALAN[3:5], offsets, strict=True):
         rows.check(
-            name, np.abs(values) > _FARTHEST_OFFSET, values,
+            name,
+            np.abs(values) > _FARTHEST_OFFSET,
+            values,
             f" m is more than {_FARTHEST_OFFSET:g} m; is it in another unit?",
-        )  # fmt: skip
+        )
     good = rows.good
     seen = camera_target(
         index[heliostat],
@@ -262,9 +268,11 @@ def _points(rows: Rows, end: str, far: npt.NDArray[np.bool_]) -> FloatArray:
     points = np.stack([rows.numbers(name, what) for name in names], axis=-1)
     for name, values in zip(names, points.T, strict=True):
         rows.check(
-            name, ~far & (np.abs(values) > _FARTHEST), values,
+            name,
+            ~far & (np.abs(values) > _FARTHEST),
+            values,
             f" m is more than {_FARTHEST / 1e3:g} km from the plant; give ENU metres about it",
-        )  # fmt: skip
+        )
     for i in np.flatnonzero(far & ~points.any(axis=-1)):
         rows.refuse(i, names[0], "0, 0, 0 has no direction; give one from the mirror")
     return points
@@ -277,10 +285,11 @@ def _check_kinds(rows: Rows, kinds: Sequence[str], far: dict[str, npt.NDArray[np
         for end, wanted in zip(_ENDS, KINDS.get(kind, ()), strict=False):
             if far[end][i] != wanted:
                 rows.refuse(
-                    i, f"{end}_at_infinity",
+                    i,
+                    f"{end}_at_infinity",
                     f"{str(bool(far[end][i])).lower()}, but of kind {kind} it is "
                     f"{str(wanted).lower()}; correct one of them",
-                )  # fmt: skip
+                )
 
 
 def _sigma(rows: Rows) -> FloatArray:
@@ -309,10 +318,11 @@ def _covariance(rows: Rows, end: str) -> FloatArray:
             rows.refuse(i, names[pair], f"the cell is empty; give {what}")
     for i in np.flatnonzero(~is_covariance(matrices)):
         rows.refuse(
-            i, f"{end}_cov_ee to {end}_cov_uu",
+            i,
+            f"{end}_cov_ee to {end}_cov_uu",
             f"{[float(matrices[i, a, b]) for a, b in _PAIRS.values()]} is no covariance (not "
             "positive semidefinite); correct them or leave all six empty",
-        )  # fmt: skip
+        )
     return matrices
 
 

@@ -142,11 +142,17 @@ def sightings(
     if (index < 0).any():
         raise InputError("sightings: a heliostat's row is below 0")
     return Sightings(
-        index, spread(time, np.float64), table, ends[0], ends[1], far_source, far_destination,
+        index,
+        spread(time, np.float64),
+        table,
+        ends[0],
+        ends[1],
+        far_source,
+        far_destination,
         spreads,
         _covariances(source_covariance, rows, "source_covariance"),
         _covariances(destination_covariance, rows, "destination_covariance"),
-    )  # fmt: skip
+    )
 
 
 def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
@@ -301,9 +307,15 @@ def camera_target(
         rad² and m², as :func:`sightings`.
     """
     return sightings(
-        heliostat, counts, sun, centroid, time=time, sigma=sigma,
-        source_covariance=sun_covariance, destination_covariance=centroid_covariance,
-    )  # fmt: skip
+        heliostat,
+        counts,
+        sun,
+        centroid,
+        time=time,
+        sigma=sigma,
+        source_covariance=sun_covariance,
+        destination_covariance=centroid_covariance,
+    )
 
 
 def drone(
@@ -331,9 +343,16 @@ def drone(
         four-fold, and leave the other 0.
     """
     return sightings(
-        heliostat, counts, led, camera, time=time, sigma=sigma, source_at_infinity=False,
-        source_covariance=led_covariance, destination_covariance=camera_covariance,
-    )  # fmt: skip
+        heliostat,
+        counts,
+        led,
+        camera,
+        time=time,
+        sigma=sigma,
+        source_at_infinity=False,
+        source_covariance=led_covariance,
+        destination_covariance=camera_covariance,
+    )
 
 
 def sun_sensor(
@@ -360,9 +379,15 @@ def sun_sensor(
         measurement, so all of it is the destination's, four-fold.
     """
     return sightings(
-        heliostat, counts, sun, sun, time=time, sigma=2.0 * as_float(normal_sigma),
-        destination_at_infinity=True, destination_covariance=4.0 * as_float(normal_covariance),
-    )  # fmt: skip
+        heliostat,
+        counts,
+        sun,
+        sun,
+        time=time,
+        sigma=2.0 * as_float(normal_sigma),
+        destination_at_infinity=True,
+        destination_covariance=4.0 * as_float(normal_covariance),
+    )
 
 
 def field_camera(
@@ -391,9 +416,15 @@ def field_camera(
     """
     # To the law a camera is a target: the sun's light came to this point.
     return camera_target(
-        heliostat, counts, sun, camera, time=time, sigma=sigma, sun_covariance=sun_covariance,
+        heliostat,
+        counts,
+        sun,
+        camera,
+        time=time,
+        sigma=sigma,
+        sun_covariance=sun_covariance,
         centroid_covariance=camera_covariance,
-    )  # fmt: skip
+    )
 
 
 def join(parts: Sequence[Sightings]) -> Sightings:

@@ -219,14 +219,24 @@ def workers(scheduler: str | None) -> "Iterator[Callable[..., object] | None]":
 
 
 def learn(
-    loaded: Loaded, model: str | tuple[str, ...], *, used: "object" = None,
-    priors: dict[str, float] | None = None, scheduler: str | None = None, quiet: bool = False,
-) -> "Learned":  # fmt: skip
+    loaded: Loaded,
+    model: str | tuple[str, ...],
+    *,
+    used: "object" = None,
+    priors: dict[str, float] | None = None,
+    scheduler: str | None = None,
+    quiet: bool = False,
+) -> "Learned":
     """Learn the heliostats behind a progress bar."""
     from heliotrope.calibration.learn import learning
 
     with workers(scheduler) as run, progress("learning", quiet) as advance:
         return learning.learn(
-            loaded.heliostats.mechanism, loaded.seen, model, used=used, priors=priors,  # type: ignore[arg-type]
-            runner=run, progress=advance,  # type: ignore[arg-type]
-        )  # fmt: skip
+            loaded.heliostats.mechanism,
+            loaded.seen,
+            model,
+            used=used,  # type: ignore[arg-type]
+            priors=priors,
+            runner=run,  # type: ignore[arg-type]
+            progress=advance,
+        )

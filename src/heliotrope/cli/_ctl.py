@@ -13,8 +13,9 @@ from heliotrope.errors import InputError
 if TYPE_CHECKING:
     from heliotrope.console.client import Client
 
-app = typer.Typer(help="Look at and command a plant that runs, through its console.",
-                  no_args_is_help=True)  # fmt: skip
+app = typer.Typer(
+    help="Look at and command a plant that runs, through its console.", no_args_is_help=True
+)
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
@@ -129,15 +130,30 @@ def show(
     context: typer.Context,
     what: Annotated[
         str,
-        typer.Argument(help="alarms, events, packets, clusters, calibration, schedule, holds, "
-                       "emergency, sun, accounts, tokens, or the name of a heliostat."),
+        typer.Argument(
+            help="alarms, events, packets, clusters, calibration, schedule, holds, "
+            "emergency, sun, accounts, tokens, or the name of a heliostat."
+        ),
     ],
-) -> None:  # fmt: skip
+) -> None:
     """Print something of the plant as JSON."""
     from urllib.parse import quote
 
-    known = ("alarms", "events", "packets", "clusters", "calibration", "schedule", "holds",
-             "emergency", "sun", "authority", "field", "accounts", "tokens")  # fmt: skip
+    known = (
+        "alarms",
+        "events",
+        "packets",
+        "clusters",
+        "calibration",
+        "schedule",
+        "holds",
+        "emergency",
+        "sun",
+        "authority",
+        "field",
+        "accounts",
+        "tokens",
+    )
     path = what if what in known else f"heliostats/{quote(what, safe='')}"
     with _client(context) as client:
         print_json(client.get(path))

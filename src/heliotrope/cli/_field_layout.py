@@ -50,12 +50,17 @@ def layout(
     kinds = ("png", "svg", "pdf")
     if picture is not None and picture.suffix.removeprefix(".").lower() not in kinds:
         raise InputError(f"picture {picture}: give a file that ends in .png, .svg or .pdf")
-    mirror = Mirror(width, height, 0.5 * height + 0.7 if pivot is None else pivot,
-                    clearance=clearance)  # fmt: skip
+    mirror = Mirror(
+        width, height, 0.5 * height + 0.7 if pivot is None else pivot, clearance=clearance
+    )
     plant = lay_out(
-        kind, heliostats, mirror=mirror, tower_height=tower,
-        site=Site(latitude, longitude, altitude, name=name), name=name,
-    )  # fmt: skip
+        kind,
+        heliostats,
+        mirror=mirror,
+        tower_height=tower,
+        site=Site(latitude, longitude, altitude, name=name),
+        name=name,
+    )
     write_plant(plant, out, _table(table))
     if picture is not None:
         _draw(plant, picture)
@@ -78,10 +83,12 @@ def _tell(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
     if as_json:
         print_json(facts)
         return
-    print(f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
-          f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
-          f"farthest {facts['farthest_m']:.0f} m away; mirrors keep {facts['nearest_gap_m']:.2f} m "
-          "apart however they turn")  # fmt: skip
+    print(
+        f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
+        f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
+        f"farthest {facts['farthest_m']:.0f} m away; mirrors keep {facts['nearest_gap_m']:.2f} m "
+        "apart however they turn"
+    )
 
 
 def _table(name: str) -> Literal["csv", "parquet"]:

@@ -21,9 +21,14 @@ _OFTEN = 20
 
 
 def follow(
-    source: "Source", job: "Job", *, burst: int = 1, archive: Path | None = None,
-    memory: Path | None = None, as_json: bool = False,
-) -> int:  # fmt: skip
+    source: "Source",
+    job: "Job",
+    *,
+    burst: int = 1,
+    archive: Path | None = None,
+    memory: Path | None = None,
+    as_json: bool = False,
+) -> int:
     """Read every frame of a source and print what it shows; return how many were read.
 
     Parameters

@@ -47,9 +47,16 @@ def calibrate(
     learned = shared.learn(loaded, chosen, **options)
     note = f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}"
     result = Result(
-        loaded.heliostats.names, learned, loaded.plant, loaded.group, assessed, loaded.ids,
-        loaded.left_out, note, shared.describe(scored),
-    )  # fmt: skip
+        loaded.heliostats.names,
+        learned,
+        loaded.plant,
+        loaded.group,
+        assessed,
+        loaded.ids,
+        loaded.left_out,
+        note,
+        shared.describe(scored),
+    )
     _show(result, report, as_json)
 
 
@@ -119,18 +126,32 @@ def print_result(result: "Result") -> None:
 
     learned = result.learned
     rows = [
-        [row.name, str(row.before.count),
-         str(int(learned.outlier[learned.sightings.heliostat == row.index].sum())),
-         shown(row.before.median), shown(row.after.median), shown(row.held.median),
-         shown(row.held.p95), row.outcome.name.lower()]
+        [
+            row.name,
+            str(row.before.count),
+            str(int(learned.outlier[learned.sightings.heliostat == row.index].sum())),
+            shown(row.before.median),
+            shown(row.after.median),
+            shown(row.held.median),
+            shown(row.held.p95),
+            row.outcome.name.lower(),
+        ]
         for row in result.rows()
-    ]  # fmt: skip
+    ]
     print_table(
-        ["heliostat", "sightings", "outliers", "median before", "after", "held out",
-         "held out 95 %", "fit"],
+        [
+            "heliostat",
+            "sightings",
+            "outliers",
+            "median before",
+            "after",
+            "held out",
+            "held out 95 %",
+            "fit",
+        ],
         rows,
         title="beam error, mrad",
-    )  # fmt: skip
+    )
     a = result.assessment
     if a is not None and np.isfinite(a.median_of_medians):
         print(

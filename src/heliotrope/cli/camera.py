@@ -68,9 +68,13 @@ def _pattern(text: str) -> tuple[int, int]:
 
 
 def _from_chessboard(
-    plant: "Plant", places: tuple[Path, Path], frames: "Sequence[Frame]", name: str,
-    board: tuple[tuple[int, int], float], as_json: bool,
-) -> None:  # fmt: skip
+    plant: "Plant",
+    places: tuple[Path, Path],
+    frames: "Sequence[Frame]",
+    name: str,
+    board: tuple[tuple[int, int], float],
+    as_json: bool,
+) -> None:
     from dataclasses import replace
 
     from heliotrope.imaging.lens import calibrate_chessboard
@@ -96,40 +100,66 @@ def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgo
         )
     if as_json:
         boards = [
-            {"name": b.name, "used": b.used, "reason": b.reason, "deviation_px": b.deviation,
-             "tilt_rad": b.tilt}
+            {
+                "name": b.name,
+                "used": b.used,
+                "reason": b.reason,
+                "deviation_px": b.deviation,
+                "tilt_rad": b.tilt,
+            }
             for b in lens.boards
-        ]  # fmt: skip
-        sigma = {"focal_px": lens.sigma[:2], "center_px": lens.sigma[2:4],
-                 "distortion": lens.sigma[4:]}  # fmt: skip
-        print_json({**_document(camera), "sigma": sigma, "terms": lens.model,
-                    "coverage": lens.coverage, "pictures": boards, "notes": notes,
-                    "written": str(place)})  # fmt: skip
+        ]
+        sigma = {
+            "focal_px": lens.sigma[:2],
+            "center_px": lens.sigma[2:4],
+            "distortion": lens.sigma[4:],
+        }
+        print_json(
+            {
+                **_document(camera),
+                "sigma": sigma,
+                "terms": lens.model,
+                "coverage": lens.coverage,
+                "pictures": boards,
+                "notes": notes,
+                "written": str(place),
+            }
+        )
         return
     for board in lens.boards:
-        print(f"{board.name}: " + (f"{board.deviation:.2f} px" if board.used else
-                                   f"left out: {board.reason}"))  # fmt: skip
+        print(
+            f"{board.name}: "
+            + (f"{board.deviation:.2f} px" if board.used else f"left out: {board.reason}")
+        )
     (fx, fy), (cx, cy) = lens.matrix.diagonal()[:2], lens.matrix[:2, 2]
     s = lens.sigma
-    print(f"focal length {fx:.1f} ± {s[0]:.1f}, {fy:.1f} ± {s[1]:.1f} px; principal point "
-          f"{cx:.1f} ± {s[2]:.1f}, {cy:.1f} ± {s[3]:.1f} px")  # fmt: skip
+    print(
+        f"focal length {fx:.1f} ± {s[0]:.1f}, {fy:.1f} ± {s[1]:.1f} px; principal point "
+        f"{cx:.1f} ± {s[2]:.1f}, {cy:.1f} ± {s[3]:.1f} px"
+    )
     terms = [
         f"{term} {value:.4f} ± {sigma:.4f}"
-        for term, value, sigma in zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, s[4:],
-                                      strict=True)
+        for term, value, sigma in zip(
+            ("k1", "k2", "p1", "p2", "k3"), lens.distortion, s[4:], strict=True
+        )
         if sigma > 0.0
-    ]  # fmt: skip
+    ]
     print("distortion: " + (", ".join(terms) or "none that the pictures show"))
-    print(f"deviation {lens.deviation:.2f} px; boards cover {100 * lens.coverage:.0f} % of the "
-          "frame")  # fmt: skip
+    print(
+        f"deviation {lens.deviation:.2f} px; boards cover {100 * lens.coverage:.0f} % of the frame"
+    )
     _print_notes(notes)
     print(f"camera {camera.name} written to {place}")
 
 
 def _from_marks(
-    plant: "Plant", places: tuple[Path, Path], frames: "Sequence[Frame]", name: str,
-    anew: bool, as_json: bool,
-) -> None:  # fmt: skip
+    plant: "Plant",
+    places: tuple[Path, Path],
+    frames: "Sequence[Frame]",
+    name: str,
+    anew: bool,
+    as_json: bool,
+) -> None:
     from dataclasses import replace
 
     from heliotrope.imaging.targets import teaching
@@ -146,8 +176,15 @@ def _from_marks(
     )
     teaching.write_with_pictures(teaching.with_camera(plant, camera), places[1], places[0].parent)
     if as_json:
-        print_json({**_document(camera), **_fit_document(fit), "marks": len(fit.residuals),
-                    "not_found": list(seen.reasons), "written": str(places[1])})  # fmt: skip
+        print_json(
+            {
+                **_document(camera),
+                **_fit_document(fit),
+                "marks": len(fit.residuals),
+                "not_found": list(seen.reasons),
+                "written": str(places[1]),
+            }
+        )
         return
     for reason in seen.reasons:
         print(reason)
@@ -167,8 +204,10 @@ def teach(
     click: Annotated[bool, typer.Option("--click", help="Click the points in a browser.")] = False,
     kind: Annotated[
         list[str] | None,
-        typer.Option(help="What is at the points: corner, tee, square, disc or picture; "
-                          "NAME=KIND for one of them."),
+        typer.Option(
+            help="What is at the points: corner, tee, square, disc or picture; "
+            "NAME=KIND for one of them."
+        ),
     ] = None,
     size: Annotated[
         list[str] | None, typer.Option(help="Size of the marks, m; NAME=SIZE for one of them.")
@@ -182,7 +221,7 @@ def teach(
     anew: Annotated[bool, typer.Option("--anew", help="Solve a known lens again, too.")] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Tell once where a target's points are in a picture: its marks and the camera's place."""
     from heliotrope.imaging.targets import teaching
 
@@ -197,9 +236,17 @@ def teach(
 
         given |= click_points(surface, frame, given, image.name, _announcer(as_json))
     taught = teaching.teach(
-        loaded, target, frame, given, camera=camera, wishes=wishes, wish=wish, sigma=sigma_px,
-        anew=anew, prefix=f"{place.stem}-{target}",
-    )  # fmt: skip
+        loaded,
+        target,
+        frame,
+        given,
+        camera=camera,
+        wishes=wishes,
+        wish=wish,
+        sigma=sigma_px,
+        anew=anew,
+        prefix=f"{place.stem}-{target}",
+    )
     teaching.write_taught(taught, place, plant.parent)
     _show_taught(taught, place, as_json)
 
@@ -241,9 +288,10 @@ def _wishes(
     def of(name: str) -> Wish:
         try:
             return Wish(
-                kind.get(name, kind.get("")), size.get(name, size.get("")),
+                kind.get(name, kind.get("")),
+                size.get(name, size.get("")),
                 stroke.get(name, stroke.get("")),
-            )  # fmt: skip
+            )
         except InputError as error:
             raise InputError(f"point {name}: {error}" if name else str(error)) from None
 
@@ -265,13 +313,26 @@ def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Valu
 def _show_taught(taught: "Taught", place: Path, as_json: bool) -> None:
     if as_json:
         points = [
-            {"name": p.name, "pixel": p.pixel, "sigma_px": _sigma(p.covariance),
-             "mark": p.mark.kind if p.mark else None, "refined": p.refined, "note": p.note}
+            {
+                "name": p.name,
+                "pixel": p.pixel,
+                "sigma_px": _sigma(p.covariance),
+                "mark": p.mark.kind if p.mark else None,
+                "refined": p.refined,
+                "note": p.note,
+            }
             for p in taught.points
-        ]  # fmt: skip
-        print_json({**_document(taught.plant.camera(taught.camera)), **_fit_document(taught.fit),
-                    "target": taught.target, "points": points,
-                    "pictures": sorted(taught.pictures), "written": str(place)})  # fmt: skip
+        ]
+        print_json(
+            {
+                **_document(taught.plant.camera(taught.camera)),
+                **_fit_document(taught.fit),
+                "target": taught.target,
+                "points": points,
+                "pictures": sorted(taught.pictures),
+                "written": str(place),
+            }
+        )
         return
     import numpy as np
 
@@ -280,16 +341,30 @@ def _show_taught(taught: "Taught", place: Path, as_json: bool) -> None:
         x, y = point.pixel
         kind = "–" if point.mark is None else point.mark.kind
         how = "refined" if point.refined else "as given"
-        rows.append([point.name, f"{x:.2f}", f"{y:.2f}", f"{_sigma(point.covariance):.2f}",
-                     f"{np.hypot(*residual):.2f}", kind, how])  # fmt: skip
-    print_table(["point", "x px", "y px", "± px", "off px", "mark", ""], rows,
-                title=f"target {taught.target}")  # fmt: skip
+        rows.append(
+            [
+                point.name,
+                f"{x:.2f}",
+                f"{y:.2f}",
+                f"{_sigma(point.covariance):.2f}",
+                f"{np.hypot(*residual):.2f}",
+                kind,
+                how,
+            ]
+        )
+    print_table(
+        ["point", "x px", "y px", "± px", "off px", "mark", ""],
+        rows,
+        title=f"target {taught.target}",
+    )
     for point in taught.points:
         if point.note:
             print(f"{point.name}: {point.note}")
     _print_fit(taught.fit, len(taught.points), "points")
-    print(f"camera {taught.camera} and {sum(p.mark is not None for p in taught.points)} marks "
-          f"written to {place}")  # fmt: skip
+    print(
+        f"camera {taught.camera} and {sum(p.mark is not None for p in taught.points)} marks "
+        f"written to {place}"
+    )
 
 
 @app.command()
@@ -308,35 +383,71 @@ def show(
         return
     seen = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
     if as_json:
-        print_json([
-            {**_document(camera), "targets": {s.target: vars(s) for s in seen[camera.name]}}
-            for camera in loaded.cameras
-        ])  # fmt: skip
+        print_json(
+            [
+                {**_document(camera), "targets": {s.target: vars(s) for s in seen[camera.name]}}
+                for camera in loaded.cameras
+            ]
+        )
         return
-    rows = []
+    _print_cameras(loaded.cameras)
+    table = [
+        [
+            name,
+            s.target,
+            f"{s.distance:.1f}",
+            f"{1e3 * s.metres_per_pixel:.1f}",
+            f"{np.degrees(s.obliquity):.0f}",
+            f"{100 * s.share:.0f}",
+            str(s.marks),
+        ]
+        for name, listed in seen.items()
+        for s in listed
+    ]
+    if table:
+        print_table(
+            ["camera", "target", "distance m", "mm/px", "oblique °", "in the frame %", "marks"],
+            table,
+        )
     for camera in loaded.cameras:
+        if camera.position is None:
+            print(
+                f"camera {camera.name}: where it stands is not known; heliotrope camera "
+                "calibrate (or teach) finds it"
+            )
+
+
+def _print_cameras(cameras: "Sequence[Camera]") -> None:
+    import numpy as np
+
+    rows = []
+    for camera in cameras:
         wide, high = np.degrees(_field(camera))
         where = "–" if camera.position is None else ", ".join(f"{v:.2f}" for v in camera.position)
         bent = " ".join(f"{v:.3g}" for v in np.trim_zeros(camera.distortion, "b")) or "0"
-        rows.append([
-            camera.name, "{} × {}".format(*camera.size), f"{camera.matrix[0, 0]:.1f}",
-            f"{wide:.2f} × {high:.2f}", where, bent,
-            f"{camera.deviation:.2f}" if camera.deviation > 0.0 else "–",
-        ])  # fmt: skip
-    print_table(["camera", "frame px", "focal px", "field °", "east, north, up m",
-                 "distortion k1 k2 p1 p2 k3", "deviation px"], rows)  # fmt: skip
-    table = [
-        [name, s.target, f"{s.distance:.1f}", f"{1e3 * s.metres_per_pixel:.1f}",
-         f"{np.degrees(s.obliquity):.0f}", f"{100 * s.share:.0f}", str(s.marks)]
-        for name, listed in seen.items() for s in listed
-    ]  # fmt: skip
-    if table:
-        print_table(["camera", "target", "distance m", "mm/px", "oblique °", "in the frame %",
-                     "marks"], table)  # fmt: skip
-    for camera in loaded.cameras:
-        if camera.position is None:
-            print(f"camera {camera.name}: where it stands is not known; heliotrope camera "
-                  "calibrate (or teach) finds it")  # fmt: skip
+        rows.append(
+            [
+                camera.name,
+                "{} × {}".format(*camera.size),
+                f"{camera.matrix[0, 0]:.1f}",
+                f"{wide:.2f} × {high:.2f}",
+                where,
+                bent,
+                f"{camera.deviation:.2f}" if camera.deviation > 0.0 else "–",
+            ]
+        )
+    print_table(
+        [
+            "camera",
+            "frame px",
+            "focal px",
+            "field °",
+            "east, north, up m",
+            "distortion k1 k2 p1 p2 k3",
+            "deviation px",
+        ],
+        rows,
+    )
 
 
 # -- shared ----------------------------------------------------------------------------
@@ -346,9 +457,10 @@ def _place_to_write(plant: Path, out: Path | None) -> Path:
     """Return the plant file to write, before anything is worked out."""
     if plant.suffix.lower() == ".json":
         raise FormatError(
-            plant, "a tower alone is no plant; give the folder that has heliostat properties too "
-            "(properties/ID.json), and --out plant.toml"
-        )  # fmt: skip
+            plant,
+            "a tower alone is no plant; give the folder that has heliostat properties too "
+            "(properties/ID.json), and --out plant.toml",
+        )
     place = plant if out is None else out
     if place.suffix.lower() != ".toml":
         raise InputError(f"{place}: only plant files (TOML) are written; add --out plant.toml")
@@ -379,14 +491,21 @@ def _field(camera: "Camera") -> Any:
 def _document(camera: "Camera") -> dict[str, Any]:
     import numpy as np
 
-    place = {} if camera.position is None else {
-        "position_m": camera.position, "rotation": camera.R_camera_enu}  # fmt: skip
+    place = (
+        {}
+        if camera.position is None
+        else {"position_m": camera.position, "rotation": camera.R_camera_enu}
+    )
     return {
-        "camera": camera.name, "size_px": camera.size,
-        "focal_px": np.diagonal(camera.matrix)[:2], "center_px": camera.matrix[:2, 2],
-        "field_deg": np.degrees(_field(camera)), "distortion": camera.distortion,
-        "deviation_px": camera.deviation, **place,
-    }  # fmt: skip
+        "camera": camera.name,
+        "size_px": camera.size,
+        "focal_px": np.diagonal(camera.matrix)[:2],
+        "center_px": camera.matrix[:2, 2],
+        "field_deg": np.degrees(_field(camera)),
+        "distortion": camera.distortion,
+        "deviation_px": camera.deviation,
+        **place,
+    }
 
 
 def _fit_document(fit: "CameraFit") -> dict[str, Any]:
@@ -410,8 +529,10 @@ def _print_fit(fit: "CameraFit", count: int, what: str) -> None:
     names = zip(position, ("east", "north", "up"), strict=True)
     place = ", ".join(f"{v:.2f} ± {fit.sigma(name):.2f}" for v, name in names)
     rms = float(np.sqrt(np.mean(np.sum(fit.residuals**2, axis=1))))
-    print(f"{count} {what}, residuals {rms:.2f} px; pixels on their plane good to "
-          f"{1e3 * fit.plane_sigma:.1f} mm")  # fmt: skip
+    print(
+        f"{count} {what}, residuals {rms:.2f} px; pixels on their plane good to "
+        f"{1e3 * fit.plane_sigma:.1f} mm"
+    )
     print(f"camera at ({place}) m; focal length {fit.camera.matrix[0, 0]:.1f} px")
     _print_notes(fit.notes)
 

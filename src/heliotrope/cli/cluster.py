@@ -56,9 +56,14 @@ async def _run(installation: "Installation", every: float) -> None:
     bus = SerialBus(installation.bus_url, clock, installation.bus)
     link, time = _link(installation, clock), time_of(installation, clock)
     cluster = Cluster(
-        installation.config, bus, link, clock, time, Kept(installation.state),
+        installation.config,
+        bus,
+        link,
+        clock,
+        time,
+        Kept(installation.state),
         line_of(installation.emergency_line),
-    )  # fmt: skip
+    )
     ending = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -97,7 +102,10 @@ def _link(installation: "Installation", clock: "Clock") -> "Link":
 
         tls = ssl.create_default_context() if authority is None else client_tls(authority)
     broker = Broker(
-        installation.host, installation.port, installation.plant.username,
-        installation.password or None, tls,
-    )  # fmt: skip
+        installation.host,
+        installation.port,
+        installation.plant.username,
+        installation.password or None,
+        tls,
+    )
     return mqtt_link(broker, installation.prefix, name, key, clock, plant=False)

@@ -48,9 +48,13 @@ def demo(
     tested = learning.learn(group.mechanism, seen, model, used=training)
     learned = learning.learn(group.mechanism, seen, model)
     result = Result(
-        group.names, learned, plant, "azel", assessment.assess(group.names, tested),
+        group.names,
+        learned,
+        plant,
+        "azel",
+        assessment.assess(group.names, tested),
         note="random split, 70 % to learn from",
-    )  # fmt: skip
+    )
     calibrated = plant.with_groups({"azel": result.results.apply(group)})
     write_plant(calibrated, into / "plant.toml")
     day = _track_day(calibrated, truth)
@@ -61,11 +65,15 @@ def demo(
     if as_json:
         print_json({**figures, "plant": str(into / "plant.toml"), "report": str(page)})
         return
-    print("beam error, median: {before_mrad:.2f} mrad as installed, {held_out_mrad:.3f} mrad "
-          "calibrated, on measurements held out".format(**figures))  # fmt: skip
-    print("tracked {date}, {positions} positions of {heliostats} heliostats: beam error against "
-          "the true mirrors {day_before_mrad:.2f} mrad before, {day_after_mrad:.3f} mrad after "
-          "(RMS)".format(**figures))  # fmt: skip
+    print(
+        "beam error, median: {before_mrad:.2f} mrad as installed, {held_out_mrad:.3f} mrad "
+        "calibrated, on measurements held out".format(**figures)
+    )
+    print(
+        "tracked {date}, {positions} positions of {heliostats} heliostats: beam error against "
+        "the true mirrors {day_before_mrad:.2f} mrad before, {day_after_mrad:.3f} mrad after "
+        "(RMS)".format(**figures)
+    )
     print(f"plant file: {into / 'plant.toml'}")
     print(f"the day:    {into / 'day.png'}")
     print(f"report:     {page}")
@@ -96,9 +104,14 @@ def _measure(plant: "Plant", truth: Any, seed: int) -> Any:
             noise = rng.normal(0.0, CENTROID_NOISE, (len(nominal), 2)) @ target.axes
             lit = np.flatnonzero(np.isfinite(spot).all(axis=-1))
             parts.append(
-                (lit, counts[lit], np.tile(sun, (len(lit), 1)), (spot + noise)[lit],
-                 np.full(len(lit), times[k].timestamp()))
-            )  # fmt: skip
+                (
+                    lit,
+                    counts[lit],
+                    np.tile(sun, (len(lit), 1)),
+                    (spot + noise)[lit],
+                    np.full(len(lit), times[k].timestamp()),
+                )
+            )
     rows, counts, source, spots, seconds = (np.concatenate(p) for p in zip(*parts, strict=True))
     distance = np.linalg.norm(nominal.position[rows] - target.center, axis=-1)
     return sightings(rows, counts, source, spots, time=seconds, sigma=CENTROID_NOISE / distance)
@@ -155,8 +168,10 @@ def _day_picture(day: dict[str, Any]) -> Any:
     figure = Figure(figsize=(8.0, 4.0), layout="constrained")
     ax = figure.subplots()
     hours = np.array([(t - DAY).total_seconds() / 3600.0 for t in day["times"]])
-    for key, colour, label in (("before", "#999999", "as installed"),
-                               ("after", "#0072b2", "calibrated")):  # fmt: skip
+    for key, colour, label in (
+        ("before", "#999999", "as installed"),
+        ("after", "#0072b2", "calibrated"),
+    ):
         lines = ax.plot(hours, 1e3 * day[key], color=colour, lw=0.8, alpha=0.7)
         lines[0].set_label(f"{label} (18 heliostats)")
     ax.set_yscale("log")

@@ -71,17 +71,34 @@ def _print(document: dict[str, Any]) -> None:
         return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else "–"
 
     rows = [
-        [name, str(h["n"]), str(h["n_held_out"]), shown(h["median_beam_mrad"]),
-         shown(h["mean_beam_mrad"]), shown(h["rms_beam_mrad"]), shown(h["p95_beam_mrad"]),
-         shown(h["median_normal_mrad"]), shown(h["coverage_90"])]
+        [
+            name,
+            str(h["n"]),
+            str(h["n_held_out"]),
+            shown(h["median_beam_mrad"]),
+            shown(h["mean_beam_mrad"]),
+            shown(h["rms_beam_mrad"]),
+            shown(h["p95_beam_mrad"]),
+            shown(h["median_normal_mrad"]),
+            shown(h["coverage_90"]),
+        ]
         for name, h in document["heliostats"].items()
-    ]  # fmt: skip
+    ]
     print_table(
-        ["heliostat", "sightings", "held out", "median", "mean", "RMS", "95 %",
-         "normal, median", "in 90 % ellipse"],
+        [
+            "heliostat",
+            "sightings",
+            "held out",
+            "median",
+            "mean",
+            "RMS",
+            "95 %",
+            "normal, median",
+            "in 90 % ellipse",
+        ],
         rows,
         title=f"beam error of held-out sightings, mrad ({document['split']} split)",
-    )  # fmt: skip
+    )
     whose = f"heliostats with {document['enough']} or more"
     if not document["enough"]:
         whose = "all heliostats (none has 20 sightings)"

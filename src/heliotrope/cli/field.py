@@ -32,7 +32,9 @@ def check(
             print(f"{finding.severity}: {finding.text}")
         if not wrong:
             plant = plant_file.read_plant(file)
-            print(f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
-                  f"{'can run, see above' if findings else 'all is well'}")  # fmt: skip
+            print(
+                f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
+                f"{'can run, see above' if findings else 'all is well'}"
+            )
     if wrong:
         raise typer.Exit(2)

@@ -84,9 +84,13 @@ def image(
     job = _job(place, target, crop, camera, empty, memory, annotated if pictures else None)
     with shared.connected(scheduler) as client, shared.progress("reading", as_json) as advance:
         outcomes = campaign.process_many(
-            files, job, entries,
-            processes=processes or len(os.sched_getaffinity(0)), client=client, progress=advance,
-        )  # fmt: skip
+            files,
+            job,
+            entries,
+            processes=processes or len(os.sched_getaffinity(0)),
+            client=client,
+            progress=advance,
+        )
     left_out: list[str] = []
     count = 0
     if to_sightings is not None:
@@ -100,9 +104,15 @@ def image(
 
 
 def _follow(
-    paths: list[str], place: "Place", job: "Job", limit: int | None, burst: int,
-    archive: Path | None, memory: Path | None, as_json: bool,
-) -> None:  # fmt: skip
+    paths: list[str],
+    place: "Place",
+    job: "Job",
+    limit: int | None,
+    burst: int,
+    archive: Path | None,
+    memory: Path | None,
+    as_json: bool,
+) -> None:
     from heliotrope.cli._live import follow
     from heliotrope.errors import InputError
     from heliotrope.imaging.sources import open_source
@@ -177,9 +187,14 @@ def _files(paths: Sequence[Path]) -> list[Path]:
 
 
 def _job(
-    place: Place, target: str, crop: bool, camera: str,
-    empty: Path | None, memory: Path | None, annotated: Path | None,
-) -> "Job":  # fmt: skip
+    place: Place,
+    target: str,
+    crop: bool,
+    camera: str,
+    empty: Path | None,
+    memory: Path | None,
+    annotated: Path | None,
+) -> "Job":
     from heliotrope.errors import InputError, UnknownNameError
     from heliotrope.imaging.campaign import Job
     from heliotrope.imaging.files import read_image
@@ -235,20 +250,24 @@ def _write(
 
 
 def _show(
-    outcomes: "Sequence[Outcome]", as_json: bool, table: Path | None, count: int,
+    outcomes: "Sequence[Outcome]",
+    as_json: bool,
+    table: Path | None,
+    count: int,
     left_out: list[str],
-) -> None:  # fmt: skip
+) -> None:
     read = [o for o in outcomes if not o.problem]
     if as_json:
         print_json(
             {
                 "images": [o.document for o in read],
-                "unreadable": [{"file": str(o.path), "problem": o.problem} for o in outcomes
-                               if o.problem],
+                "unreadable": [
+                    {"file": str(o.path), "problem": o.problem} for o in outcomes if o.problem
+                ],
                 "sightings": None if table is None else {"file": str(table), "count": count},
                 "left_out": left_out,
             }
-        )  # fmt: skip
+        )
         return
     if len(read) <= 40:
         print_spots(read)

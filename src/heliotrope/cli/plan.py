@@ -206,9 +206,13 @@ def _made(plant: "Plant", path: Path | None) -> "Sightings | None":
 
 
 def _parts(
-    plant: "Plant", wanted: list[str] | None, model: str, made: "Sightings | None",
-    start: datetime, step: Callable[[int, int], None],
-) -> list[_Part]:  # fmt: skip
+    plant: "Plant",
+    wanted: list[str] | None,
+    model: str,
+    made: "Sightings | None",
+    start: datetime,
+    step: Callable[[int, int], None],
+) -> list[_Part]:
     import numpy as np
 
     from heliotrope.calibration.information import expectation, precision, suns_of_year
@@ -232,10 +236,14 @@ def _parts(
         seen = None if made is None else _of(made, [place[n] for n in labels], len(place))
         parts.append(
             _Part(
-                labels, mechanism, parameters, precision(mechanism, parameters, seen),
-                expectation(mechanism, aim, suns, parameters).form, aim,
+                labels,
+                mechanism,
+                parameters,
+                precision(mechanism, parameters, seen),
+                expectation(mechanism, aim, suns, parameters).form,
+                aim,
             )
-        )  # fmt: skip
+        )
     return parts
 
 
@@ -323,9 +331,13 @@ def _all_plans(
         # Each on its own part of a step, so that two are not on a target at once.
         shift = slot * (number % max(1, int(order.every // slot)))
         found = planning.candidates(
-            part.mechanism[i : i + 1], plant.site, order.targets, times + shift, part.names,
+            part.mechanism[i : i + 1],
+            plant.site,
+            order.targets,
+            times + shift,
+            part.names,
             sigma=order.sigma,
-        )  # fmt: skip
+        )
         free = [
             t <= stop - slot and (int(k), float(t)) not in taken
             for k, t in zip(found.target, found.time, strict=True)
@@ -338,9 +350,12 @@ def _all_plans(
                 "or the other heliostats' turns leave no time; widen the span"
             )
         plans[name] = planning.plan(
-            found, 10 if order.count is None else order.count, part.information[i], part.form[i],
+            found,
+            10 if order.count is None else order.count,
+            part.information[i],
+            part.form[i],
             criterion=order.criterion,
-        )  # fmt: skip
+        )
         chosen = plans[name].chosen
         taken |= {(int(k), float(t)) for k, t in zip(chosen.target, chosen.time, strict=True)}
         possible = possible or found
@@ -402,10 +417,18 @@ def _campaign(plant: "Plant", parts: list[_Part], order: _Order) -> None:
     start, stop = (t.timestamp() for t in order.span)
     with progress("scheduling", order.as_json) as step:
         found = planner.campaign(
-            fleets, plant.site, order.targets, start, stop, timing=order.timing,
-            every=order.every, ahead=order.ahead, worth=order.worth, count=order.count,
+            fleets,
+            plant.site,
+            order.targets,
+            start,
+            stop,
+            timing=order.timing,
+            every=order.every,
+            ahead=order.ahead,
+            worth=order.worth,
+            count=order.count,
             progress=step,
-        )  # fmt: skip
+        )
     labels = [name for p in parts for name in p.labels]
     targets = [t.name for t in order.targets]
     rows = campaign_rows(found, labels, targets)

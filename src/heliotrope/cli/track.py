@@ -135,8 +135,10 @@ def _print_branches(document: dict[str, Any], heliostat: str) -> None:
                 branch["text"],
             ]
         )
-    print(f"{heliostat} at {document['time'].isoformat()}, sun at "
-          f"{document['sun_elevation_deg']:.2f}° of elevation")  # fmt: skip
+    print(
+        f"{heliostat} at {document['time'].isoformat()}, sun at "
+        f"{document['sun_elevation_deg']:.2f}° of elevation"
+    )
     names = "joints " + " and ".join(document["joints"])
     print_table(["branch", "azimuth", "elevation", names, "counts", "residual", ""], rows)
     print("* the one to take")

@@ -117,18 +117,22 @@ class Discovery:
         named = {node.member.serial: node for node in self._nodes}
         found = [
             {
-                "serial": here.serial, "firmware": here.firmware, "address": here.address,
+                "serial": here.serial,
+                "firmware": here.firmware,
+                "address": here.address,
                 "name": named[here.serial].name if here.serial in named else "",
                 "expected": named[here.serial].address if here.serial in named else 0,
             }
             for here in sorted(self._found.values(), key=lambda here: here.serial)
-        ]  # fmt: skip
+        ]
         missing = [
             node.name
             for node in self._nodes
             if node.member.serial is not None and node.member.serial not in self._found
         ]
         return {
-            "found": found, "missing": missing, "garbled": self._garbled,
+            "found": found,
+            "missing": missing,
+            "garbled": self._garbled,
             "questions": self.questions,
-        }  # fmt: skip
+        }

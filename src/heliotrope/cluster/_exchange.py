@@ -110,10 +110,17 @@ class Exchange:
         return values
 
     async def ask(
-        self, node: Node, name: str, *values: Any, key: bytes = b"", expires: float,
-        numbers: tuple[str, ...] = ("ACK",), timeout: float | None = None, tries: int = 1,
+        self,
+        node: Node,
+        name: str,
+        *values: Any,
+        key: bytes = b"",
+        expires: float,
+        numbers: tuple[str, ...] = ("ACK",),
+        timeout: float | None = None,
+        tries: int = 1,
         urgent: bool = False,
-    ) -> Answer | None:  # fmt: skip
+    ) -> Answer | None:
         """Send a message to a node, the same frame again if nothing comes, and return the answer.
 
         A frame that is repeated before any other is made acts once: if the node has taken it
@@ -147,9 +154,13 @@ class Exchange:
         return None
 
     async def gather(
-        self, name: str, *values: Any, span: float, key: bytes = b"",
+        self,
+        name: str,
+        *values: Any,
+        span: float,
+        key: bytes = b"",
         complete: Callable[[bytes], bool] = lambda _: False,
-    ) -> tuple[bytes | None, int]:  # fmt: skip
+    ) -> tuple[bytes | None, int]:
         """Ask everybody, and return all that comes within a time in s, and the sequence.
 
         None instead of the bytes if `interrupt` was called meanwhile.
@@ -159,9 +170,12 @@ class Exchange:
         return await self._patiently(frame, span, None, complete), sequence
 
     async def _patiently(
-        self, frame: bytes, timeout: float, expires: float | None,
+        self,
+        frame: bytes,
+        timeout: float,
+        expires: float | None,
         complete: Callable[[bytes], bool] | None,
-    ) -> bytes | None:  # fmt: skip
+    ) -> bytes | None:
         """Do a transaction that may take long; None if `interrupt` was called meanwhile."""
         try:
             async with asyncio.timeout(None) as self._gathering:

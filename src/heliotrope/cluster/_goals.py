@@ -147,9 +147,15 @@ class Goals:
         self._watches: dict[int, list[_Watch]] = {}
 
     def begin(
-        self, identity: str, name: str, node: Node, now: float,
-        *, sure: bool = True, shift: Shift | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        identity: str,
+        name: str,
+        node: Node,
+        now: float,
+        *,
+        sure: bool = True,
+        shift: Shift | None = None,
+    ) -> None:
         """Note that a node has acknowledged a command; goals of other commands are void.
 
         Not ``sure``: it may have, its answer was lost; ``shift``, if known, tells whether it has.

@@ -191,10 +191,22 @@ class Node:
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
         # An ACK shows that it is there, not what state it is in.
         _ROW.pack_into(
-            block, self.index * _ROW.size, state, fault, flags, _age(now - self.status_at),
-            *self.steps, sun_age, supply, temperature, boots, crc, self.counts.asked & NEVER,
-            self.counts.answered & NEVER, _age(now - self.steps_at),
-        )  # fmt: skip
+            block,
+            self.index * _ROW.size,
+            state,
+            fault,
+            flags,
+            _age(now - self.status_at),
+            *self.steps,
+            sun_age,
+            supply,
+            temperature,
+            boots,
+            crc,
+            self.counts.asked & NEVER,
+            self.counts.answered & NEVER,
+            _age(now - self.steps_at),
+        )
 
 
 def _age(seconds: float) -> int:

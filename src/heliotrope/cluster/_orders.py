@@ -132,10 +132,17 @@ class Orders:
     """
 
     def __init__(
-        self, config: ClusterConfig, nodes: Sequence[Node], exchange: Exchange, goals: Goals,
-        reports: Reports, kept: Kept, clock: Callable[[], float],
-        gps: Callable[[], float | None], look: Callable[[Node], Awaitable[None]],
-    ) -> None:  # fmt: skip
+        self,
+        config: ClusterConfig,
+        nodes: Sequence[Node],
+        exchange: Exchange,
+        goals: Goals,
+        reports: Reports,
+        kept: Kept,
+        clock: Callable[[], float],
+        gps: Callable[[], float | None],
+        look: Callable[[Node], Awaitable[None]],
+    ) -> None:
         self._config, self._nodes, self._exchange = config, nodes, exchange
         self._goals, self._reports, self._kept = goals, reports, kept
         self._clock, self._gps, self._look = clock, gps, look
@@ -306,9 +313,15 @@ class Orders:
             return await self._give_address(job, head, key)
         slow = bool(key) or step.name in _STORED
         answer = await self._exchange.ask(
-            node, step.name, *head, *step.values, key=key, expires=order.deadline, tries=TRIES,
+            node,
+            step.name,
+            *head,
+            *step.values,
+            key=key,
+            expires=order.deadline,
+            tries=TRIES,
             timeout=self._config.stored_answer if slow else None,
-        )  # fmt: skip
+        )
         if answer is not None:
             return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
         job.unanswered = True
@@ -324,17 +337,21 @@ class Orders:
         )
         await self._exchange.transmit(frame, life=job.order.deadline - self._clock())
         data, sequence = await self._exchange.gather(
-            "DISCOVER", serial, serial, span=SPAN + self._config.stored_answer,
+            "DISCOVER",
+            serial,
+            serial,
+            span=SPAN + self._config.stored_answer,
             complete=lambda data: data.endswith(b"\0") and bool(data.strip(b"\0")),
-        )  # fmt: skip
+        )
         found = [] if data is None else heard(data, sequence)[0]
         if not found:
             return self._again(job, f"no answer of serial number {serial} before it expired")
         if found[0].address != address:
             return self._again(
-                job, f"serial number {serial} stays at address {found[0].address}: its key or "
-                "edition is another, or its state forbids it"
-            )  # fmt: skip
+                job,
+                f"serial number {serial} stays at address {found[0].address}: its key or "
+                "edition is another, or its state forbids it",
+            )
         return self._advance(job)
 
     def _expiry(self, gps: float, order: Order) -> int:
@@ -431,9 +448,13 @@ class Orders:
 async def stored(exchange: Exchange, node: Node, item: str, expires: float) -> bytes | None:
     """Return what a node has stored of an item, b"" if nothing; None if it does not answer."""
     answer = await exchange.ask(
-        node, "QUERY_STORED", _ITEM_NUMBER[item], expires=expires, tries=TRIES,
+        node,
+        "QUERY_STORED",
+        _ITEM_NUMBER[item],
+        expires=expires,
+        tries=TRIES,
         numbers=("STORED",),
-    )  # fmt: skip
+    )
     if answer is None or answer.values[0] != _ITEM_NUMBER[item]:
         return None
     data: bytes = answer.values[1]

@@ -39,9 +39,13 @@ class Asked:
     """Answers the plant's questions when nothing else is to be done."""
 
     def __init__(
-        self, config: ClusterConfig, nodes: Sequence[Node], exchange: Exchange, reports: Reports,
+        self,
+        config: ClusterConfig,
+        nodes: Sequence[Node],
+        exchange: Exchange,
+        reports: Reports,
         clock: Callable[[], float],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._config, self._nodes, self._exchange = config, nodes, exchange
         self._reports, self._clock = reports, clock
         self._waiting: deque[Ask | _Recall] = deque(maxlen=64)

@@ -54,9 +54,13 @@ class Urgent:
     """
 
     def __init__(
-        self, nodes: Sequence[Node], exchange: Exchange, goals: Goals, reports: Reports,
+        self,
+        nodes: Sequence[Node],
+        exchange: Exchange,
+        goals: Goals,
+        reports: Reports,
         clock: Callable[[], float],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._nodes, self._exchange = nodes, exchange
         self._goals, self._reports, self._clock = goals, reports, clock
         self._orders: list[_Order] = []
@@ -159,10 +163,13 @@ class Urgent:
         self._asked.add((order.name, node.index))
         # An order that came when this was on its way already is asked for itself.
         same = [
-            other for other in self._orders
-            if other is not order and other.name == order.name and other.began <= begin
+            other
+            for other in self._orders
+            if other is not order
+            and other.name == order.name
+            and other.began <= begin
             and node in other.waiting
-        ]  # fmt: skip
+        ]
         for one in (order, *same):
             one.tries[node.index] += 1
             self._sent(one, [node])
@@ -191,7 +198,9 @@ class Urgent:
             self._reports.alarm("order_unacknowledged", node.name, "EMERGENCY", text)
             if age > _PATIENCE and not order.given_up:
                 self._reports.add(
-                    order.identity, Stage.FAILED, node.name,
+                    order.identity,
+                    Stage.FAILED,
+                    node.name,
                     f"{order.name} not acknowledged within {_PATIENCE:g} s; it is asked further",
-                )  # fmt: skip
+                )
         order.given_up = order.given_up or age > _PATIENCE

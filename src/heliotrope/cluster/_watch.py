@@ -83,9 +83,13 @@ class Watch:
     """
 
     def __init__(
-        self, cluster: str, longest_autonomy: float, reports: Reports, now: float,
+        self,
+        cluster: str,
+        longest_autonomy: float,
+        reports: Reports,
+        now: float,
         line: Callable[[], bool] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._cluster, self._longest, self._line = cluster, longest_autonomy, line
         self._reports = reports
         self._autonomy = 0.0
@@ -111,10 +115,12 @@ class Watch:
         autonomy = min(lease.autonomy, self._longest)
         if autonomy < lease.autonomy:
             self._reports.alarm(
-                "autonomy_limited", "", "WARNING",
+                "autonomy_limited",
+                "",
+                "WARNING",
                 f"the plant grants {lease.autonomy:g} s of autonomy; cluster {self._cluster} is "
                 f"configured for {self._longest:g} s, which it keeps to",
-            )  # fmt: skip
+            )
         else:
             self._reports.clear("autonomy_limited", "")
         if autonomy != self._autonomy:
@@ -161,9 +167,11 @@ class Watch:
         fresh = any(action.new and action.act == act for action in actions)
         new = act if strong and (fresh or before != act) else None
         self.verdict = Verdict(
-            act, new, tuple(f"{action.act.name} {action.condition}" for action in actions),
+            act,
+            new,
+            tuple(f"{action.act.name} {action.condition}" for action in actions),
             next((a.text for a in actions if a.act >= Act.REFUSE_NEW), ""),
-        )  # fmt: skip
+        )
         return self.verdict
 
     def _step(self, time: Time, now: float) -> float:

@@ -22,8 +22,9 @@ from heliotrope.sun import Site
 _SHORTEST_KEY, _LONGEST_KEY = 16, 64
 _OTHERS = 0o077
 _MISSING = {
-    "heliostats": "the cluster has no such heliostat", "clusters": "the plant has no such cluster",
-}  # fmt: skip
+    "heliostats": "the cluster has no such heliostat",
+    "clusters": "the plant has no such cluster",
+}
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
@@ -230,33 +231,51 @@ def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installa
     config = ClusterConfig(
         name=document.name,
         site=Site(
-            site.latitude_deg, site.longitude_deg, site.height_m, site.pressure_pa,
-            site.temperature_c, document.name, site.delta_t_s,
+            site.latitude_deg,
+            site.longitude_deg,
+            site.height_m,
+            site.pressure_pa,
+            site.temperature_c,
+            document.name,
+            site.delta_t_s,
         ),
         heliostats=tuple(
             Member(each.name, each.address, each.serial, secrets.members.get(each.name, b""))
             for each in document.heliostats
         ),
-        answer=bus.answer_s, stored_answer=bus.stored_answer_s,
-        steps_every=polling.steps_every_s, silence=polling.silence_s, phase=polling.phase_s,
+        answer=bus.answer_s,
+        stored_answer=bus.stored_answer_s,
+        steps_every=polling.steps_every_s,
+        silence=polling.silence_s,
+        phase=polling.phase_s,
         longest_autonomy=document.safety.longest_autonomy_s,
-    )  # fmt: skip
+    )
     if document.time.source == "gps" and not document.time.url:
         raise FormatError(path, "source is gps, and no url is given; add it", "time")
     if document.time.source == "gps" and document.time.ntp:
         raise FormatError(
-            path, "ntp belongs to source system; with gps the computer's clock is asked through "
-            "system_tolerance_s", "time.ntp",
-        )  # fmt: skip
+            path,
+            "ntp belongs to source system; with gps the computer's clock is asked through "
+            "system_tolerance_s",
+            "time.ntp",
+        )
     line = document.safety.emergency_line
     scheme, host, port, prefix = url_parts(path, document.plant.url, "plant.url")
     return Installation(
-        config=config, bus_url=bus.url, bus=BusSettings(baud_rate=bus.baud_rate, echo=bus.echo),
-        plant=document.plant, scheme=scheme, host=host, port=port, prefix=prefix,
-        plant_key=secrets.plant, password=secrets.password, time=document.time,
+        config=config,
+        bus_url=bus.url,
+        bus=BusSettings(baud_rate=bus.baud_rate, echo=bus.echo),
+        plant=document.plant,
+        scheme=scheme,
+        host=host,
+        port=port,
+        prefix=prefix,
+        plant_key=secrets.plant,
+        password=secrets.password,
+        time=document.time,
         state=path.parent / (document.state or f"{document.name}.state.json"),
         emergency_line=path.parent / line if line else None,
-    )  # fmt: skip
+    )
 
 
 def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
@@ -274,9 +293,10 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
         raise FormatError(path, f"{url!r} is no URL; give tcp://host:port", where) from None
     if parts.scheme not in _PORTS or not parts.hostname:
         raise FormatError(
-            path, f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
+            path,
+            f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
             where,
-        )  # fmt: skip
+        )
     port = port or _PORTS[parts.scheme]
     prefix = parts.path.strip("/")
     if port is None or (parts.scheme != "tcp" and not prefix):
@@ -337,9 +357,11 @@ class Keys:
         if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
             # The value itself is not told: it would stand in a log.
             raise FormatError(
-                self._path, f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "
-                f"{_LONGEST_KEY} bytes in hexadecimal, as of: openssl rand -hex 32", name
-            )  # fmt: skip
+                self._path,
+                f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "
+                f"{_LONGEST_KEY} bytes in hexadecimal, as of: openssl rand -hex 32",
+                name,
+            )
         return bytes.fromhex(text)
 
     def check(self, names: list[str]) -> None:

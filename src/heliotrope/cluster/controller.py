@@ -105,9 +105,15 @@ class Cluster:
     """
 
     def __init__(
-        self, config: ClusterConfig, bus: Bus, link: Link, clock: Clock, time: TimeKeeper,
-        kept: Kept | None = None, line: Callable[[], bool] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        config: ClusterConfig,
+        bus: Bus,
+        link: Link,
+        clock: Clock,
+        time: TimeKeeper,
+        kept: Kept | None = None,
+        line: Callable[[], bool] | None = None,
+    ) -> None:
         self.config = config
         self._link, self._clock, self._time = link, clock, time
         self._kept = kept or Kept(None)
@@ -126,9 +132,16 @@ class Cluster:
             self.nodes, self._exchange, self._goals, self._reports, clock.monotonic
         )
         self._orders = Orders(
-            config, self.nodes, self._exchange, self._goals, self._reports, self._kept,
-            clock.monotonic, self._bus_time, self._look,
-        )  # fmt: skip
+            config,
+            self.nodes,
+            self._exchange,
+            self._goals,
+            self._reports,
+            self._kept,
+            clock.monotonic,
+            self._bus_time,
+            self._look,
+        )
         self._asked = Asked(config, self.nodes, self._exchange, self._reports, clock.monotonic)
         # The first call loads the libraries, which takes longer than a second may.
         sun_values(0, present.utc_s if self._epoch_of_time else 0.0, config.site)
@@ -466,14 +479,18 @@ class Cluster:
         present, now = self._time.time(), self._clock.monotonic()
         self._reports.status(
             Status(
-                cluster=self.config.name, count=len(self.nodes), utc_s=present.utc_s,
-                time_quality=present.quality, time_error_s=min(present.error, _UNBOUNDED),
-                lease_left=self._watch.lease_left(now), cycle_s=now - begin,
+                cluster=self.config.name,
+                count=len(self.nodes),
+                utc_s=present.utc_s,
+                time_quality=present.quality,
+                time_error_s=min(present.error, _UNBOUNDED),
+                lease_left=self._watch.lease_left(now),
+                cycle_s=now - begin,
                 acts=self._watch.verdict.acts,
                 names=self._names if (self._number - self._told_names) % _NAMES_EVERY == 0 else (),
                 block=rows(self.nodes, now),
             )
-        )  # fmt: skip
+        )
         self._news.set()
 
     async def _tell(self) -> None:

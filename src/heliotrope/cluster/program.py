@@ -38,9 +38,10 @@ def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
         asked = timekeeping.kernel_synchronised if time.ntp else None
         return SystemTime(clock, time.error_s, synchronised=asked, drift_ppm=time.drift_ppm)
     discipline = DisciplineSettings(
-        latency=time.latency_s, drift_ppm=time.drift_ppm,
+        latency=time.latency_s,
+        drift_ppm=time.drift_ppm,
         system_tolerance=time.system_tolerance_s or None,
-    )  # fmt: skip
+    )
     return GpsTime(time.url, clock, GpsSettings(time.baud_rate, discipline=discipline))
 
 
@@ -103,7 +104,12 @@ class LocalCluster:
         time = time_of(installation, clock)
         self.link: Link = near
         self.cluster = Cluster(
-            config, bus, far, clock, time, Kept(installation.state),
+            config,
+            bus,
+            far,
+            clock,
+            time,
+            Kept(installation.state),
             line_of(installation.emergency_line),
-        )  # fmt: skip
+        )
         self.parts: tuple[Any, ...] = (near, far, bus, time)

@@ -93,10 +93,11 @@ class Files:
         data, was = bytes(body), Headers(raw=start["headers"])
         kind = was.get("content-type", "application/octet-stream")
         known = {
-            "Content-Type": kind, "Vary": "Accept-Encoding",
+            "Content-Type": kind,
+            "Vary": "Accept-Encoding",
             "ETag": f'"{hashlib.sha256(data).hexdigest()[:24]}"',
             "Cache-Control": "no-cache" if path_is_plain(scope["path"]) else _FOREVER,
-        }  # fmt: skip
+        }
         packed = kind.startswith(_PACKED) and len(data) > SMALL
         return data, gzip.compress(data, 6, mtime=0) if packed else None, known
 

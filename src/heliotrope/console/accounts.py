@@ -27,9 +27,12 @@ router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 def _who(who: Caller) -> models.Who:
     return models.Who(
-        name=who.person.name, role=who.person.role.name.lower(), by=who.by, expires=who.expires,
+        name=who.person.name,
+        role=who.person.role.name.lower(),
+        by=who.by,
+        expires=who.expires,
         csrf=who.csrf,
-    )  # fmt: skip
+    )
 
 
 @router.get("/session", response_model=models.Who, tags=["people"])
@@ -39,9 +42,11 @@ async def session(who: Anyone) -> models.Who:
 
 
 @router.post(
-    "/session", response_model=models.Who, tags=["people"],
+    "/session",
+    response_model=models.Who,
+    tags=["people"],
     responses={429: {"model": models.Problem, "description": "Too many failures"}},
-)  # fmt: skip
+)
 async def sign_in(
     console: Here, request: Request, response: Response, given: models.LogIn
 ) -> models.Who:
@@ -50,9 +55,14 @@ async def sign_in(
         raise HTTPException(403, "this page is from elsewhere; sign in at the console itself")
     secret, expires = await log_in(console, given.name, given.password, _address(request))
     response.set_cookie(
-        COOKIE, secret, max_age=int(console.settings.session_s), path="/", httponly=True,
-        samesite="strict", secure=console.settings.tls or console.settings.plain,
-    )  # fmt: skip
+        COOKIE,
+        secret,
+        max_age=int(console.settings.session_s),
+        path="/",
+        httponly=True,
+        samesite="strict",
+        secure=console.settings.tls or console.settings.plain,
+    )
     account = await console.read(lambda: console.people.account(given.name))
     role = account.role if account is not None else "viewer"
     return models.Who(
@@ -70,9 +80,11 @@ async def sign_out(console: Here, who: Anyone, response: Response) -> None:
 
 
 @router.put(
-    "/session/password", status_code=204, tags=["people"],
+    "/session/password",
+    status_code=204,
+    tags=["people"],
     responses={429: {"model": models.Problem, "description": "Too many failures"}},
-)  # fmt: skip
+)
 async def own_password(
     console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
 ) -> None:
@@ -134,9 +146,13 @@ async def change_account(
         raise HTTPException(404, f"there is no account {name}")
     kept = await _hashed(console, given.password) if given.password is not None else None
     made = await asyncio.to_thread(
-        console.people.change, name, console.now(), role=given.role, password_hash=kept,
+        console.people.change,
+        name,
+        console.now(),
+        role=given.role,
+        password_hash=kept,
         disabled=given.disabled,
-    )  # fmt: skip
+    )
     console.known.clear()
     console.operations.logbook.event("people", who.person.name, f"account {name} changed")
     return _account(made)
@@ -157,9 +173,13 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
     if ROLES[given.role] > who.person.role:
         raise HTTPException(403, f"token: its role {given.role} is higher than one's own")
     made, secret = await asyncio.to_thread(
-        console.people.add_token, who.person.name, given.label, given.role, console.now(),
+        console.people.add_token,
+        who.person.name,
+        given.label,
+        given.role,
+        console.now(),
         86_400.0 * given.days,
-    )  # fmt: skip
+    )
     console.operations.logbook.event(
         "people", who.person.name, f"token {given.label} made, {given.role}"
     )

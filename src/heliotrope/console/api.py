@@ -98,12 +98,20 @@ def _field(here: Operations) -> dict[str, Any]:
     volumes = here.plant.beams.volumes
     keep_outs = [{"name": v.name, "outline": outline(v).round(2).tolist()} for v in volumes]
     return {
-        "plant": design.name, "names": here.names, "positions": here.positions.round(3),
-        "clusters": here.clusters, "cluster": plant.cluster,
-        "size": sizes[len(sizes) // 2], "tower": middle, "receivers": here.receivers,
-        "targets": here.targets, "keep_outs": keep_outs, "surfaces": here.aim_names,
-        "states": states.STATES, "faults": meanings.FAULTS,
-    }  # fmt: skip
+        "plant": design.name,
+        "names": here.names,
+        "positions": here.positions.round(3),
+        "clusters": here.clusters,
+        "cluster": plant.cluster,
+        "size": sizes[len(sizes) // 2],
+        "tower": middle,
+        "receivers": here.receivers,
+        "targets": here.targets,
+        "keep_outs": keep_outs,
+        "surfaces": here.aim_names,
+        "states": states.STATES,
+        "faults": meanings.FAULTS,
+    }
 
 
 @router.get("/summary", response_model=models.Summary, tags=["plant"])
@@ -142,9 +150,11 @@ async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Res
 
 
 @router.get(
-    "/targets/{name}/photograph", tags=["calibration"], response_class=Response,
+    "/targets/{name}/photograph",
+    tags=["calibration"],
+    response_class=Response,
     responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "None was taken yet"}},
-)  # fmt: skip
+)
 async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
     """Return the last photograph of a target, with what the software saw in it."""
     del who
@@ -164,9 +174,14 @@ async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
     del who
     view = console.operations.camera(name)
     return answer(
-        {"target": view.target, "version": view.version, "at": view.at,
-         "reading": view.reading, "centroid": view.centroid}
-    )  # fmt: skip
+        {
+            "target": view.target,
+            "version": view.version,
+            "at": view.at,
+            "reading": view.reading,
+            "centroid": view.centroid,
+        }
+    )
 
 
 @router.get("/alarms", response_model=models.many(models.AlarmRow), tags=["alarms"])
@@ -185,9 +200,12 @@ async def events(console: Here, request: Request, who: Anyone, limit: Limit = 20
 
 @router.get("/packets", response_model=models.many(models.PacketRow), tags=["logs"])
 async def packets(
-    console: Here, request: Request, who: Anyone, limit: Limit = 200,
+    console: Here,
+    request: Request,
+    who: Anyone,
+    limit: Limit = 200,
     cluster: Annotated[str, Query(max_length=64)] = "",
-) -> Response:  # fmt: skip
+) -> Response:
     """Return the last messages between plant and clusters, newest first."""
     del who
     return shared(

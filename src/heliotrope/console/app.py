@@ -65,14 +65,24 @@ def create(
                 work.cancel()
 
     app = FastAPI(
-        title="Heliotrope", version=__version__, description=ABOUT, lifespan=alive,
-        openapi_url="/api/v1/openapi.json", docs_url=None, redoc_url=None,
-    )  # fmt: skip
+        title="Heliotrope",
+        version=__version__,
+        description=ABOUT,
+        lifespan=alive,
+        openapi_url="/api/v1/openapi.json",
+        docs_url=None,
+        redoc_url=None,
+    )
     app.state.console = console
     for router in (api.router, commands.router, accounts.router):
         app.include_router(router)
-    for kind, status in ((HeliotropeError, 422), (UnknownNameError, 404), (RefusedError, 409),
-                         (AuditError, 503), (StoreError, 503)):  # fmt: skip
+    for kind, status in (
+        (HeliotropeError, 422),
+        (UnknownNameError, 404),
+        (RefusedError, 409),
+        (AuditError, 503),
+        (StoreError, 503),
+    ):
         app.add_exception_handler(kind, _problem(status))
     app.add_middleware(Files)
     # The one that is added last stands first.

@@ -298,9 +298,10 @@ async def checked(console: Console, name: str, password: str, address: str) -> A
     if (wait := console.attempts.wait(*keys)) > 0.0:
         seconds = math.ceil(wait)
         raise HTTPException(
-            429, f"too many failed log-ins; try again in {seconds} s",
+            429,
+            f"too many failed log-ins; try again in {seconds} s",
             {"Retry-After": str(seconds)},
-        )  # fmt: skip
+        )
     console.attempts.begin(*keys)
     account = await console.read(lambda: console.people.account(name))
     kept = account.password_hash if account is not None and not account.disabled else None

@@ -28,9 +28,11 @@ def authority_of(console: Console, who: Caller) -> models.AuthorityState:
     if grant is None:
         return models.AuthorityState(holder="", role="", mine=False, lifetime=authority.lifetime)
     return models.AuthorityState(
-        holder=grant.holder.name, role=grant.holder.role.name.lower(),
-        mine=grant.holder == who.person, lifetime=authority.lifetime,
-    )  # fmt: skip
+        holder=grant.holder.name,
+        role=grant.holder.role.name.lower(),
+        mine=grant.holder == who.person,
+        lifetime=authority.lifetime,
+    )
 
 
 async def _told(console: Console) -> None:

@@ -24,10 +24,19 @@ from heliotrope.plant.operations.operations import Operations
 
 MARK = b"HLS1"
 ROW = np.dtype(
-    [("row", "<u4"), ("error", "<f4"), ("measured", "<f4"), ("calibrated", "<u4"),
-     ("sightings", "<u2"), ("flags", "<u2"), ("state", "u1"), ("fault", "u1"), ("on", "u1"),
-     ("held", "u1")]
-)  # fmt: skip
+    [
+        ("row", "<u4"),
+        ("error", "<f4"),
+        ("measured", "<f4"),
+        ("calibrated", "<u4"),
+        ("sightings", "<u2"),
+        ("flags", "<u2"),
+        ("state", "u1"),
+        ("fault", "u1"),
+        ("on", "u1"),
+        ("held", "u1"),
+    ]
+)
 #: Flags that come and go with every step or sun vector: they would make every row change.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
 #: Health of a cluster as the page colours it.
@@ -166,14 +175,17 @@ def header_of(operations: Operations) -> dict[str, Any]:
         "clusters": [_health(row) for row in operations.cluster_rows()],
         "measuring": plain(list(calibration.running)),
         "calibration": {
-            "on": calibration.on, "reason": calibration.reason, "done": calibration.done,
-            "waiting": calibration.waiting, "failed": calibration.failed,
+            "on": calibration.on,
+            "reason": calibration.reason,
+            "done": calibration.done,
+            "waiting": calibration.waiting,
+            "failed": calibration.failed,
             "quality": plain(quality),
         },
         "cameras": cameras,
         "order": plain(operations.emergency_view()),
         "events": _newest(operations),
-    }  # fmt: skip
+    }
     return found
 
 

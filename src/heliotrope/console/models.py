@@ -27,8 +27,9 @@ def model_of(view: type) -> type[BaseModel]:
     """Return the model of a view."""
     if view not in _MADE:
         hints = typing.get_type_hints(view)
-        fields: dict[str, Any] = {f.name: (_type(hints[f.name]), ...) for f in
-                                  dataclasses.fields(view)}  # fmt: skip
+        fields: dict[str, Any] = {
+            f.name: (_type(hints[f.name]), ...) for f in dataclasses.fields(view)
+        }
         made = create_model(view.__name__, **fields)
         made.__doc__ = view.__doc__
         _MADE[view] = made

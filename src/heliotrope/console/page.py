@@ -52,11 +52,16 @@ def attach(app: FastAPI) -> None:
     """Add the page to an application; a process can have one."""
     ui.page("/", title="Heliotrope", response_timeout=10.0)(_page)
     ui.run_with(
-        app, title="Heliotrope", favicon=Path(__file__).with_name("static") / "mark.svg",
-        dark=True, tailwind=False, show_welcome_message=False,
+        app,
+        title="Heliotrope",
+        favicon=Path(__file__).with_name("static") / "mark.svg",
+        dark=True,
+        tailwind=False,
+        show_welcome_message=False,
         # Nothing of the page runs here: bindings need not be looked at.
-        binding_refresh_interval=None, reconnect_timeout=10.0,
-    )  # fmt: skip
+        binding_refresh_interval=None,
+        reconnect_timeout=10.0,
+    )
 
 
 async def _page(request: Request) -> Response | None:
@@ -113,9 +118,10 @@ def _tabs() -> None:
 
 def _head(who: Caller) -> str:
     facts = {
-        "heliotrope-csrf": who.csrf, "heliotrope-person": who.person.name,
+        "heliotrope-csrf": who.csrf,
+        "heliotrope-person": who.person.name,
         "heliotrope-role": who.person.role.name.lower(),
-    }  # fmt: skip
+    }
     metas = "".join(
         f'<meta name="{name}" content="{escape(text)}">' for name, text in facts.items()
     )

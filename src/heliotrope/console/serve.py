@@ -38,11 +38,21 @@ class ConsoleServer:
         self.app = create(operations, people, self.settings)
         chosen = self.settings
         config = uvicorn.Config(
-            self.app, host=chosen.host, port=chosen.port, log_config=None, access_log=False,
-            server_header=False, proxy_headers=False, lifespan="on", ws="websockets-sansio",
-            ws_per_message_deflate=False, ws_max_size=1 << 16, timeout_graceful_shutdown=2,
-            ssl_certfile=chosen.certificate, ssl_keyfile=chosen.key,
-        )  # fmt: skip
+            self.app,
+            host=chosen.host,
+            port=chosen.port,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            proxy_headers=False,
+            lifespan="on",
+            ws="websockets-sansio",
+            ws_per_message_deflate=False,
+            ws_max_size=1 << 16,
+            timeout_graceful_shutdown=2,
+            ssl_certfile=chosen.certificate,
+            ssl_keyfile=chosen.key,
+        )
         self._server = _Server(config)
 
     async def run(self) -> None:

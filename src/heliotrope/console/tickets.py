@@ -44,7 +44,12 @@ class Tickets:
 def state_of(ticket: Ticket) -> TicketState:
     """Return how far a command has come."""
     return TicketState(
-        identity=ticket.identity, command=ticket.name, heliostats=len(ticket.heliostats),
-        counted=ticket.counted(), finished=ticket.finished, good=ticket.good, text=ticket.text,
+        identity=ticket.identity,
+        command=ticket.name,
+        heliostats=len(ticket.heliostats),
+        counted=ticket.counted(),
+        finished=ticket.finished,
+        good=ticket.good,
+        text=ticket.text,
         refusals=dict(list(ticket.refusals.items())[:100]),
-    )  # fmt: skip
+    )

@@ -50,10 +50,16 @@ def prototype() -> Plant:
         },
         targets=(Target("target", _square((0.0, 0.0, 13.0), 3.0), np.array([0.0, 0.0, 13.0])),),
         receivers=(
-            Receiver("receiver", "planar", np.array([0.0, 0.0, 16.5]),
-                     np.array([0.0, -1.0, 0.0]), 1.5, 1.5),
+            Receiver(
+                "receiver",
+                "planar",
+                np.array([0.0, 0.0, 16.5]),
+                np.array([0.0, -1.0, 0.0]),
+                1.5,
+                1.5,
+            ),
         ),
-    )  # fmt: skip
+    )
 
 
 def azimuth_elevation(position: FloatArray) -> Mechanism:

@@ -78,10 +78,11 @@ def _part(ax: "Axes", plant: Plant) -> None:
     rows = np.flatnonzero((np.abs(place - middle) <= 0.5 * side).all(axis=1))
     cluster = _numbers(plant)
     mirrors = [
-        Rectangle((place[i, 0] - 0.5 * width[i], place[i, 1] - 0.5 * height[i]), width[i],
-                  height[i])
+        Rectangle(
+            (place[i, 0] - 0.5 * width[i], place[i, 1] - 0.5 * height[i]), width[i], height[i]
+        )
         for i in rows
-    ]  # fmt: skip
+    ]
     colours = [_COLOURS[cluster[i] % len(_COLOURS)] for i in rows]
     circles = [Circle((place[i, 0], place[i, 1]), 0.5 * diagonal[i]) for i in rows]
     ax.add_collection(PatchCollection(circles, facecolor="none", edgecolor="#999999", lw=0.6))

@@ -28,16 +28,23 @@ def square_target(name: str, center: FloatArray, side: float, facing: float) -> 
     up = np.array([0.0, 0.0, 1.0])
     half, inset = 0.5 * side, (0.5 - _INSET) * side
     marks = tuple(
-        Mark(mark, kind, center + inset * (x * right + y * up), _MARK * side, _STROKE * side,
-             turns * 0.5 * np.pi)
+        Mark(
+            mark,
+            kind,
+            center + inset * (x * right + y * up),
+            _MARK * side,
+            _STROKE * side,
+            turns * 0.5 * np.pi,
+        )
         for mark, (kind, x, y, turns) in _MARKS.items()
-    )  # fmt: skip
+    )
     return Target(name, _corners(center, half * right, half * up), center, marks=marks)
 
 
 def _corners(center: FloatArray, right: FloatArray, up: FloatArray) -> FloatArray:
-    return np.stack([center - right + up, center + right + up, center + right - up,
-                     center - right - up])  # fmt: skip
+    return np.stack(
+        [center - right + up, center + right + up, center + right - up, center - right - up]
+    )
 
 
 def watching_camera(target: Target, name: str, away: float, height: float, aside: float) -> Camera:
@@ -78,6 +85,12 @@ def aperture(name: str, center: FloatArray, side: float, facing: float, down: fl
 def cylinder(name: str, center: FloatArray, diameter: float, height: float) -> Receiver:
     """Return a cylinder that takes light from all around."""
     return Receiver(
-        name, "external_cylinder", center, as_float([0.0, -1.0, 0.0]), diameter, height,
-        radius=0.5 * diameter, opening_angle=2.0 * np.pi,
-    )  # fmt: skip
+        name,
+        "external_cylinder",
+        center,
+        as_float([0.0, -1.0, 0.0]),
+        diameter,
+        height,
+        radius=0.5 * diameter,
+        opening_angle=2.0 * np.pi,
+    )

@@ -278,9 +278,15 @@ def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
     depth = 0.5 * np.sqrt(3.0) * step
     # Right of the bearing and outwards, from the middle of the triangle's height.
     own = np.array(
-        [[0.0, -depth], [-0.5 * step, 0.0], [0.5 * step, 0.0], [-step, depth], [0.0, depth],
-         [step, depth]]
-    )  # fmt: skip
+        [
+            [0.0, -depth],
+            [-0.5 * step, 0.0],
+            [0.5 * step, 0.0],
+            [-step, depth],
+            [0.0, depth],
+            [step, depth],
+        ]
+    )
     turned = own * [1.0, -1.0]
     shape = np.where((np.arange(len(around)) % 2 == 0)[:, None, None], own, turned)
     outward = np.stack([np.sin(around), np.cos(around)], axis=-1)[:, None, :]
@@ -345,9 +351,11 @@ def stepped(position: FloatArray, mirror: Mirror) -> Mechanism:
     azimuth = rotary(200, ratio, min_angle=-np.radians(200.0), max_angle=np.radians(200.0), **gear)
     elevation = rotary(200, ratio, min_angle=np.radians(-3.6), max_angle=np.radians(93.6), **gear)
     return kinds.azimuth_elevation(
-        position, pivot_height=mirror.pivot_height, pivot_offset=mirror.pivot_offset,
+        position,
+        pivot_height=mirror.pivot_height,
+        pivot_offset=mirror.pivot_offset,
         drives=(azimuth, elevation),
-    )  # fmt: skip
+    )
 
 
 def malan_plant(heliostats: int = 10_000) -> Plant:
@@ -423,12 +431,21 @@ def lay_out(
         )
     count = len(places)
     return Plant(
-        name or kind, site,
-        {"azel": Heliostats(places.names, stepped(places.position, size),
-                            np.full(count, size.width), np.full(count, size.height),
-                            cluster=clusters(count))},
-        targets, (receiver,), cameras=cameras,
-    )  # fmt: skip
+        name or kind,
+        site,
+        {
+            "azel": Heliostats(
+                places.names,
+                stepped(places.position, size),
+                np.full(count, size.width),
+                np.full(count, size.height),
+                cluster=clusters(count),
+            )
+        },
+        targets,
+        (receiver,),
+        cameras=cameras,
+    )
 
 
 def _tower_height(heliostats: int, mirror: Mirror) -> float:

@@ -53,9 +53,10 @@ def read_document(
     raw = read_toml(path, f"a {kind} file")
     if raw.get("format") != f"heliotrope-{kind}":
         raise FormatError(
-            path, f"format is {raw.get('format')!r}; a {kind} file says "
-            f'format = "heliotrope-{kind}" and version = 1'
-        )  # fmt: skip
+            path,
+            f"format is {raw.get('format')!r}; a {kind} file says "
+            f'format = "heliotrope-{kind}" and version = 1',
+        )
     try:
         return model.model_validate(raw)
     except ValidationError as error:

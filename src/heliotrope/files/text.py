@@ -44,9 +44,10 @@ def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
         raise FormatError(file, f"the file is empty; it should be {what}")
     if size > LIMIT:
         raise FormatError(
-            file, f"{size / 2**20:.0f} MiB are more than the limit of {LIMIT / 2**20:.0f} MiB; "
-            f"this is not {what}"
-        )  # fmt: skip
+            file,
+            f"{size / 2**20:.0f} MiB are more than the limit of {LIMIT / 2**20:.0f} MiB; "
+            f"this is not {what}",
+        )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise FormatError(file, f"the file is binary; it should be {what}")
     return file

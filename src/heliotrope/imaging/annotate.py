@@ -108,10 +108,11 @@ class _Sheet:
         import cv2
 
         face = next(
-            f for f in self.faces
+            f
+            for f in self.faces
             if f.picture.shape == placed.spot.region.shape
             and (placed.target is None or placed.target in f.picture.face.targets)
-        )  # fmt: skip
+        )
         found = cv2.findContours(
             placed.spot.region.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
         )

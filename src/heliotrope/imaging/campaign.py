@@ -177,9 +177,13 @@ def look(
         if name:
             _target(job, name, path)
         photograph = read_photograph(
-            frame, job.targets, job.camera, settings=job.settings, previous=previous,
+            frame,
+            job.targets,
+            job.camera,
+            settings=job.settings,
+            previous=previous,
             without=job.without,
-        )  # fmt: skip
+        )
     reading, refusal = meant(photograph, name)
     drawn = None
     if job.annotated is not None:

@@ -159,9 +159,10 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
             raise FormatError(file, "this is a device or a pipe; give an image file")
         if state.st_size > most:
             raise FormatError(
-                file, f"{state.st_size / 2**20:.0f} MiB are more than {limit / 1e6:.3g} million "
-                "pixels can have; this is no image, or the limit must be raised"
-            )  # fmt: skip
+                file,
+                f"{state.st_size / 2**20:.0f} MiB are more than {limit / 1e6:.3g} million "
+                "pixels can have; this is no image, or the limit must be raised",
+            )
         data = file.read_bytes()
     except FileNotFoundError:
         if file.is_symlink():
@@ -471,9 +472,10 @@ def _decode(file: Path, image: _Image) -> Pixels:
     found = (pixels.shape[1], pixels.shape[0])
     if found != image.size or pixels.dtype not in (np.uint8, np.uint16):
         raise FormatError(
-            file, f"decoded to {found} px of {pixels.dtype} where its header says {image.size}; "
-            "convert it to a PNG"
-        )  # fmt: skip
+            file,
+            f"decoded to {found} px of {pixels.dtype} where its header says {image.size}; "
+            "convert it to a PNG",
+        )
     return cast("Pixels", np.ascontiguousarray(pixels))
 
 
@@ -637,9 +639,11 @@ def _with_texts(data: bytes, frame: Frame) -> bytes:
     if frame.time is not None:
         texts["Creation Time"] = frame.time.isoformat()
     values = {
-        "time_deviation_s": frame.time_deviation, "exposure_s": frame.exposure,
-        "gain": frame.gain, "count": frame.count,
-    }  # fmt: skip
+        "time_deviation_s": frame.time_deviation,
+        "exposure_s": frame.exposure,
+        "gain": frame.gain,
+        "count": frame.count,
+    }
     known = {k: v for k, v in values.items() if math.isfinite(v) and (k, v) != ("count", 1)}
     if known:
         texts["Heliotrope"] = json.dumps(known)

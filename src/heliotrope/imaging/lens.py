@@ -130,9 +130,11 @@ def _eight_bit(grey: npt.ArrayLike) -> npt.NDArray[np.uint8]:
 
 
 def calibrate_chessboard(
-    images: Sequence[npt.ArrayLike], pattern: tuple[int, int], square: float,
+    images: Sequence[npt.ArrayLike],
+    pattern: tuple[int, int],
+    square: float,
     names: Sequence[str] = (),
-) -> Lens:  # fmt: skip
+) -> Lens:
     """Return the lens that took pictures of a flat chessboard.
 
     Parameters
@@ -173,9 +175,12 @@ def calibrate_chessboard(
 
 
 def calibrate_corners(
-    size: tuple[int, int], corners: Sequence[FloatArray | None], pattern: tuple[int, int],
-    square: float, names: Sequence[str],
-) -> Lens:  # fmt: skip
+    size: tuple[int, int],
+    corners: Sequence[FloatArray | None],
+    pattern: tuple[int, int],
+    square: float,
+    names: Sequence[str],
+) -> Lens:
     """Return the lens from corners found elsewhere; the rest as :func:`calibrate_chessboard`.
 
     ``corners`` has one entry for each picture, px (columns * rows, 2), None where none were
@@ -213,8 +218,12 @@ def _solve(
     """Return the lens with the terms of a model, its criterion and the boards' normals."""
     import cv2
 
-    kept = (cv2.CALIB_FIX_K1, 0), (cv2.CALIB_FIX_K2, 1), (cv2.CALIB_ZERO_TANGENT_DIST, 2), (
-        cv2.CALIB_FIX_K3, 4)  # fmt: skip
+    kept = (
+        (cv2.CALIB_FIX_K1, 0),
+        (cv2.CALIB_FIX_K2, 1),
+        (cv2.CALIB_ZERO_TANGENT_DIST, 2),
+        (cv2.CALIB_FIX_K3, 4),
+    )
     flags = sum(flag for flag, term in kept if term not in MODELS[model])
     seen = [np.float32(b.corners).reshape(-1, 1, 2) for b in boards if b.used]
     where = [np.float32(points).reshape(-1, 1, 3)] * len(seen)
@@ -234,10 +243,19 @@ def _solve(
     criterion = n * np.log(0.5 * deviation**2 + floor) + len(MODELS[model]) * np.log(n)
     tilts = np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0))
     told = zip(boards, np.cumsum([b.used for b in boards]) - 1, strict=True)
-    after = [replace(b, deviation=float(np.ravel(apart)[k]), tilt=float(tilts[k])) if b.used else b
-             for b, k in told]  # fmt: skip
-    lens = Lens(size, as_float(matrix), as_float(distortion).ravel()[:5], float(deviation),
-                as_float(sigma).ravel()[:9], model, tuple(after))  # fmt: skip
+    after = [
+        replace(b, deviation=float(np.ravel(apart)[k]), tilt=float(tilts[k])) if b.used else b
+        for b, k in told
+    ]
+    lens = Lens(
+        size,
+        as_float(matrix),
+        as_float(distortion).ravel()[:5],
+        float(deviation),
+        as_float(sigma).ravel()[:9],
+        model,
+        tuple(after),
+    )
     return lens, float(criterion), as_float(normals)
 
 
@@ -297,7 +315,7 @@ def _lens_notes(lens: Lens) -> tuple[str, ...]:
         (relative > 1.0, f"the focal length is known to {relative:.1f} %; steeper tilts tell more"),
         (share < 50.0, f"boards cover {share:.0f} % of the frame; beyond, distortion is guessed"),
         (used < 6, f"{used} pictures were used; ten or more make a lens that can be trusted"),
-    )  # fmt: skip
+    )
     return tuple(text for said, text in notes if said)
 
 
@@ -339,9 +357,12 @@ class CameraFit:
 
 
 def resection(
-    lens: Lens | Camera, points: npt.ArrayLike, pixels: npt.ArrayLike,
-    sigma: npt.ArrayLike = 0.3, name: str = "camera",
-) -> CameraFit:  # fmt: skip
+    lens: Lens | Camera,
+    points: npt.ArrayLike,
+    pixels: npt.ArrayLike,
+    sigma: npt.ArrayLike = 0.3,
+    name: str = "camera",
+) -> CameraFit:
     """Return where a camera stands whose lens is known.
 
     Both poses of a plane (Collins and Bartoli 2014, IPPE) and that of the general problem
@@ -373,9 +394,12 @@ def resection(
 
 
 def calibrate_marks(
-    size: tuple[int, int], points: Sequence[npt.ArrayLike], pixels: Sequence[npt.ArrayLike],
-    sigma: float | Sequence[npt.ArrayLike] = 0.3, name: str = "camera",
-) -> CameraFit:  # fmt: skip
+    size: tuple[int, int],
+    points: Sequence[npt.ArrayLike],
+    pixels: Sequence[npt.ArrayLike],
+    sigma: float | Sequence[npt.ArrayLike] = 0.3,
+    name: str = "camera",
+) -> CameraFit:
     """Return a camera of which nothing is known but the points that it saw.
 
     Solves pose, focal length (pixels are square), principal point and k1, the last three with
@@ -437,8 +461,13 @@ class _Problem:
         """Return the camera of unknowns."""
         matrix, distortion = self.lens(x)
         position = self.origin - self.turn(x).T @ self.shift(x)
-        return replace(self.base, matrix=matrix, distortion=distortion, position=position,
-                       R_camera_enu=self.turn(x))  # fmt: skip
+        return replace(
+            self.base,
+            matrix=matrix,
+            distortion=distortion,
+            position=position,
+            R_camera_enu=self.turn(x),
+        )
 
     def turn(self, x: FloatArray) -> FloatArray:
         """Return R_camera_enu."""
@@ -556,8 +585,16 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
 
     solved = []
     for start in starts:
-        found = least_squares(problem.residuals, start, problem.slopes, method="lm",
-                              x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)  # fmt: skip
+        found = least_squares(
+            problem.residuals,
+            start,
+            problem.slopes,
+            method="lm",
+            x_scale="jac",
+            xtol=1e-12,
+            ftol=1e-12,
+            gtol=1e-12,
+        )
         if (problem.local @ problem.turn(found.x)[2] + problem.shift(found.x)[2] > 0.0).all():
             solved.append((2.0 * float(found.cost), found.x))
     name = f"camera {problem.base.name}"
@@ -583,8 +620,14 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
     if problem.free:
         camera = replace(camera, deviation=float(np.sqrt(2.0 * np.mean(residuals**2))))
     change = _to_pose(problem, x)
-    fit = CameraFit(camera, POSE + INNER * problem.free, change @ raw @ change.T, residuals,
-                    _plane_sigma(problem, x, raw), other)  # fmt: skip
+    fit = CameraFit(
+        camera,
+        POSE + INNER * problem.free,
+        change @ raw @ change.T,
+        residuals,
+        _plane_sigma(problem, x, raw),
+        other,
+    )
     return replace(fit, notes=tuple(_notes(problem, fit, scale)))
 
 
@@ -613,9 +656,12 @@ def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)
     step = 1e-4 * float(np.ptp(few, axis=0).max())
     across = np.stack(
-        [problem.predict(x, points + step * a)[0] - problem.predict(x, points - step * a)[0]
-         for a in axes], axis=-1,
-    ) / (2.0 * step)  # fmt: skip
+        [
+            problem.predict(x, points + step * a)[0] - problem.predict(x, points - step * a)[0]
+            for a in axes
+        ],
+        axis=-1,
+    ) / (2.0 * step)
     # The pixel is held: the place on the plane moves by what the prediction does not.
     moved = np.linalg.solve(across, problem.predict(x, points)[1])
     return float(np.sqrt(0.5 * np.einsum("nip,pq,niq->n", moved, raw, moved).mean()))
@@ -631,8 +677,10 @@ def _notes(problem: _Problem, fit: CameraFit, scale: float) -> list[str]:
         notes.append(f"the points do not tell focal length from distance: {have}, {unsure}; {good}")
     if problem.free:
         sigma = problem.prior[1]
-        what = ("the principal point", 1, f"the frame's centre ± {sigma[1]:.0f} px"), (
-            "k1", 3, f"0 ± {K1_SIGMA}")  # fmt: skip
+        what = (
+            ("the principal point", 1, f"the frame's centre ± {sigma[1]:.0f} px"),
+            ("k1", 3, f"0 ± {K1_SIGMA}"),
+        )
         notes += [
             f"the points do not determine {quantity}; it keeps its prior, {prior}"
             for quantity, k, prior in what

@@ -134,9 +134,10 @@ def _entry(file: Path, line: int, row: Mapping[str, str]) -> Entry:
             time = None
         if time is None or time.tzinfo is None:
             raise FormatError(
-                file, f"{text!r} is no time with a zone; write 2026-06-21T12:00:00Z",
+                file,
+                f"{text!r} is no time with a zone; write 2026-06-21T12:00:00Z",
                 f"line {line}, column timestamp",
-            )  # fmt: skip
+            )
     empty = row.get("empty", "").strip()
     return Entry(
         heliostat=row.get("heliostat", "").strip(),

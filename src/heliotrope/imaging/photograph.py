@@ -221,9 +221,13 @@ def _one_thread() -> "ThreadpoolController":
 
 
 def _read(
-    frame: Frame, targets: Sequence[Target], camera: Camera | None, chosen: Settings,
-    previous: Sequence[View], without: Frame | None,
-) -> Photograph:  # fmt: skip
+    frame: Frame,
+    targets: Sequence[Target],
+    camera: Camera | None,
+    chosen: Settings,
+    previous: Sequence[View],
+    without: Frame | None,
+) -> Photograph:
     given, frame = frame, linear(frame, chosen.gamma)
     found = find_targets(frame, targets, camera, previous, chosen.pictures)
     readings = {f.target.name: Reading(f, (), (_missing(f),)) for f in found if not f.found}
@@ -265,9 +269,11 @@ def read_crop(frame: Frame, target: Target, settings: Settings | None = None) ->
         seen, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
     found = FoundTarget(target, True, "")
     return Photograph(
-        frame, (_reading(found, spots, seen, chosen),),
-        tuple(s for s in spots if s.target is None), (seen,),
-    )  # fmt: skip
+        frame,
+        (_reading(found, spots, seen, chosen),),
+        tuple(s for s in spots if s.target is None),
+        (seen,),
+    )
 
 
 def linear(frame: Frame, gamma: float) -> Frame:
@@ -308,9 +314,11 @@ def _trimmed(picture: Rectified, rim: int) -> Rectified:
     import cv2
 
     inner = cv2.erode(
-        picture.surface.astype(np.uint8), np.ones((2 * rim + 1, 2 * rim + 1), np.uint8),
-        borderType=cv2.BORDER_CONSTANT, borderValue=0,
-    )  # fmt: skip
+        picture.surface.astype(np.uint8),
+        np.ones((2 * rim + 1, 2 * rim + 1), np.uint8),
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
     return replace(picture, surface=inner > 0)
 
 
@@ -390,9 +398,14 @@ def _placed(picture: Rectified, spot: Spot) -> PlacedSpot:
         axes, plane = target.axes, target.plane_coordinates(point)
         point = target.point(plane)
     return PlacedSpot(
-        spot, target, np.asarray(plane), covariance, np.asarray(point),
-        np.asarray(axes.T @ covariance @ axes), np.asarray(pixel),
-    )  # fmt: skip
+        spot,
+        target,
+        np.asarray(plane),
+        covariance,
+        np.asarray(point),
+        np.asarray(axes.T @ covariance @ axes),
+        np.asarray(pixel),
+    )
 
 
 def _target_at(face: Face, point: FloatArray) -> Target | None:

@@ -32,16 +32,32 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 
     from .wire import Frame, Gate
 
-(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT,
- FEED) = range(10)  # fmt: skip
+(SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT, FEED) = range(10)
 
 #: Faults; their texts, and the names of the flags' bits, stand in ``names``.
-(NO_FAULT, STUCK_PRIMARY, STUCK_SECONDARY, LIMIT_SWITCH, SUPPLY, TEMPERATURE, SENSOR, COUNTS,
- BOOTS, JOURNAL, LATCHED) = range(11)  # fmt: skip
+(
+    NO_FAULT,
+    STUCK_PRIMARY,
+    STUCK_SECONDARY,
+    LIMIT_SWITCH,
+    SUPPLY,
+    TEMPERATURE,
+    SENSOR,
+    COUNTS,
+    BOOTS,
+    JOURNAL,
+    LATCHED,
+) = range(11)
 
 #: Where settings may change: those of the calibration, and those of the machine.
-CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT, states.IDLE,
-               states.DEFOCUSED)  # fmt: skip
+CALIBRATION = (
+    states.UNCONFIGURED,
+    states.STOWED,
+    states.LOCKED,
+    states.FAULT,
+    states.IDLE,
+    states.DEFOCUSED,
+)
 MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT, states.IDLE)
 STATES_OF = {
     "SET_ARMATURE": CALIBRATION, "SET_BIAS": CALIBRATION, "SET_POSITION": CALIBRATION,
@@ -103,9 +119,15 @@ class Controller:
     # Beginning.
 
     def boot(
-        self, primary: int, secondary: int, doubt: int, state: int, aim: "bytes | None",
-        boots: int, looping: bool,
-    ) -> "list[tuple[Any, ...]]":  # fmt: skip
+        self,
+        primary: int,
+        secondary: int,
+        doubt: int,
+        state: int,
+        aim: "bytes | None",
+        boots: int,
+        looping: bool,
+    ) -> "list[tuple[Any, ...]]":
         """Start with what the journal holds: ``primary, secondary, doubt, state, aim, boots,
         looping`` of ``Journal``, its items being in the configuration already.
         """  # noqa: D205 - the names are the summary
@@ -167,12 +189,13 @@ class Controller:
                 self._event("LAPSED")
         elif state == states.STOWING and kind == RETURN and not fresh:
             self._event("LAPSED")
-        elif state == states.DEFOCUSED and dark:
-            self._event("SILENT")
-        elif (
-            state == states.FAULT and dark and kind != STOW and self.motion.known
+        elif (state == states.DEFOCUSED and dark) or (
+            state == states.FAULT
+            and dark
+            and kind != STOW
+            and self.motion.known
             and not self.motion.at_stow()
-        ):  # fmt: skip
+        ):
             self._event("SILENT")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
@@ -277,9 +300,15 @@ class Controller:
         return self.out
 
     def on_message(
-        self, number: int, sequence: int, values: "tuple[Any, ...]", payload: bytes,
-        verdict: int, now_ms: int, reply: bool,
-    ) -> "list[tuple[Any, ...]]":  # fmt: skip
+        self,
+        number: int,
+        sequence: int,
+        values: "tuple[Any, ...]",
+        payload: bytes,
+        verdict: int,
+        now_ms: int,
+        reply: bool,
+    ) -> "list[tuple[Any, ...]]":
         """Take a message.
 
         Parameters
@@ -301,9 +330,15 @@ class Controller:
         return self.out
 
     def _message(
-        self, number: int, sequence: int, values: "tuple[Any, ...] | None", payload: bytes,
-        verdict: int, now_ms: int, reply: bool,
-    ) -> None:  # fmt: skip
+        self,
+        number: int,
+        sequence: int,
+        values: "tuple[Any, ...] | None",
+        payload: bytes,
+        verdict: int,
+        now_ms: int,
+        reply: bool,
+    ) -> None:
         who, name = messages.who_of(number), messages.name_of(number)
         if who == messages.ANYONE:
             # Never refused, whatever the verdict.
@@ -362,20 +397,41 @@ class Controller:
     def status(self) -> "tuple[Any, ...]":
         """The numbers of STATUS."""
         return (
-            self.state, self.flags(), self.fault, self._uptime_s, self.sun.age_ms(),
-            self.supply_mv, self.temperature_degc, self.config.armature_crc, self.boots,
-        )  # fmt: skip
+            self.state,
+            self.flags(),
+            self.fault,
+            self._uptime_s,
+            self.sun.age_ms(),
+            self.supply_mv,
+            self.temperature_degc,
+            self.config.armature_crc,
+            self.boots,
+        )
 
     def flags(self) -> int:
         """Bits of ``names.FLAGS``."""
         motion = self.motion
         bits = 0
-        for i, value in enumerate((
-            not motion.still(), self.sun.fresh(), self.clock.second is not None,
-            self.config.complete(), motion.ready, motion.at_stow(), self._aim_locked, motion.rough,
-            self._doubtful, not motion.known, motion.unreachable, motion.cut,
-            self._clock_jumped, self._ticks_jumped, self._present != 0, motion.kind == DIAGNOSE,
-        )):  # fmt: skip
+        for i, value in enumerate(
+            (
+                not motion.still(),
+                self.sun.fresh(),
+                self.clock.second is not None,
+                self.config.complete(),
+                motion.ready,
+                motion.at_stow(),
+                self._aim_locked,
+                motion.rough,
+                self._doubtful,
+                not motion.known,
+                motion.unreachable,
+                motion.cut,
+                self._clock_jumped,
+                self._ticks_jumped,
+                self._present != 0,
+                motion.kind == DIAGNOSE,
+            )
+        ):
             bits |= bool(value) << i
         return bits
 

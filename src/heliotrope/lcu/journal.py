@@ -433,9 +433,15 @@ class Journal:
         flags = (REST if rest else 0) | (AIM if self.aim is not None else 0)
         flags |= self.doubts << 3 | self.unhealthy
         data = struct.pack(
-            RING_RECORD, self._counter, primary, secondary, self.aim or bytes(12),
-            self.state, flags, self.boots,
-        )  # fmt: skip
+            RING_RECORD,
+            self._counter,
+            primary,
+            secondary,
+            self.aim or bytes(12),
+            self.state,
+            flags,
+            self.boots,
+        )
         data += struct.pack("<I", crc32(data))
         offset = self._offset(self._block, self._place)
         self._place += 1

@@ -175,7 +175,25 @@ def fields_of(number: int) -> list[str]:
 
 
 #: Results in ACK.
-(DONE, REFUSED_STATE, REFUSED_AUTHORITY, REFUSED_KEY, EXPIRED, DUPLICATE, BAD_VALUE, BUSY,
- NOT_STORED) = range(9)  # fmt: skip
-RESULTS = ("done", "not in this state", "not the authority", "wrong key", "expired",
-           "duplicate", "value out of range", "busy", "flash failed")  # fmt: skip
+(
+    DONE,
+    REFUSED_STATE,
+    REFUSED_AUTHORITY,
+    REFUSED_KEY,
+    EXPIRED,
+    DUPLICATE,
+    BAD_VALUE,
+    BUSY,
+    NOT_STORED,
+) = range(9)
+RESULTS = (
+    "done",
+    "not in this state",
+    "not the authority",
+    "wrong key",
+    "expired",
+    "duplicate",
+    "value out of range",
+    "busy",
+    "flash failed",
+)

@@ -142,9 +142,12 @@ class Motion:
         """Whether it stands at stow."""
         stow = self.config.stow
         return (
-            self.known and self.still() and stow is not None
-            and self.place(0) == stow[0] and self.place(1) == stow[1]
-        )  # fmt: skip
+            self.known
+            and self.still()
+            and stow is not None
+            and self.place(0) == stow[0]
+            and self.place(1) == stow[1]
+        )
 
     def halted(self, primary: int, secondary: int) -> None:
         """The hardware was stopped at once, with these signed steps emitted but not made."""
@@ -186,9 +189,10 @@ class Motion:
                 return
             steps[i] = drive.nearest(angles[i])
         inside = (
-            stepper.follow(steps[0], steps[1]) if order < 0
+            stepper.follow(steps[0], steps[1])
+            if order < 0
             else stepper.go(steps[0], steps[1], order)
-        )  # fmt: skip
+        )
         self.cut = not inside
 
     def _follow(self, aim: tuple[float, float, float]) -> bool:
@@ -372,9 +376,10 @@ class Motion:
             east, north = 0.5 * (standby[0] - here[0]), 0.5 * (standby[1] - here[1])
             sine, cosine = 0.5, 0.866
             aside = (
-                here[0] + cosine * east - sine * north, here[1] + sine * east + cosine * north,
+                here[0] + cosine * east - sine * north,
+                here[1] + sine * east + cosine * north,
                 here[2],
-            )  # fmt: skip
+            )
             points = [aside, (standby[0], standby[1], here[2])]
         return self._pieces(points + [standby])
 

@@ -137,9 +137,14 @@ class Node:
             self.trouble, doubt = str(error), -1
         self._chance = (serial * 0x9E3779B1 + journal.boots) & 0xFFFFFFFF or 1
         actions = self.controller.boot(
-            journal.primary, journal.secondary, doubt, journal.state, journal.aim,
-            journal.boots, journal.looping,
-        )  # fmt: skip
+            journal.primary,
+            journal.secondary,
+            doubt,
+            journal.state,
+            journal.aim,
+            journal.boots,
+            journal.looping,
+        )
         self._obey(actions, now_ms)
         if self.trouble or not good:
             self.on_fault(controller.JOURNAL, now_ms, False)

@@ -6,10 +6,30 @@ mean stands in ``names``. The table is text: on a microcontroller a tuple for ea
 7 kB more.
 """
 
-STATES = ("UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING", "DEFOCUSED",
-          "LOCKED", "SEARCHING", "FAULT")  # fmt: skip
-(UNCONFIGURED, STOWED, STOWING, APPROACHING, IDLE, TRACKING, DEFOCUSED, LOCKED, SEARCHING,
- FAULT) = range(10)  # fmt: skip
+STATES = (
+    "UNCONFIGURED",
+    "STOWED",
+    "STOWING",
+    "APPROACHING",
+    "IDLE",
+    "TRACKING",
+    "DEFOCUSED",
+    "LOCKED",
+    "SEARCHING",
+    "FAULT",
+)
+(
+    UNCONFIGURED,
+    STOWED,
+    STOWING,
+    APPROACHING,
+    IDLE,
+    TRACKING,
+    DEFOCUSED,
+    LOCKED,
+    SEARCHING,
+    FAULT,
+) = range(10)
 
 #: The sun must be fresh to enter these, and stays needed: LAPSED leaves them.
 NEED_SUN = (APPROACHING, TRACKING, SEARCHING)

@@ -60,8 +60,14 @@ HORIZON_S = 30
 #: After this silence of a sender its next frame must be a SESSION, ms.
 SILENCE_MS = 10000
 
-RANGES = {"B": (0, 255), "b": (-128, 127), "H": (0, 65535), "h": (-32768, 32767),
-          "I": (0, 4294967295), "i": (-2147483648, 2147483647)}  # fmt: skip
+RANGES = {
+    "B": (0, 255),
+    "b": (-128, 127),
+    "H": (0, 65535),
+    "h": (-32768, 32767),
+    "I": (0, 4294967295),
+    "i": (-2147483648, 2147483647),
+}
 LARGEST_SINGLE = 3.4028234663852886e38
 LARGEST_DOUBLE = 1.7976931348623157e308
 

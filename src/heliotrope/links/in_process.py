@@ -147,9 +147,14 @@ class MemoryLine:
             lane.news.set()
 
     def end(
-        self, place: int, name: str, clock: Clock, *,
-        settings: LinkSettings | None = None, seed: int = 0,
-    ) -> CarriedLink:  # fmt: skip
+        self,
+        place: int,
+        name: str,
+        clock: Clock,
+        *,
+        settings: LinkSettings | None = None,
+        seed: int = 0,
+    ) -> CarriedLink:
         """Return a new link at one end, as for a program that starts there anew.
 
         Parameters

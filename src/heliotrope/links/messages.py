@@ -32,14 +32,24 @@ VERSION = 1
 #: may be asked for less often.
 NODE = np.dtype(
     [
-        ("state", "u1"), ("fault", "u1"), ("flags", "<u4"), ("heard_ms", "<u4"),
-        ("primary", "<i4"), ("secondary", "<i4"),
-        ("primary_goal", "<i4"), ("secondary_goal", "<i4"),
-        ("sun_age_ms", "<u4"), ("supply_mv", "<u2"), ("temperature_degc", "i1"),
-        ("boots", "<u2"), ("armature_crc", "<u4"), ("asked", "<u4"), ("answered", "<u4"),
+        ("state", "u1"),
+        ("fault", "u1"),
+        ("flags", "<u4"),
+        ("heard_ms", "<u4"),
+        ("primary", "<i4"),
+        ("secondary", "<i4"),
+        ("primary_goal", "<i4"),
+        ("secondary_goal", "<i4"),
+        ("sun_age_ms", "<u4"),
+        ("supply_mv", "<u2"),
+        ("temperature_degc", "i1"),
+        ("boots", "<u2"),
+        ("armature_crc", "<u4"),
+        ("asked", "<u4"),
+        ("answered", "<u4"),
         ("steps_ms", "<u4"),
     ]
-)  # fmt: skip
+)
 NEVER = 0xFFFFFFFF
 
 

@@ -96,9 +96,13 @@ def armature(
     a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
     check_axes(a1, a2)
     parts = np.broadcast_arrays(
-        a1, as_vectors(origin_1, "origin_1"), a2, as_vectors(origin_2, "origin_2"),
-        as_vectors(vertex, "vertex"), normalize(normal, "normal"),
-    )  # fmt: skip
+        a1,
+        as_vectors(origin_1, "origin_1"),
+        a2,
+        as_vectors(origin_2, "origin_2"),
+        as_vectors(vertex, "vertex"),
+        normalize(normal, "normal"),
+    )
     return Armature(np.concatenate(parts, axis=-1))
 
 

@@ -199,9 +199,13 @@ class Mechanism:
             else:
                 vertex += delta[..., None] * self.normal
         return replace(
-            self, position=position, origins=origins, angles=angles, vertex=vertex,
+            self,
+            position=position,
+            origins=origins,
+            angles=angles,
+            vertex=vertex,
             drives=Drive(table),
-        )  # fmt: skip
+        )
 
     def pose(self, counts: npt.ArrayLike) -> Pose:
         """Return normals and vertices at drive counts.

@@ -123,10 +123,14 @@ def _assemble(
     v = as_vectors(vertex, "vertex")
     offsets = [as_float(step[2]) for step in steps]
     shape = np.broadcast_shapes(
-        position.shape[:-1], turned.shape[:-2], v.shape[:-1], normal.shape[:-1],
-        *(step[1].shape[:-1] for step in steps), *(o.shape[:-1] for o in offsets),
+        position.shape[:-1],
+        turned.shape[:-2],
+        v.shape[:-1],
+        normal.shape[:-1],
+        *(step[1].shape[:-1] for step in steps),
+        *(o.shape[:-1] for o in offsets),
         *(t.shape[:-1] for t in tables),
-    )  # fmt: skip
+    )
 
     def spread(array: FloatArray, *tail: int) -> FloatArray:
         return np.array(np.broadcast_to(array, (*shape, *tail)))
@@ -184,10 +188,19 @@ def azimuth_elevation(
     """
     height, front = as_float(pivot_height), as_float(pivot_offset)
     return two_axis(
-        position, -UP, EAST, NORTH, kind="azimuth_elevation", names=("azimuth", "elevation"),
-        leans=("north", "east"), pole=UP, origin_1=height[..., None] * UP,
-        vertex=front[..., None] * NORTH, orientation=orientation, drives=drives,
-    )  # fmt: skip
+        position,
+        -UP,
+        EAST,
+        NORTH,
+        kind="azimuth_elevation",
+        names=("azimuth", "elevation"),
+        leans=("north", "east"),
+        pole=UP,
+        origin_1=height[..., None] * UP,
+        vertex=front[..., None] * NORTH,
+        orientation=orientation,
+        drives=drives,
+    )
 
 
 def tilt_roll(
@@ -231,10 +244,17 @@ def tilt_roll(
     n = normalize(UP - a1[..., 2:] * a1, "normal")
     height, gap, front = as_float(pivot_height), as_float(spacing), as_float(pivot_offset)
     return two_axis(
-        position, a1, np.cross(n, a1), n, kind=kind, names=("tilt", "roll"),
-        origin_1=height[..., None] * UP, origin_2=gap[..., None] * n,
-        vertex=front[..., None] * n, drives=drives,
-    )  # fmt: skip
+        position,
+        a1,
+        np.cross(n, a1),
+        n,
+        kind=kind,
+        names=("tilt", "roll"),
+        origin_1=height[..., None] * UP,
+        origin_2=gap[..., None] * n,
+        vertex=front[..., None] * n,
+        drives=drives,
+    )
 
 
 def target_aligned(
@@ -257,9 +277,13 @@ def target_aligned(
     p, a = as_vectors(position, "position"), as_vectors(aim, "aim")
     towards = a - (p + as_float(pivot_height)[..., None] * UP)
     return tilt_roll(
-        p, towards, kind="target_aligned", pivot_height=pivot_height,
-        pivot_offset=pivot_offset, drives=drives,
-    )  # fmt: skip
+        p,
+        towards,
+        kind="target_aligned",
+        pivot_height=pivot_height,
+        pivot_offset=pivot_offset,
+        drives=drives,
+    )
 
 
 def pitch_roll(
@@ -279,9 +303,14 @@ def pitch_roll(
     facing = as_float(azimuth)
     axis = np.stack([np.cos(facing), -np.sin(facing), np.zeros_like(facing)], axis=-1)
     return tilt_roll(
-        position, axis, kind="pitch_roll", pivot_height=pivot_height, spacing=spacing,
-        pivot_offset=pivot_offset, drives=drives,
-    )  # fmt: skip
+        position,
+        axis,
+        kind="pitch_roll",
+        pivot_height=pivot_height,
+        spacing=spacing,
+        pivot_offset=pivot_offset,
+        drives=drives,
+    )
 
 
 def polar(
@@ -313,10 +342,18 @@ def polar(
     equator = np.stack([zero, -np.sin(phi), np.cos(phi)], axis=-1)
     height, front = as_float(pivot_height), as_float(pivot_offset)
     return two_axis(
-        position, -north_pole, -EAST, equator, kind="polar", names=("hour_angle", "declination"),
-        leans=_lean_names(north_pole), pole=north_pole, origin_1=height[..., None] * UP,
-        vertex=front[..., None] * equator, drives=drives,
-    )  # fmt: skip
+        position,
+        -north_pole,
+        -EAST,
+        equator,
+        kind="polar",
+        names=("hour_angle", "declination"),
+        leans=_lean_names(north_pole),
+        pole=north_pole,
+        origin_1=height[..., None] * UP,
+        vertex=front[..., None] * equator,
+        drives=drives,
+    )
 
 
 def two_jacks(
@@ -342,10 +379,18 @@ def two_jacks(
         As in PAINT's heliostat properties, m, (..., 3).
     """
     return two_axis(
-        position, EAST, UP, -NORTH, kind="two_jacks", names=("elevation", "azimuth"),
-        leans=("up", "north"), origin_1=joint_translation_1, origin_2=joint_translation_2,
-        arm=concentrator_translation, drives=drives,
-    )  # fmt: skip
+        position,
+        EAST,
+        UP,
+        -NORTH,
+        kind="two_jacks",
+        names=("elevation", "azimuth"),
+        leans=("up", "north"),
+        origin_1=joint_translation_1,
+        origin_2=joint_translation_2,
+        arm=concentrator_translation,
+        drives=drives,
+    )
 
 
 def single_axis(
@@ -386,10 +431,13 @@ def single_axis(
     height = as_float(pivot_height)
     lean_names = _lean_names(a)
     steps: list[tuple[str, FloatArray, npt.ArrayLike]] = [
-        (f"tilt_{lean_names[0]}", normalize(np.cross(a, _LEANS[lean_names[0]])),
-         height[..., None] * UP),
+        (
+            f"tilt_{lean_names[0]}",
+            normalize(np.cross(a, _LEANS[lean_names[0]])),
+            height[..., None] * UP,
+        ),
         (f"tilt_{lean_names[1]}", normalize(np.cross(a, _LEANS[lean_names[1]])), 0.0),
         ("rotation", a, 0.0),
-    ]  # fmt: skip
+    ]
     drives = None if drive is None else (drive,)
     return _assemble("single_axis", steps, (2,), p, None, drives, vertex, n)

@@ -44,63 +44,188 @@ class Parameter:
 
 #: Rows that every mechanism has; their code does not depend on the joints.
 _PLACE = (
-    Parameter("position_east", "m", "survey error", "stands further east", 0.05,
-              ("Malan ΔE",), (slot.MOVES_POSITION, 0, 0)),
-    Parameter("position_north", "m", "survey error", "stands further north", 0.05,
-              ("Malan ΔN",), (slot.MOVES_POSITION, 0, 1)),
-    Parameter("position_up", "m", "survey error", "stands higher", 0.05,
-              ("Malan ΔZ",), (slot.MOVES_POSITION, 0, 2)),
-    Parameter("pivot_offset", "m", "distance of the mirror's surface from the pivot",
-              "surface further in front", 0.02, ("Guo H_z",), (slot.MOVES_ALONG_NORMAL, 0, 0)),
-)  # fmt: skip
+    Parameter(
+        "position_east",
+        "m",
+        "survey error",
+        "stands further east",
+        0.05,
+        ("Malan ΔE",),
+        (slot.MOVES_POSITION, 0, 0),
+    ),
+    Parameter(
+        "position_north",
+        "m",
+        "survey error",
+        "stands further north",
+        0.05,
+        ("Malan ΔN",),
+        (slot.MOVES_POSITION, 0, 1),
+    ),
+    Parameter(
+        "position_up",
+        "m",
+        "survey error",
+        "stands higher",
+        0.05,
+        ("Malan ΔZ",),
+        (slot.MOVES_POSITION, 0, 2),
+    ),
+    Parameter(
+        "pivot_offset",
+        "m",
+        "distance of the mirror's surface from the pivot",
+        "surface further in front",
+        0.02,
+        ("Guo H_z",),
+        (slot.MOVES_ALONG_NORMAL, 0, 0),
+    ),
+)
 
 #: Rows by the name of a fixed joint.
 _JOINTS = {
     row.name: row
     for row in (
-        Parameter("tilt_north", "rad", "pedestal not upright", "primary axis leans to north",
-                  0.010, ("Malan ε_ptN", "Guo ψ_t, ψ_a in polar form")),
-        Parameter("tilt_east", "rad", "pedestal not upright", "primary axis leans to east",
-                  0.010, ("Malan ε_ptE", "Guo ψ_t, ψ_a in polar form")),
-        Parameter("tilt_up", "rad", "primary bearing not level", "primary axis leans up",
-                  0.010, ("PAINT −first_joint_tilt_n",)),
-        Parameter("non_orthogonality", "rad", "secondary axis not perpendicular to primary",
-                  "secondary axis leans towards the positive primary axis", 0.005,
-                  ("Malan ε_NO", "Guo −τ₁", "PAINT second_joint_tilt_n")),
-        Parameter("canting", "rad", "normal not perpendicular to the secondary axis",
-                  "normal leans towards the positive secondary axis", 0.005,
-                  ("Guo μ", "boresight (Khalsa)")),
-        Parameter("canting_secondary", "rad", "normal turned about the secondary axis",
-                  "right-handed about it", 0.005),
+        Parameter(
+            "tilt_north",
+            "rad",
+            "pedestal not upright",
+            "primary axis leans to north",
+            0.010,
+            ("Malan ε_ptN", "Guo ψ_t, ψ_a in polar form"),
+        ),
+        Parameter(
+            "tilt_east",
+            "rad",
+            "pedestal not upright",
+            "primary axis leans to east",
+            0.010,
+            ("Malan ε_ptE", "Guo ψ_t, ψ_a in polar form"),
+        ),
+        Parameter(
+            "tilt_up",
+            "rad",
+            "primary bearing not level",
+            "primary axis leans up",
+            0.010,
+            ("PAINT −first_joint_tilt_n",),
+        ),
+        Parameter(
+            "non_orthogonality",
+            "rad",
+            "secondary axis not perpendicular to primary",
+            "secondary axis leans towards the positive primary axis",
+            0.005,
+            ("Malan ε_NO", "Guo −τ₁", "PAINT second_joint_tilt_n"),
+        ),
+        Parameter(
+            "canting",
+            "rad",
+            "normal not perpendicular to the secondary axis",
+            "normal leans towards the positive secondary axis",
+            0.005,
+            ("Guo μ", "boresight (Khalsa)"),
+        ),
+        Parameter(
+            "canting_secondary",
+            "rad",
+            "normal turned about the secondary axis",
+            "right-handed about it",
+            0.005,
+        ),
     )
-}  # fmt: skip
+}
 
 #: Rows of a drive: (suffix, slot, row). The name is "<joint>_<suffix>".
 _ANY_DRIVE = (
-    ("bias", slot.BIAS, Parameter("", "rad", "encoder zero", "actual = ideal + bias", 0.010,
-     ("Malan γ_bias, α_bias", "Guo γ₀, α₀"))),
-    ("scale", slot.SCALE, Parameter("", "1", "gear ratio error", "moves further than ideal",
-     1e-3, ("Baheti & Scott", "linear error (Khalsa)"))),
-    ("worm_cos", slot.WORM_COS, Parameter("", "rad", "once-per-turn gear error, cosine part",
-     "adds cos(ratio · angle)", 0.002, ("Malan (6.1)",))),
-    ("worm_sin", slot.WORM_SIN, Parameter("", "rad", "once-per-turn gear error, sine part",
-     "adds sin(ratio · angle)", 0.002, ("Malan (6.1)",))),
-)  # fmt: skip
+    (
+        "bias",
+        slot.BIAS,
+        Parameter(
+            "",
+            "rad",
+            "encoder zero",
+            "actual = ideal + bias",
+            0.010,
+            ("Malan γ_bias, α_bias", "Guo γ₀, α₀"),
+        ),
+    ),
+    (
+        "scale",
+        slot.SCALE,
+        Parameter(
+            "",
+            "1",
+            "gear ratio error",
+            "moves further than ideal",
+            1e-3,
+            ("Baheti & Scott", "linear error (Khalsa)"),
+        ),
+    ),
+    (
+        "worm_cos",
+        slot.WORM_COS,
+        Parameter(
+            "",
+            "rad",
+            "once-per-turn gear error, cosine part",
+            "adds cos(ratio · angle)",
+            0.002,
+            ("Malan (6.1)",),
+        ),
+    ),
+    (
+        "worm_sin",
+        slot.WORM_SIN,
+        Parameter(
+            "",
+            "rad",
+            "once-per-turn gear error, sine part",
+            "adds sin(ratio · angle)",
+            0.002,
+            ("Malan (6.1)",),
+        ),
+    ),
+)
 
 _LINEAR_DRIVE = (
-    ("stroke_offset", slot.STROKE, Parameter("", "m", "length of the jack at 0 counts",
-     "longer", 0.005, ("PAINT initial_stroke_length",))),
-    ("initial_angle", slot.ZERO, Parameter("", "rad", "angle at 0 counts", "larger", 0.020,
-     ("PAINT initial_angle",))),
-    ("offset", slot.OFFSET, Parameter("", "m", "joint to the fixed end", "longer", 0.003,
-     ("PAINT offset",))),
-    ("pivot_radius", slot.RADIUS, Parameter("", "m", "joint to the moving end", "longer", 0.003,
-     ("PAINT pivot_radius",))),
-)  # fmt: skip
+    (
+        "stroke_offset",
+        slot.STROKE,
+        Parameter(
+            "",
+            "m",
+            "length of the jack at 0 counts",
+            "longer",
+            0.005,
+            ("PAINT initial_stroke_length",),
+        ),
+    ),
+    (
+        "initial_angle",
+        slot.ZERO,
+        Parameter("", "rad", "angle at 0 counts", "larger", 0.020, ("PAINT initial_angle",)),
+    ),
+    (
+        "offset",
+        slot.OFFSET,
+        Parameter("", "m", "joint to the fixed end", "longer", 0.003, ("PAINT offset",)),
+    ),
+    (
+        "pivot_radius",
+        slot.RADIUS,
+        Parameter("", "m", "joint to the moving end", "longer", 0.003, ("PAINT pivot_radius",)),
+    ),
+)
 
-_SAG = Parameter("sag", "rad", "gravity bends the structure, ∝ cos(elevation)",
-                 "adds to the angle of the elevation joint", 0.002,
-                 ("Stone & Kiefer",))  # fmt: skip
+_SAG = Parameter(
+    "sag",
+    "rad",
+    "gravity bends the structure, ∝ cos(elevation)",
+    "adds to the angle of the elevation joint",
+    0.002,
+    ("Stone & Kiefer",),
+)
 
 
 def table(
@@ -127,10 +252,12 @@ def table(
             name = f"{joints[index]}_{suffix}"
             rows.append(
                 replace(
-                    row, name=name, cause=f"{joints[index]}: {row.cause}",
+                    row,
+                    name=name,
+                    cause=f"{joints[index]}: {row.cause}",
                     code=(slot.MOVES_DRIVE, d, place),
                 )
-            )  # fmt: skip
+            )
         if joints[index] == "elevation":
             rows.append(replace(_SAG, code=(slot.MOVES_DRIVE, d, slot.SAG)))
     return {row.name: row for row in rows}

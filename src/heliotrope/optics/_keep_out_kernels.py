@@ -239,8 +239,17 @@ def move(table, corners, armatures, path, sun, reach, radius, near, spread, reso
         for v in range(len(table)):
             found[i, v, :] = math.nan
             poses = _move(
-                table[v], corners, armatures[i], path[i], s, reach[i], radius[i], near[i],
-                spread[i], resolution, found[i, v],
-            )  # fmt: skip
+                table[v],
+                corners,
+                armatures[i],
+                path[i],
+                s,
+                reach[i],
+                radius[i],
+                near[i],
+                spread[i],
+                resolution,
+                found[i, v],
+            )
             tried += abs(poses)
     return tried

@@ -56,14 +56,22 @@ class Mirrors:
         InputError
             If a number is out of range.
         """
-        given = {"width": width, "height": height, "focus": focus, "error": error,
-                 "reflectivity": reflectivity}  # fmt: skip
+        given = {
+            "width": width,
+            "height": height,
+            "focus": focus,
+            "error": error,
+            "reflectivity": reflectivity,
+        }
         arrays = np.broadcast_arrays(*(np.atleast_1d(as_float(v)) for v in given.values()))
         values = dict(zip(given, (np.ascontiguousarray(a) for a in arrays), strict=True))
         if values["width"].ndim != 1:
             raise InputError(f"mirrors: shape {values['width'].shape}; give numbers or (N,)")
-        limits = {"width": (0.0, np.inf, "m"), "height": (0.0, np.inf, "m"),
-                  "reflectivity": (0.0, 1.0 + 1e-12, "")}  # fmt: skip
+        limits = {
+            "width": (0.0, np.inf, "m"),
+            "height": (0.0, np.inf, "m"),
+            "reflectivity": (0.0, 1.0 + 1e-12, ""),
+        }
         for name, (low, high, unit) in limits.items():
             wrong = ~((values[name] > low) & (values[name] < high))
             if wrong.any():
@@ -144,9 +152,11 @@ def beams(
     if origin.ndim != 2:
         raise InputError(f"beams: vertices and aims of shape {way.shape}; give (N, 3)")
     return Beams(
-        origin, normalize(way, "aim - vertex"), mirrors.broadcast(len(origin)),
+        origin,
+        normalize(way, "aim - vertex"),
+        mirrors.broadcast(len(origin)),
         reaches(reach, len(origin)),
-    )  # fmt: skip
+    )
 
 
 def concentration(

@@ -151,9 +151,14 @@ def predicted(
     cell = (edges[0][1] - edges[0][0]) * (edges[1][1] - edges[1][0])
     total, caught = float(power.sum()), float(power @ inside)
     return FluxView(
-        receiver.name, middle[0], middle[1], flux / cell, caught,
-        caught / total if total > 0.0 else float("nan"), len(power),
-    )  # fmt: skip
+        receiver.name,
+        middle[0],
+        middle[1],
+        flux / cell,
+        caught,
+        caught / total if total > 0.0 else float("nan"),
+        len(power),
+    )
 
 
 def _axes(receiver: Receiver) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -185,8 +185,9 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     return Glare(
         np.max(np.where(dark, 0.0, one.burn), axis=-1),
         np.max(np.where(dark, 0.0, one.flash), axis=-1),
-        np.sum(e, axis=-1), as_float(total),
-    )  # fmt: skip
+        np.sum(e, axis=-1),
+        as_float(total),
+    )
 
 
 def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -344,8 +345,12 @@ def glare_map(
     line = np.linspace(-0.5 * size, 0.5 * size, cells)
     points = middle + line[:, None, None] * axes[1] + line[None, :, None] * axes[0]
     rows = [glare_at(given, row, dni=dni, eye=eye) for row in points]
-    together = Glare(*(np.stack([getattr(r, n) for r in rows]) for n in
-                       ("burn", "flash", "corneal", "subtended")))  # fmt: skip
+    together = Glare(
+        *(
+            np.stack([getattr(r, n) for r in rows])
+            for n in ("burn", "flash", "corneal", "subtended")
+        )
+    )
     return GlareMap(line, line, points, together)
 
 

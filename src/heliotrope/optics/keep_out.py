@@ -104,9 +104,17 @@ def enter(given: Beams, volumes: Sequence[Volume], *, dni: float = SUN) -> Entri
     first, last = np.empty(shape), np.empty(shape)
     radius, near, spread = given.mirrors.arrays()
     kernels.enter(
-        table, corners, given.origin, given.direction, given.reach, radius, near, spread,
-        first, last,
-    )  # fmt: skip
+        table,
+        corners,
+        given.origin,
+        given.direction,
+        given.reach,
+        radius,
+        near,
+        spread,
+        first,
+        last,
+    )
     strongest = _strongest(given.mirrors, first, last, dni)
     names = tuple(v.name for v in volumes)
     return Entries(names, first, last, given.point(first), strongest)
@@ -213,16 +221,28 @@ def move(
     found = np.empty((count, len(volumes), 8))
     radius, near, spread = every.arrays()
     poses = kernels.move(
-        table, corners, _rows(rows, count), _rows(joints, count), s, reaches(reach, count),
-        radius, near, spread, resolution, found,
-    )  # fmt: skip
+        table,
+        corners,
+        _rows(rows, count),
+        _rows(joints, count),
+        s,
+        reaches(reach, count),
+        radius,
+        near,
+        spread,
+        resolution,
+        found,
+    )
     first = found[..., 1]
     last = _leaving(found, table, corners, every, reaches(reach, count))
     return Motion(
-        tuple(v.name for v in volumes), found[..., 0], first,
+        tuple(v.name for v in volumes),
+        found[..., 0],
+        first,
         found[..., 2:5] + first[..., None] * found[..., 5:8],
-        _strongest(every, first, last, dni), int(poses),
-    )  # fmt: skip
+        _strongest(every, first, last, dni),
+        int(poses),
+    )
 
 
 def _leaving(
@@ -235,9 +255,17 @@ def _leaving(
         one, end = np.empty((1, 1)), np.empty((1, 1))
         pose = found[i, v]
         kernels.enter(
-            table[v : v + 1], corners, pose[None, 2:5], pose[None, 5:8], reach[i : i + 1],
-            radius[i : i + 1], near[i : i + 1], spread[i : i + 1], one, end,
-        )  # fmt: skip
+            table[v : v + 1],
+            corners,
+            pose[None, 2:5],
+            pose[None, 5:8],
+            reach[i : i + 1],
+            radius[i : i + 1],
+            near[i : i + 1],
+            spread[i : i + 1],
+            one,
+            end,
+        )
         last[i, v] = np.fmax(last[i, v], end[0, 0])
     return last
 

@@ -60,9 +60,13 @@ class Ways:
     """
 
     def __init__(
-        self, beams: BeamCheck, field: FieldState, aims: FloatArray, standbys: FloatArray,
+        self,
+        beams: BeamCheck,
+        field: FieldState,
+        aims: FloatArray,
+        standbys: FloatArray,
         sun: Callable[[], FloatArray],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._beams, self._field = beams, field
         self._aims, self._standbys, self._sun = aims, standbys, sun
 

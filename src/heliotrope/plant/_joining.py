@@ -104,9 +104,15 @@ class Joiner:
     """
 
     def __init__(
-        self, queue: JoinQueue, orders: PlantOrders, beams: BeamCheck, field: FieldState,
-        aims: FloatArray, sun: Callable[[], FloatArray], life: float,
-    ) -> None:  # fmt: skip
+        self,
+        queue: JoinQueue,
+        orders: PlantOrders,
+        beams: BeamCheck,
+        field: FieldState,
+        aims: FloatArray,
+        sun: Callable[[], FloatArray],
+        life: float,
+    ) -> None:
         self._queue, self._orders, self._beams, self._field = queue, orders, beams, field
         self._aims, self._sun, self._life = aims, sun, life
 

@@ -12,8 +12,14 @@ from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 
 #: States in which a controller takes items of its calibration, and items of its machine.
-TAKES_CALIBRATION = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT,
-                     states.IDLE, states.DEFOCUSED)  # fmt: skip
+TAKES_CALIBRATION = (
+    states.UNCONFIGURED,
+    states.STOWED,
+    states.LOCKED,
+    states.FAULT,
+    states.IDLE,
+    states.DEFOCUSED,
+)
 TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
 #: Before what failed is tried again, s.
 AGAIN = 30.0
@@ -106,10 +112,10 @@ class Pusher:
     def _push(self, name: str, missing: tuple[str, ...], token: int, now: float) -> None:
         state = int(self._field.rows["state"][self._field.index[name]])
         able = [
-            item for item in missing
-            if state in TAKES_MACHINE
-            or (state in TAKES_CALIBRATION and item in CALIBRATION_ITEMS)
-        ]  # fmt: skip
+            item
+            for item in missing
+            if state in TAKES_MACHINE or (state in TAKES_CALIBRATION and item in CALIBRATION_ITEMS)
+        ]
         if not able or now - self._tried.get(name, -math.inf) < AGAIN:
             return
         self._tried[name] = now

@@ -214,9 +214,12 @@ class Sentinel:
         if rows:
             index = np.array(rows, dtype=np.intp)
             order.take_rows(
-                tuple(self._field.names[r] for r in rows), self._field.rows[index],
-                self._field.heard[index], Drive(self._drives.table[index]), now,
-            )  # fmt: skip
+                tuple(self._field.names[r] for r in rows),
+                self._field.rows[index],
+                self._field.heard[index],
+                Drive(self._drives.table[index]),
+                now,
+            )
 
     def refusal(self, clusters: Iterable[str]) -> str:
         """Return why nothing new may move now in some clusters, "" if it may."""

@@ -21,9 +21,17 @@ from heliotrope.safety.evaluation import (
 
 #: Readings that the plant makes itself; all others must be fed by somebody.
 OWN_READINGS = frozenset(
-    {"emergency_order", "nodes_unacknowledged", "flux_after_emergency", "authority_silence",
-     "cluster_silence", "sun_elevation", "audit_silence", "node_fault_share"}
-)  # fmt: skip
+    {
+        "emergency_order",
+        "nodes_unacknowledged",
+        "flux_after_emergency",
+        "authority_silence",
+        "cluster_silence",
+        "sun_elevation",
+        "audit_silence",
+        "node_fault_share",
+    }
+)
 #: Rows that follow from an emergency, and alone keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
 

@@ -102,9 +102,12 @@ class BeamCheck:
     """
 
     def __init__(
-        self, design: Plant, names: Sequence[str], volumes: Sequence[Volume] | None = None,
+        self,
+        design: Plant,
+        names: Sequence[str],
+        volumes: Sequence[Volume] | None = None,
         eyes: npt.ArrayLike | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         place = {name: i for i, name in enumerate(design.names)}
         rows = np.array([place[name] for name in names], dtype=np.intp)
         self.names = tuple(names)
@@ -114,8 +117,9 @@ class BeamCheck:
         self.armature = Armature(design.armature.table[rows])
         self.drives = Drive(design.drives.table[rows])
         groups = design.groups.values()
-        sizes = [np.concatenate([getattr(g, what) for g in groups])[rows]
-                 for what in ("width", "height")]  # fmt: skip
+        sizes = [
+            np.concatenate([getattr(g, what) for g in groups])[rows] for what in ("width", "height")
+        ]
         self.mirrors = Mirrors.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
@@ -124,16 +128,22 @@ class BeamCheck:
         self.drives.table[row] = drives
 
     def poses(
-        self, rows: npt.NDArray[np.intp], aims: FloatArray, sun: FloatArray,
+        self,
+        rows: npt.NDArray[np.intp],
+        aims: FloatArray,
+        sun: FloatArray,
         counts: FloatArray | None = None,
-    ) -> Tracking:  # fmt: skip
+    ) -> Tracking:
         """Return the poses for aims (K, 3) of heliostats (K,), the nearest to counts (K, 2)."""
         # By night nothing moves; the pose for a sun overhead tells as much of the beam's way.
         source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
         return track(
-            Armature(self.armature.table[rows]), source, aims,
-            drives=Drive(self.drives.table[rows]), current=counts,
-        )  # fmt: skip
+            Armature(self.armature.table[rows]),
+            source,
+            aims,
+            drives=Drive(self.drives.table[rows]),
+            current=counts,
+        )
 
     def problems(
         self,
@@ -297,9 +307,13 @@ class BeamCheck:
         return found
 
     def _sweep(
-        self, found: dict[str, str], rows: npt.NDArray[np.intp], start: FloatArray,
-        aims: FloatArray, sun: FloatArray,
-    ) -> None:  # fmt: skip
+        self,
+        found: dict[str, str],
+        rows: npt.NDArray[np.intp],
+        start: FloatArray,
+        aims: FloatArray,
+        sun: FloatArray,
+    ) -> None:
         """Add what is in the way from one point to another."""
         before = self.poses(rows, start, sun)
         counts = before.chosen(before.counts)
@@ -317,9 +331,13 @@ class BeamCheck:
         self._tell(found, rows, motion.entered, motion.distance, "on its way there")
 
     def _tell(
-        self, found: dict[str, str], rows: npt.NDArray[np.intp], entered: npt.NDArray[np.bool_],
-        distance: FloatArray, when: str,
-    ) -> None:  # fmt: skip
+        self,
+        found: dict[str, str],
+        rows: npt.NDArray[np.intp],
+        entered: npt.NDArray[np.bool_],
+        distance: FloatArray,
+        when: str,
+    ) -> None:
         for i in np.flatnonzero(entered.any(axis=-1)):
             v = int(np.flatnonzero(entered[i])[0])
             found.setdefault(

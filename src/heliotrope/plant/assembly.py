@@ -85,22 +85,35 @@ class RealPlant:
     """
 
     def __init__(
-        self, design: Plant, links: PlantLinks, clock: SystemClock, audit: Audit, *,
-        records: Records | None = None, assigned: Assigned | None = None,
-        cameras: RealCameras | None = None, machine: Machine | None = None,
-        work: WorkSettings | None = None, plant: PlantSettings | None = None,
-        by_gain: bool = False, cycle: CycleSettings = CYCLE,
-    ) -> None:  # fmt: skip
+        self,
+        design: Plant,
+        links: PlantLinks,
+        clock: SystemClock,
+        audit: Audit,
+        *,
+        records: Records | None = None,
+        assigned: Assigned | None = None,
+        cameras: RealCameras | None = None,
+        machine: Machine | None = None,
+        work: WorkSettings | None = None,
+        plant: PlantSettings | None = None,
+        by_gain: bool = False,
+        cycle: CycleSettings = CYCLE,
+    ) -> None:
         self.design, self.clock, self.audit = design, clock, audit
         self._links, self._cameras = links, cameras
         self.logbook = Logbook(clock, records)
         if cameras is not None:
             cameras.on_alarm = self.logbook.take_alarm
         self.plant = PlantController(
-            design, self.logbook.tapped(links.links), clock, audit,
+            design,
+            self.logbook.tapped(links.links),
+            clock,
+            audit,
             settings=plant or PlantSettings(sensors=links.sensors.names),
-            assigned=assigned, on_alarm=self.logbook.take_alarm,
-        )  # fmt: skip
+            assigned=assigned,
+            on_alarm=self.logbook.take_alarm,
+        )
         settings = work or WorkSettings()
         chosen = None if cameras is None else CentringCycle(self.plant, cameras, cycle)
         scheduler: Scheduling | None = None
@@ -110,10 +123,15 @@ class RealPlant:
             () if cameras is None else [t for t in design.targets if t.name not in cameras.unseen]
         )
         self.operations = Operations(
-            self.plant, self.logbook, chosen,
+            self.plant,
+            self.logbook,
+            chosen,
             cameras={} if cameras is None else {t.name: cameras for t in seen},
-            scheduler=scheduler, records=records, settings=settings, extra=self._extra,
-        )  # fmt: skip
+            scheduler=scheduler,
+            records=records,
+            settings=settings,
+            extra=self._extra,
+        )
         if machine is not None:
             self._want(machine, chosen)
 
@@ -151,9 +169,12 @@ class RealPlant:
             self._cameras.start()
         try:
             async with (
-                running(*parts), running(*(one.cluster for one in local)), running(self.plant),
-                running(self.operations), asyncio.TaskGroup() as group,
-            ):  # fmt: skip
+                running(*parts),
+                running(*(one.cluster for one in local)),
+                running(self.plant),
+                running(self.operations),
+                asyncio.TaskGroup() as group,
+            ):
                 tasks = [group.create_task(self._look()), group.create_task(self._sense())]
                 yield self
                 for task in tasks:

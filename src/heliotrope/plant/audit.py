@@ -237,9 +237,10 @@ def read(path: str | Path) -> tuple[list[Record], int]:
             if known is not None and _repeats(known, event, fields):
                 continue
             raise FormatError(
-                path, f"{event!r} of record {identity} does not fit what stands before",
+                path,
+                f"{event!r} of record {identity} does not fit what stands before",
                 f"line {number}",
-            )  # fmt: skip
+            )
         if known is None:
             fields["values"] = tuple(fields.get("values", ()))
             fields["heliostats"] = tuple(fields.get("heliostats", ()))

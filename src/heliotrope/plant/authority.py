@@ -44,9 +44,19 @@ class Role(IntEnum):
 
 #: Commands that an operator may give; all others of the wire need an engineer.
 OPERATOR_COMMANDS = frozenset(
-    {"APPROACH", "IDLE", "TRACK", "REFOCUS", "LOCK", "UNLOCK", "AIM", "STANDBY", "LOCK_AIM",
-     "SEARCH"}
-)  # fmt: skip
+    {
+        "APPROACH",
+        "IDLE",
+        "TRACK",
+        "REFOCUS",
+        "LOCK",
+        "UNLOCK",
+        "AIM",
+        "STANDBY",
+        "LOCK_AIM",
+        "SEARCH",
+    }
+)
 
 
 @dataclass(frozen=True)

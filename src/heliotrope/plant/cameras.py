@@ -67,7 +67,7 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
         raise InputError(
             f"{who}: the plant file names no source of its frames; add source, as rtsp://…, "
             "http://…/now.jpg, usb:0, or a folder that the camera writes into"
-        )  # fmt: skip
+        )
     found = open_source(camera.source, folder=folder, size=camera.size, watch=True, stop=stop)
     if isinstance(found, VideoSource):
         raise InputError(f"{who}: {camera.source} is a recording; give a source of live frames")
@@ -165,10 +165,15 @@ class RealCameras:
     """
 
     def __init__(
-        self, design: Plant, folder: Path, clock: Clock, *, memory: Path | None = None,
+        self,
+        design: Plant,
+        folder: Path,
+        clock: Clock,
+        *,
+        memory: Path | None = None,
         patience: float = PATIENCE,
         sources: Callable[[Camera, Path, threading.Event], Source] = source_of,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._clock, self._patience = clock, patience
         self.on_alarm: Callable[[Alarm], None] = lambda _: None
         self._stop = threading.Event()

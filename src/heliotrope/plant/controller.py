@@ -163,15 +163,28 @@ class PlantController:
         self._points = Points(self.field.names, assigned)
         self.aims, self.standbys = self._points.aims, self._points.standbys
         self._joiner = Joiner(
-            self._joining, self._orders, self.beams, self.field, self.aims, self.sun_vector,
+            self._joining,
+            self._orders,
+            self.beams,
+            self.field,
+            self.aims,
+            self.sun_vector,
             self.settings.join_life,
-        )  # fmt: skip
+        )
         self._ways = Ways(self.beams, self.field, self.aims, self.standbys, self.sun_vector)
         self._sentinel = Sentinel(
-            clock, design.site, self.field, self._ends, self._orders, self._joining,
-            self.authority, self._watch, self.beams.drives,
-            Lookout(self.beams, self.field, self.sun_vector), self.settings.repeat,
-        )  # fmt: skip
+            clock,
+            design.site,
+            self.field,
+            self._ends,
+            self._orders,
+            self._joining,
+            self.authority,
+            self._watch,
+            self.beams.drives,
+            Lookout(self.beams, self.field, self.sun_vector),
+            self.settings.repeat,
+        )
         self._pusher = Pusher(self.field, self.wanted, self._orders, self._ask_stored)
         self._paid_at = -math.inf
         self._answers: dict[str, asyncio.Future[Answer]] = {}
@@ -252,8 +265,15 @@ class PlantController:
                 if found is not None:
                     self._sentinel.take_progress(*found, message)
             case Alarm():
-                self._tell(Alarm(message.condition, message.subject or end.name,
-                                 message.severity, message.text, message.active))  # fmt: skip
+                self._tell(
+                    Alarm(
+                        message.condition,
+                        message.subject or end.name,
+                        message.severity,
+                        message.text,
+                        message.active,
+                    )
+                )
             case Answer():
                 self._take_answer(end, message)
             case _:
@@ -480,9 +500,13 @@ class PlantController:
     # Commands.
 
     def command(
-        self, person: Person, token: int, name: str, heliostats: Sequence[str] = (),
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        heliostats: Sequence[str] = (),
         values: Sequence[float] = (),
-    ) -> Ticket:  # fmt: skip
+    ) -> Ticket:
         """Give a command of the wire to some heliostats, or to all.
 
         Parameters
@@ -623,16 +647,25 @@ class PlantController:
         return ticket
 
     def _join(
-        self, ticket: Ticket, name: str, values: tuple[float, ...], heliostats: Sequence[str],
+        self,
+        ticket: Ticket,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
         token: int,
-    ) -> None:  # fmt: skip
+    ) -> None:
         until = self.now() + self.settings.join_wait
         self._joining.put(Job(ticket, name, values, token, deque(heliostats), until))
 
     def _accept(
-        self, person: Person, token: int, name: str, values: tuple[float, ...],
-        heliostats: Sequence[str], note: str = "",
-    ) -> Ticket:  # fmt: skip
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Sequence[str],
+        note: str = "",
+    ) -> Ticket:
         rows = [self.field.place(n) for n in heliostats]
         self.authority.check(person, token, name)
         clusters = {self.field.clusters[self.field.cluster[row]] for row in rows}

@@ -102,8 +102,9 @@ class FieldState:
             twice = sorted({name for name in self.names if self.names.count(name) > 1})
             raise InputError(
                 f"field: heliostat {twice[0]} is in two clusters; a name stands once"
-                if twice else "field: no cluster has a heliostat; give at least one"
-            )  # fmt: skip
+                if twice
+                else "field: no cluster has a heliostat; give at least one"
+            )
         self.cluster = np.array([c for _, c in pairs], dtype=np.intp)
         self.limit = limit
         self.rows: npt.NDArray[Any] = np.zeros(len(pairs), NODE)
@@ -249,10 +250,13 @@ class FieldState:
         flags = int(node["flags"])
         known = fault < len(meanings.FAULTS)
         return HeliostatState(
-            name, cluster, age, live=True,
+            name,
+            cluster,
+            age,
+            live=True,
             state=states.STATES[int(node["state"])],
             fault=meanings.FAULTS[fault] if known else f"fault {fault}",
             flags=tuple(flag for i, flag in enumerate(meanings.FLAGS) if flags >> i & 1),
             counts=(int(node["primary"]), int(node["secondary"])),
             goals=(int(node["primary_goal"]), int(node["secondary_goal"])),
-        )  # fmt: skip
+        )

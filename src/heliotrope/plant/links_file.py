@@ -103,15 +103,18 @@ class LinksFile:
         for name in homes:
             if name not in self.document.clusters:
                 raise FormatError(
-                    self.path, f"the plant has a cluster {name} of {len(homes[name])} heliostats, "
-                    "and no line says how it is reached; add one", "clusters",
-                )  # fmt: skip
+                    self.path,
+                    f"the plant has a cluster {name} of {len(homes[name])} heliostats, "
+                    "and no line says how it is reached; add one",
+                    "clusters",
+                )
         for name in self.document.clusters:
             if name not in homes:
                 raise FormatError(
-                    self.path, f"the plant has no cluster {name}; it has {', '.join(homes)}",
+                    self.path,
+                    f"the plant has no cluster {name}; it has {', '.join(homes)}",
                     "clusters",
-                )  # fmt: skip
+                )
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
         """Return the plant's ends of the links, and what has to run beside them.
@@ -217,9 +220,10 @@ def _check(found: LinksFile) -> None:
     for name in document.sensors:
         if name not in FED:
             raise FormatError(
-                path, f"no row of the safety table needs it; give one of {', '.join(sorted(FED))}",
+                path,
+                f"no row of the safety table needs it; give one of {', '.join(sorted(FED))}",
                 f"sensors.{name}",
-            )  # fmt: skip
+            )
     ways = set(document.clusters.values())
     for way, table in (("tcp", document.tcp), ("mqtt", document.mqtt)):
         if way in ways and table is None:
@@ -229,14 +233,18 @@ def _check(found: LinksFile) -> None:
             raise FormatError(path, "a cluster without a name or a way; give both", "clusters")
         if how == "tcp" and name not in found.keys:
             raise FormatError(
-                path, "a cluster that connects over TCP proves itself by its key; put one into the "
-                "keys' file, table [clusters]", f"clusters.{name}",
-            )  # fmt: skip
+                path,
+                "a cluster that connects over TCP proves itself by its key; put one into the "
+                "keys' file, table [clusters]",
+                f"clusters.{name}",
+            )
         if how not in ("tcp", "mqtt") and not (path.parent / how).is_file():
             raise FormatError(
-                path, f'{how!r}: give "tcp", "mqtt", or the cluster file of a bus at this machine '
-                "(no such file)", f"clusters.{name}",
-            )  # fmt: skip
+                path,
+                f'{how!r}: give "tcp", "mqtt", or the cluster file of a bus at this machine '
+                "(no such file)",
+                f"clusters.{name}",
+            )
     if document.tcp is not None:
         _listen(path, document.tcp.listen)
         if (document.tcp.certificate is None) != (document.tcp.key is None):

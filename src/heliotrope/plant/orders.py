@@ -89,9 +89,14 @@ class PlantOrders:
         return bool(self._owed) and not self.problem
 
     def accept(
-        self, record: tuple[str, str, str], values: Sequence[float], heliostats: Sequence[str],
-        note: str = "", *, late: bool = False,
-    ) -> Ticket:  # fmt: skip
+        self,
+        record: tuple[str, str, str],
+        values: Sequence[float],
+        heliostats: Sequence[str],
+        note: str = "",
+        *,
+        late: bool = False,
+    ) -> Ticket:
         """Accept a command: its record is safe when this returns.
 
         Parameters
@@ -142,9 +147,14 @@ class PlantOrders:
     # Sending.
 
     def command(
-        self, ticket: Ticket, name: str, values: tuple[float, ...], heliostats: Iterable[str],
-        token: int, lifetime: float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        ticket: Ticket,
+        name: str,
+        values: tuple[float, ...],
+        heliostats: Iterable[str],
+        token: int,
+        lifetime: float | None = None,
+    ) -> None:
         """Send a command to some of a ticket's heliostats; ``lifetime`` other than usual, in s."""
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._by_cluster(heliostats):
@@ -244,9 +254,10 @@ class PlantOrders:
         if now - self._purged_at >= FORGOTTEN:
             self._purged_at = now
             self._under = {
-                key: u for key, u in self._under.items()
+                key: u
+                for key, u in self._under.items()
                 if u.ticket.identity in self._open or now - u.at < FORGOTTEN
-            }  # fmt: skip
+            }
 
     def _repeat(self, now: float) -> None:
         """Send DEFOCUS and STOW again to those that have not acknowledged them."""

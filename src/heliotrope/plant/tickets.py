@@ -87,9 +87,10 @@ class Ticket:
         for i in late:
             acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
             text = (
-                f"acknowledged, but not done within {self._patience:.0f} s" if acknowledged
+                f"acknowledged, but not done within {self._patience:.0f} s"
+                if acknowledged
                 else "no answer before it expired"
-            )  # fmt: skip
+            )
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def unacknowledged(self) -> tuple[str, ...]:

@@ -172,9 +172,10 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
         Whose readings are there.
     """
     tracks = {
-        key: track for key, track in state.tracks.items()
+        key: track
+        for key, track in state.tracks.items()
         if key[0] != name or not key[1] or track.tripped_at is not None
-    }  # fmt: skip
+    }
     for subject in subjects:
         key = (name, subject)
         tracks[key] = state.tracks.get(key, Track(seen=state.now))
@@ -203,9 +204,19 @@ def evaluate(
         time = state.now
         text = f"the monotonic time went from {state.now:g} s to {now:g} s; restart this controller"
         actions.append(
-            Action(Act.DEFOCUS, Scope.FIELD, "", "time_went_back", Severity.EMERGENCY,
-                   DEFOCUS_BUDGET, time, new=True, waits=False, text=text)
-        )  # fmt: skip
+            Action(
+                Act.DEFOCUS,
+                Scope.FIELD,
+                "",
+                "time_went_back",
+                Severity.EMERGENCY,
+                DEFOCUS_BUDGET,
+                time,
+                new=True,
+                waits=False,
+                text=text,
+            )
+        )
     rows = {row.name: row for row in state.table}
     tracks: dict[Key, Track] = {}
     for (name, subject), track in state.tracks.items():
@@ -298,8 +309,18 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
     known = {row.reading for row in state.table}
     for name in sorted({name for name, _ in readings} - known):
         text = f"reading {name!r} is in no row of the table; correct its name"
-        yield Action(Act.ALARM, Scope.FIELD, "", "unknown_reading", Severity.WARNING, 0.0, now,
-                     new=False, waits=False, text=text)  # fmt: skip
+        yield Action(
+            Act.ALARM,
+            Scope.FIELD,
+            "",
+            "unknown_reading",
+            Severity.WARNING,
+            0.0,
+            now,
+            new=False,
+            waits=False,
+            text=text,
+        )
 
 
 def acknowledge(

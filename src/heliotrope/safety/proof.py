@@ -157,9 +157,12 @@ class Proof:
             late |= open_
         flux = self._flux_proven(now)
         return ProofReport(
-            tuple(sorted(silent)), tuple(sorted(open_)), tuple(sorted(late)), flux,
+            tuple(sorted(silent)),
+            tuple(sorted(open_)),
+            tuple(sorted(late)),
+            flux,
             complete=not silent and not open_ and flux is True,
-        )  # fmt: skip
+        )
 
     def _flux_proven(self, now: float) -> bool | None:
         known = self.flux is not None and 0.0 <= now - self.flux.at <= FLUX_AGE

@@ -126,10 +126,14 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
         np.array([index[name] for name in columns["heliostat"]], np.intp),
         array("time"),
         array("counts").reshape(len(rows), drives),
-        points("source"), points("destination"),
-        array("source_at_infinity", np.bool_), array("destination_at_infinity", np.bool_),
-        array("sigma"), matrices("source"), matrices("destination"),
-    )  # fmt: skip
+        points("source"),
+        points("destination"),
+        array("source_at_infinity", np.bool_),
+        array("destination_at_infinity", np.bool_),
+        array("sigma"),
+        matrices("source"),
+        matrices("destination"),
+    )
     texts = [tuple(columns[name]) for name in ("kind", "target", "campaign")]
     return KeptSightings(array("number", np.int64), names, seen, *texts)
 
@@ -140,14 +144,24 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
 def version_row(version: ParameterVersion) -> Row:
     """Return the row of the table ``parameter_version``."""
     return {
-        "heliostat": version.heliostat, "version": version.version, "at": version.at,
-        "model": version.model, "names": list(version.names), "value": version.values.tolist(),
-        "covariance": version.covariance.tolist(), "prior": version.prior.tolist(),
-        "error_before": real(version.before), "error_after": real(version.after),
-        "scale": real(version.scale), "outcome": version.outcome, "person": version.person,
-        "campaign": version.campaign, "note": version.note, "pushed": list(version.pushed),
+        "heliostat": version.heliostat,
+        "version": version.version,
+        "at": version.at,
+        "model": version.model,
+        "names": list(version.names),
+        "value": version.values.tolist(),
+        "covariance": version.covariance.tolist(),
+        "prior": version.prior.tolist(),
+        "error_before": real(version.before),
+        "error_after": real(version.after),
+        "scale": real(version.scale),
+        "outcome": version.outcome,
+        "person": version.person,
+        "campaign": version.campaign,
+        "note": version.note,
+        "pushed": list(version.pushed),
         "code": version.code,
-    }  # fmt: skip
+    }
 
 
 def used_rows(version: ParameterVersion) -> list[Row]:
@@ -155,12 +169,14 @@ def used_rows(version: ParameterVersion) -> list[Row]:
     misses = np.concatenate([version.residual_before, version.residual_after], axis=1)
     return [
         {
-            "heliostat": version.heliostat, "version": version.version, "place": place,
+            "heliostat": version.heliostat,
+            "version": version.version,
+            "place": place,
             "sighting": int(sighting),
             **{name: real(x) for name, x in zip(_MISSES, misses[place], strict=True)},
         }
         for place, sighting in enumerate(version.sightings)
-    ]  # fmt: skip
+    ]
 
 
 def parameter_version(row: RowMapping, used: Sequence[RowMapping] = ()) -> ParameterVersion:
@@ -168,15 +184,27 @@ def parameter_version(row: RowMapping, used: Sequence[RowMapping] = ()) -> Param
     misses = np.array([[number(u[name]) for name in _MISSES] for u in used]).reshape(-1, 4)
     names = tuple(row["names"])
     return ParameterVersion(
-        row["heliostat"], row["at"], names,
+        row["heliostat"],
+        row["at"],
+        names,
         np.array(row["value"], np.float64),
         np.array(row["covariance"], np.float64).reshape(len(names), len(names)),
         np.array(row["prior"], np.float64),
-        number(row["error_before"]), number(row["error_after"]), number(row["scale"]),
-        row["outcome"], np.array([u["sighting"] for u in used], np.int64),
-        misses[:, :2], misses[:, 2:], row["model"], row["person"], row["campaign"], row["note"],
-        tuple(row["pushed"]), row["code"], row["version"],
-    )  # fmt: skip
+        number(row["error_before"]),
+        number(row["error_after"]),
+        number(row["scale"]),
+        row["outcome"],
+        np.array([u["sighting"] for u in used], np.int64),
+        misses[:, :2],
+        misses[:, 2:],
+        row["model"],
+        row["person"],
+        row["campaign"],
+        row["note"],
+        tuple(row["pushed"]),
+        row["code"],
+        row["version"],
+    )
 
 
 # -- the others --------------------------------------------------------------------------
@@ -196,10 +224,16 @@ def visit(row: RowMapping) -> VisitEntry:
 def plan_rows(plan: Sequence[PlannedVisit]) -> list[Row]:
     """Return the rows of the table ``plan``, in the order of their time."""
     return [
-        {"place": i, "heliostat": p.heliostat, "target": p.target, "due": p.due,
-         "gain": real(p.gain), "note": p.note}
+        {
+            "place": i,
+            "heliostat": p.heliostat,
+            "target": p.target,
+            "due": p.due,
+            "gain": real(p.gain),
+            "note": p.note,
+        }
         for i, p in enumerate(sorted(plan, key=lambda p: p.due))
-    ]  # fmt: skip
+    ]
 
 
 def planned(row: RowMapping) -> PlannedVisit:
@@ -212,10 +246,14 @@ def planned(row: RowMapping) -> PlannedVisit:
 def campaign_row(entry: CampaignEntry) -> Row:
     """Return the row of the table ``campaign``."""
     return {
-        "name": entry.name, "begun": entry.begun, "finished": entry.finished,
-        "model": entry.model, "note": entry.note, "expected": reals(entry.expected),
+        "name": entry.name,
+        "begun": entry.begun,
+        "finished": entry.finished,
+        "model": entry.model,
+        "note": entry.note,
+        "expected": reals(entry.expected),
         "found": reals(entry.found),
-    }  # fmt: skip
+    }
 
 
 def campaign(row: RowMapping) -> CampaignEntry:
@@ -229,19 +267,28 @@ def campaign(row: RowMapping) -> CampaignEntry:
 def event_row(entry: Event, number: int) -> Row:
     """Return the row of the table ``event``."""
     return {
-        "number": number, "at": entry.at, "source": entry.source,
-        "severity": SEVERITIES.index(entry.severity), "heliostat": entry.heliostat,
-        "text": entry.text, "values": reals(entry.values),
-    }  # fmt: skip
+        "number": number,
+        "at": entry.at,
+        "source": entry.source,
+        "severity": SEVERITIES.index(entry.severity),
+        "heliostat": entry.heliostat,
+        "text": entry.text,
+        "values": reals(entry.values),
+    }
 
 
 def event(row: RowMapping) -> Event:
     """Return an event from its row."""
     values = {name: number(x) for name, x in row["values"].items()}
     return Event(
-        row["at"], row["source"], row["text"], SEVERITIES[row["severity"]], row["heliostat"],
-        values, row["number"],
-    )  # fmt: skip
+        row["at"],
+        row["source"],
+        row["text"],
+        SEVERITIES[row["severity"]],
+        row["heliostat"],
+        values,
+        row["number"],
+    )
 
 
 def alarm(row: RowMapping) -> AlarmEntry:

@@ -109,7 +109,10 @@ def change_points(
             connection.execute(delete(table).where(which))
     for kind, places in new.items():
         rows.replace(
-            connection, table,
-            [{"kind": kind, "heliostat": name, "east": p[0], "north": p[1], "up": p[2]}
-             for name, p in places.items()],
-        )  # fmt: skip
+            connection,
+            table,
+            [
+                {"kind": kind, "heliostat": name, "east": p[0], "north": p[1], "up": p[2]}
+                for name, p in places.items()
+            ],
+        )

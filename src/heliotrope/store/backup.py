@@ -79,8 +79,11 @@ def backup(
         files = {str(p.relative_to(beside)): checksum(p) for p in _files(beside)}
         size = sum(p.stat().st_size for p in _files(beside))
         manifest = {
-            "heliotrope": __version__, "revision": HEAD, "made": now.isoformat(), "files": files,
-        }  # fmt: skip
+            "heliotrope": __version__,
+            "revision": HEAD,
+            "made": now.isoformat(),
+            "files": files,
+        }
         (beside / MANIFEST).write_text(json.dumps(manifest, indent=1), encoding="utf-8")
         for path in _files(beside):
             _sync(path)

@@ -256,9 +256,11 @@ class Database:
 
 _READER = ("PRAGMA busy_timeout=5000", "PRAGMA wal_autocheckpoint=0", "PRAGMA query_only=ON")
 _WRITER = (
-    "PRAGMA busy_timeout=5000", "PRAGMA journal_mode=WAL", "PRAGMA synchronous=FULL",
+    "PRAGMA busy_timeout=5000",
+    "PRAGMA journal_mode=WAL",
+    "PRAGMA synchronous=FULL",
     "PRAGMA foreign_keys=ON",
-)  # fmt: skip
+)
 
 
 def _prepare(engine: Engine, begin: str, pragmas: tuple[str, ...]) -> None:

@@ -152,10 +152,17 @@ def _residuals(seen: KeptSightings, history: Sequence[ParameterVersion]) -> Iter
             row = row_of.get(int(sighting))
             place = ("", "") if row is None else (row + 1, seen.sightings.time[row])
             yield (
-                version.version, place[0], sighting, place[1] and format_time(float(place[1])),
-                float(before[i, 0]), float(before[i, 1]), float(np.hypot(*before[i])),
-                float(after[i, 0]), float(after[i, 1]), float(np.hypot(*after[i])),
-            )  # fmt: skip
+                version.version,
+                place[0],
+                sighting,
+                place[1] and format_time(float(place[1])),
+                float(before[i, 0]),
+                float(before[i, 1]),
+                float(np.hypot(*before[i])),
+                float(after[i, 0]),
+                float(after[i, 1]),
+                float(np.hypot(*after[i])),
+            )
 
 
 _VERSIONS = (
@@ -166,9 +173,20 @@ _VERSIONS = (
 
 def _version(v: ParameterVersion) -> Sequence[Any]:
     return (
-        v.version, format_time(v.at), v.model, v.outcome, len(v.sightings), v.before, v.after,
-        v.scale, v.person, v.campaign, " ".join(v.pushed), v.code, v.note,
-    )  # fmt: skip
+        v.version,
+        format_time(v.at),
+        v.model,
+        v.outcome,
+        len(v.sightings),
+        v.before,
+        v.after,
+        v.scale,
+        v.person,
+        v.campaign,
+        " ".join(v.pushed),
+        v.code,
+        v.note,
+    )
 
 
 #: Values are deviations from the nominal mechanism in rad, m or 1; see the parameter reference.
@@ -179,9 +197,13 @@ def _parameters(history: Sequence[ParameterVersion]) -> Iterable[Sequence[Any]]:
     for v in history:
         for p, name in enumerate(v.names):
             yield (
-                v.version, format_time(v.at), name, float(v.values[p]), float(v.sigma[p]),
+                v.version,
+                format_time(v.at),
+                name,
+                float(v.values[p]),
+                float(v.sigma[p]),
                 float(v.prior[p]),
-            )  # fmt: skip
+            )
 
 
 _COVARIANCE = ("version", "parameter_1", "parameter_2", "covariance", "correlation")

@@ -211,8 +211,9 @@ class Keeper:
         table = tables.parameter_version
         last = (
             select(table.c.heliostat, func.max(table.c.version).label("version"))
-            .group_by(table.c.heliostat).subquery()
-        )  # fmt: skip
+            .group_by(table.c.heliostat)
+            .subquery()
+        )
         same = and_(table.c.heliostat == last.c.heliostat, table.c.version == last.c.version)
         query = select(table).join(last, same).order_by(table.c.heliostat)
         if heliostats is not None and len(heliostats) <= _MANY:
@@ -356,10 +357,18 @@ class Keeper:
         names = list(dict.fromkeys(heliostats))
         first = self._take_numbers(tables.hold, len(names))
         made = [
-            {"number": first + i, "heliostat": name, "reason": reason, "person": person,
-             "since": at, "until": until, "ended": None, "ended_by": ""}
+            {
+                "number": first + i,
+                "heliostat": name,
+                "reason": reason,
+                "person": person,
+                "since": at,
+                "until": until,
+                "ended": None,
+                "ended_by": "",
+            }
             for i, name in enumerate(names)
-        ]  # fmt: skip
+        ]
 
         def work(connection: Connection) -> None:
             _end_holds(connection, names, person, at)

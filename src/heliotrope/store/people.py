@@ -335,9 +335,14 @@ class People:
         self._note_use(row["key"], now)
         least = min(row["role"], row["owner_role"], key=ROLES.index)
         return ApiToken(
-            row["key"], row["name"], row["label"], least, row["created"], row["expires"],
+            row["key"],
+            row["name"],
+            row["label"],
+            least,
+            row["created"],
+            row["expires"],
             row["last_used"],
-        )  # fmt: skip
+        )
 
     def _note_use(self, key: str, now: float) -> None:
         last = self._noted.get(key)

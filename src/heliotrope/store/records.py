@@ -200,11 +200,25 @@ def version_of(
     last = errors(nominal.with_parameters(fitted.parameters), seen)
     rms = [float(np.sqrt(np.mean(e.beam**2))) if len(seen) else np.nan for e in (first, last)]
     return ParameterVersion(
-        heliostat, at, tuple(fitted.names), fitted.values[0], fitted.covariance[0],
-        fitted.prior[0], rms[0], rms[1], float(fitted.scale[0]),
-        Outcome(int(fitted.outcome[0])).text, numbers, first.offset, last.offset,
-        model, person, campaign, note, tuple(pushed),
-    )  # fmt: skip
+        heliostat,
+        at,
+        tuple(fitted.names),
+        fitted.values[0],
+        fitted.covariance[0],
+        fitted.prior[0],
+        rms[0],
+        rms[1],
+        float(fitted.scale[0]),
+        Outcome(int(fitted.outcome[0])).text,
+        numbers,
+        first.offset,
+        last.offset,
+        model,
+        person,
+        campaign,
+        note,
+        tuple(pushed),
+    )
 
 
 @dataclass(frozen=True)

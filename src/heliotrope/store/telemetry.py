@@ -34,13 +34,18 @@ from heliotrope.store.records import StoreError
 STALE = 255
 #: Pieces of work that may wait for the disk.
 _WAITING = 64
-SCHEMA = pa.schema([
-    ("time", pa.timestamp("ms", "UTC")),
-    ("heliostat", pa.dictionary(pa.int32(), pa.string())),
-    ("state", pa.dictionary(pa.int16(), pa.string())),
-    ("fault", pa.uint8()), ("flags", pa.uint16()),
-    ("primary", pa.int32()), ("secondary", pa.int32()), ("age", pa.float32()),
-])  # fmt: skip
+SCHEMA = pa.schema(
+    [
+        ("time", pa.timestamp("ms", "UTC")),
+        ("heliostat", pa.dictionary(pa.int32(), pa.string())),
+        ("state", pa.dictionary(pa.int16(), pa.string())),
+        ("fault", pa.uint8()),
+        ("flags", pa.uint16()),
+        ("primary", pa.int32()),
+        ("secondary", pa.int32()),
+        ("age", pa.float32()),
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -333,9 +338,12 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
     try:
         with beside.open("wb") as file:
             pq.write_table(
-                table.take(order), file, compression="zstd",
-                use_dictionary=["heliostat", "state", "age"], column_encoding=differences,
-            )  # fmt: skip
+                table.take(order),
+                file,
+                compression="zstd",
+                use_dictionary=["heliostat", "state", "age"],
+                column_encoding=differences,
+            )
             file.flush()
             os.fsync(file.fileno())
         beside.replace(final)

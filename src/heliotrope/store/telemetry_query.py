@@ -79,9 +79,10 @@ def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa
         f"SELECT * REPLACE (CAST(time AS TIMESTAMP) AS time) FROM ({rows})"
     )
     for setting in (
-        "python_enable_replacements=false", "enable_external_access=false",
+        "python_enable_replacements=false",
+        "enable_external_access=false",
         "lock_configuration=true",
-    ):  # fmt: skip
+    ):
         connection.execute(f"SET {setting}")
 
 

@@ -280,10 +280,18 @@ class RenderedCamera:
             # The facets are canted at the distance of the target, wherever the mirror looks.
             slant = float(np.linalg.norm(target.center - mirror.vertex))
             beam = reflected_beam(
-                target, mirror.vertex, sun, mirror.width, mirror.height, normal=mirror.normal,
-                facets=optics.facets, focal=slant, slope_error=optics.slope_error,
-                reflectivity=optics.reflectivity, dni=optics.dni,
-            )  # fmt: skip
+                target,
+                mirror.vertex,
+                sun,
+                mirror.width,
+                mirror.height,
+                normal=mirror.normal,
+                facets=optics.facets,
+                focal=slant,
+                slope_error=optics.slope_error,
+                reflectivity=optics.reflectivity,
+                dni=optics.dni,
+            )
             thrown.append(Thrown(target.name, beam))
         return tuple(thrown)
 
@@ -297,9 +305,11 @@ class RenderedCamera:
         scene = exposed(replace(scene, beams=beams), PEAK)
         self.taken += 1
         picture = render(
-            scene, int(self._chance.integers(1 << 32)), name=f"{scene.camera.name} {self.taken}",
+            scene,
+            int(self._chance.integers(1 << 32)),
+            name=f"{scene.camera.name} {self.taken}",
             time=self._sight.clock.utc(),
-        )  # fmt: skip
+        )
         self.last = picture.frame
         return picture.frame
 

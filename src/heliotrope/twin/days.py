@@ -114,9 +114,11 @@ class Days:
         self._learnt: tuple[str, ...] = ()
 
     def live(
-        self, span: timedelta, look: timedelta = timedelta(seconds=60),
+        self,
+        span: timedelta,
+        look: timedelta = timedelta(seconds=60),
         progress: Callable[[datetime], None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Let time pass.
 
         Parameters
@@ -149,9 +151,13 @@ class Days:
         if not free:
             return None
         return self.scheduler.next(
-            self.now, vector(self.now, self.plant.site), self.field, free, self.holds,
+            self.now,
+            vector(self.now, self.plant.site),
+            self.field,
+            free,
+            self.holds,
             self.weather,
-        )  # fmt: skip
+        )
 
     def mechanism(self, name: str) -> Mechanism:
         """Return a heliostat as it is believed to be, (1,)."""
@@ -179,9 +185,13 @@ class Days:
         away = np.linalg.norm(seen - pose.vertex, axis=1)[:, None]
         shift = self.noise * away * self.chance.standard_normal((len(times), 2))
         return camera_target(
-            np.zeros(len(times), dtype=np.intp), counts, suns, seen + shift @ surface.axes,
-            time=times, sigma=self.noise,
-        )  # fmt: skip
+            np.zeros(len(times), dtype=np.intp),
+            counts,
+            suns,
+            seen + shift @ surface.axes,
+            time=times,
+            sigma=self.noise,
+        )
 
     def _visit(self, told: Assignment) -> Visited:
         name, settings = told.heliostat, self.scheduler.settings

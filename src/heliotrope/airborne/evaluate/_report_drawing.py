@@ -61,9 +61,14 @@ class Panel:
         return np.stack(np.broadcast_arrays(across, down), axis=-1)
 
     def line(
-        self, x: npt.ArrayLike, y: npt.ArrayLike, colour: str, *, closed: bool = False,
+        self,
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        colour: str,
+        *,
+        closed: bool = False,
         width: float = 1.2,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Draw a line through points (n,)."""
         way = " ".join(f"{a:.1f},{b:.1f}" for a, b in self.place(x, y))
         kind = "polygon" if closed else "polyline"
@@ -72,9 +77,15 @@ class Panel:
         )
 
     def dots(
-        self, x: npt.ArrayLike, y: npt.ArrayLike, colour: str, tips: Sequence[str] = (),
-        *, size: float = 2.2, hollow: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        colour: str,
+        tips: Sequence[str] = (),
+        *,
+        size: float = 2.2,
+        hollow: bool = False,
+    ) -> None:
         """Draw points (n,), each with the text that it shows under the pointer."""
         fill = "white" if hollow else colour
         for k, (a, b) in enumerate(self.place(x, y)):

@@ -91,9 +91,13 @@ def flight_row(found: Orientations, flight: str = "") -> dict[str, Any]:
     }
     row |= _pair("rot_mean", _over([o.correction for o in every], mean=True))
     for name, what in (
-        ("rot_rms", "correction"), ("sigma", "sigma"), ("sigma_plain", "sigma_plain"),
-        ("sigma_mean", "sigma_mean"), ("systematic", "systematic"), ("sigma_tot", "sigma_total"),
-    ):  # fmt: skip
+        ("rot_rms", "correction"),
+        ("sigma", "sigma"),
+        ("sigma_plain", "sigma_plain"),
+        ("sigma_mean", "sigma_mean"),
+        ("systematic", "systematic"),
+        ("sigma_tot", "sigma_total"),
+    ):
         row |= _pair(name, _over([getattr(o, what) for o in every]))
     return row
 
@@ -161,9 +165,13 @@ def _row(
         "elevation_deg": float(np.degrees(o.elevation)),
     }
     for what, values in (
-        ("rot", o.correction), ("sigma", o.sigma), ("sigma_plain", o.sigma_plain),
-        ("sigma_mean", o.sigma_mean), ("systematic", o.systematic), ("sigma_tot", o.sigma_total),
-    ):  # fmt: skip
+        ("rot", o.correction),
+        ("sigma", o.sigma),
+        ("sigma_plain", o.sigma_plain),
+        ("sigma_mean", o.sigma_mean),
+        ("systematic", o.systematic),
+        ("sigma_tot", o.sigma_total),
+    ):
         row |= _pair(what, values)
     if budget is not None:
         place = None if places is None else places[o.heliostat]

@@ -72,9 +72,13 @@ class Budget:
         return as_float(np.sqrt(sum(p**2 for p in self.parts(distance).values())))
 
     def covariance(
-        self, point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike,
-        axes: npt.ArrayLike, place: npt.ArrayLike | None = None,
-    ) -> FloatArray:  # fmt: skip
+        self,
+        point: npt.ArrayLike,
+        camera: npt.ArrayLike,
+        led: npt.ArrayLike,
+        axes: npt.ArrayLike,
+        place: npt.ArrayLike | None = None,
+    ) -> FloatArray:
         """Return the covariance along two axes of what N points of a mirror share, (2, 2), rad².
 
         Parameters

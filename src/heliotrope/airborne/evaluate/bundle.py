@@ -285,9 +285,13 @@ def adjust(
         raise InputError("bundle: no corner of a mirror was seen in any photograph")
     layout = _Layout.of(len(places), len(stand), owner)
     state = State(
-        places, as_float(rotations), np.zeros_like(places), np.zeros(3), stand,
+        places,
+        as_float(rotations),
+        np.zeros_like(places),
+        np.zeros(3),
+        stand,
         np.zeros((int(layout.owner.max()) + 1, 3)),
-    )  # fmt: skip
+    )
     start, moved, converged, rounds = stand, np.zeros((len(stand), _OF_MIRROR)), False, 0
     solver: SuperLU | None = None
     for rounds in range(1, _MOST_ROUNDS + 1):
@@ -308,9 +312,13 @@ def adjust(
 
 
 def _told(
-    layout: _Layout, state: State, corners: Corners, solver: "SuperLU", rounds: int,
+    layout: _Layout,
+    state: State,
+    corners: Corners,
+    solver: "SuperLU",
+    rounds: int,
     converged: bool,
-) -> Adjusted:  # fmt: skip
+) -> Adjusted:
     gap, _ = residuals(state, corners, derivative=False)
     scaled = gap / corners.sigma[:, None]
     outlier = np.linalg.norm(scaled, axis=-1) > 4.0
@@ -369,9 +377,14 @@ def _priors(
 
 
 def _normal_equations(
-    layout: _Layout, corners: Corners, gap: FloatArray, parts: tuple[FloatArray, ...],
-    scale: FloatArray, prior: FloatArray, pull: FloatArray,
-) -> "tuple[SuperLU, FloatArray]":  # fmt: skip
+    layout: _Layout,
+    corners: Corners,
+    gap: FloatArray,
+    parts: tuple[FloatArray, ...],
+    scale: FloatArray,
+    prior: FloatArray,
+    pull: FloatArray,
+) -> "tuple[SuperLU, FloatArray]":
     """Return the factorised normal matrix and the right-hand side."""
     from scipy.sparse.linalg import splu
 

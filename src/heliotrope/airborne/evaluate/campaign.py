@@ -123,8 +123,10 @@ def evaluate_campaign(poses: Sequence[Pose], priors: Priors | None = None) -> Ca
             else:
                 problems[k] = (*problems[k], "no reflection on any mirror in its photographs")
     if all(one is None for one in found):
-        told = next((f"{p.name}: {line[-1]}" for p, line in zip(poses, problems, strict=True)
-                     if line), "there is none")  # fmt: skip
+        told = next(
+            (f"{p.name}: {line[-1]}" for p, line in zip(poses, problems, strict=True) if line),
+            "there is none",
+        )
         raise InputError(f"no flight of {len(poses)} gives a reflection; the first: {told}")
     offset, covariance = _common(done, (priors or Priors()).offset)
     return Campaign(tuple(found), tuple(problems), offset, covariance, len(done))
@@ -153,9 +155,10 @@ def _groups(poses: Sequence[Pose], usable: Sequence[int]) -> list[list[int]]:
         grown = True
         while grown:
             near = [
-                k for k in left
+                k
+                for k in left
                 if heliostats & set(poses[k].heliostat.tolist()) and _alike(camera, poses[k].camera)
-            ]  # fmt: skip
+            ]
             grown = bool(near)
             for k in near:
                 left.remove(k)

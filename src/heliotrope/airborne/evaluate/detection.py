@@ -296,10 +296,10 @@ def _lines(
         weight = base / (1.0 + (residual / (2.0 * np.maximum(typical, 0.03))) ** 2) ** 2
         weight = np.maximum(weight, 1e-9)
     deviation = np.sqrt(
-        np.sum(weight * residual**2, axis=-1) / weight.sum(axis=-1) / np.maximum(
-            base.sum(axis=-1) - 2.0, 1.0
-        )
-    )  # fmt: skip
+        np.sum(weight * residual**2, axis=-1)
+        / weight.sum(axis=-1)
+        / np.maximum(base.sum(axis=-1) - 2.0, 1.0)
+    )
     return lines, np.hypot(deviation, 0.01), enough
 
 
@@ -429,9 +429,10 @@ def _centroid(
     center = np.array([float(j), float(i)])
     if clipped > 3:
         weight = np.where((above > 0.5 * peak) & (far <= _WINDOW), above, 0.0)
-        center = np.array([
-            np.sum(weight * columns[None]), np.sum(weight * rows[:, None])
-        ]) / weight.sum()  # fmt: skip
+        center = (
+            np.array([np.sum(weight * columns[None]), np.sum(weight * rows[:, None])])
+            / weight.sum()
+        )
     else:
         for _ in range(12):
             away = np.hypot(rows[:, None] - center[1], columns[None] - center[0])

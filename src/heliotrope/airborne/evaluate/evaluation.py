@@ -142,16 +142,20 @@ def read_many(
 
 
 def _read(
-    photos: Sequence[Photo], camera: LedCamera, stand: Standing, processes: int,
+    photos: Sequence[Photo],
+    camera: LedCamera,
+    stand: Standing,
+    processes: int,
     client: "Client | None",
-) -> Iterator[tuple[int, Seen]]:  # fmt: skip
+) -> Iterator[tuple[int, Seen]]:
     if client is not None:
         from distributed import as_completed as completed
 
         # The field travels once.
         shared = client.scatter((camera, stand), broadcast=True)  # type: ignore[no-untyped-call]
-        tasks = {client.submit(_read_shared, p, shared, pure=False): k
-                 for k, p in enumerate(photos)}  # fmt: skip
+        tasks = {
+            client.submit(_read_shared, p, shared, pure=False): k for k, p in enumerate(photos)
+        }
         for future in completed(list(tasks)):  # type: ignore[no-untyped-call]
             yield tasks[future], future.result()
     elif processes > 1 and len(photos) >= FEWEST_FOR_PROCESSES:
@@ -266,15 +270,26 @@ def evaluate(
             "mirrors look at the drone (commands.csv)?"
         )
     return Evaluation(
-        tuple(places), tuple(told), tuple(used), adjusted, state.stand, adjusted.place_covariance,
-        found, tuple(problems),
-    )  # fmt: skip
+        tuple(places),
+        tuple(told),
+        tuple(used),
+        adjusted,
+        state.stand,
+        adjusted.place_covariance,
+        found,
+        tuple(problems),
+    )
 
 
 def _evaluate_dark(
-    told: Sequence[Photo], seen: Sequence[Seen], camera: LedCamera, stand: Standing,
-    shape: ShapeOf, priors: Priors, problems: tuple[str, ...],
-) -> Evaluation:  # fmt: skip
+    told: Sequence[Photo],
+    seen: Sequence[Seen],
+    camera: LedCamera,
+    stand: Standing,
+    shape: ShapeOf,
+    priors: Priors,
+    problems: tuple[str, ...],
+) -> Evaluation:
     """Evaluate a flight at night: attitudes from the lights alone, positions as RTK has them."""
     shifts = np.zeros((len(told), len(stand), 2))
 
@@ -286,15 +301,26 @@ def _evaluate_dark(
     found = turn_together(start, stand, shape, cut)
     position = as_float([p.position for p in told])
     state = State(
-        position, as_float([p.rotation for p in found.photos]), np.zeros_like(position),
-        np.zeros(3), found.stand, np.zeros((len(stand), 3)),
-    )  # fmt: skip
+        position,
+        as_float([p.rotation for p in found.photos]),
+        np.zeros_like(position),
+        np.zeros(3),
+        found.stand,
+        np.zeros((len(stand), 3)),
+    )
     place = float(np.linalg.norm([priors.offset, priors.position, priors.kinematics]))
     places = found.place_covariance(place)
     adjusted = Adjusted(
-        state, priors.offset**2 * np.eye(3), np.full(position.shape, np.nan), places,
-        np.empty((0, 2)), float("nan"), np.empty(0, np.bool_), 0, True,
-    )  # fmt: skip
+        state,
+        priors.offset**2 * np.eye(3),
+        np.full(position.shape, np.nan),
+        places,
+        np.empty((0, 2)),
+        float("nan"),
+        np.empty(0, np.bool_),
+        0,
+        True,
+    )
     rows = cut(found.photos, found.stand)
     return Evaluation(
         found.photos, tuple(told), tuple(seen), adjusted, found.stand, places, rows, problems
@@ -307,14 +333,22 @@ def corners_of(seen: Sequence[Seen]) -> Corners:
     for k, one in enumerate(seen):
         row, corner = np.nonzero(np.isfinite(one.corners).all(axis=-1))
         parts.append(
-            (np.full(len(row), k), one.mirror[row], corner, one.corners[row, corner],
-             one.corner_sigma[row])
-        )  # fmt: skip
+            (
+                np.full(len(row), k),
+                one.mirror[row],
+                corner,
+                one.corners[row, corner],
+                one.corner_sigma[row],
+            )
+        )
     joined = [np.concatenate(p) for p in zip(*parts, strict=True)]
     return Corners(
-        joined[0].astype(np.intp), joined[1].astype(np.intp), joined[2].astype(np.intp),
-        as_float(joined[3]), as_float(joined[4]),
-    )  # fmt: skip
+        joined[0].astype(np.intp),
+        joined[1].astype(np.intp),
+        joined[2].astype(np.intp),
+        as_float(joined[3]),
+        as_float(joined[4]),
+    )
 
 
 def _with_edges(
@@ -328,9 +362,13 @@ def _with_edges(
 
 
 def _adjusted(
-    told: Sequence[Photo], seen: Sequence[Seen], stand: Standing, corners: Corners,
-    priors: Priors | None, owner: npt.ArrayLike | None = None,
-) -> Adjusted:  # fmt: skip
+    told: Sequence[Photo],
+    seen: Sequence[Seen],
+    stand: Standing,
+    corners: Corners,
+    priors: Priors | None,
+    owner: npt.ArrayLike | None = None,
+) -> Adjusted:
     """Adjust; once more if the corners scatter more or less than they say."""
     places = as_float([p.position for p in told])
     spreads = as_float([p.sigma_position for p in told])
@@ -354,17 +392,26 @@ def _local_shifts(adjusted: Adjusted, corners: Corners, photos: int, mirrors: in
     gap, _ = residuals(adjusted.state, corners, derivative=False)
     where = corners.photo * mirrors + corners.mirror
     count = np.bincount(where[kept], minlength=photos * mirrors)
-    shift = np.stack([
-        np.bincount(where[kept], weights=gap[kept, i], minlength=photos * mirrors) for i in (0, 1)
-    ], axis=-1)  # fmt: skip
+    shift = np.stack(
+        [
+            np.bincount(where[kept], weights=gap[kept, i], minlength=photos * mirrors)
+            for i in (0, 1)
+        ],
+        axis=-1,
+    )
     mean = shift / np.maximum(count, 1)[:, None]
     return as_float(np.where((count >= 3)[:, None], mean, 0.0).reshape(photos, mirrors, 2))
 
 
 def _reflections(
-    photos: Sequence[Photo], seen: Sequence[Seen], camera: LedCamera, stand: Standing,
-    shape: ShapeOf, shifts: FloatArray, beside: float = 0.0,
-) -> Reflections:  # fmt: skip
+    photos: Sequence[Photo],
+    seen: Sequence[Seen],
+    camera: LedCamera,
+    stand: Standing,
+    shape: ShapeOf,
+    shifts: FloatArray,
+    beside: float = 0.0,
+) -> Reflections:
     """Return the reflections of all spots, by the ray of each and its mirror.
 
     Rays that pass ``beside`` m and a little beside all facets are left out.
@@ -494,11 +541,14 @@ def check_rtk(
     places = as_float([p.position for p in told])
     scaled = corners.sigma * max(usual.deviation, 0.1) if _rescaled(usual) else corners.sigma
     free = adjust(
-        places, np.ones_like(places), usual.state.rotation, usual.state.stand,
+        places,
+        np.ones_like(places),
+        usual.state.rotation,
+        usual.state.stand,
         Corners(corners.photo, corners.mirror, corners.corner, corners.place, scaled),
         # The mirrors stand where both together put them: their errors are not RTK's.
         Priors(offset=1e-6, position=1e-6, turn=1e-6),
-    )  # fmt: skip
+    )
     gap = places - free.state.position
     return RtkCheck(
         tuple(p.name for p in told),

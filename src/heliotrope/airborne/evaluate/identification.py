@@ -173,9 +173,13 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
 
 
 def _believe(
-    tried: list[Tried], photo: Photo, camera: LedCamera, stand: Standing,
-    rows: npt.NDArray[np.intp], patches: int,
-) -> Identified:  # fmt: skip
+    tried: list[Tried],
+    photo: Photo,
+    camera: LedCamera,
+    stand: Standing,
+    rows: npt.NDArray[np.intp],
+    patches: int,
+) -> Identified:
     none = np.empty(0, dtype=np.intp)
     ranked: list[tuple[float, int, Tried]] = []
     for one in tried:

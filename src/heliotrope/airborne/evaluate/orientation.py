@@ -342,9 +342,15 @@ def measure_field(
             continue
         try:
             one = measure(
-                mine, shape(row), turns[row], feet[row], slopes=slopes, budget=budget, mean=mean,
+                mine,
+                shape(row),
+                turns[row],
+                feet[row],
+                slopes=slopes,
+                budget=budget,
+                mean=mean,
                 place=None if seen is None else seen[row],
-            )  # fmt: skip
+            )
         except InputError as error:
             left_out[names[row]] = str(error)
             continue
@@ -367,9 +373,12 @@ def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
 
 
 def _mean(
-    omega: FloatArray, own: Reflections, shape: MirrorShape, keep: npt.NDArray[np.bool_],
+    omega: FloatArray,
+    own: Reflections,
+    shape: MirrorShape,
+    keep: npt.NDArray[np.bool_],
     mean: Mean,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     if mean == "plain":
         return as_float(omega[keep].mean(axis=0))
     if mean != "area":
@@ -380,10 +389,17 @@ def _mean(
 
 
 def _told(
-    own: Reflections, shape: MirrorShape, R: FloatArray, vertex: FloatArray, start: FloatArray,
-    found: FloatArray, keep: npt.NDArray[np.bool_], budget: Budget, mean: Mean,
+    own: Reflections,
+    shape: MirrorShape,
+    R: FloatArray,
+    vertex: FloatArray,
+    start: FloatArray,
+    found: FloatArray,
+    keep: npt.NDArray[np.bool_],
+    budget: Budget,
+    mean: Mean,
     place: npt.ArrayLike | None,
-) -> Orientation:  # fmt: skip
+) -> Orientation:
     part, kept = own.take(keep), found[keep]
     uv = shape.along_facet(part.facet, part.xy)
     known = spread_mean(kept, shape, part.facet, uv)
@@ -417,9 +433,11 @@ def _told(
 
 
 def _facet_means(
-    shape: MirrorShape, facet: npt.NDArray[np.intp], found: FloatArray,
+    shape: MirrorShape,
+    facet: npt.NDArray[np.intp],
+    found: FloatArray,
     keep: npt.NDArray[np.bool_],
-) -> tuple[FacetMean, ...]:  # fmt: skip
+) -> tuple[FacetMean, ...]:
     means = []
     for k in range(len(shape)):
         on = facet == k

@@ -98,9 +98,16 @@ def _leans(ax: "Axes", found: Orientations, places: FloatArray) -> None:
     size = max(rms(np.linalg.norm(lean[:, :2], axis=-1)), 1e-6)
     span = max(float(np.ptp(places[:, :2], axis=0).max()), 10.0)
     arrows = ax.quiver(
-        places[:, 0], places[:, 1], lean[:, 0], lean[:, 1], angles="xy", scale_units="xy",
-        scale=size / (0.08 * span), width=3e-3, color=OUTLIER,
-    )  # fmt: skip
+        places[:, 0],
+        places[:, 1],
+        lean[:, 0],
+        lean[:, 1],
+        angles="xy",
+        scale_units="xy",
+        scale=size / (0.08 * span),
+        width=3e-3,
+        color=OUTLIER,
+    )
     key = round_below(size)
     ax.quiverkey(arrows, 0.8, 1.03, key, f"{key:g} mrad", labelpos="E", coordinates="axes")
 
@@ -126,9 +133,16 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
     x = around(np.concatenate([corners[..., 0].ravel(), seen.x]))
     y = around(np.concatenate([corners[..., 1].ravel(), seen.y]))
     panel = Panel(
-        56.0, 60.0, 440.0, 390.0, x, y, "points, and where normals lean to",
-        "x, m (right, seen from the front)", "y, m",
-    ).equal()  # fmt: skip
+        56.0,
+        60.0,
+        440.0,
+        390.0,
+        x,
+        y,
+        "points, and where normals lean to",
+        "x, m (right, seen from the front)",
+        "y, m",
+    ).equal()
     for k, outline in enumerate(corners):
         panel.line(outline[:, 0], outline[:, 1], "#444", closed=True)
         left, low = outline.min(axis=0).tolist()
@@ -154,9 +168,16 @@ def _distribution(o: Orientation, k: int) -> Panel:
     values, rejected = 1e3 * o.difference[~o.outlier, k], 1e3 * o.difference[o.outlier, k]
     count, title = len(values), _NAMES[k]
     panel = Panel(
-        560.0, (60.0, 294.0)[k], 270.0, 156.0, around(1e3 * o.difference[:, k]), (0.0, 1.0), title,
-        f"difference in {_NAMES[k]}, mrad (× rejected)", "points",
-    )  # fmt: skip
+        560.0,
+        (60.0, 294.0)[k],
+        270.0,
+        156.0,
+        around(1e3 * o.difference[:, k]),
+        (0.0, 1.0),
+        title,
+        f"difference in {_NAMES[k]}, mrad (× rejected)",
+        "points",
+    )
     if count > 1 and (spread := float(values.std(ddof=1))) > 0.0:
         mean = float(values.mean())
         heights, edges = np.histogram(values, bins=max(5, int(np.sqrt(count)) + 1))
@@ -182,10 +203,16 @@ def _facets(o: Orientation) -> Panel:
     every = 1 + (len(o.facets) - 1) // _MOST_LABELS
     labels = tuple("" if f.facet % every else f"{f.facet}: {f.count}" for f in o.facets)
     panel = Panel(
-        890.0, 60.0, 270.0, 156.0, (-0.6, len(o.facets) - 0.4),
+        890.0,
+        60.0,
+        270.0,
+        156.0,
+        (-0.6, len(o.facets) - 0.4),
         around(np.concatenate([means - reach, means + reach, np.zeros((1, 2))])),
-        "mean of each facet (● rotX, ○ rotY), mrad", "facet: points", labels=labels,
-    )  # fmt: skip
+        "mean of each facet (● rotX, ○ rotY), mrad",
+        "facet: points",
+        labels=labels,
+    )
     panel.line(panel.x, (0.0, 0.0), "#888", width=0.6)
     for k, colour in enumerate(_COLOURS):
         place = np.arange(len(o.facets)) + 0.12 * (2 * k - 1)
@@ -200,9 +227,15 @@ def _facets(o: Orientation) -> Panel:
 def _order(o: Orientation) -> Panel:
     good, photo = ~o.outlier, o.reflections.photo.astype(np.float64)
     panel = Panel(
-        890.0, 294.0, 270.0, 156.0, around(photo), around(1e3 * o.difference[good]),
-        "in the order of the photographs, mrad", "photograph",
-    )  # fmt: skip
+        890.0,
+        294.0,
+        270.0,
+        156.0,
+        around(photo),
+        around(1e3 * o.difference[good]),
+        "in the order of the photographs, mrad",
+        "photograph",
+    )
     panel.line(panel.x, (0.0, 0.0), "#888", width=0.6)
     for k, colour in enumerate(_COLOURS):
         panel.dots(photo[good], 1e3 * o.difference[good, k], colour, _tips(o, good), hollow=k == 1)

@@ -129,9 +129,10 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
     height, width = picture.shape[:2]
     if (width, height) != camera.size:
         return Seen(
-            photo.name, f"unreadable: {width} × {height} px, but the camera's photographs have "
+            photo.name,
+            f"unreadable: {width} × {height} px, but the camera's photographs have "
             f"{camera.size[0]} × {camera.size[1]} px; give that camera's file",
-        )  # fmt: skip
+        )
     return look(picture, photo, camera, stand)
 
 
@@ -143,9 +144,10 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> 
     usual = float(np.median(side[near]))
     if usual < SMALLEST:
         return Seen(
-            photo.name, f"small: mirrors are {usual:.0f} px across, less than {SMALLEST:.0f}; "
+            photo.name,
+            f"small: mirrors are {usual:.0f} px across, less than {SMALLEST:.0f}; "
             "fly nearer or with a longer lens",
-        )  # fmt: skip
+        )
     clipped = float((picture[::8, ::8] >= 254).all(axis=2).mean())
     if clipped > 0.5:
         return Seen(
@@ -249,9 +251,12 @@ def _area(corners: FloatArray) -> FloatArray:
 
 
 def _attitude(
-    start: FloatArray, photo: Photo, stand: Standing, rows: npt.NDArray[np.intp],
+    start: FloatArray,
+    photo: Photo,
+    stand: Standing,
+    rows: npt.NDArray[np.intp],
     corners: FloatArray,
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Return the rotation that brings all found corners closest (Wahba)."""
     seen = np.isfinite(corners).all(axis=-1)
     if int(seen.sum()) < 4:

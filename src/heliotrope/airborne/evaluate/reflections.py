@@ -111,9 +111,15 @@ def reflections(
         i = int(np.flatnonzero(wrong)[0])
         raise InputError(f"reflection {i}: sigma {spread[i]} m must be above 0")
     return Reflections(
-        index(photo, "photo"), index(heliostat, "heliostat"), index(facet, "facet"),
-        place[:, 0].copy(), place[:, 1].copy(), ends[0], ends[1], spread,
-    )  # fmt: skip
+        index(photo, "photo"),
+        index(heliostat, "heliostat"),
+        index(facet, "facet"),
+        place[:, 0].copy(),
+        place[:, 1].copy(),
+        ends[0],
+        ends[1],
+        spread,
+    )
 
 
 def join(parts: Sequence[Reflections]) -> Reflections:
@@ -176,9 +182,11 @@ def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflection
     for name in ("photo", "facet"):
         given = numbers[name]
         rows.check(
-            name, ~((given >= 0) & (given == np.floor(given))) & np.isfinite(given), given,
+            name,
+            ~((given >= 0) & (given == np.floor(given))) & np.isfinite(given),
+            given,
             " is no whole number from 0",
-        )  # fmt: skip
+        )
     sigma = numbers["sigma_m"]
     rows.check("sigma_m", ~(sigma > 0.0) & np.isfinite(sigma), sigma, " m must be above 0")
     good = rows.good
@@ -186,11 +194,14 @@ def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflection
         np.stack([numbers[f"{end}_{axis}_m"][good] for axis in _AXES], axis=-1) for end in _VECTORS
     ]
     return reflections(
-        numbers["photo"][good].astype(np.intp), heliostat[good],
+        numbers["photo"][good].astype(np.intp),
+        heliostat[good],
         numbers["facet"][good].astype(np.intp),
         np.stack([numbers["x_m"][good], numbers["y_m"][good]], axis=-1),
-        ends[0], ends[1], sigma[good],
-    ), rows.left_out  # fmt: skip
+        ends[0],
+        ends[1],
+        sigma[good],
+    ), rows.left_out
 
 
 def _checked(path: str | Path) -> Path:

@@ -213,9 +213,12 @@ def _map(flight: Flown) -> str:
 
 
 def _page(
-    flights: Sequence[Flown], shown: set[str], maps: list[str], sections: list[str],
+    flights: Sequence[Flown],
+    shown: set[str],
+    maps: list[str],
+    sections: list[str],
     notes: tuple[str, ...],
-) -> str:  # fmt: skip
+) -> str:
     measured = sum(len(f.found.found) for f in flights)
     missing = sum(len(f.found.left_out) for f in flights)
     told = (
@@ -257,14 +260,29 @@ def _of_flights(flights: Sequence[Flown]) -> str:
     body = []
     for f in flights:
         row = flight_row(f.found, f.name)
-        body.append([
-            html.escape(f.name) or "–", row["heliostats"], row["not_measured"],
-            row["photographs_with_reflections"], row["points"], row["outliers"],
-            f"{row['distance_m']:.0f}",
-            _both(row, "rot_mean", "+"),
-            *(_both(row, name) for name in ("rot_rms", "sigma", "sigma_plain", "sigma_mean",
-                                            "systematic", "sigma_tot")),
-        ])  # fmt: skip
+        body.append(
+            [
+                html.escape(f.name) or "–",
+                row["heliostats"],
+                row["not_measured"],
+                row["photographs_with_reflections"],
+                row["points"],
+                row["outliers"],
+                f"{row['distance_m']:.0f}",
+                _both(row, "rot_mean", "+"),
+                *(
+                    _both(row, name)
+                    for name in (
+                        "rot_rms",
+                        "sigma",
+                        "sigma_plain",
+                        "sigma_mean",
+                        "systematic",
+                        "sigma_tot",
+                    )
+                ),
+            ]
+        )
     return _table(head, body)
 
 
@@ -279,15 +297,21 @@ def _of_heliostats(flights: Sequence[Flown], shown: set[str]) -> str:
     for f in flights:
         for o, row in zip(f.found.found, f.rows(), strict=True):
             name = html.escape(_anchor(f, o))
-            body.append([
-                f'<a href="#{name}">{name}</a>' if _anchor(f, o) in shown else name,
-                o.count, int(o.outlier.sum()), f"{row['azimuth_deg']:.4f}",
-                f"{row['elevation_deg']:.4f}", _both(row, "rot", "+"),
-                *(_both(row, w) for w in ("sigma", "sigma_plain", "sigma_mean")),
-                *(_both(row, f"systematic_{cause}") for cause in causes),
-                *(_both(row, w) for w in ("systematic", "sigma_tot")),
-                f"{o.normality[0]:.2f}, {o.normality[1]:.2f}", len(o.warnings) or "",
-            ])  # fmt: skip
+            body.append(
+                [
+                    f'<a href="#{name}">{name}</a>' if _anchor(f, o) in shown else name,
+                    o.count,
+                    int(o.outlier.sum()),
+                    f"{row['azimuth_deg']:.4f}",
+                    f"{row['elevation_deg']:.4f}",
+                    _both(row, "rot", "+"),
+                    *(_both(row, w) for w in ("sigma", "sigma_plain", "sigma_mean")),
+                    *(_both(row, f"systematic_{cause}") for cause in causes),
+                    *(_both(row, w) for w in ("systematic", "sigma_tot")),
+                    f"{o.normality[0]:.2f}, {o.normality[1]:.2f}",
+                    len(o.warnings) or "",
+                ]
+            )
     return _table(head, body)
 
 
@@ -304,11 +328,16 @@ def _causes(flights: Sequence[Flown]) -> list[str]:
 def _of_facets(flights: Sequence[Flown]) -> str:
     head = ("heliostat", "facet", "points", "rotX, rotY", "σ of the mean")
     body = [
-        [html.escape(f"{f.name}/{row['heliostat']}" if f.name else row["heliostat"]), row["facet"],
-         row["points"], _both(row, "rot", "+"), _both(row, "sigma")]
+        [
+            html.escape(f"{f.name}/{row['heliostat']}" if f.name else row["heliostat"]),
+            row["facet"],
+            row["points"],
+            _both(row, "rot", "+"),
+            _both(row, "sigma"),
+        ]
         for f in flights
         for row in facet_rows(f.found)
-    ]  # fmt: skip
+    ]
     return _table(head, body)
 
 

@@ -88,10 +88,12 @@ def to_sightings(
         raise InputError(f"to_sightings: counts of {len(table)} heliostats for {n} names")
     times = np.broadcast_to(as_float(time), (n,))
     make = _of_points if per == "reflection" else _of_mean
-    return join([
-        make(o, table[o.heliostat], float(times[o.heliostat]), systematic)
-        for o in orientations.found
-    ])  # fmt: skip
+    return join(
+        [
+            make(o, table[o.heliostat], float(times[o.heliostat]), systematic)
+            for o in orientations.found
+        ]
+    )
 
 
 def _sigma(o: Orientation, systematic: bool) -> float:
@@ -126,9 +128,13 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
     )
     sigma = 2.0 * _sigma(o, systematic) / np.sqrt(share)
     return drone(
-        np.full(len(kept), o.heliostat), np.tile(counts, (len(kept), 1)), led, camera,
-        time=time, sigma=sigma,
-    )  # fmt: skip
+        np.full(len(kept), o.heliostat),
+        np.tile(counts, (len(kept), 1)),
+        led,
+        camera,
+        time=time,
+        sigma=sigma,
+    )
 
 
 # -- together with others --------------------------------------------------------------
@@ -243,9 +249,13 @@ def _turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> 
 
 
 def _joint_step(
-    mechanism: Mechanism, seen: Sightings, first: int, told: Calibration, turn: FloatArray,
+    mechanism: Mechanism,
+    seen: Sightings,
+    first: int,
+    told: Calibration,
+    turn: FloatArray,
     spread: FloatArray,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+) -> tuple[FloatArray, FloatArray]:
     """Return Gauss and Newton's step of the turns (N, 2), and the covariance of all unknowns."""
     fitted = mechanism.with_parameters(told.parameters)[seen.heliostat]
     lines = linearise(fitted, seen, told.names)

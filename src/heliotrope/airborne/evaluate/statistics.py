@@ -214,9 +214,12 @@ def _spread_mean(
     weights = np.einsum("lr,lrn->n", weight, np.array([fit.weights for fit in fits]))
     share = _RATIOS / (1.0 + _RATIOS)
     return SpreadMean(
-        np.sqrt(plain), weights, np.sqrt(kriged),
-        float(weight.sum(axis=1) @ lengths), float(weight.sum(axis=0) @ share),
-    )  # fmt: skip
+        np.sqrt(plain),
+        weights,
+        np.sqrt(kriged),
+        float(weight.sum(axis=1) @ lengths),
+        float(weight.sum(axis=0) @ share),
+    )
 
 
 def matern(distance: npt.ArrayLike) -> FloatArray:
@@ -286,9 +289,13 @@ class _Fit:
 
     @classmethod
     def of(
-        cls, data: FloatArray, correlation: FloatArray, to_mirror: FloatArray, within: float,
+        cls,
+        data: FloatArray,
+        correlation: FloatArray,
+        to_mirror: FloatArray,
+        within: float,
         one: FloatArray,
-    ) -> "_Fit":  # fmt: skip
+    ) -> "_Fit":
         n = len(data)
         root, basis = np.linalg.eigh(correlation)
         root = np.maximum(root, 0.0)

@@ -105,10 +105,12 @@ def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
         half = 0.5 * float(np.hypot(surface.width, surface.height))
         found.append(
             KeepOut(
-                surface.name, surface.center[None, :2], half + clearance,
+                surface.name,
+                surface.center[None, :2],
+                half + clearance,
                 top=float(surface.center[2]) + 0.5 * surface.height + clearance,
             )
-        )  # fmt: skip
+        )
     return tuple(found)
 
 
@@ -260,9 +262,12 @@ class Airspace:
             way.append(int(before[0, way[-1]]))
         found = points[way[::-1]]
         # Climbs of no length are no points of their own.
-        keep = [k for k, p in enumerate(found)
-                if (k > 0 or not np.allclose(p, start)) and
-                (k < len(found) - 1 or not np.allclose(p, stop))]  # fmt: skip
+        keep = [
+            k
+            for k, p in enumerate(found)
+            if (k > 0 or not np.allclose(p, start))
+            and (k < len(found) - 1 or not np.allclose(p, stop))
+        ]
         return as_float(found[keep].reshape(-1, 3))
 
     def _graph(self, level: float) -> tuple[FloatArray, FloatArray]:

@@ -207,9 +207,13 @@ class _Ways:
 
 
 def fly(
-    stations: Sequence[Station], order: Sequence[int], airspace: Airspace, home: FloatArray,
-    craft: Craft, labels: Sequence[str],
-) -> list[Sortie]:  # fmt: skip
+    stations: Sequence[Station],
+    order: Sequence[int],
+    airspace: Airspace,
+    home: FloatArray,
+    craft: Craft,
+    labels: Sequence[str],
+) -> list[Sortie]:
     """Return the sorties of the drones.
 
     Parameters
@@ -275,9 +279,14 @@ def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> 
 
 
 def _one(
-    drone: int, rows: Sequence[int], stations: Sequence[Station], home: FloatArray, craft: Craft,
-    ways: _Ways, others: "Sequence[Timeline]" = (),
-) -> list[Sortie]:  # fmt: skip
+    drone: int,
+    rows: Sequence[int],
+    stations: Sequence[Station],
+    home: FloatArray,
+    craft: Craft,
+    ways: _Ways,
+    others: "Sequence[Timeline]" = (),
+) -> list[Sortie]:
     """Sorties of one drone that flies ``rows`` in order and keeps away from others."""
     work = _Work(drone, stations, home, craft, ways, others, {}, [], [])
     for row in rows:
@@ -483,9 +492,15 @@ class CameraTarget:
 
 
 def camera_target(
-    site: Site, photographs: int, *, minutes: float = 2.0, targets: int = 1, clear: float = 0.7,
-    year: int = 2026, min_elevation: float = float(np.radians(10.0)),
-) -> CameraTarget:  # fmt: skip
+    site: Site,
+    photographs: int,
+    *,
+    minutes: float = 2.0,
+    targets: int = 1,
+    clear: float = 0.7,
+    year: int = 2026,
+    min_elevation: float = float(np.radians(10.0)),
+) -> CameraTarget:
     """Return how long the same number of poses takes with camera and target.
 
     Parameters

@@ -62,10 +62,18 @@ def mission(plan: FlightPlan, sortie: Sortie, name: str) -> Mission:
     lat, lon, _ = enu_to_geodetic(points, _origin(plan.plant.site))
     home = tuple(float(v) for v in enu_to_geodetic(sortie.home, _origin(plan.plant.site)))
     return Mission(
-        name, lat, lon, points[:, 2] - sortie.home[2], np.array(yaw) % 360.0, np.array(pitch),
-        np.array(stay), np.array(photo, dtype=np.bool_), plan.wishes.craft.speed,
-        (home[0], home[1], home[2]), _return_height(plan.wishes.airspace, sortie),
-    )  # fmt: skip
+        name,
+        lat,
+        lon,
+        points[:, 2] - sortie.home[2],
+        np.array(yaw) % 360.0,
+        np.array(pitch),
+        np.array(stay),
+        np.array(photo, dtype=np.bool_),
+        plan.wishes.craft.speed,
+        (home[0], home[1], home[2]),
+        _return_height(plan.wishes.airspace, sortie),
+    )
 
 
 def _origin(site: Site) -> tuple[float, float, float]:
@@ -99,9 +107,13 @@ def fence(plan: FlightPlan) -> Fence:
 
 
 def write_plan(
-    plan: FlightPlan, folder: str | Path, *, formats: Sequence[str] = FORMATS,
-    aircraft: str = "M3E", progress: Progress | None = None,
-) -> list[Path]:  # fmt: skip
+    plan: FlightPlan,
+    folder: str | Path,
+    *,
+    formats: Sequence[str] = FORMATS,
+    aircraft: str = "M3E",
+    progress: Progress | None = None,
+) -> list[Path]:
     """Write plan.json, commands.csv and the waypoint files of all sorties into a folder.
 
     Parameters
@@ -159,9 +171,18 @@ def commands(plan: FlightPlan) -> str:
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(
-        ["cluster", "point", "heliostat", "look_east_m", "look_north_m", "look_up_m", "count_1",
-         "count_2", "reachable"]
-    )  # fmt: skip
+        [
+            "cluster",
+            "point",
+            "heliostat",
+            "look_east_m",
+            "look_north_m",
+            "look_up_m",
+            "count_1",
+            "count_2",
+            "reachable",
+        ]
+    )
     for k, look in enumerate(plan.look):
         names = [plan.mirrors.names[i] for i in plan.clusters.rows(k)]
         for point in range(len(look)):
@@ -169,9 +190,16 @@ def commands(plan: FlightPlan) -> str:
             able = look.facing.able[point].tolist()
             for i, (first, second) in enumerate(look.facing.counts[point].tolist()):
                 writer.writerow(
-                    [plan.labels[k], point + 1, names[i], *where, f"{first:.3f}", f"{second:.3f}",
-                     str(able[i]).lower()]
-                )  # fmt: skip
+                    [
+                        plan.labels[k],
+                        point + 1,
+                        names[i],
+                        *where,
+                        f"{first:.3f}",
+                        f"{second:.3f}",
+                        str(able[i]).lower(),
+                    ]
+                )
     return text.getvalue()
 
 
@@ -206,8 +234,11 @@ def document(plan: FlightPlan) -> dict[str, Any]:
             "fence": None if air.fence is None else air.fence.tolist(),
             "keep_out": [
                 {
-                    "name": k.name, "polygon": k.corners.tolist(), "radius_m": k.radius,
-                    "bottom_m": _finite(k.bottom), "top_m": _finite(k.top),
+                    "name": k.name,
+                    "polygon": k.corners.tolist(),
+                    "radius_m": k.radius,
+                    "bottom_m": _finite(k.bottom),
+                    "top_m": _finite(k.top),
                 }
                 for k in air.keep_outs
             ],
@@ -222,7 +253,7 @@ def document(plan: FlightPlan) -> dict[str, Any]:
         ],
         "stations": [_station(plan, row, timing[row]) for row in range(len(plan.stations))],
         "sorties": [_sortie(plan, sortie) for sortie in plan.sorties],
-    }  # fmt: skip
+    }
 
 
 def _station(plan: FlightPlan, row: int, timing: list[float]) -> dict[str, Any]:
@@ -313,10 +344,13 @@ def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArra
         return root[key].number(0.0, 10_000.0) if root.has(key) else default
 
     return Airspace(
-        tuple(volumes), _polygon(root["fence"]) if root.has("fence") else base.fence,
-        number("min_height_m", base.min_height), number("max_height_m", base.max_height),
-        number("margin_m", base.margin), base.ground,
-    ), as_float(root["home"].vector()) if root.has("home") else None  # fmt: skip
+        tuple(volumes),
+        _polygon(root["fence"]) if root.has("fence") else base.fence,
+        number("min_height_m", base.min_height),
+        number("max_height_m", base.max_height),
+        number("margin_m", base.margin),
+        base.ground,
+    ), as_float(root["home"].vector()) if root.has("home") else None
 
 
 def _keep_out(node: Node) -> KeepOut:

@@ -69,9 +69,15 @@ def _ways(ax: "Axes", plan: FlightPlan) -> None:
         some = [s for s in plan.sorties if s.drone == drone][:2]
         if some:
             line = timeline(some, plan.stations, plan.wishes.craft, drone)
-            ax.plot(line.place[:, 0], line.place[:, 1], "-", lw=0.8, color=colour,
-                    label=f"drone {drone + 1}, its first {len(some)} of "
-                    f"{sum(s.drone == drone for s in plan.sorties)} sorties")  # fmt: skip
+            ax.plot(
+                line.place[:, 0],
+                line.place[:, 1],
+                "-",
+                lw=0.8,
+                color=colour,
+                label=f"drone {drone + 1}, its first {len(some)} of "
+                f"{sum(s.drone == drone for s in plan.sorties)} sorties",
+            )
         ax.plot(home[0], home[1], "^", ms=8, color=colour)
 
 
@@ -100,9 +106,13 @@ def _directions(ax: "Axes", plan: FlightPlan) -> None:
     azimuth, elevation = azimuth_elevation(place)
     share = number / len(plan.labels)
     dots = ax.scatter(
-        azimuth, 90.0 - np.degrees(elevation), s=20.0 + 80.0 * share, c=100.0 * share,
-        cmap="viridis", vmin=0.0,
-    )  # fmt: skip
+        azimuth,
+        90.0 - np.degrees(elevation),
+        s=20.0 + 80.0 * share,
+        c=100.0 * share,
+        cmap="viridis",
+        vmin=0.0,
+    )
     assert ax.figure is not None
     ax.figure.colorbar(dots, ax=ax, label="clusters seen from there, %", shrink=0.7)
     # Clockwise from north, as azimuth is.

@@ -217,19 +217,35 @@ def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) 
     sorties = flight.fly(stations, order.tolist(), airspace, homes, wishes.craft, labels)
     poses = sum(int(one.facing.able.sum()) for one in look)
     return FlightPlan(
-        plant, wishes, all_mirrors, found, labels, tuple(look), tuple(stations), tuple(sorties),
-        homes, flight.separation(sorties, stations, wishes.craft),
+        plant,
+        wishes,
+        all_mirrors,
+        found,
+        labels,
+        tuple(look),
+        tuple(stations),
+        tuple(sorties),
+        homes,
+        flight.separation(sorties, stations, wishes.craft),
         flight.camera_target(
-            plant.site, poses, minutes=wishes.photo_minutes,
-            targets=max(1, len(plant.targets)), clear=wishes.clear,
+            plant.site,
+            poses,
+            minutes=wishes.photo_minutes,
+            targets=max(1, len(plant.targets)),
+            clear=wishes.clear,
         ),
-    )  # fmt: skip
+    )
 
 
 def _look(
-    plant: Plant, all_mirrors: Mirrors, center: FloatArray, rows: npt.NDArray[np.intp],
-    suns: FloatArray, wishes: Wishes, label: str,
-) -> LookPoints:  # fmt: skip
+    plant: Plant,
+    all_mirrors: Mirrors,
+    center: FloatArray,
+    rows: npt.NDArray[np.intp],
+    suns: FloatArray,
+    wishes: Wishes,
+    label: str,
+) -> LookPoints:
     """Calibration points of one cluster, chosen for the heliostat in its middle."""
     away = np.linalg.norm(plant.position[rows] - center, axis=-1)
     group, row = plant.find(all_mirrors.names[int(rows[np.argmin(away)])])
@@ -245,9 +261,17 @@ def _look(
             raise InputError("the plant has no receiver and no target; beams must go somewhere")
         aim = surfaces[0]
     return look_points(
-        all_mirrors, rows, middle, aim, names, suns, wishes.airspace, wishes.sampling,
-        wishes.choosing, label,
-    )  # fmt: skip
+        all_mirrors,
+        rows,
+        middle,
+        aim,
+        names,
+        suns,
+        wishes.airspace,
+        wishes.sampling,
+        wishes.choosing,
+        label,
+    )
 
 
 def _model(mechanism: Mechanism) -> str:
@@ -258,22 +282,31 @@ def _model(mechanism: Mechanism) -> str:
 
 
 def _stations(
-    all_mirrors: Mirrors, rows: npt.NDArray[np.intp], look: LookPoints, cluster: int,
+    all_mirrors: Mirrors,
+    rows: npt.NDArray[np.intp],
+    look: LookPoints,
+    cluster: int,
     wishes: Wishes,
-) -> list[Station]:  # fmt: skip
+) -> list[Station]:
     speed = all_mirrors.drives.table[rows][..., SLOTS["speed"]]
     travel = flight.mirror_travel(look.facing.counts, speed)
     return [
         Station(
-            cluster, k,
+            cluster,
+            k,
             pattern(
-                look.facing.vertex[k], all_mirrors.corners[rows], all_mirrors.slopes[rows],
-                all_mirrors.facet_area[rows], look.point[k], look.direction[k], wishes.sampling,
+                look.facing.vertex[k],
+                all_mirrors.corners[rows],
+                all_mirrors.slopes[rows],
+                all_mirrors.facet_area[rows],
+                look.point[k],
+                look.direction[k],
+                wishes.sampling,
             ),
             float(travel[k]),
         )
         for k in range(len(look))
-    ]  # fmt: skip
+    ]
 
 
 def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: Airspace) -> None:

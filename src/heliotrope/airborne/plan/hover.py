@@ -133,8 +133,10 @@ def mirrors(plant: Plant) -> Mirrors:
             right[:, 0, 0], up[:, 0, 1] = 0.5 * group.width, 0.5 * group.height
         else:
             centre, right, up = (
-                group.facets.center, group.facets.half_width, group.facets.half_height
-            )  # fmt: skip
+                group.facets.center,
+                group.facets.half_width,
+                group.facets.half_height,
+            )
         parts.append((centre, right, up))
     facets = max(part[0].shape[1] for part in parts)
     corners, slopes, areas = [], [], []
@@ -148,9 +150,13 @@ def mirrors(plant: Plant) -> Mirrors:
         slopes.append(np.pad(slope, (*missing, (0, 0)), constant_values=np.nan))
         areas.append(4.0 * np.linalg.norm(normal, axis=-1).min(axis=1))
     return Mirrors(
-        plant.names, plant.armature, plant.drives, np.concatenate(corners),
-        np.concatenate(slopes), np.concatenate(areas),
-    )  # fmt: skip
+        plant.names,
+        plant.armature,
+        plant.drives,
+        np.concatenate(corners),
+        np.concatenate(slopes),
+        np.concatenate(areas),
+    )
 
 
 @dataclass(frozen=True)
@@ -202,9 +208,11 @@ def face(
         vertex = solved.chosen(solved.vertex)
         sun = normalize(goal - vertex, "direction to the look point")
     return Facing(
-        solved.chosen(solved.counts), solved.chosen(solved.normal), vertex,
+        solved.chosen(solved.counts),
+        solved.chosen(solved.normal),
+        vertex,
         solved.chosen(solved.reachable),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)
@@ -240,9 +248,13 @@ class Pattern:
 
 
 def reach(
-    corners: FloatArray, slopes: FloatArray, vertex: FloatArray, point: FloatArray,
-    direction: FloatArray, sampling: Sampling,
-) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    corners: FloatArray,
+    slopes: FloatArray,
+    vertex: FloatArray,
+    point: FloatArray,
+    direction: FloatArray,
+    sampling: Sampling,
+) -> tuple[FloatArray, FloatArray]:
     """Return the lower and upper bound of drone places that mirrors ask for.
 
     Parameters
@@ -309,9 +321,14 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
 
 
 def pattern(
-    facing_vertex: FloatArray, corners: FloatArray, slopes: FloatArray, facet_area: FloatArray,
-    point: npt.ArrayLike, direction: npt.ArrayLike, sampling: Sampling,
-) -> Pattern:  # fmt: skip
+    facing_vertex: FloatArray,
+    corners: FloatArray,
+    slopes: FloatArray,
+    facet_area: FloatArray,
+    point: npt.ArrayLike,
+    direction: npt.ArrayLike,
+    sampling: Sampling,
+) -> Pattern:
     """Return the hover points from which all of n mirrors are sampled.
 
     Parameters

@@ -118,10 +118,17 @@ def directions(choosing: Choosing) -> FloatArray:
 
 
 def look_points(
-    mirrors: Mirrors, rows: npt.NDArray[np.intp], middle: Mechanism, aim: npt.ArrayLike,
-    names: tuple[str, ...], suns: FloatArray, airspace: Airspace, sampling: Sampling,
-    choosing: Choosing, label: str = "cluster",
-) -> LookPoints:  # fmt: skip
+    mirrors: Mirrors,
+    rows: npt.NDArray[np.intp],
+    middle: Mechanism,
+    aim: npt.ArrayLike,
+    names: tuple[str, ...],
+    suns: FloatArray,
+    airspace: Airspace,
+    sampling: Sampling,
+    choosing: Choosing,
+    label: str = "cluster",
+) -> LookPoints:
     """Return the calibration points of one cluster.
 
     Parameters
@@ -191,9 +198,13 @@ def look_points(
 
 
 def _free(
-    airspace: Airspace, points: FloatArray, towards: FloatArray, mirrors: Mirrors,
-    rows: npt.NDArray[np.intp], sampling: Sampling,
-) -> npt.NDArray[np.bool_]:  # fmt: skip
+    airspace: Airspace,
+    points: FloatArray,
+    towards: FloatArray,
+    mirrors: Mirrors,
+    rows: npt.NDArray[np.intp],
+    sampling: Sampling,
+) -> npt.NDArray[np.bool_]:
     """Around which points there is room for a pattern."""
     corners, distance = mirrors.corners[rows], sampling.distance
     middle = corners.mean(axis=2, keepdims=True)
@@ -209,9 +220,12 @@ def _free(
 
 
 def _candidates(
-    middle: Mechanism, towards: FloatArray, points: FloatArray, names: tuple[str, ...],
+    middle: Mechanism,
+    towards: FloatArray,
+    points: FloatArray,
+    names: tuple[str, ...],
     sigma: float,
-) -> Candidates:  # fmt: skip
+) -> Candidates:
     """Sightings of the drone by one mirror; their "time" is the row of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
@@ -225,6 +239,15 @@ def _candidates(
         jacobian = np.empty((0, 2, len(names)))
     angle = np.zeros(len(rows))
     return Candidates(
-        names, ("drone",), zero, zero, as_float(rows), towards[rows], counts,
-        facing.normal[rows, 0], angle, angle, jacobian,
-    )  # fmt: skip
+        names,
+        ("drone",),
+        zero,
+        zero,
+        as_float(rows),
+        towards[rows],
+        counts,
+        facing.normal[rows, 0],
+        angle,
+        angle,
+        jacobian,
+    )

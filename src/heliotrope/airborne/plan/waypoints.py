@@ -150,12 +150,25 @@ def litchi(mission: Mission) -> str:
         actions += [(-1, 0)] * (_LITCHI_ACTIONS - len(actions))
         writer.writerow(
             [
-                f"{mission.latitude_deg[k]:.9f}", f"{mission.longitude_deg[k]:.9f}",
-                f"{mission.height[k]:.3f}", f"{mission.yaw_deg[k]:.2f}", 0, 0, 2,
-                f"{mission.pitch_deg[k]:.2f}", *(v for pair in actions for v in pair), 0,
-                f"{mission.speed:g}", 0, 0, 0, 0, -1, -1,
+                f"{mission.latitude_deg[k]:.9f}",
+                f"{mission.longitude_deg[k]:.9f}",
+                f"{mission.height[k]:.3f}",
+                f"{mission.yaw_deg[k]:.2f}",
+                0,
+                0,
+                2,
+                f"{mission.pitch_deg[k]:.2f}",
+                *(v for pair in actions for v in pair),
+                0,
+                f"{mission.speed:g}",
+                0,
+                0,
+                0,
+                0,
+                -1,
+                -1,
             ]
-        )  # fmt: skip
+        )
     return text.getvalue()
 
 
@@ -198,10 +211,18 @@ def read_litchi(path: str | Path) -> Mission:
     if not len(table) or (np.abs(table[:, 0]) > 90.0).any() or (np.abs(table[:, 1]) > 180.0).any():
         raise FormatError(path, "no waypoint, or a latitude or longitude out of its range")
     return Mission(
-        Path(path).stem, table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 7],
-        1e-3 * np.where(kind == 0, value, 0.0).sum(axis=1), (kind == 1).any(axis=1),
-        float(table[0, 39]), (0.0, 0.0, 0.0), 0.0,
-    )  # fmt: skip
+        Path(path).stem,
+        table[:, 0],
+        table[:, 1],
+        table[:, 2],
+        table[:, 3],
+        table[:, 7],
+        1e-3 * np.where(kind == 0, value, 0.0).sum(axis=1),
+        (kind == 1).any(axis=1),
+        float(table[0, 39]),
+        (0.0, 0.0, 0.0),
+        0.0,
+    )
 
 
 # --- DJI ------------------------------------------------------------------------------
@@ -417,15 +438,18 @@ def read_wpml(path: str | Path) -> Mission:
         stay = [m.findtext(".//w:hoverTime", "0", spaces) for m in marks]
         kinds = [[a.text for a in m.findall(".//w:actionActuatorFunc", spaces)] for m in marks]
         return Mission(
-            Path(path).stem, place[:, 1], place[:, 0],
+            Path(path).stem,
+            place[:, 1],
+            place[:, 0],
             np.array([float(value(m, "w:executeHeight")) for m in marks]),
             np.array([float(value(m, "w:waypointHeadingAngle")) for m in marks]) % 360.0,
-            np.array(pitch, dtype=np.float64), np.array(stay, dtype=np.float64),
+            np.array(pitch, dtype=np.float64),
+            np.array(stay, dtype=np.float64),
             np.array(["takePhoto" in kind for kind in kinds]),
             float(value(roots["waylines.wpml"], "w:autoFlightSpeed")),
             _triple(value(config, "w:takeOffRefPoint")),
             float(value(roots["waylines.wpml"], "w:globalRTHHeight")),
-        )  # fmt: skip
+        )
     except (ValueError, IndexError) as error:
         raise FormatError(file, f"a number cannot be read ({error})") from None
 
@@ -481,12 +505,16 @@ def qgc(mission: Mission, fence: Fence | None = None) -> str:
         add(
             _WAYPOINT,
             [
-                round(float(mission.stay[k]), 1), 0, 0, round(float(mission.yaw_deg[k]), 2),
+                round(float(mission.stay[k]), 1),
+                0,
+                0,
+                round(float(mission.yaw_deg[k]), 2),
                 round(float(mission.latitude_deg[k]), 9),
-                round(float(mission.longitude_deg[k]), 9), height,
+                round(float(mission.longitude_deg[k]), 9),
+                height,
             ],
             height,
-        )  # fmt: skip
+        )
         if mission.photo[k]:
             add(_PHOTO, [0, 0, 1, 0, None, None, None])
     add(_RETURN, [0, 0, 0, 0, 0, 0, 0])
@@ -555,13 +583,22 @@ def read_qgc(path: str | Path) -> Mission:
             tilt = params[0].number()
         elif command == _WAYPOINT:
             lat, lon = params[4].number(-90.0, 90.0), params[5].number(-180.0, 180.0)
-            rows.append([lat, lon, params[6].number(), params[3].number(), 0.0,
-                         params[0].number(), 0.0])  # fmt: skip
+            rows.append(
+                [lat, lon, params[6].number(), params[3].number(), 0.0, params[0].number(), 0.0]
+            )
         elif command == _PHOTO and rows:
             rows[-1][4], rows[-1][6] = tilt, 1.0
     table = np.array(rows).reshape(-1, 7)
     return Mission(
-        Path(path).stem, table[:, 0], table[:, 1], table[:, 2], table[:, 3], table[:, 4],
-        table[:, 5], table[:, 6] > 0.0, speed,
-        mission["plannedHomePosition"].vector(), 0.0,
-    )  # fmt: skip
+        Path(path).stem,
+        table[:, 0],
+        table[:, 1],
+        table[:, 2],
+        table[:, 3],
+        table[:, 4],
+        table[:, 5],
+        table[:, 6] > 0.0,
+        speed,
+        mission["plannedHomePosition"].vector(),
+        0.0,
+    )

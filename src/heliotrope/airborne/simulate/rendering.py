@@ -191,9 +191,12 @@ def _ground(camera: LedCamera, photo: Photo, scene: Scene) -> Light:
         for k in (0, 1)
     ]
     grains = cv2.remap(
-        _texture(), maps[0], maps[1], cv2.INTER_LINEAR,
+        _texture(),
+        maps[0],
+        maps[1],
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_WRAP,
-    )  # fmt: skip
+    )
     light = conditions.ground * np.maximum(1.0 + conditions.contrast * grains, 0.05)
     if (down < 0.05).any():
         share = cv2.warpAffine((down < 0.05).astype(np.float32), matrix, (width, height), **turned)
@@ -383,10 +386,17 @@ def write_photo(
     yaw, pitch, roll = (math.degrees(a) for a in gimbal_of_rotation(told.rotation))
     exif, xmp = exif_and_xmp(
         Metadata(
-            (picture.shape[1], picture.shape[0]), told.time, float(latitude), float(longitude),
-            float(height), yaw, pitch, roll, told.sigma_position,
+            (picture.shape[1], picture.shape[0]),
+            told.time,
+            float(latitude),
+            float(longitude),
+            float(height),
+            yaw,
+            pitch,
+            roll,
+            told.sigma_position,
         )
-    )  # fmt: skip
+    )
     good, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
     if not good:
         raise InputError(f"{path}: the picture cannot be encoded as JPEG")

@@ -27,8 +27,11 @@ from heliotrope.mechanism.tracking import Status, track
 
 #: Deviations of mechanisms that were roughly adjusted, standard deviations in rad.
 ADJUSTED: Mapping[str, float] = {
-    "tilt_north": 1e-3, "tilt_east": 1e-3, "azimuth_bias": 2e-3, "elevation_bias": 2e-3,
-}  # fmt: skip
+    "tilt_north": 1e-3,
+    "tilt_east": 1e-3,
+    "azimuth_bias": 2e-3,
+    "elevation_bias": 2e-3,
+}
 
 
 @dataclass(frozen=True)
@@ -213,15 +216,23 @@ def fly(
         for k, (time, place) in enumerate(zip(times, places, strict=True))
     ]
     return Flight(
-        camera, heliostats, as_float(counts), standing(really, counts), shapes,
-        tuple(p[0] for p in pairs), tuple(p[1] for p in pairs),
-    )  # fmt: skip
+        camera,
+        heliostats,
+        as_float(counts),
+        standing(really, counts),
+        shapes,
+        tuple(p[0] for p in pairs),
+        tuple(p[1] for p in pairs),
+    )
 
 
 def install(
-    heliostats: Heliostats, rows: npt.ArrayLike, errors: Errors, focal: npt.ArrayLike = np.inf,
+    heliostats: Heliostats,
+    rows: npt.ArrayLike,
+    errors: Errors,
+    focal: npt.ArrayLike = np.inf,
     seed: int = 0,
-) -> Installed:  # fmt: skip
+) -> Installed:
     """Return some heliostats of a field as they really are.
 
     Parameters
@@ -243,9 +254,12 @@ def install(
 
 
 def _shape(
-    heliostats: Heliostats, row: int, focal: npt.ArrayLike, wrong: Errors,
+    heliostats: Heliostats,
+    row: int,
+    focal: npt.ArrayLike,
+    wrong: Errors,
     rng: np.random.Generator,
-) -> MirrorShape:  # fmt: skip
+) -> MirrorShape:
     shape = ideal(heliostats, row, focal)
     if wrong.slope <= 0.0:
         return shape
@@ -263,9 +277,13 @@ def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) 
 
 
 def _photograph(
-    name: str, time: datetime, place: FloatArray, focus: FloatArray, wrong: Errors,
+    name: str,
+    time: datetime,
+    place: FloatArray,
+    focus: FloatArray,
+    wrong: Errors,
     rng: np.random.Generator,
-) -> tuple[Photo, Photo]:  # fmt: skip
+) -> tuple[Photo, Photo]:
     """Return a photograph as it was taken and as the drone tells it."""
     # The drone steers by its own RTK: what it believes is where it was sent.
     true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
@@ -292,10 +310,15 @@ def exact_reflections(flight: Flight) -> Reflections:
         if len(seen):
             parts.append(
                 reflections(
-                    seen.position, row, seen.facet, seen.xy, camera[seen.position],
-                    led[seen.position], 1e-9,
+                    seen.position,
+                    row,
+                    seen.facet,
+                    seen.xy,
+                    camera[seen.position],
+                    led[seen.position],
+                    1e-9,
                 )
-            )  # fmt: skip
+            )
     found = join(parts)
     return found.take(np.lexsort((found.heliostat, found.photo)))
 
@@ -327,6 +350,10 @@ def reflections_of(
     off = (told - true).mean(axis=0) if corrected and len(told) else np.zeros(3)
     camera = told[exact.photo] - off
     return replace(
-        exact, x=noisy[:, 0], y=noisy[:, 1], camera=camera, led=camera + exact.led - exact.camera,
+        exact,
+        x=noisy[:, 0],
+        y=noisy[:, 1],
+        camera=camera,
+        led=camera + exact.led - exact.camera,
         sigma=np.full(len(exact), max(wrong.reflection, 1e-6)),
-    )  # fmt: skip
+    )

@@ -153,9 +153,14 @@ def scene(shape: MirrorShape, conditions: Conditions, seed: int) -> Scene:
     lamp_off = c.budget.lamp * rng.standard_normal(3)
     xy = seen.xy + c.reflection * rng.standard_normal(seen.xy.shape)
     found = reflections(
-        seen.position, 0, seen.facet, xy, (camera + off)[seen.position],
-        (led + off + lamp_off)[seen.position], max(c.reflection, 1e-6),
-    )  # fmt: skip
+        seen.position,
+        0,
+        seen.facet,
+        xy,
+        (camera + off)[seen.position],
+        (led + off + lamp_off)[seen.position],
+        max(c.reflection, 1e-6),
+    )
     return Scene(real, true, vertex, told, told_vertex, found)
 
 

@@ -233,9 +233,25 @@ def _covariance(hessian, sigma, gradient, factor, step, out):
 
 @njit(**OPTIONS)
 def fit_block(
-    arrays, codes, sigma, offsets, data, loss, rounds, limit, lowest_scale,
-    x, covariance, scales, squares, costs, iterations, status, start, stop,
-):  # fmt: skip
+    arrays,
+    codes,
+    sigma,
+    offsets,
+    data,
+    loss,
+    rounds,
+    limit,
+    lowest_scale,
+    x,
+    covariance,
+    scales,
+    squares,
+    costs,
+    iterations,
+    status,
+    start,
+    stop,
+):
     """Fit heliostats ``start`` to ``stop``.
 
     ``offsets`` (N + 1,) are the sightings of each, ``rounds`` how often the scale of the

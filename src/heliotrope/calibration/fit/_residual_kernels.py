@@ -107,9 +107,21 @@ def place_mechanism(base, codes, sigma, y, scratch):
     apply_parameters(codes, x, position_, origins_, angles_, drives_, vertex_, normal)
     zero, frames, screw_axes, screw_points, n, m = pose
     chain_pose(
-        position_, orientation, axes, origins_, angles_, driven, zero, vertex_, normal,
-        frames, screw_axes, screw_points, n, m,
-    )  # fmt: skip
+        position_,
+        orientation,
+        axes,
+        origins_,
+        angles_,
+        driven,
+        zero,
+        vertex_,
+        normal,
+        frames,
+        screw_axes,
+        screw_points,
+        n,
+        m,
+    )
     for p in range(codes.shape[0]):
         _twist(codes, p, sigma[p], driven, pose, twists, places)
     one = driven[0]

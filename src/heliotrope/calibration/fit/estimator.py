@@ -150,14 +150,8 @@ def fit(
     UnknownNameError
         If the model or one of its parameters is not known.
     """
-    if len(mechanism.shape) != 1:
-        raise InputError(f"fit: mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+    _check_rows(mechanism, sightings)
     count, rows = len(mechanism), len(sightings)
-    if rows and int(sightings.heliostat.max()) >= count:
-        raise InputError(
-            f"fit: a sighting is of heliostat row {int(sightings.heliostat.max())}; there are "
-            f"{count} heliostats"
-        )
     names = parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
     sigma = _priors(mechanism, names, priors or {})
     used = np.ones(rows, dtype=np.bool_) if keep is None else np.asarray(keep, dtype=np.bool_)
@@ -188,18 +182,43 @@ def fit(
     arrays = started.kernel_arrays
     run_blocks(
         lambda a, b: kernels.fit_block(
-            arrays, codes, sigma, offsets, data, _LOSSES[loss], 4 if adapt_scale else 0,
-            max_iterations, 1e-3, result.values, result.covariance, result.scale, squares, costs,
-            result.iterations, result.outcome, a, b,
+            arrays,
+            codes,
+            sigma,
+            offsets,
+            data,
+            _LOSSES[loss],
+            4 if adapt_scale else 0,
+            max_iterations,
+            1e-3,
+            result.values,
+            result.covariance,
+            result.scale,
+            squares,
+            costs,
+            result.iterations,
+            result.outcome,
+            a,
+            b,
         ),
         count,
         minimum_rows=2,
-    )  # fmt: skip
+    )
     # The prior stands around the start: a zero that is off by a radian is a wrong entry,
     # not an improbable installation.
     result.values[:] += begin
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
     return result
+
+
+def _check_rows(mechanism: Mechanism, sightings: Sightings) -> None:
+    if len(mechanism.shape) != 1:
+        raise InputError(f"fit: mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+    if len(sightings) and int(sightings.heliostat.max()) >= len(mechanism):
+        raise InputError(
+            f"fit: a sighting is of heliostat row {int(sightings.heliostat.max())}; there are "
+            f"{len(mechanism)} heliostats"
+        )
 
 
 def _priors(
@@ -225,8 +244,11 @@ def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
         # Unknown times are alike.
         alike &= ~(key[order[1:]] != key[order[:-1]]) | np.isnan(key[order[1:]].astype(float))
     if alike.any():
-        more = (*s.source_covariance.reshape(len(s), -1).T,
-                *s.destination_covariance.reshape(len(s), -1).T, s.sigma)  # fmt: skip
+        more = (
+            *s.source_covariance.reshape(len(s), -1).T,
+            *s.destination_covariance.reshape(len(s), -1).T,
+            s.sigma,
+        )
         order = np.lexsort((*more, *s.destination.T, *s.source.T, *s.counts.T, *first[1:]))
     return order
 
@@ -237,15 +259,24 @@ def _data(s: Sightings, vertex: FloatArray, keep: npt.NDArray[np.bool_]) -> tupl
     if len(s):
         axes, whiten = whitening(s, vertex)
     return (
-        s.counts, s.source, s.source_at_infinity, s.destination, s.destination_at_infinity, axes,
-        whiten, keep,
-    )  # fmt: skip
+        s.counts,
+        s.source,
+        s.source_at_infinity,
+        s.destination,
+        s.destination_at_infinity,
+        axes,
+        whiten,
+        keep,
+    )
 
 
 def _far_starts(
-    mechanism: Mechanism, s: Sightings, used: npt.NDArray[np.bool_], pose: Pose,
+    mechanism: Mechanism,
+    s: Sightings,
+    used: npt.NDArray[np.bool_],
+    pose: Pose,
     names: tuple[str, ...],
-) -> FloatArray:  # fmt: skip
+) -> FloatArray:
     """Starting values: zero, but zeros and strokes where the nominal ones are far off.
 
     Each sighting says at which joint angles the nominal axes would produce it. Against
@@ -269,13 +300,15 @@ def _far_starts(
         found = [
             [
                 _regress(
-                    Drive(mechanism.drives.table[i, d]), s.counts[part, d],
-                    solved.angles[:, branch, d], stroke is not None,
+                    Drive(mechanism.drives.table[i, d]),
+                    s.counts[part, d],
+                    solved.angles[:, branch, d],
+                    stroke is not None,
                 )
                 for d, (_, stroke) in enumerate(places)
             ]
             for branch in (0, 1)
-        ]  # fmt: skip
+        ]
         # Both joints are on the same branch; the wrong one is off by half a turn.
         scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in found]
         for (zero, stroke), (_, shift, longer) in zip(

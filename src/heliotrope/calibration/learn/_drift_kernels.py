@@ -21,9 +21,22 @@ from heliotrope.jit import OPTIONS
 
 @njit(**OPTIONS)
 def gram(
-    first, first_time, first_regime, first_epoch, second, second_time, second_regime,
-    second_epoch, same, static, regime, step, part, amplitude, tau,
-):  # fmt: skip
+    first,
+    first_time,
+    first_regime,
+    first_epoch,
+    second,
+    second_time,
+    second_regime,
+    second_epoch,
+    same,
+    static,
+    regime,
+    step,
+    part,
+    amplitude,
+    tau,
+):
     """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
 
     ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) theirs;
@@ -61,7 +74,7 @@ def gram(
 @njit(**OPTIONS)
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
-):  # fmt: skip
+):
     """As `gram` of the same rows, half of it mirrored; fills ``decay`` (n, n, G) up to i = j.
 
     Processes of one group have one time, so that one exponential serves them all. What shares
@@ -101,7 +114,7 @@ def _decaying_gram(
 @njit(**OPTIONS)
 def cost_and_gradient(
     jacobian, time, label, epoch, residual, static, regime, step, part, group, amplitude, tau, noise
-):  # fmt: skip
+):
     """Negative log likelihood and its gradient by log (noise, amplitudes (C,), times (G,)).
 
     ``group`` (C,) says which of the G times a process has; ``tau`` is (G,).
@@ -143,16 +156,43 @@ def cost_and_gradient(
 
 @njit(**OPTIONS)
 def pooled_block(
-    jacobian, time, label, epoch, residual, offsets, static, regime, step, part, group, amplitude,
-    tau, noise, costs, gradients, start, stop,
-):  # fmt: skip
+    jacobian,
+    time,
+    label,
+    epoch,
+    residual,
+    offsets,
+    static,
+    regime,
+    step,
+    part,
+    group,
+    amplitude,
+    tau,
+    noise,
+    costs,
+    gradients,
+    start,
+    stop,
+):
     """Cost and gradient of heliostats ``start`` to ``stop``, one a row."""
     for i in range(start, stop):
         a, b = offsets[i], offsets[i + 1]
         cost, gradient = cost_and_gradient(
-            jacobian[a:b], time[a:b], label[a:b], epoch[a:b], residual[a:b], static[i], regime,
-            step, part, group, amplitude, tau, noise,
-        )  # fmt: skip
+            jacobian[a:b],
+            time[a:b],
+            label[a:b],
+            epoch[a:b],
+            residual[a:b],
+            static[i],
+            regime,
+            step,
+            part,
+            group,
+            amplitude,
+            tau,
+            noise,
+        )
         costs[i] = cost
         gradients[i] = gradient
 

@@ -161,9 +161,13 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
 
 
 def _one(
-    name: str, i: int, count: int, learned: Learned, found: Prediction,
+    name: str,
+    i: int,
+    count: int,
+    learned: Learned,
+    found: Prediction,
     rows: npt.NDArray[np.intp],
-) -> HeliostatFigures:  # fmt: skip
+) -> HeliostatFigures:
     mine = learned.sightings.heliostat == i
     beam = found.errors.beam[rows]
     return HeliostatFigures(

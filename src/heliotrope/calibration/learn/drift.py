@@ -283,10 +283,22 @@ def _gram(hyper: Hyperparameters, a: Linear, b: Linear | None = None) -> FloatAr
     other = a if b is None else b
     tau = hyper.tau[hyper.group]
     found: FloatArray = kernels.gram(
-        a.jacobian, a.time, a.regime, a.epoch, other.jacobian, other.time, other.regime,
-        other.epoch, b is None, a.spread(hyper) ** 2, hyper.regime**2, hyper.step**2,
-        hyper.part, hyper.amplitude, tau,
-    )  # fmt: skip
+        a.jacobian,
+        a.time,
+        a.regime,
+        a.epoch,
+        other.jacobian,
+        other.time,
+        other.regime,
+        other.epoch,
+        b is None,
+        a.spread(hyper) ** 2,
+        hyper.regime**2,
+        hyper.step**2,
+        hyper.part,
+        hyper.amplitude,
+        tau,
+    )
     return found
 
 
@@ -344,9 +356,12 @@ def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperp
 
 
 def _search(
-    hyper: Hyperparameters, field: Sequence[Linear], centre: FloatArray, spread: FloatArray,
+    hyper: Hyperparameters,
+    field: Sequence[Linear],
+    centre: FloatArray,
+    spread: FloatArray,
     iterations: int,
-) -> tuple[Hyperparameters, float]:  # fmt: skip
+) -> tuple[Hyperparameters, float]:
     rows = [d for d in field if len(d)]
     if not rows:
         return hyper, 0.0
@@ -364,13 +379,28 @@ def _search(
         h = hyper.with_vector(vector)
         run_blocks(
             lambda a, b: kernels.pooled_block(
-                jacobian, time, label, epoch, rest, offsets, static, regime, hyper.step**2, part,
+                jacobian,
+                time,
+                label,
+                epoch,
+                rest,
+                offsets,
+                static,
+                regime,
+                hyper.step**2,
+                part,
                 group,
-                h.amplitude, h.tau, h.noise, costs, gradients, a, b,
+                h.amplitude,
+                h.tau,
+                h.noise,
+                costs,
+                gradients,
+                a,
+                b,
             ),
             len(rows),
             minimum_rows=2,
-        )  # fmt: skip
+        )
         stray = (vector - centre) / spread
         total = float(costs.sum() + 0.5 * stray @ stray)
         slope = gradients.sum(axis=0) + stray / spread

@@ -467,10 +467,12 @@ class Part:
 
 #: Learns a list of (mechanism, sightings, used, task, hyper), on whatever machines.
 Runner = Callable[
-    [list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
-     Progress | None],
+    [
+        list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
+        Progress | None,
+    ],
     list[Part],
-]  # fmt: skip
+]
 
 
 def learn_part(
@@ -494,9 +496,12 @@ def learn_part(
 
 
 def _cut(
-    mechanism: Mechanism, sightings: Sightings, used: npt.NDArray[np.bool_], task: Task,
+    mechanism: Mechanism,
+    sightings: Sightings,
+    used: npt.NDArray[np.bool_],
+    task: Task,
     rows: npt.NDArray[np.intp],
-) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:  # fmt: skip
+) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:
     """The part of a field with heliostats ``rows``, renumbered, and its sightings' places."""
     place = np.full(len(mechanism), -1)
     place[rows] = np.arange(len(rows))
@@ -507,10 +512,14 @@ def _cut(
 
 
 def _join(
-    mechanism: Mechanism, sightings: Sightings, used: npt.NDArray[np.bool_],
-    model: tuple[str, ...], hyper: Hyperparameters,
-    pieces: list[npt.NDArray[np.intp]], parts: list[Part],
-) -> Learned:  # fmt: skip
+    mechanism: Mechanism,
+    sightings: Sightings,
+    used: npt.NDArray[np.bool_],
+    model: tuple[str, ...],
+    hyper: Hyperparameters,
+    pieces: list[npt.NDArray[np.intp]],
+    parts: list[Part],
+) -> Learned:
     regime = np.full(len(sightings), -1)
     outlier = np.zeros(len(sightings), dtype=np.bool_)
     lengths = np.full(len(sightings), np.nan)

@@ -111,9 +111,12 @@ class _Exchange:
     """The chosen beams, and what each heliostat's are worth together."""
 
     def __init__(
-        self, covariance: FloatArray, form: FloatArray, options: Sequence[Option],
+        self,
+        covariance: FloatArray,
+        form: FloatArray,
+        options: Sequence[Option],
         chosen: Sequence[Sequence[int]],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.form, self.options = form, options
         self.chosen = [list(rows) for rows in chosen]
         self.information = np.linalg.inv(covariance)

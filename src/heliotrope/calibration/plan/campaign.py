@@ -222,9 +222,15 @@ def campaign(
     if len(drives) != 1:
         raise InputError("campaign: mechanisms with different numbers of drives; plan each alone")
     work = _Work(
-        tuple(fleets), site, tuple(targets), timing or Timing(), limits or Limits(),
-        ahead, worth, count,
-    )  # fmt: skip
+        tuple(fleets),
+        site,
+        tuple(targets),
+        timing or Timing(),
+        limits or Limits(),
+        ahead,
+        worth,
+        count,
+    )
     cells, slots = _cells(work, start, stop, every)
     done = 0
     for begin, day in groupby(cells, key=lambda cell: cell[0]):
@@ -282,9 +288,16 @@ class _Work:
     """The state of a campaign: covariances in scaled parameters, padded to the largest P."""
 
     def __init__(
-        self, fleets: tuple[Fleet, ...], site: Site, targets: tuple[Target, ...],
-        timing: Timing, limits: Limits, ahead: bool, worth: float, count: int | None,
-    ) -> None:  # fmt: skip
+        self,
+        fleets: tuple[Fleet, ...],
+        site: Site,
+        targets: tuple[Target, ...],
+        timing: Timing,
+        limits: Limits,
+        ahead: bool,
+        worth: float,
+        count: int | None,
+    ) -> None:
         self.fleets, self.site, self.targets = fleets, site, targets
         self.timing, self.limits = timing, limits
         self.ahead, self.worth, self.limit = ahead, worth, count
@@ -325,9 +338,13 @@ class _Work:
         seconds[able] = (np.abs(aimed.counts - stand) / speed)[able].max(axis=-1)
         slope = np.zeros((len(able), 2, self.form.shape[-1]))
         slope[able, :, :p] = sighting_jacobian(
-            some[np.flatnonzero(able)], aimed.counts[able],
-            np.broadcast_to(sun, (int(able.sum()), 3)), target, fleet.names, fleet.sigma,
-        )  # fmt: skip
+            some[np.flatnonzero(able)],
+            aimed.counts[able],
+            np.broadcast_to(sun, (int(able.sum()), 3)),
+            target,
+            fleet.names,
+            fleet.sigma,
+        )
         part = slice(self.offsets[k] + rows.start, self.offsets[k] + rows.stop)
         return _View(able, slope * self.scale[part, None], seconds, aimed.counts)
 
@@ -355,8 +372,9 @@ class _Work:
             some = cells[first : first + look]
             suns = [solar.vector(c + self._shift, self.site) for c in some]
             views = [[self.field_view(s[len(s) // 2], t) for t in self.targets] for s in suns]
-            options = [self._option(v, len(c)) for c, row in zip(some, views, strict=True)
-                       for v in row]  # fmt: skip
+            options = [
+                self._option(v, len(c)) for c, row in zip(some, views, strict=True) for v in row
+            ]
             wanted: list[list[int] | None] = [None] * len(options)
             if self.ahead:
                 left = None if self.limit is None else self.limit - len(self.rows)
@@ -365,8 +383,9 @@ class _Work:
                 wanted[:] = _allocation.exchanged(known, form, options, first_choice)
             for n, arrivals in enumerate(some):
                 places = range(n * len(self.targets), (n + 1) * len(self.targets))
-                queues = [_Queue(self, views[n][o - places[0]], options[o], wanted[o])
-                          for o in places]  # fmt: skip
+                queues = [
+                    _Queue(self, views[n][o - places[0]], options[o], wanted[o]) for o in places
+                ]
                 self._cell(begin, arrivals, suns[n], queues)
                 yield arrivals
 
@@ -426,9 +445,20 @@ class _Work:
         self.version[i] += 1
         self.free[i] = done + way
         time = arrive + self._shift
-        self.rows.append((arrive - way, arrive, time, done, done + way, i, j, own.counts[0],
-                          float(np.sqrt(self.square[i])),
-                          float(np.sqrt(self.square.sum() / self.counted))))  # fmt: skip
+        self.rows.append(
+            (
+                arrive - way,
+                arrive,
+                time,
+                done,
+                done + way,
+                i,
+                j,
+                own.counts[0],
+                float(np.sqrt(self.square[i])),
+                float(np.sqrt(self.square.sum() / self.counted)),
+            )
+        )
 
     def result(self, slots: int, drives: int) -> Campaign:
         """The schedule as arrays."""
@@ -438,12 +468,20 @@ class _Work:
             return np.array(columns[k], dtype=np.float64)
 
         return Campaign(
-            leave=numbers(0), arrive=numbers(1), time=numbers(2), done=numbers(3),
-            back=numbers(4), heliostat=np.array(columns[5], dtype=np.intp),
-            target=np.array(columns[6], dtype=np.intp), counts=numbers(7).reshape(-1, drives),
-            heliostat_error=numbers(8), error=numbers(9), before=self.before,
-            expected=np.asarray(np.sqrt(self.square)), slots=slots,
-        )  # fmt: skip
+            leave=numbers(0),
+            arrive=numbers(1),
+            time=numbers(2),
+            done=numbers(3),
+            back=numbers(4),
+            heliostat=np.array(columns[5], dtype=np.intp),
+            target=np.array(columns[6], dtype=np.intp),
+            counts=numbers(7).reshape(-1, drives),
+            heliostat_error=numbers(8),
+            error=numbers(9),
+            before=self.before,
+            expected=np.asarray(np.sqrt(self.square)),
+            slots=slots,
+        )
 
 
 class _Queue:

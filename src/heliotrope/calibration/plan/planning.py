@@ -104,9 +104,9 @@ class Candidates:
             index = index.astype(np.intp)
         whole = ("names", "targets")
         return replace(
-            self, **{f.name: getattr(self, f.name)[index] for f in fields(self)
-                     if f.name not in whole},
-        )  # fmt: skip
+            self,
+            **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in whole},
+        )
 
     def of(self, heliostat: int) -> "Candidates":
         """Return those of one heliostat."""
@@ -219,11 +219,21 @@ def candidates(
     spread = np.broadcast_to(as_float(sigma), (len(mechanism),))
     step = max(1, CHUNK // max(1, len(moments)))
     parts = [
-        _part(mechanism, first, min(first + step, len(mechanism)), k, target, moments, suns,
-              names, spread, bounds)
+        _part(
+            mechanism,
+            first,
+            min(first + step, len(mechanism)),
+            k,
+            target,
+            moments,
+            suns,
+            names,
+            spread,
+            bounds,
+        )
         for first in range(0, len(mechanism), step)
         for k, target in enumerate(targets)
-    ]  # fmt: skip
+    ]
     joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     order = np.lexsort((joined[2], joined[1], joined[0]))
     labels = tuple(t.name for t in targets)
@@ -231,9 +241,17 @@ def candidates(
 
 
 def _part(
-    mechanism: Mechanism, first: int, last: int, k: int, target: Target, moments: FloatArray,
-    suns: FloatArray, names: tuple[str, ...], sigma: FloatArray, limits: Limits,
-) -> tuple[np.ndarray, ...]:  # fmt: skip
+    mechanism: Mechanism,
+    first: int,
+    last: int,
+    k: int,
+    target: Target,
+    moments: FloatArray,
+    suns: FloatArray,
+    names: tuple[str, ...],
+    sigma: FloatArray,
+    limits: Limits,
+) -> tuple[np.ndarray, ...]:
     """The arrays of :class:`Candidates` for some heliostats and one target."""
     some = mechanism[first:last]
     aimed = aim_at(some, suns[:, None], target, limits)
@@ -241,10 +259,16 @@ def _part(
     counts = aimed.counts[which, row]
     slope = sighting_jacobian(some[row], counts, suns[which], target, names, sigma[first + row])
     return (
-        (first + row).astype(np.intp), np.full(len(row), k, dtype=np.intp), moments[which],
-        suns[which], counts, aimed.normal[which, row], aimed.incidence[which, row],
-        aimed.obliquity[which, row], slope,
-    )  # fmt: skip
+        (first + row).astype(np.intp),
+        np.full(len(row), k, dtype=np.intp),
+        moments[which],
+        suns[which],
+        counts,
+        aimed.normal[which, row],
+        aimed.incidence[which, row],
+        aimed.obliquity[which, row],
+        slope,
+    )
 
 
 def sighting_jacobian(

@@ -152,10 +152,21 @@ def plan_picture(plans: Mapping[str, Plan], possible: Candidates) -> "Figure":
         if len(plans) == 1:
             _ranks(left, azimuth, elevation, plan)
         steps = np.arange(len(plan) + 1)
-        right.plot(steps, 1e3 * np.append(plan.before, plan.error), "o-", ms=4, color=colour,
-                   label=f"{name}, in order of time")  # fmt: skip
-        right.plot(steps, 1e3 * np.append(plan.before, plan.best_first), ":", color=colour,
-                   label=f"{name}, best first")  # fmt: skip
+        right.plot(
+            steps,
+            1e3 * np.append(plan.before, plan.error),
+            "o-",
+            ms=4,
+            color=colour,
+            label=f"{name}, in order of time",
+        )
+        right.plot(
+            steps,
+            1e3 * np.append(plan.before, plan.best_first),
+            ":",
+            color=colour,
+            label=f"{name}, best first",
+        )
     left.set_xlabel("azimuth of the sun, ° clockwise from north")
     left.set_ylabel("elevation, °")
     right.set_xlabel("measurements made")
@@ -174,8 +185,9 @@ def _sun_paths(ax: "Axes", possible: Candidates, centre: float) -> None:
         np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 3e4) + 1)
     ):
         azimuth, elevation = _place(sun[run], centre)
-        ax.plot(azimuth, elevation, ".-", ms=2, lw=0.5, color="#bbbbbb",
-                label="" if n else "possible")  # fmt: skip
+        ax.plot(
+            azimuth, elevation, ".-", ms=2, lw=0.5, color="#bbbbbb", label="" if n else "possible"
+        )
 
 
 def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Plan) -> None:
@@ -189,8 +201,13 @@ def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Plan) -
             if np.hypot(azimuth[k] - azimuth[first], elevation[k] - elevation[first]) < 4.0
         ]
         text = ", ".join(str(r) for r in sorted(plan.rank[near]))
-        ax.annotate(text, (azimuth[first], elevation[first]), xytext=(5, 5),
-                    textcoords="offset points", fontsize=8)  # fmt: skip
+        ax.annotate(
+            text,
+            (azimuth[first], elevation[first]),
+            xytext=(5, 5),
+            textcoords="offset points",
+            fontsize=8,
+        )
         left = [k for k in left if k not in near]
 
 
@@ -219,8 +236,12 @@ def campaign_picture(found: Campaign, position: FloatArray, targets: Sequence[st
     left.set_xlabel("east, m")
     left.set_ylabel("north, m")
     hours = (found.time - found.time[0]) / 3600.0 if len(found) else np.empty(0)
-    right.plot(hours, 1e3 * found.error, color=_COLOURS[0],
-               label=f"{len(found):,} measurements on {', '.join(targets)}")  # fmt: skip
+    right.plot(
+        hours,
+        1e3 * found.error,
+        color=_COLOURS[0],
+        label=f"{len(found):,} measurements on {', '.join(targets)}",
+    )
     right.set_xlabel("hours since the first measurement")
     right.set_ylabel("expected beam error of the field, mrad RMS")
     if len(found) and found.before > 10.0 * found.error[-1]:

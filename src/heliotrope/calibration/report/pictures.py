@@ -68,17 +68,25 @@ def field_map(result: "Result") -> "Figure":
         size = 45.0 if known.sum() < 200 else 8.0
         top = max(float(np.percentile(values[known], 95)), 1e-6)
         dots = ax.scatter(
-            places[known, 0], places[known, 1], c=values[known], s=size, cmap="cividis",
-            vmin=0.0, vmax=top,
-        )  # fmt: skip
+            places[known, 0],
+            places[known, 1],
+            c=values[known],
+            s=size,
+            cmap="cividis",
+            vmin=0.0,
+            vmax=top,
+        )
         figure.colorbar(dots, label="median beam error after, mrad", extend="max")
         if known.sum() <= 60:
             for i in np.flatnonzero(known):
                 where = (float(places[i, 0]), float(places[i, 1]))
                 ax.annotate(
-                    result.names[i], where, xytext=(3, 3), textcoords="offset points",
+                    result.names[i],
+                    where,
+                    xytext=(3, 3),
+                    textcoords="offset points",
                     fontsize=6,
-                )  # fmt: skip
+                )
     for target in result.targets:
         ax.plot(*target[:2], "k^", ms=7)
     ax.set_aspect("equal", adjustable="datalim")
@@ -152,9 +160,12 @@ def _target(ax: "Axes", groups: list[tuple[FloatArray, str, str]], title: str) -
 
 
 def _residual(
-    ax: "Axes", x: FloatArray, beam: FloatArray,
-    groups: list[tuple[npt.NDArray[np.bool_], str, str]], label: str,
-) -> None:  # fmt: skip
+    ax: "Axes",
+    x: FloatArray,
+    beam: FloatArray,
+    groups: list[tuple[npt.NDArray[np.bool_], str, str]],
+    label: str,
+) -> None:
     good = np.zeros(len(x), dtype=np.bool_)
     for mask, colour, name in groups:
         good |= mask & (name != "outliers")
@@ -170,9 +181,12 @@ def _residual(
 
 
 def _in_time(
-    ax: "Axes", result: "Result", i: int, mine: npt.NDArray[np.intp],
+    ax: "Axes",
+    result: "Result",
+    i: int,
+    mine: npt.NDArray[np.intp],
     groups: list[tuple[npt.NDArray[np.bool_], str, str]],
-) -> None:  # fmt: skip
+) -> None:
     seconds = result.learned.sightings.time[mine]
     known = np.isfinite(seconds)
     if not known.any():
@@ -195,9 +209,14 @@ def _year(ax: "Axes", result: "Result", i: int) -> None:
     shown = 1e3 * found.rms
     if np.isfinite(shown).any():
         mesh = ax.pcolormesh(
-            np.degrees(found.hour), np.degrees(found.declination), shown, cmap="cividis",
-            vmin=0.0, vmax=float(np.nanpercentile(shown, 98)), rasterized=True,
-        )  # fmt: skip
+            np.degrees(found.hour),
+            np.degrees(found.declination),
+            shown,
+            cmap="cividis",
+            vmin=0.0,
+            vmax=float(np.nanpercentile(shown, 98)),
+            rasterized=True,
+        )
         ax.figure.colorbar(mesh, ax=ax, label="expected beam error, mrad RMS")
     ax.set_title("over the year, without new sightings", fontsize=10)
     ax.set_xlabel("hour angle, ° (afternoon positive)")

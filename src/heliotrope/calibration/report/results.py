@@ -92,10 +92,15 @@ def at_moment(names: tuple[str, ...], learned: Learned, time: float | None = Non
     rows = np.arange(len(names))
     values, spread = learned.parameters_at(rows, np.full(len(names), when))
     return Results(
-        learned.model, learned.names, names, when, values, spread,
+        learned.model,
+        learned.names,
+        names,
+        when,
+        values,
+        spread,
         np.array([m.hyper.noise for m in learned.members]),
         np.array([len(m.data) for m in learned.members]),
-    )  # fmt: skip
+    )
 
 
 def write_json(

@@ -104,17 +104,27 @@ class FlightFolder:
 
 
 def open_flight(
-    folder: Path, field: Path, camera: Path | None, commands: Path | None, cluster: str,
-    point: str, focal: float | None,
-) -> FlightFolder:  # fmt: skip
+    folder: Path,
+    field: Path,
+    camera: Path | None,
+    commands: Path | None,
+    cluster: str,
+    point: str,
+    focal: float | None,
+) -> FlightFolder:
     """Return the photographs of a folder with the field, the camera and the commands."""
     return _flight(folder, open_plant(field), camera, commands, cluster, point, focal)
 
 
 def open_campaign(
-    folder: Path, field: Path, camera: Path | None, commands: Path | None, cluster: str,
-    point: str, focal: float | None,
-) -> tuple[list[FlightFolder], list[str]]:  # fmt: skip
+    folder: Path,
+    field: Path,
+    camera: Path | None,
+    commands: Path | None,
+    cluster: str,
+    point: str,
+    focal: float | None,
+) -> tuple[list[FlightFolder], list[str]]:
     """Return the flights of a folder, and a line for each that cannot be used.
 
     A folder without photographs whose subfolders have some is a campaign. A subfolder holds its
@@ -161,9 +171,14 @@ def _has_photos(folder: Path) -> bool:
 
 
 def _flight(
-    folder: Path, plant: "Plant", camera: Path | None, commands: Path | None, cluster: str,
-    point: str, focal: float | None,
-) -> FlightFolder:  # fmt: skip
+    folder: Path,
+    plant: "Plant",
+    camera: Path | None,
+    commands: Path | None,
+    cluster: str,
+    point: str,
+    focal: float | None,
+) -> FlightFolder:
     import numpy as np
 
     from heliotrope.airborne.photo import read_camera, read_photos
@@ -190,9 +205,15 @@ def _flight(
             "evaluate the groups one by one, each with a table of its own commands"
         )
     return FlightFolder(
-        plant, photos, problems, lens, join_standing(parts), np.concatenate(values),
-        np.concatenate(order), np.inf if focal is None else focal,
-    )  # fmt: skip
+        plant,
+        photos,
+        problems,
+        lens,
+        join_standing(parts),
+        np.concatenate(values),
+        np.concatenate(order),
+        np.inf if focal is None else focal,
+    )
 
 
 def read_flight(
@@ -204,7 +225,11 @@ def read_flight(
     what = f"reading {flight.name}".strip()
     with shared.connected(scheduler) as client, shared.progress(what, quiet) as advance:
         return read_many(
-            flight.photos, flight.camera, flight.stand,
-            processes=processes or len(os.sched_getaffinity(0)), client=client, keep=keep,
+            flight.photos,
+            flight.camera,
+            flight.stand,
+            processes=processes or len(os.sched_getaffinity(0)),
+            client=client,
+            keep=keep,
             progress=advance,
-        )  # fmt: skip
+        )

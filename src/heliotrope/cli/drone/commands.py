@@ -7,8 +7,9 @@ from heliotrope.cli.drone.plan import plan
 from heliotrope.cli.drone.rtk import rtk
 from heliotrope.cli.drone.simulate import simulate
 
-app = typer.Typer(help="Measure a field with a drone, its lamp and its camera.",
-                  no_args_is_help=True)  # fmt: skip
+app = typer.Typer(
+    help="Measure a field with a drone, its lamp and its camera.", no_args_is_help=True
+)
 
 
 @app.callback()

@@ -75,9 +75,16 @@ def evaluate(
     for flight, shapes in zip(flights, surfaces, strict=True):
         seen = shared.read_flight(flight, out / "photographs", processes, scheduler, as_json)
         poses.append(
-            Pose(flight.name, flight.photos, seen, flight.camera, flight.stand, flight.heliostat,
-                 shapes.__getitem__)
-        )  # fmt: skip
+            Pose(
+                flight.name,
+                flight.photos,
+                seen,
+                flight.camera,
+                flight.stand,
+                flight.heliostat,
+                shapes.__getitem__,
+            )
+        )
     _tell(problems)
     for flight in flights:
         _tell(flight.problems, flight.name)
@@ -124,9 +131,11 @@ def _far_off(found: "Campaign", prior: float) -> list[str]:
 
 
 def _measure(
-    flights: list[shared.FlightFolder], surfaces: "list[list[MirrorShape]]", found: "Campaign",
+    flights: list[shared.FlightFolder],
+    surfaces: "list[list[MirrorShape]]",
+    found: "Campaign",
     budget: "Budget",
-) -> list[_Measured]:  # fmt: skip
+) -> list[_Measured]:
     from heliotrope.airborne.evaluate.orientation import measure_field
 
     measured = []
@@ -135,9 +144,14 @@ def _measure(
             continue
         # Where the mirrors stand is known from the photographs, and how well.
         orientations = measure_field(
-            one.reflections, flight.stand.names, shapes.__getitem__, flight.stand.rotation,
-            one.stand.vertex, budget=budget, places=one.place_covariance,
-        )  # fmt: skip
+            one.reflections,
+            flight.stand.names,
+            shapes.__getitem__,
+            flight.stand.rotation,
+            one.stand.vertex,
+            budget=budget,
+            places=one.place_covariance,
+        )
         measured.append(_Measured(flight, one, shapes, orientations, budget))
     return measured
 
@@ -211,9 +225,11 @@ def _sightings(one: _Measured) -> "Sightings":
 
     times = [p.time.timestamp() for p in one.found.photos if p.time is not None]
     made = to_sightings(
-        one.orientations, one.flight.counts, time=float(np.mean(times)) if times else 0.0,
+        one.orientations,
+        one.flight.counts,
+        time=float(np.mean(times)) if times else 0.0,
         per="orientation",
-    )  # fmt: skip
+    )
     return replace(made, heliostat=one.flight.heliostat[made.heliostat])
 
 
@@ -224,10 +240,16 @@ def _report(
 
     notes = (f"{_offset(found)}.", *not_used)
     flown = [
-        Flown(f.flight.name, f.orientations, f.surfaces.__getitem__, f.found.stand.vertex,
-              f.budget, f.found.place_covariance)
+        Flown(
+            f.flight.name,
+            f.orientations,
+            f.surfaces.__getitem__,
+            f.found.stand.vertex,
+            f.budget,
+            f.found.place_covariance,
+        )
         for f in measured
-    ]  # fmt: skip
+    ]
     with calibration.progress("drawing", quiet) as advance:
         write_campaign_report(flown, out, notes=notes, progress=advance)
 
@@ -286,8 +308,10 @@ def _show(measured: list[_Measured], found: "Campaign", out: Path, given: int) -
     mirrors = sum(len(s.mirror) for m in measured for s in m.found.seen)
     reflections = sum(len(m.found.reflections) for m in measured)
     flights = f"{len(measured)} of {len(found.flights)} flights, " if len(found.flights) > 1 else ""
-    print(f"{flights}{used} of {given} photographs used, {mirrors} pictures of mirrors, "
-          f"{reflections} reflections")  # fmt: skip
+    print(
+        f"{flights}{used} of {given} photographs used, {mirrors} pictures of mirrors, "
+        f"{reflections} reflections"
+    )
     print(_offset(found))
     _show_orientations(measured, out)
     warned = [
@@ -309,8 +333,9 @@ def _show(measured: list[_Measured], found: "Campaign", out: Path, given: int) -
 def _show_orientations(measured: list[_Measured], out: Path) -> None:
     from heliotrope.airborne.evaluate.report import orientation_rows
 
-    rows = [(_full(m, r["heliostat"]), r) for m in measured
-            for r in orientation_rows(m.orientations)]  # fmt: skip
+    rows = [
+        (_full(m, r["heliostat"]), r) for m in measured for r in orientation_rows(m.orientations)
+    ]
     names = ("rot", "sigma_mean", "sigma_tot")
     body = [
         [name, str(row["points"]), str(row["outliers"])]
@@ -318,8 +343,19 @@ def _show_orientations(measured: list[_Measured], out: Path) -> None:
         for name, row in rows[:40]
     ]
     print_table(
-        ["heliostat", "points", "outliers", "rotX", "rotY", "σ_mean X", "σ_mean Y", "σ_tot X",
-         "σ_tot Y"], body, "Orientation less command, mrad",
-    )  # fmt: skip
+        [
+            "heliostat",
+            "points",
+            "outliers",
+            "rotX",
+            "rotY",
+            "σ_mean X",
+            "σ_mean Y",
+            "σ_tot X",
+            "σ_tot Y",
+        ],
+        body,
+        "Orientation less command, mrad",
+    )
     if len(rows) > 40:
         print(f"and {len(rows) - 40} more in {out / 'orientations.csv'}")

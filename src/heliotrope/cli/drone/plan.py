@@ -92,13 +92,18 @@ def plan(
         view=float(np.radians(view_deg)),
         model=model,
         sampling=Sampling(
-            distance=distance, pointing=1e-3 * pointing_mrad, samples=samples,
+            distance=distance,
+            pointing=1e-3 * pointing_mrad,
+            samples=samples,
             focal=np.inf if facet_focal is None else facet_focal,
-            led_offset=parse_point(led, "--led"), least_spacing=least_spacing,
+            led_offset=parse_point(led, "--led"),
+            least_spacing=least_spacing,
         ),
         choosing=Choosing(points, criterion, 1e-3 * sigma_mrad, float(low), float(high)),
         craft=Craft(
-            drones, speed, photo=parse_duration(photo).total_seconds(),
+            drones,
+            speed,
+            photo=parse_duration(photo).total_seconds(),
             endurance=parse_duration(endurance).total_seconds(),
             change=parse_duration(change).total_seconds(),
         ),
@@ -106,7 +111,7 @@ def plan(
         home=place if home is None else np.array(parse_point(home, "--home")),
         hours_a_day=hours_a_day,
         photo_minutes=target_minutes,
-    )  # fmt: skip
+    )
     _check_aircraft(aircraft)
     with progress("choosing directions", as_json) as step:
         made = plan_flight(plant, wishes, step)

@@ -57,9 +57,10 @@ def rtk(
         for k, axis in enumerate(("east", "north", "up"))
     ]
     print_table(
-        ["axis", "common offset", "± of it", "σ of one", "of that photogrammetry"], rows,
+        ["axis", "common offset", "± of it", "σ of one", "of that photogrammetry"],
+        rows,
         f"RTK less photogrammetry, {len(check.names)} photographs, mm",
-    )  # fmt: skip
+    )
     body = [
         [axis, *(f"{1e6 * v:.1f}" for v in row)]
         for axis, row in zip(("east", "north", "up"), check.covariance, strict=True)

@@ -105,10 +105,15 @@ class _Drawing:
     seed: int
 
     def draw(
-        self, mirrors: "Heliostats", counts: "FloatArray", pattern: "FloatArray",
-        middle: "FloatArray", folder: Path, installed: "Installed | None" = None,
+        self,
+        mirrors: "Heliostats",
+        counts: "FloatArray",
+        pattern: "FloatArray",
+        middle: "FloatArray",
+        folder: Path,
+        installed: "Installed | None" = None,
         flight: int = 0,
-    ) -> int:  # fmt: skip
+    ) -> int:
         """Render one flight into a folder; returns the number of photographs."""
         from datetime import UTC, datetime, timedelta
 
@@ -116,16 +121,28 @@ class _Drawing:
         from heliotrope.airborne.simulate.simulation import fly
 
         flown = fly(
-            mirrors, self.camera, counts, pattern, middle, errors=self.errors, focal=self.focal,
+            mirrors,
+            self.camera,
+            counts,
+            pattern,
+            middle,
+            errors=self.errors,
+            focal=self.focal,
             start=datetime(2026, 6, 21, 10, tzinfo=UTC) + timedelta(minutes=20 * flight),
-            seed=self.seed, installed=installed, flight=flight,
-        )  # fmt: skip
+            seed=self.seed,
+            installed=installed,
+            flight=flight,
+        )
         origin = (self.site.latitude_deg, self.site.longitude_deg, self.site.height)
         with calibration.progress(f"rendering {folder.name}", False) as advance:
             render_flight(
-                flown, folder, origin, conditions=self.light, seed=self.seed + 1000 * flight,
+                flown,
+                folder,
+                origin,
+                conditions=self.light,
+                seed=self.seed + 1000 * flight,
                 progress=advance,
-            )  # fmt: skip
+            )
         _write_truth(folder / "truth", flown)
         return len(flown.taken)
 
@@ -152,9 +169,14 @@ def _campaign(
             mirrors, station.heliostats, drawing.errors, drawing.focal, drawing.seed
         )
         photographs += drawing.draw(
-            mirrors.take(station.heliostats), station.counts, station.pattern, station.middle,
-            folder / station.name, installed, k,
-        )  # fmt: skip
+            mirrors.take(station.heliostats),
+            station.counts,
+            station.pattern,
+            station.middle,
+            folder / station.name,
+            installed,
+            k,
+        )
     print(f"{photographs} photographs in {len(chosen)} flights: {folder}")
     print(f"truth of each (orientations.csv, photographs.csv, slopes): {folder}/*/truth")
 

@@ -92,9 +92,13 @@ class Shown:
         except ImportError as error:
             raise _missing(error) from None
         return ConsoleSettings(
-            host=self.host, port=self.port, names=self.names, certificate=self.certificate,
-            key=self.key, plain=self.plain,
-        )  # fmt: skip
+            host=self.host,
+            port=self.port,
+            names=self.names,
+            certificate=self.certificate,
+            key=self.key,
+            plain=self.plain,
+        )
 
 
 def load_console(shown: Shown) -> None:
@@ -188,7 +192,7 @@ async def archive(live: AtWork, shown: Shown) -> AsyncIterator[None]:
             flags = frame.flags.astype(np.uint16)
             kept.take(
                 frame.at, Look(frame.state, frame.fault, flags, frame.counts, as_float(frame.age))
-            )  # fmt: skip
+            )
             await asyncio.sleep(5.0)
 
     try:

@@ -179,10 +179,19 @@ def run(
     if field is not None and heliostats is not None:
         raise InputError("run: --heliostats is for the default plant; leave it out with a field")
     shown = Shown(
-        host=host, port=port, names=tuple(name or ()), certificate=certificate, key=key,
-        plain=plain, console=not no_console, browser=not no_browser, data=data,
-        database=database, minutes=minutes, every=every,
-    )  # fmt: skip
+        host=host,
+        port=port,
+        names=tuple(name or ()),
+        certificate=certificate,
+        key=key,
+        plain=plain,
+        console=not no_console,
+        browser=not no_browser,
+        data=data,
+        database=database,
+        minutes=minutes,
+        every=every,
+    )
     if clusters is None:
         if configure or check:
             raise InputError("run: --configure and --check need a real plant; give --clusters")
@@ -190,9 +199,14 @@ def run(
         from heliotrope.cli.run.simulated import Choice, run_plant
 
         choice = Choice(
-            speed=speed, start=_start(start, design), seed=seed, exact=exact, idle=bool(idle),
-            gain=gain, boards=prototype,
-        )  # fmt: skip
+            speed=speed,
+            start=_start(start, design),
+            seed=seed,
+            exact=exact,
+            idle=bool(idle),
+            gain=gain,
+            boards=prototype,
+        )
         run_plant(design, choice, shown)
         return
     if field is None:

@@ -105,27 +105,38 @@ def _machine(design: Plant) -> "Machine":
 
 
 async def _run(
-    design: Plant, choice: RealChoice, shown: Shown, links: "PlantLinks",
+    design: Plant,
+    choice: RealChoice,
+    shown: Shown,
+    links: "PlantLinks",
     machine: "Machine | None",
-) -> None:  # fmt: skip
+) -> None:
     ending = ending_at_signals()
     print(f"{design.name}: {len(design):,} heliostats", flush=True)
     load_console(shown)
     with store(shown) as keeper:
         clock = SystemClock()
         live = RealPlant(
-            design, links, clock, KeptAudit(keeper, clock, clock.utc()), records=keeper,
-            assigned=KeptPoints(keeper), machine=machine, by_gain=choice.gain,
+            design,
+            links,
+            clock,
+            KeptAudit(keeper, clock, clock.utc()),
+            records=keeper,
+            assigned=KeptPoints(keeper),
+            machine=machine,
+            by_gain=choice.gain,
             cameras=_cameras(design, choice, shown, clock),
             # What a person gives to the automatic work is calibrated too.
             work=WorkSettings(wanted=not choice.idle),
-        )  # fmt: skip
+        )
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
         server = console_of(live, keeper, shown)
         async with (
-            live.running(), archive(live, shown), console(server, live, keeper, shown) as seen,
-        ):  # fmt: skip
+            live.running(),
+            archive(live, shown),
+            console(server, live, keeper, shown) as seen,
+        ):
             await watch(live, shown, ending, seen=seen)
             if not await stow(live, ending):
                 print(live.left(), flush=True)

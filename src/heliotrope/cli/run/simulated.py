@@ -52,15 +52,20 @@ async def _run(design: Plant, choice: Choice, shown: Shown) -> None:
     clock = VirtualClock(loop.time, choice.start)
     with store(shown) as keeper:
         live = LivePlant(
-            design, clock, _options(choice), records=keeper,
-            audit=KeptAudit(keeper, SystemClock(), clock.utc()), assigned=KeptPoints(keeper),
+            design,
+            clock,
+            _options(choice),
+            records=keeper,
+            audit=KeptAudit(keeper, SystemClock(), clock.utc()),
+            assigned=KeptPoints(keeper),
             extra=lambda: {"lag": loop.lag, "speed": loop.speed},
-        )  # fmt: skip
+        )
         server = console_of(live, keeper, shown)
         async with (
-            live.running(), archive(live, shown),
+            live.running(),
+            archive(live, shown),
             console(server, live, keeper, shown, choice.speed) as seen,
-        ):  # fmt: skip
+        ):
             await watch(live, shown, ending, seen=seen, speed=choice.speed)
             await stow(live, ending)
             await live.end()
@@ -69,7 +74,9 @@ async def _run(design: Plant, choice: Choice, shown: Shown) -> None:
 
 def _options(choice: Choice) -> LiveOptions:
     return LiveOptions(
-        seed=choice.seed, rendered=not choice.exact,
-        boards=choice.boards, plain=not choice.gain,
+        seed=choice.seed,
+        rendered=not choice.exact,
+        boards=choice.boards,
+        plain=not choice.gain,
         work=WorkSettings(wanted=not choice.idle, calibrate=not choice.idle),
-    )  # fmt: skip
+    )

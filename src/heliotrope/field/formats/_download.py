@@ -288,9 +288,11 @@ def _attempt(job: Job, channel: Channel) -> bool:
         _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
         start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
         said = Entry(
-            response.headers.get("etag", ""), response.headers.get("last-modified", ""),
-            _whole(response), done=False,
-        )  # fmt: skip
+            response.headers.get("etag", ""),
+            response.headers.get("last-modified", ""),
+            _whole(response),
+            done=False,
+        )
         # A part would mean that the file that is there is older than what the entry says.
         same = entry is None or (entry.etag, entry.modified) == (said.etag, said.modified)
         if have == said.size >= 0 and same and not job.part.exists():

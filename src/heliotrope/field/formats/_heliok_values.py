@@ -60,9 +60,10 @@ class Values:
         found = list(element.elements(tag))
         if len(found) != 1:
             raise self.error(
-                element, f"<{element.tag}> {element.get('name') or ''} has {len(found)} elements "
-                f"<{tag}>; it needs one"
-            )  # fmt: skip
+                element,
+                f"<{element.tag}> {element.get('name') or ''} has {len(found)} elements "
+                f"<{tag}>; it needs one",
+            )
         return found[0]
 
     def lengths(self, element: Element, attribute: str, count: int) -> FloatArray:
@@ -83,23 +84,26 @@ class Values:
         parts = self.text(element, attribute).split(",")
         if len(parts) != count:
             raise self.error(
-                element, f"<{element.tag}> {attribute} has {len(parts)} numbers; it needs {count}, "
-                "separated by commas"
-            )  # fmt: skip
+                element,
+                f"<{element.tag}> {attribute} has {len(parts)} numbers; it needs {count}, "
+                "separated by commas",
+            )
         numbers = np.empty(count)
         for i, part in enumerate(parts):
             match = _NUMBER.fullmatch(part)
             value = math.nan if match is None else float(match[1])
             if match is None or not math.isfinite(value):
                 raise self.error(
-                    element, f"<{element.tag}> {attribute}: {part.strip()!r} is not a finite "
-                    "number; write it with digits and a point"
-                )  # fmt: skip
+                    element,
+                    f"<{element.tag}> {attribute}: {part.strip()!r} is not a finite "
+                    "number; write it with digits and a point",
+                )
             if match[2] is not None and match[2] not in units:
                 known = ", ".join(units) or "none"
                 raise self.error(
-                    element, f"<{element.tag}> {attribute}: unit {match[2]!r} is not known here; "
-                    f"known: {known}"
-                )  # fmt: skip
+                    element,
+                    f"<{element.tag}> {attribute}: unit {match[2]!r} is not known here; "
+                    f"known: {known}",
+                )
             numbers[i] = value * (unit if match[2] is None else units[match[2]])
         return numbers

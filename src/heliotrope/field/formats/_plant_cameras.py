@@ -15,9 +15,14 @@ def build_mark(table: MarkTable) -> Mark:
     if stroke is None:
         stroke = 0.2 * table.size_m if table.kind in ("corner", "tee") else 0.0
     return Mark(
-        table.name, table.kind, np.array(table.at_m), table.size_m, stroke,
-        float(np.radians(table.turn_deg)), table.code,
-    )  # fmt: skip
+        table.name,
+        table.kind,
+        np.array(table.at_m),
+        table.size_m,
+        stroke,
+        float(np.radians(table.turn_deg)),
+        table.code,
+    )
 
 
 def mark_document(mark: Mark) -> dict[str, Any]:

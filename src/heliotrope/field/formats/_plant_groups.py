@@ -26,16 +26,23 @@ from heliotrope.sun import Site
 
 # Numbers of a drive as the writer names them; "rate" and its like have no unit in the
 # name because it depends on the kind.
-_RAW = {**{n: i for n, i in SLOTS.items() if n != "initial_angle"},
-        "kind": slot.KIND, "sense": slot.SENSE}  # fmt: skip
+_RAW = {
+    **{n: i for n, i in SLOTS.items() if n != "initial_angle"},
+    "kind": slot.KIND,
+    "sense": slot.SENSE,
+}
 _XYZ = "xyz"
 _POSITION = ("east_m", "north_m", "up_m")
 
 
 def build_group(
-    path: Path, name: str, group: GroupTable, table: HeliostatTable,
-    rows: npt.NDArray[np.intp], site: Site,
-) -> Heliostats:  # fmt: skip
+    path: Path,
+    name: str,
+    group: GroupTable,
+    table: HeliostatTable,
+    rows: npt.NDArray[np.intp],
+    site: Site,
+) -> Heliostats:
     """Return the heliostats of one group.
 
     Raises
@@ -71,9 +78,13 @@ class _Reader:
     """Numbers of one group, from the TOML or, where it has such a column, from the table."""
 
     def __init__(
-        self, path: Path, name: str, group: GroupTable, table: HeliostatTable,
+        self,
+        path: Path,
+        name: str,
+        group: GroupTable,
+        table: HeliostatTable,
         rows: npt.NDArray[np.intp],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.path, self.name, self.group, self.table, self.rows = path, name, group, table, rows
 
     def fail(self, problem: str, where: str = "") -> FormatError:
@@ -88,9 +99,11 @@ class _Reader:
         if np.isnan(column).any():
             i = int(self.rows[np.flatnonzero(np.isnan(column))[0]])
             raise FormatError(
-                self.table.path, f"heliostat {self.table.name[i]}: the cell is empty, but others "
-                f"of group {self.name} have a value; fill it", f"line {i + 2}, column {key}",
-            )  # fmt: skip
+                self.table.path,
+                f"heliostat {self.table.name[i]}: the cell is empty, but others "
+                f"of group {self.name} have a value; fill it",
+                f"line {i + 2}, column {key}",
+            )
         return column
 
     def number(self, key: str, given: float | None) -> FloatArray | None:
@@ -174,8 +187,13 @@ class _Reader:
             return drive_kinds.rotary(
                 values.pop("steps_per_turn"), values.pop("gear_ratio"), **values
             )
-        needed = ("increment_per_m", "initial_stroke_length_m", "offset_m", "pivot_radius_m",
-                  "initial_angle")  # fmt: skip
+        needed = (
+            "increment_per_m",
+            "initial_stroke_length_m",
+            "offset_m",
+            "pivot_radius_m",
+            "initial_angle",
+        )
         for key in needed:
             if key not in values:
                 raise self.fail(f"{key} is missing, here and as a column {where}.{key}", where)

@@ -22,8 +22,17 @@ KINDS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 
 #: Angles of a drive; each may be given with ``_deg``, ``_mrad`` or ``_rad``.
-DRIVE_ANGLES = ("zero", "initial_angle", "bias", "worm_cos", "worm_sin", "sag", "sag_phase",
-                "min_angle", "max_angle")  # fmt: skip
+DRIVE_ANGLES = (
+    "zero",
+    "initial_angle",
+    "bias",
+    "worm_cos",
+    "worm_sin",
+    "sag",
+    "sag_phase",
+    "min_angle",
+    "max_angle",
+)
 ANGLE_UNITS = {"deg": 0.017453292519943295, "mrad": 1e-3, "rad": 1.0}
 
 
@@ -195,17 +204,25 @@ def _drive(name: str, kind: str, **own: Any) -> type[BaseModel]:
 
 
 RotaryDrive = _drive(
-    "RotaryDrive", "rotary", steps_per_turn=(Positive, ...), gear_ratio=(Positive, ...),
-    microsteps=(Positive, 1.0), sense=(Literal[1, -1], 1),
-)  # fmt: skip
+    "RotaryDrive",
+    "rotary",
+    steps_per_turn=(Positive, ...),
+    gear_ratio=(Positive, ...),
+    microsteps=(Positive, 1.0),
+    sense=(Literal[1, -1], 1),
+)
 DirectDrive = _drive("DirectDrive", "direct")
 # The constants of a jack often differ from heliostat to heliostat, so that they may
 # stand in the table instead.
 LinearDrive = _drive(
-    "LinearDrive", "linear", increment_per_m=(Positive | None, None),
-    initial_stroke_length_m=(Positive | None, None), offset_m=(Positive | None, None),
-    pivot_radius_m=(Positive | None, None), clockwise=(Literal[0, 1], 1),
-)  # fmt: skip
+    "LinearDrive",
+    "linear",
+    increment_per_m=(Positive | None, None),
+    initial_stroke_length_m=(Positive | None, None),
+    offset_m=(Positive | None, None),
+    pivot_radius_m=(Positive | None, None),
+    clockwise=(Literal[0, 1], 1),
+)
 AnyDrive = Annotated[
     RotaryDrive | DirectDrive | LinearDrive | RawDrive,  # type: ignore[valid-type]
     Field(discriminator="kind"),

@@ -122,10 +122,11 @@ def _check_names(path: Path, names: Sequence[str], problems: list[FormatError]) 
         elif name in first:
             problems.append(
                 FormatError(
-                    path, f"heliostat {name} stands in line {first[name] + 2} already; "
-                    "names are unique", f"line {i + 2}",
+                    path,
+                    f"heliostat {name} stands in line {first[name] + 2} already; names are unique",
+                    f"line {i + 2}",
                 )
-            )  # fmt: skip
+            )
         else:
             first[name] = i
         if len(problems) >= MOST_PROBLEMS:

@@ -43,23 +43,31 @@ def volume_document(volume: Volume) -> dict[str, Any]:
     match volume:
         case Box():
             own = {
-                "kind": "box", "center_m": _numbers(volume.center),
-                "size_m": _numbers(volume.size), "azimuth_rad": volume.azimuth,
-            }  # fmt: skip
+                "kind": "box",
+                "center_m": _numbers(volume.center),
+                "size_m": _numbers(volume.size),
+                "azimuth_rad": volume.azimuth,
+            }
         case Sphere():
             own = {
-                "kind": "sphere", "center_m": _numbers(volume.center), "radius_m": volume.radius,
-            }  # fmt: skip
+                "kind": "sphere",
+                "center_m": _numbers(volume.center),
+                "radius_m": volume.radius,
+            }
         case Cylinder():
             own = {
-                "kind": "cylinder", "start_m": _numbers(volume.start),
-                "end_m": _numbers(volume.end), "radius_m": volume.radius,
-            }  # fmt: skip
+                "kind": "cylinder",
+                "start_m": _numbers(volume.start),
+                "end_m": _numbers(volume.end),
+                "radius_m": volume.radius,
+            }
         case Prism():
             own = {
-                "kind": "prism", "corners_m": _numbers(volume.corners),
-                "bottom_m": volume.bottom, "top_m": volume.top,
-            }  # fmt: skip
+                "kind": "prism",
+                "corners_m": _numbers(volume.corners),
+                "bottom_m": volume.bottom,
+                "top_m": volume.top,
+            }
     return {"name": volume.name, **own}
 
 

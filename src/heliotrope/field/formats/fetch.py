@@ -196,8 +196,12 @@ def fetch_heliostats(
                 raise UnknownNameError(what, one, known)
     return _run(
         lambda run: run.heliostats(names, kinds, images),
-        into, base_url, progress, client, settings,
-    )  # fmt: skip
+        into,
+        base_url,
+        progress,
+        client,
+        settings,
+    )
 
 
 def fetch_tower(
@@ -409,9 +413,11 @@ class _Run:
         name = unquote(urlsplit(url).path.rsplit("/", 1)[-1])
         if not _FILE.fullmatch(name) or name.endswith(".part"):
             raise FetchError(
-                _of(item.link.heliostat, f"{item.url}: the file's name {name!r} is not a plain "
-                    "one; refused")
-            )  # fmt: skip
+                _of(
+                    item.link.heliostat,
+                    f"{item.url}: the file's name {name!r} is not a plain one; refused",
+                )
+            )
         place = [item.link.heliostat, item.link.kind.capitalize(), name]
         parts = [part for part in place if part]
         size, checksum = asset.get("file:size"), str(asset.get("file:checksum", ""))

@@ -226,9 +226,10 @@ def _model(values: Values, element: Element, name: str) -> Model:
     normal = normalize(normal)
     if np.linalg.norm(np.cross(normal, secondary.direction)) < ALONG_LIMIT:
         raise values.error(
-            tracking, f"HeliostatKit {name}: the normal lies along the secondary axis, which "
-            "then cannot turn it"
-        )  # fmt: skip
+            tracking,
+            f"HeliostatKit {name}: the normal lies along the secondary axis, which "
+            "then cannot turn it",
+        )
     return Model(
         name=name,
         primary=primary,
@@ -252,9 +253,10 @@ def _axis(values: Values, element: Element) -> Axis:
     stops = values.angles(element, "rotationAngles", 2)
     if stops[0] >= stops[1]:
         raise values.error(
-            element, f"<{element.tag}> rotationAngles {np.degrees(stops[0]):g}° to "
-            f"{np.degrees(stops[1]):g}°: the lower stop stands first; exchange them"
-        )  # fmt: skip
+            element,
+            f"<{element.tag}> rotationAngles {np.degrees(stops[0]):g}° to "
+            f"{np.degrees(stops[1]):g}°: the lower stop stands first; exchange them",
+        )
     return Axis(values.lengths(element, "translation", 3), normalize(along), stops)
 
 
@@ -263,9 +265,10 @@ def _facet(values: Values, element: Element, normal: FloatArray) -> Surface:
     away = np.degrees(angle_between(axes[:, 2], normal))
     if away > FACET_LIMIT_DEG:
         raise values.error(
-            element, f"<Facet> rotation: its normal stands {away:.0f}° from that of <Tracking>, "
-            f"which is more than {FACET_LIMIT_DEG:g}°; turn the facet"
-        )  # fmt: skip
+            element,
+            f"<Facet> rotation: its normal stands {away:.0f}° from that of <Tracking>, "
+            f"which is more than {FACET_LIMIT_DEG:g}°; turn the facet",
+        )
     return _surface(values, values.child(element, "ShapeKit"), center, axes)
 
 
@@ -311,10 +314,15 @@ def _kits(values: Values, node: Element, place: _Kit) -> Iterator[_Kit]:
         if child.tag == "Node":
             moved, turned = _place(values, child)
             yield from _kits(
-                values, child,
-                _Kit(child, (*place.path, child.get("name") or ""),
-                     place.position + place.axes @ moved, place.axes @ turned),
-            )  # fmt: skip
+                values,
+                child,
+                _Kit(
+                    child,
+                    (*place.path, child.get("name") or ""),
+                    place.position + place.axes @ moved,
+                    place.axes @ turned,
+                ),
+            )
         elif child.tag in {"HeliostatKit", "ShapeKit"}:
             yield _Kit(child, place.path, place.position, place.axes)
 
@@ -379,9 +387,11 @@ def site(document: Document, height: float) -> Site:
     location = values.child(values.child(document.root, "World"), "Location")
     longitude, latitude = (values.angles(location, n, 1)[0] for n in ("longitude", "latitude"))
     return Site(
-        float(np.degrees(latitude)), float(np.degrees(longitude)), height,
+        float(np.degrees(latitude)),
+        float(np.degrees(longitude)),
+        height,
         name=location.get("name") or "",
-    )  # fmt: skip
+    )
 
 
 def sun(document: Document) -> FloatArray:
@@ -472,9 +482,14 @@ def _target(surface: Surface, name: str) -> Target:
 
 def _receiver(surface: Surface, name: str) -> Receiver:
     return Receiver(
-        name, "planar", surface.center, surface.axes[:, 2], surface.width, surface.height,
+        name,
+        "planar",
+        surface.center,
+        surface.axes[:, 2],
+        surface.width,
+        surface.height,
         _corners(surface),
-    )  # fmt: skip
+    )
 
 
 def _group(placed: list[PlacedModel], upright: int) -> Heliostats:

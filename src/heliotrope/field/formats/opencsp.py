@@ -125,10 +125,11 @@ def read_field(path: str | Path) -> Field:
     if len(wrong):
         i = int(wrong[0])
         raise table.error(
-            i, "Num. Facets",
+            i,
+            "Num. Facets",
             f"heliostat {names[i]}: {facets[i]} facets are not {rows[i]} rows × {columns[i]} "
             "columns",
-        )  # fmt: skip
+        )
     return Field(
         names=names,
         location=np.stack([table.numbers(axis) for axis in "XYZ"], axis=-1),
@@ -178,9 +179,10 @@ class _Table:
         missing = [name for name in needed if name not in header]
         if missing:
             raise FormatError(
-                file, f"no column {', '.join(map(repr, missing))}; {what} has "
-                f"{', '.join(needed)}", "header",
-            )  # fmt: skip
+                file,
+                f"no column {', '.join(map(repr, missing))}; {what} has {', '.join(needed)}",
+                "header",
+            )
         if len(found) == 1:
             raise FormatError(file, f"there is no row below the header; {what} has some")
         for line, row in found[1:]:
@@ -221,9 +223,11 @@ class _Table:
                 raise self.error(i, column, f"a {what} without a name; give it one")
             if name in seen:
                 raise self.error(
-                    i, column, f"{what} {name}: the name is that of line {self.lines[seen[name]]} "
-                    "too; names are unique"
-                )  # fmt: skip
+                    i,
+                    column,
+                    f"{what} {name}: the name is that of line {self.lines[seen[name]]} "
+                    "too; names are unique",
+                )
             seen[name] = i
         return names
 
@@ -426,10 +430,16 @@ def _tables(heliostats: Heliostats) -> tuple[Field, FloatArray]:
     rows, columns = _grid(center[0])
     full = np.ones(count, dtype=np.int64)
     table = Field(
-        heliostats.names, pivot, full * center.shape[1], full * rows, full * columns,
+        heliostats.names,
+        pivot,
+        full * center.shape[1],
+        full * rows,
+        full * columns,
         pivot[:, 2] - mechanism.position[:, 2],
-        np.sum(mechanism.vertex * mechanism.normal, axis=-1), width, height,
-    )  # fmt: skip
+        np.sum(mechanism.vertex * mechanism.normal, axis=-1),
+        width,
+        height,
+    )
     return table, center
 
 

@@ -343,10 +343,12 @@ def to_heliostats(properties: Iterable[Properties], origin: Origin) -> Heliostat
     )
     translations = np.stack([p.translations for p in listed])
     mechanism = kinds.two_jacks(
-        position, drives,
-        joint_translation_1=translations[:, 0], joint_translation_2=translations[:, 1],
+        position,
+        drives,
+        joint_translation_1=translations[:, 0],
+        joint_translation_2=translations[:, 1],
         concentrator_translation=translations[:, 2],
-    )  # fmt: skip
+    )
     tilted = sorted({name for p in listed for name in p.tilts})
     mechanism = mechanism.with_parameters(
         {name: np.array([p.tilts.get(name, 0.0) for p in listed]) for name in tilted}
@@ -485,8 +487,11 @@ def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str
             )
     latitude, longitude, height = (float(v) for v in enu_to_geodetic(one.position, origin))
     chain: dict[str, object] = {"actuators": [_actuator(one.drives.table[k], k) for k in (0, 1)]}
-    for part, joint in (("joint_translation_{}_1", 2), ("joint_translation_{}_2", 3),
-                        ("concentrator_translation_{}", 5)):  # fmt: skip
+    for part, joint in (
+        ("joint_translation_{}_1", 2),
+        ("joint_translation_{}_2", 3),
+        ("concentrator_translation_{}", 5),
+    ):
         row = one.origins[joint] + (one.origins[0] if joint == 2 else 0.0)
         chain |= {part.format(axis): float(row[k]) for k, axis in enumerate("enu")}
     chain |= {

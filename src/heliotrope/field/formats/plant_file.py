@@ -6,10 +6,10 @@ column of its dotted name. Written files give every number with all its digits, 
 what is read again is the same plant.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from heliotrope.field.formats._plant_cameras import (
     mark_document,
 )
 from heliotrope.field.formats._plant_groups import build_group, group_document
-from heliotrope.field.formats._plant_models import PlantDocument, TargetTable
+from heliotrope.field.formats._plant_models import PlantDocument, ReceiverTable, TargetTable
 from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.plant import Plant
@@ -30,6 +30,9 @@ from heliotrope.files.documents import read_document
 from heliotrope.files.text import write_text
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.sun import Site
+
+Table = TypeVar("Table")
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,22 @@ def _models() -> list[Any]:
     from heliotrope.field.formats import _plant_models as models
 
     return [
-        models.PlantDocument, models.PlantTable, models.SiteTable, models.TargetTable,
-        models.MarkTable, models.ReceiverTable, models.CameraTable, models.GroupTable,
-        models.ChainTable, models.RotaryDrive, models.LinearDrive, models.BoxTable,
-        models.SphereTable, models.CylinderTable, models.PrismTable,
-    ]  # fmt: skip
+        models.PlantDocument,
+        models.PlantTable,
+        models.SiteTable,
+        models.TargetTable,
+        models.MarkTable,
+        models.ReceiverTable,
+        models.CameraTable,
+        models.GroupTable,
+        models.ChainTable,
+        models.RotaryDrive,
+        models.LinearDrive,
+        models.BoxTable,
+        models.SphereTable,
+        models.CylinderTable,
+        models.PrismTable,
+    ]
 
 
 _MODELS = _models()
@@ -82,11 +96,15 @@ def _assemble(
 ) -> Plant | None:
     """Build the plant; what is wrong is added to ``problems``."""
     site = Site(
-        document.site.latitude_deg, document.site.longitude_deg, document.site.height_m,
-        pressure=document.site.pressure_pa, temperature_c=document.site.temperature_c,
-        name=document.site.name, delta_t=document.site.delta_t_s,
-    )  # fmt: skip
-    groups, targets, receivers, cameras, keep_outs = {}, [], [], [], []
+        document.site.latitude_deg,
+        document.site.longitude_deg,
+        document.site.height_m,
+        pressure=document.site.pressure_pa,
+        temperature_c=document.site.temperature_c,
+        name=document.site.name,
+        delta_t=document.site.delta_t_s,
+    )
+    groups = {}
     for group in sorted(set(table.group) - set(document.groups)):
         known = ", ".join(document.groups)
         problems.append(
@@ -101,39 +119,58 @@ def _assemble(
             problems.append(error)
         except InputError as error:
             problems.append(FormatError(path, str(error), f"groups.{name}"))
-    for k, target in enumerate(document.targets):
-        try:
-            targets.append(_target(target))
-        except InputError as error:
-            problems.append(FormatError(path, str(error), f"targets[{k}]"))
-    for k, r in enumerate(document.receivers):
-        try:
-            corners = None if r.corners_m is None else np.array(r.corners_m)
-            receivers.append(
-                Receiver(r.name, r.kind, np.array(r.center_m), np.array(r.normal), r.width_m,
-                         r.height_m, corners, r.radius_m, r.opening_angle_rad)
-            )  # fmt: skip
-        except InputError as error:
-            problems.append(FormatError(path, str(error), f"receivers[{k}]"))
-    for k, camera in enumerate(document.cameras):
-        try:
-            cameras.append(build_camera(camera))
-        except InputError as error:
-            problems.append(FormatError(path, str(error), f"cameras[{k}]"))
-    for k, volume in enumerate(document.keep_out):
-        try:
-            keep_outs.append(build_volume(volume))
-        except InputError as error:
-            problems.append(FormatError(path, str(error), f"keep_out[{k}]"))
+    targets = _each(path, "targets", document.targets, _target, problems)
+    receivers = _each(path, "receivers", document.receivers, _receiver, problems)
+    cameras = _each(path, "cameras", document.cameras, build_camera, problems)
+    keep_outs = _each(path, "keep_out", document.keep_out, build_volume, problems)
     eyes = {name: np.array(point) for name, point in document.eyes_m.items()}
     if problems:
         return None
     try:
-        return Plant(document.plant.name, site, groups, tuple(targets), tuple(receivers),
-                     cameras=tuple(cameras), keep_outs=tuple(keep_outs), eyes=eyes)  # fmt: skip
+        return Plant(
+            document.plant.name,
+            site,
+            groups,
+            targets,
+            receivers,
+            cameras=cameras,
+            keep_outs=keep_outs,
+            eyes=eyes,
+        )
     except InputError as error:
         problems.append(FormatError(path, str(error)))
         return None
+
+
+def _each(
+    path: Path,
+    key: str,
+    tables: Sequence[Table],
+    build: Callable[[Table], Made],
+    problems: list[FormatError],
+) -> tuple[Made, ...]:
+    """Build one object from each table of an array; what is wrong is added to ``problems``."""
+    made = []
+    for k, table in enumerate(tables):
+        try:
+            made.append(build(table))
+        except InputError as error:
+            problems.append(FormatError(path, str(error), f"{key}[{k}]"))
+    return tuple(made)
+
+
+def _receiver(table: ReceiverTable) -> Receiver:
+    return Receiver(
+        table.name,
+        table.kind,
+        np.array(table.center_m),
+        np.array(table.normal),
+        table.width_m,
+        table.height_m,
+        None if table.corners_m is None else np.array(table.corners_m),
+        table.radius_m,
+        table.opening_angle_rad,
+    )
 
 
 def _target(table: TargetTable) -> Target:
@@ -161,8 +198,9 @@ def rectangle(center: FloatArray, width: float, height: float, facing: float) ->
     # Seen from the front, the right hand is a quarter turn back from where it faces.
     right = 0.5 * width * direction(facing - 0.5 * np.pi, 0.0)
     up = np.array([0.0, 0.0, 0.5 * height])
-    return np.stack([center - right + up, center + right + up, center + right - up,
-                     center - right - up])  # fmt: skip
+    return np.stack(
+        [center - right + up, center + right + up, center + right - up, center - right - up]
+    )
 
 
 def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"] = "csv") -> None:

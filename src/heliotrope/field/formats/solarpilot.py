@@ -125,10 +125,11 @@ def read_layout(path: str | Path) -> Layout:
     width = len(rows[0][1])
     if width not in WIDTHS:
         raise FormatError(
-            file, f"{width} columns; a layout has 14 (template, enabled, in layout, location, "
+            file,
+            f"{width} columns; a layout has 14 (template, enabled, in layout, location, "
             "focus, cant, aim), 12 (without the flags), 6 or 4 (up to the location)",
             f"line {rows[0][0]}",
-        )  # fmt: skip
+        )
     flags = WIDTHS[width]
     names = [_column_name(k) for k in range(14) if flags or k not in {1, 2}][:width]
     template = np.empty(len(rows), dtype=np.int64)
@@ -146,9 +147,14 @@ def read_layout(path: str | Path) -> Layout:
         start = 3 if flags else 1
         numbers[i, : width - start] = reader.numbers(start)
     return Layout(
-        template, switches[:, 0], switches[:, 1],
-        numbers[:, :3], numbers[:, 3:5], numbers[:, 5:8], numbers[:, 8:],
-    )  # fmt: skip
+        template,
+        switches[:, 0],
+        switches[:, 1],
+        numbers[:, :3],
+        numbers[:, 3:5],
+        numbers[:, 5:8],
+        numbers[:, 8:],
+    )
 
 
 def _column_name(k: int) -> str:
@@ -222,9 +228,10 @@ class _Row:
         value = _FLAGS.get(self.cells[k].lower())
         if value is None:
             raise self.error(
-                k, f"{self.cells[k]!r} is not 0 or 1; {len(self.cells)} columns begin with "
-                "template, enabled, in layout"
-            )  # fmt: skip
+                k,
+                f"{self.cells[k]!r} is not 0 or 1; {len(self.cells)} columns begin with "
+                "template, enabled, in layout",
+            )
         return value
 
     def numbers(self, start: int) -> list[float]:
@@ -390,11 +397,15 @@ def from_plant(plant: Plant) -> Layout:
         on = np.ones(count, dtype=np.bool_)
         parts.append(
             Layout(
-                np.full(count, number, dtype=np.int64), on, on,
-                heliostats.mechanism.armature.origin_1.copy(), missing[:, :2], missing,
+                np.full(count, number, dtype=np.int64),
+                on,
+                on,
+                heliostats.mechanism.armature.origin_1.copy(),
+                missing[:, :2],
+                missing,
                 missing if heliostats.aim is None else heliostats.aim,
             )
-        )  # fmt: skip
+        )
     if not parts:
         raise InputError(f"plant {plant.name!r}: it has no heliostats to lay out")
     return Layout(

@@ -41,9 +41,14 @@ NOTHING = Beyond(0.0, np.zeros(2), np.zeros(2))
 
 
 def beyond(
-    picture: Rectified, soft: Image, region: Mask, total: float, peak: float,
-    centroid: FloatArray, moments: FloatArray,
-) -> Beyond:  # fmt: skip
+    picture: Rectified,
+    soft: Image,
+    region: Mask,
+    total: float,
+    peak: float,
+    centroid: FloatArray,
+    moments: FloatArray,
+) -> Beyond:
     """Return what of a beam lies beyond the border of what is seen.
 
     Parameters

@@ -69,10 +69,16 @@ class Edge:
         step = self.step(x, y)
         half = 0.5 * max(float(np.ptp(x)), 1.0)
         return np.stack(
-            [step, step * x / half, step * y / half, bell * across, -bell,
-             -bell * far * self.breadth],
+            [
+                step,
+                step * x / half,
+                step * y / half,
+                bell * across,
+                -bell,
+                -bell * far * self.breadth,
+            ],
             axis=-1,
-        )  # fmt: skip
+        )
 
     def moved(self, numbers: FloatArray) -> "Edge":
         """Return where it is after a fit gave its six columns these numbers."""
@@ -81,9 +87,11 @@ class Edge:
             return self
         turn, shift, wider = np.clip(numbers[3:] / height, -_STEP, _STEP)
         return replace(
-            self, angle=self.angle + float(turn), offset=self.offset + float(shift),
+            self,
+            angle=self.angle + float(turn),
+            offset=self.offset + float(shift),
             breadth=float(np.clip(self.breadth * np.exp(wider), 0.3, 8.0)),
-        )  # fmt: skip
+        )
 
     def crosses(self, odd: Mask, paint: Mask, near: float = 6.0) -> bool:
         """Return whether something odd is near both of its ends, at the face's border."""
@@ -217,9 +225,13 @@ def _differences(
         x = far * cos - along * sin + 0.5 * (columns - 1)
         y = far * sin + along * cos + 0.5 * (rows - 1)
         seen = cv2.remap(
-            known, x.reshape(flat).astype(np.float32), y.reshape(flat).astype(np.float32),
-            cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"),
-        )  # fmt: skip
+            known,
+            x.reshape(flat).astype(np.float32),
+            y.reshape(flat).astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=float("nan"),
+        )
         return np.asarray(seen)
 
     return np.asarray(at(_ARM) - at(-_ARM))

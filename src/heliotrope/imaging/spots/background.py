@@ -188,10 +188,13 @@ class EmptyTarget:
         write_file(
             path,
             lambda stream: np.savez_compressed(
-                stream, reflectance=self.reflectance, weight=self.weight,
-                memory=np.float64(self.memory), targets=np.array(self.targets, dtype=np.str_),
+                stream,
+                reflectance=self.reflectance,
+                weight=self.weight,
+                memory=np.float64(self.memory),
+                targets=np.array(self.targets, dtype=np.str_),
             ),
-        )  # fmt: skip
+        )
 
     @staticmethod
     def load(path: str | Path) -> "EmptyTarget":
@@ -348,9 +351,14 @@ def _polynomials(shape: tuple[int, int], orders: tuple[int, int]) -> tuple[Float
 
 
 def _ridge(
-    A: FloatArray, b: FloatArray, variance: float, prior: FloatArray, evenness: int,
-    scale: float = 1.0, turns: int = 8,
-) -> tuple[FloatArray, FloatArray, float]:  # fmt: skip
+    A: FloatArray,
+    b: FloatArray,
+    variance: float,
+    prior: FloatArray,
+    evenness: int,
+    scale: float = 1.0,
+    turns: int = 8,
+) -> tuple[FloatArray, FloatArray, float]:
     """Numbers of greatest posterior probability and their covariance.
 
     The first numbers, up to ``evenness``, are those of smooth light. How smooth it is differs
@@ -427,16 +435,27 @@ def _fit(
     patch = _patch(np.where(grid.paint, left, 0.0), found.free)
     deviation = max(found.spread, float(np.sqrt(np.mean(left[found.free] ** 2))))
     numbers, covariance, _ = _ridge(
-        found.basis[found.free], grid.soft[found.free], patch * deviation**2, found.prior,
+        found.basis[found.free],
+        grid.soft[found.free],
+        patch * deviation**2,
+        found.prior,
         grid.basis.shape[-1],
-    )  # fmt: skip
+    )
     values = _upscaled(picture.shape, orders, numbers, found.edge) * pattern
     rough = picture.values - smooth(picture, picture.values, 1.0)
     noise = 1.4826 * float(np.median(np.abs(rough[picture.paint]))) * 1.05
     return Background(
-        values.astype(np.float32), deviation, noise, patch * area, found.basis, covariance,
-        _STRIDE, method, float(found.free.sum() / grid.paint.sum()), reflectance,
-    )  # fmt: skip
+        values.astype(np.float32),
+        deviation,
+        noise,
+        patch * area,
+        found.basis,
+        covariance,
+        _STRIDE,
+        method,
+        float(found.free.sum() / grid.paint.sum()),
+        reflectance,
+    )
 
 
 def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:

@@ -185,9 +185,13 @@ def _light(picture: Rectified, background: Background) -> Image:
 
 
 def _measure(
-    picture: Rectified, background: Background, light: Image,
-    soft: Image, core: Mask, tops: Image,
-) -> Spot:  # fmt: skip
+    picture: Rectified,
+    background: Background,
+    light: Image,
+    soft: Image,
+    core: Mask,
+    tops: Image,
+) -> Spot:
     """Return the moments of one beam and how certain they are."""
     import cv2
 
@@ -280,9 +284,14 @@ def _skewness(weight: FloatArray, x: FloatArray, y: FloatArray) -> float:
 
 
 def _from_background(
-    picture: Rectified, background: Background, region: Mask, box: tuple[slice, slice],
-    dx: FloatArray, dy: FloatArray, total: float,
-) -> FloatArray:  # fmt: skip
+    picture: Rectified,
+    background: Background,
+    region: Mask,
+    box: tuple[slice, slice],
+    dx: FloatArray,
+    dy: FloatArray,
+    total: float,
+) -> FloatArray:
     """Covariance of a centroid by the background's: of its fit, its remains, and noise.
 
     With light w = value − b, the centroid moves by −Σ (x − c) δb / Σ w.

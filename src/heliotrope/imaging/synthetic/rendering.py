@@ -328,9 +328,15 @@ def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
     per_electron = sensor.gain / sensor.electrons
     curve = _srgb(np.linspace(0.0, 1.0, 4096)) if sensor.srgb else np.empty(0)
     clipped = expose(
-        level.reshape(-1), noise, float(sensor.read_noise), per_electron, float(sensor.offset),
-        curve, 2**sensor.bits - 1, out.reshape(-1),
-    )  # fmt: skip
+        level.reshape(-1),
+        noise,
+        float(sensor.read_noise),
+        per_electron,
+        float(sensor.offset),
+        curve,
+        2**sensor.bits - 1,
+        out.reshape(-1),
+    )
     return out, clipped / level.size
 
 

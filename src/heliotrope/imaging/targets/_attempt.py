@@ -176,8 +176,14 @@ class Search:
             text = next(iter(vague.values()))
         return Attempt(
             None if text else view,
-            fine.places, tuple(used), fine.reasons, text, fine.looks, known, vague,
-        )  # fmt: skip
+            fine.places,
+            tuple(used),
+            fine.reasons,
+            text,
+            fine.looks,
+            known,
+            vague,
+        )
 
     def _locate(self, pixels: FloatArray, scales: FloatArray, search: float) -> _Seen:
         seen = _Seen({}, {}, {}, {})

@@ -138,9 +138,11 @@ class _Handler(BaseHTTPRequestHandler):
         if name not in self._state.names:
             raise InputError(f"nobody asked for point {name!r}")
         width, height = self._state.size
-        if not (isinstance(value, list) and len(value) == 2 and all(
-            isinstance(v, int | float) and not isinstance(v, bool) for v in value
-        )):  # fmt: skip
+        if not (
+            isinstance(value, list)
+            and len(value) == 2
+            and all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+        ):
             raise InputError(f"point {name}: give two numbers, pixels right and down")
         x, y = (float(v) for v in value)
         # NaN fails too.
@@ -209,9 +211,12 @@ def ask(
 
 
 def click_points(
-    target: Target, frame: Frame, given: Mapping[str, Pixel], title: str,
+    target: Target,
+    frame: Frame,
+    given: Mapping[str, Pixel],
+    title: str,
     announce: Callable[[str], None],
-) -> dict[str, Pixel]:  # fmt: skip
+) -> dict[str, Pixel]:
     """Ask a person in a browser for the points of a target that are not given yet.
 
     ``announce`` is told the page's address, on this machine alone.
@@ -237,9 +242,14 @@ def click_points(
 
 
 def _page(
-    nonce: str, title: str, places: Mapping[str, Pixel], given: Mapping[str, Pixel],
-    size: Sequence[int], fewest: int, aspect: float,
-) -> bytes:  # fmt: skip
+    nonce: str,
+    title: str,
+    places: Mapping[str, Pixel],
+    given: Mapping[str, Pixel],
+    size: Sequence[int],
+    fewest: int,
+    aspect: float,
+) -> bytes:
     data = {
         "title": title,
         "size": list(size),

@@ -86,9 +86,13 @@ def constellation(
     middle = np.array([drawn[w].middle for w in which])
     spread = np.array([drawn[w].covariance for w in which])
     return Constellation(
-        tuple(drawn), which, plane, plane + (turn @ middle[..., None])[..., 0],
-        turn @ spread @ np.swapaxes(turn, 1, 2), turn,
-    )  # fmt: skip
+        tuple(drawn),
+        which,
+        plane,
+        plane + (turn @ middle[..., None])[..., 0],
+        turn @ spread @ np.swapaxes(turn, 1, 2),
+        turn,
+    )
 
 
 def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool) -> Match | None:
@@ -158,9 +162,12 @@ def _lean(linear: FloatArray, up: FloatArray) -> FloatArray:
 
 
 def _gather(
-    seen: Candidates, marks: Constellation, guess: FloatArray, linear: FloatArray,
+    seen: Candidates,
+    marks: Constellation,
+    guess: FloatArray,
+    linear: FloatArray,
     slack: FloatArray,
-) -> Places:  # fmt: skip
+) -> Places:
     """Return for each guess (G, M, 2) and mark the nearest candidate that fits, or −1, (G, M)."""
     apart = np.linalg.norm(seen.middle[None, None] - guess[:, :, None], axis=-1)
     alike = seen.likeness.T[marks.which] > _RESEMBLES
@@ -198,9 +205,9 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
             return None
         guess = mapped(H, marks.middle)
         linear = scales(H, marks.middle)
-        size = np.sqrt(12.0 * np.trace(
-            linear @ marks.covariance @ np.swapaxes(linear, 1, 2), axis1=1, axis2=2
-        ))  # fmt: skip
+        size = np.sqrt(
+            12.0 * np.trace(linear @ marks.covariance @ np.swapaxes(linear, 1, 2), axis1=1, axis2=2)
+        )
         # An affine map bends by perspective.
         loose = 0.04 * float(np.ptp(guess, axis=0).max()) if len(held) < 5 else 0.0
         again = _gather(seen, marks, guess[None], linear[None], (_TIGHT * size + loose)[None])[0]

@@ -156,9 +156,13 @@ def _profiles(
     rays = (_RADII[:, None, None] * circle[None]).transpose(1, 0, 2).reshape(2, -1)
     places = (middle[:, :, None] + _roots(covariance) @ rays).astype(np.float32)
     seen = cv2.remap(
-        mask, np.ascontiguousarray(places[:, 0]), np.ascontiguousarray(places[:, 1]),
-        cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0,
-    )  # fmt: skip
+        mask,
+        np.ascontiguousarray(places[:, 0]),
+        np.ascontiguousarray(places[:, 1]),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
     # A ring stands for its area.
     weight = np.repeat(np.sqrt(_RADII), _TURNS)
     values = np.asarray(seen, dtype=np.float64).reshape(len(middle), -1)
@@ -229,9 +233,12 @@ def outlines(light: Lightened, ratio: float) -> Outlines:
     wide, high, area = stats[:, 2], stats[:, 3], stats[:, 4]
     most = max(mask.shape) // 3
     keep = (
-        (np.maximum(wide, high) >= 5) & (np.minimum(wide, high) >= 3) & (area >= 10)
-        & (wide <= most) & (high <= most)
-    )  # fmt: skip
+        (np.maximum(wide, high) >= 5)
+        & (np.minimum(wide, high) >= 3)
+        & (area >= 10)
+        & (wide <= most)
+        & (high <= most)
+    )
     keep[0] = False
     # Clutter has thousands of parts; marks are among the larger ones.
     numbers = np.flatnonzero(keep)
@@ -380,9 +387,13 @@ def find_pictures(
     lengths = np.array([mark.size for mark in marks])[which]
     linear = (side / lengths)[:, None, None] * np.diag([1.0, -1.0])
     return Candidates(
-        middle, (side**2 / 12.0)[:, None, None] * np.eye(2), likeness,
-        np.arange(len(table)), which, linear,
-    )  # fmt: skip
+        middle,
+        (side**2 / 12.0)[:, None, None] * np.eye(2),
+        likeness,
+        np.arange(len(table)),
+        which,
+        linear,
+    )
 
 
 def picture_drawings(marks: Sequence[Mark]) -> list[Drawing]:

@@ -329,9 +329,13 @@ class _Face:
         )
 
     def _matched(
-        self, seen: detection.Candidates, kept: list[int], drawn: list[detection.Drawing],
-        which: constellation.Places, upright: bool,
-    ) -> Iterator[Attempt]:  # fmt: skip
+        self,
+        seen: detection.Candidates,
+        kept: list[int],
+        drawn: list[detection.Drawing],
+        which: constellation.Places,
+        upright: bool,
+    ) -> Iterator[Attempt]:
         search = self.search
         self.shapes = max(self.shapes, len(seen.middle))
         marks = constellation.constellation(
@@ -359,9 +363,10 @@ class _Face:
             text = best.text or best.vague.get(target.name, "")
             view = None if text else best.view
             own = tuple(
-                _found_mark(search, best, k) for k, mark in enumerate(search.marks)
+                _found_mark(search, best, k)
+                for k, mark in enumerate(search.marks)
                 if any(_one(mark, m) for m in target.marks)
-            )  # fmt: skip
+            )
             results.append(FoundTarget(target, view is not None, text, own, view))
         return results
 

@@ -31,10 +31,18 @@ def _upright(mark: Mark) -> list[FloatArray]:
         half, stem = 0.5 * s, 0.5 * w
         return [
             np.array(
-                [(-half, 0), (half, 0), (half, -w), (stem, -w), (stem, -s), (-stem, -s),
-                 (-stem, -w), (-half, -w)]
+                [
+                    (-half, 0),
+                    (half, 0),
+                    (half, -w),
+                    (stem, -w),
+                    (stem, -s),
+                    (-stem, -s),
+                    (-stem, -w),
+                    (-half, -w),
+                ]
             )
-        ]  # fmt: skip
+        ]
     if mark.kind == "square":
         return [_box(-0.5 * s, -0.5 * s, 0.5 * s, 0.5 * s)]
     if mark.kind == "disc":

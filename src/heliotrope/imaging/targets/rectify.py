@@ -133,9 +133,11 @@ def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
         clipped = _resample(_at_least(part, limit), reduction, at, 255.0)
     height, width = brightness.shape
     inside = (
-        (places[..., 0] >= 0) & (places[..., 1] >= 0)
-        & (places[..., 0] <= width - 1) & (places[..., 1] <= height - 1)
-    )  # fmt: skip
+        (places[..., 0] >= 0)
+        & (places[..., 1] >= 0)
+        & (places[..., 0] <= width - 1)
+        & (places[..., 1] <= height - 1)
+    )
     surface = _drawn((int(rows), int(columns)), first, step, _outlines(face)) & inside
     marks = _drawn((int(rows), int(columns)), first, step, _prints(face))
     if marks.any():

@@ -303,9 +303,13 @@ def _basis(values: FloatArray, first: FloatArray, step: float) -> Values:
 
 
 def _sample(
-    grey: Image, pixel: FloatArray, scale: FloatArray, first: FloatArray, step: float,
+    grey: Image,
+    pixel: FloatArray,
+    scale: FloatArray,
+    first: FloatArray,
+    step: float,
     shape: tuple[int, int],
-) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:  # fmt: skip
+) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:
     """Return a frame on a grid of the plane, and which of it is in the frame, None for all.
 
     None if less than most of it is. What is finer than the grid is averaged first.
@@ -337,9 +341,12 @@ def _sample(
     # Pixel centres of a part reduced by k: (p − left + 0.5)/k − 0.5.
     at = (b - [left, top] + 0.5) / k - 0.5
     warped = cv2.warpAffine(
-        part, np.column_stack([A / k, at]), (columns, rows),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
+        part,
+        np.column_stack([A / k, at]),
+        (columns, rows),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
     inside = None
     if (low < 0.0).any() or (high > [width - 1, height - 1]).any():
         x = b[0] + A[0, 0] * np.arange(columns) + A[0, 1] * np.arange(rows)[:, None]
@@ -430,9 +437,15 @@ def _solve(basis: Values, weight: Values, samples: Values) -> tuple[FloatArray, 
 
 
 def _judged(
-    template: _Template, samples: Values, weight: Values, inside: Values, residual: Values,
-    numbers: FloatArray, place: FloatArray, scale: FloatArray,
-) -> Refined:  # fmt: skip
+    template: _Template,
+    samples: Values,
+    weight: Values,
+    inside: Values,
+    residual: Values,
+    numbers: FloatArray,
+    place: FloatArray,
+    scale: FloatArray,
+) -> Refined:
     """Covariance, contrast and the other measures of a mark that was found."""
     step, depth = template.step, float(numbers[3])
     weight = weight * inside

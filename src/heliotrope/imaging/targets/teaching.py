@@ -136,10 +136,18 @@ def known_points(target: Target) -> dict[str, FloatArray]:
 
 
 def teach(
-    plant: Plant, target: str, frame: Frame, given: Mapping[str, Pixel], *,
-    camera: str = "camera", wishes: Mapping[str, Wish] | None = None, wish: Wish | None = None,
-    sigma: float = 1.0, anew: bool = False, prefix: str = "mark",
-) -> Taught:  # fmt: skip
+    plant: Plant,
+    target: str,
+    frame: Frame,
+    given: Mapping[str, Pixel],
+    *,
+    camera: str = "camera",
+    wishes: Mapping[str, Wish] | None = None,
+    wish: Wish | None = None,
+    sigma: float = 1.0,
+    anew: bool = False,
+    prefix: str = "mark",
+) -> Taught:
     """Return the plant with marks on a target and with the camera that took a picture of it.
 
     Parameters
@@ -189,8 +197,10 @@ def teach(
     old = {mark.name: mark for mark in surface.marks}
     asked = {n: (wishes or {}).get(n, wish or Wish()) for n in named}
     drawn = [_drawing(name, point, asked[name], old.get(name)) for name, point in named.items()]
-    found = [TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
-             for n, x in zip(named, pixels, strict=True)]  # fmt: skip
+    found = [
+        TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
+        for n, x in zip(named, pixels, strict=True)
+    ]
     # Once more with the scale and turn of what was found: a hand's are off by some per cent.
     for search in (REACH, 0.25 * REACH):
         for k, mark in enumerate(drawn):
@@ -263,9 +273,10 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
         file = Path(folder) / mark.code
         if not file.is_file():
             raise FormatError(
-                file, f"there is no such picture of mark {mark.name}; copy it beside the plant "
-                "file, or teach the mark again (heliotrope camera teach)"
-            )  # fmt: skip
+                file,
+                f"there is no such picture of mark {mark.name}; copy it beside the plant "
+                "file, or teach the mark again (heliotrope camera teach)",
+            )
         grey = read_image(file).grey
         if grey.shape[0] != grey.shape[1]:
             raise FormatError(
@@ -376,9 +387,11 @@ def _refine(
     for trial in turned:
         found = refine(frame.grey, trial, here.pixel, scale, search)
         # A drawing brighter than its surroundings is no mark.
-        if found is not None and found.contrast <= CONTRAST and (
-            best is None or found.explained > best[0].explained
-        ):  # fmt: skip
+        if (
+            found is not None
+            and found.contrast <= CONTRAST
+            and (best is None or found.explained > best[0].explained)
+        ):
             best = found, trial
     if best is None or best[0].explained < EXPLAINED:
         share = "nothing" if best is None else f"{100 * max(best[0].explained, 0.0):.0f} %"
@@ -389,10 +402,14 @@ def _refine(
 
 
 def _picture(
-    frame: Frame, here: TaughtPoint, point: FloatArray, size: float,
-    view: tuple[FloatArray, FloatArray], prefix: str,
+    frame: Frame,
+    here: TaughtPoint,
+    point: FloatArray,
+    size: float,
+    view: tuple[FloatArray, FloatArray],
+    prefix: str,
     pictures: dict[str, npt.NDArray[np.uint8]],
-) -> TaughtPoint:  # fmt: skip
+) -> TaughtPoint:
     """Take what the picture shows around a point, upright in the plane, as its mark."""
     import cv2
 
@@ -463,9 +480,15 @@ def _file_name(prefix: str, name: str, picture: npt.NDArray[np.uint8]) -> str:
 
 
 def _fit(
-    frame: Frame, known: Camera | None, name: str, anew: bool, points: FloatArray,
-    found: Sequence[TaughtPoint], H: FloatArray, plane: FloatArray,
-) -> CameraFit:  # fmt: skip
+    frame: Frame,
+    known: Camera | None,
+    name: str,
+    anew: bool,
+    points: FloatArray,
+    found: Sequence[TaughtPoint],
+    H: FloatArray,
+    plane: FloatArray,
+) -> CameraFit:
     from heliotrope.imaging.targets.finding import SURVEY
 
     pixels = np.array([p.pixel for p in found])
@@ -569,9 +592,12 @@ def see_marks(
     if not points:
         raise InputError("no target was found: " + "; ".join(reasons))
     return SeenMarks(
-        tuple(points), tuple(pixels), tuple(covariances), tuple(dict.fromkeys(names)),
+        tuple(points),
+        tuple(pixels),
+        tuple(covariances),
+        tuple(dict.fromkeys(names)),
         tuple(reasons),
-    )  # fmt: skip
+    )
 
 
 def fit_marks(

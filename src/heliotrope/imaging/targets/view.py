@@ -82,8 +82,9 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
 def _meet(a: Target, b: Target) -> bool:
     """Whether the gap between two targets of one plane is less than a quarter of their size."""
     corners, others = a.plane_coordinates(a.corners), a.plane_coordinates(b.corners)
-    gap = np.maximum(others.min(axis=0) - corners.max(axis=0),
-                     corners.min(axis=0) - others.max(axis=0))  # fmt: skip
+    gap = np.maximum(
+        others.min(axis=0) - corners.max(axis=0), corners.min(axis=0) - others.max(axis=0)
+    )
     size = max(a.width, a.height, b.width, b.height)
     return float(np.linalg.norm(np.maximum(gap, 0.0))) < 0.25 * size
 

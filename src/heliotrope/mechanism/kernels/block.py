@@ -207,9 +207,28 @@ def _better(status, residual, seconds, radians):
 
 @njit(**OPTIONS)
 def track_block(
-    armatures, drives, suns, aims, current, index, local, branch, tolerance, limit, newton,
-    angles, counts, normals, vertices, status, iterations, residual, best, start, stop,
-):  # fmt: skip
+    armatures,
+    drives,
+    suns,
+    aims,
+    current,
+    index,
+    local,
+    branch,
+    tolerance,
+    limit,
+    newton,
+    angles,
+    counts,
+    normals,
+    vertices,
+    status,
+    iterations,
+    residual,
+    best,
+    start,
+    stop,
+):
     """Track rows ``start`` to ``stop``.
 
     ``index`` (M, 5): rows of armatures, drives, suns, aims and current counts

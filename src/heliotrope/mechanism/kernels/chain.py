@@ -55,9 +55,21 @@ def _place(matrix, vector, out):
 
 @njit(**OPTIONS)
 def chain_pose(
-    position, orientation, axes, origins, angles, driven, joint_angles, vertex, normal,
-    frames, screw_axes, screw_points, n, m,
-):  # fmt: skip
+    position,
+    orientation,
+    axes,
+    origins,
+    angles,
+    driven,
+    joint_angles,
+    vertex,
+    normal,
+    frames,
+    screw_axes,
+    screw_points,
+    n,
+    m,
+):
     """Place a chain whose driven joints stand at ``joint_angles`` (D,).
 
     Fills frames (J + 1, 3, 3) (the orientation before each joint, and of the
@@ -125,9 +137,22 @@ def chain_derivative(
 
 @njit(**OPTIONS)
 def pose_block(
-    position, orientation, axes, origins, angles, drives, driven, vertex, normal,
-    counts, rows, n_out, m_out, start, stop,
-):  # fmt: skip
+    position,
+    orientation,
+    axes,
+    origins,
+    angles,
+    drives,
+    driven,
+    vertex,
+    normal,
+    counts,
+    rows,
+    n_out,
+    m_out,
+    start,
+    stop,
+):
     """Normals and vertices for counts (M, D) of mechanisms ``rows`` (M,)."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
@@ -138,16 +163,46 @@ def pose_block(
         for k in range(driven.shape[0]):
             joint_angles[k] = drive_angle(drives[r, k], counts[i, k])
         chain_pose(
-            position[r], orientation[r], axes[r], origins[r], angles[r], driven, joint_angles,
-            vertex[r], normal[r], frames, screw_axes, screw_points, n_out[i], m_out[i],
-        )  # fmt: skip
+            position[r],
+            orientation[r],
+            axes[r],
+            origins[r],
+            angles[r],
+            driven,
+            joint_angles,
+            vertex[r],
+            normal[r],
+            frames,
+            screw_axes,
+            screw_points,
+            n_out[i],
+            m_out[i],
+        )
 
 
 @njit(**OPTIONS)
 def jacobian_block(
-    position, orientation, axes, origins, angles, drives, driven, vertex, normal,
-    counts, rows, codes, n_out, m_out, dn_out, dm_out, dn_counts, dm_counts, start, stop,
-):  # fmt: skip
+    position,
+    orientation,
+    axes,
+    origins,
+    angles,
+    drives,
+    driven,
+    vertex,
+    normal,
+    counts,
+    rows,
+    codes,
+    n_out,
+    m_out,
+    dn_out,
+    dm_out,
+    dn_counts,
+    dm_counts,
+    start,
+    stop,
+):
     """Poses with derivatives by the parameters ``codes`` (P, 3) and by the counts."""
     joints = axes.shape[1]
     frames = np.empty((joints + 1, 3, 3))
@@ -159,14 +214,37 @@ def jacobian_block(
             joint_angles[k] = drive_angle(drives[r, k], counts[i, k])
         n, m = n_out[i], m_out[i]
         chain_pose(
-            position[r], orientation[r], axes[r], origins[r], angles[r], driven, joint_angles,
-            vertex[r], normal[r], frames, screw_axes, screw_points, n, m,
-        )  # fmt: skip
+            position[r],
+            orientation[r],
+            axes[r],
+            origins[r],
+            angles[r],
+            driven,
+            joint_angles,
+            vertex[r],
+            normal[r],
+            frames,
+            screw_axes,
+            screw_points,
+            n,
+            m,
+        )
         for p in range(codes.shape[0]):
             chain_derivative(
-                codes[p, 0], codes[p, 1], codes[p, 2], drives[r], driven, counts[i],
-                frames, screw_axes, screw_points, n, m, dn_out[i, p], dm_out[i, p],
-            )  # fmt: skip
+                codes[p, 0],
+                codes[p, 1],
+                codes[p, 2],
+                drives[r],
+                driven,
+                counts[i],
+                frames,
+                screw_axes,
+                screw_points,
+                n,
+                m,
+                dn_out[i, p],
+                dm_out[i, p],
+            )
         for k in range(driven.shape[0]):
             factor = angle_per_count(drives[r, k], counts[i, k])
             j = driven[k]
@@ -185,9 +263,21 @@ def armature_block(
     n, m = np.empty(3), np.empty(3)
     for i in range(start, stop):
         chain_pose(
-            position[i], orientation[i], axes[i], origins[i], angles[i], driven, joint_angles,
-            vertex[i], normal[i], frames, screw_axes, screw_points, n, m,
-        )  # fmt: skip
+            position[i],
+            orientation[i],
+            axes[i],
+            origins[i],
+            angles[i],
+            driven,
+            joint_angles,
+            vertex[i],
+            normal[i],
+            frames,
+            screw_axes,
+            screw_points,
+            n,
+            m,
+        )
         for k in range(driven.shape[0]):
             out[i, 6 * k : 6 * k + 3] = screw_axes[driven[k]]
             out[i, 6 * k + 3 : 6 * k + 6] = screw_points[driven[k]]

@@ -51,9 +51,18 @@ def load_armature(table, i):
     """Row ``i`` of armatures (N, 18) as a tuple."""
     r = (table[i, 0], table[i, 1], table[i, 2], table[i, 3], table[i, 4], table[i, 5])
     s = (table[i, 6], table[i, 7], table[i, 8], table[i, 9], table[i, 10], table[i, 11])
-    return r + s + (
-        table[i, 12], table[i, 13], table[i, 14], table[i, 15], table[i, 16], table[i, 17],
-    )  # fmt: skip
+    return (
+        r
+        + s
+        + (
+            table[i, 12],
+            table[i, 13],
+            table[i, 14],
+            table[i, 15],
+            table[i, 16],
+            table[i, 17],
+        )
+    )
 
 
 @njit(**INLINED)

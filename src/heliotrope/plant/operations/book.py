@@ -98,9 +98,13 @@ class CalibrationBook:
             self.measured[row] = 0.5 * float(np.sqrt(np.mean(beams**2)))
 
     def learn(
-        self, name: str, values: Mapping[str, float], mechanism: Mechanism, seen: Sightings,
+        self,
+        name: str,
+        values: Mapping[str, float],
+        mechanism: Mechanism,
+        seen: Sightings,
         at: float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take new parameters of a heliostat, from all its sightings; ``mechanism`` is (1,)."""
         row = self._plant.field.place(name)
         known = precision(mechanism, self.model, seen)

@@ -39,19 +39,32 @@ def detail(plant: PlantController, work: "Automat", frames: FrameMaker, name: st
     hold = work.holds.get(name)
     width, height = frames.sizes[row]
     return HeliostatView(
-        name, shown.cluster, row, frames.positions[row], float(width), float(height),
-        shown.live, shown.age, shown.state, shown.fault, shown.flags,
+        name,
+        shown.cluster,
+        row,
+        frames.positions[row],
+        float(width),
+        float(height),
+        shown.live,
+        shown.age,
+        shown.state,
+        shown.fault,
+        shown.flags,
         1e-3 * float(node["supply_mv"]) if told else float("nan"),
         float(node["temperature_degc"]) if told else float("nan"),
         int(node["boots"]) if shown.live else 0,
         _drives(plant, row) if shown.live else (),
-        plant.aims[row].copy(), plant.standbys[row].copy(), frames.on_name(row),
-        _parameters(plant, work, name), float(work.book.error[row]),
+        plant.aims[row].copy(),
+        plant.standbys[row].copy(),
+        frames.on_name(row),
+        _parameters(plant, work, name),
+        float(work.book.error[row]),
         float("nan") if truth is None else float(truth[row]),
-        work.book.history(name), work.book.results_of(name),
+        work.book.history(name),
+        work.book.results_of(name),
         next((p for p in work.plan(50) if p.heliostat == name), None),
         "" if hold is None else f"{hold.reason} ({hold.who})",
-    )  # fmt: skip
+    )
 
 
 def _drives(plant: PlantController, row: int) -> tuple[DriveView, ...]:
@@ -90,7 +103,14 @@ def emergency_view(plant: PlantController) -> EmergencyView:
         return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
     report, count = order.report(plant.now()), len(order.ticket.heliostats)
     return EmergencyView(
-        plant.emergency_on, order.act.name, order.who, order.reason, plant.now() - order.at,
-        count, count - len(report.unacknowledged), count - len(report.not_done),
-        report.not_done[:_SOME], report.text,
-    )  # fmt: skip
+        plant.emergency_on,
+        order.act.name,
+        order.who,
+        order.reason,
+        plant.now() - order.at,
+        count,
+        count - len(report.unacknowledged),
+        count - len(report.not_done),
+        report.not_done[:_SOME],
+        report.text,
+    )

@@ -72,17 +72,22 @@ class FrameMaker:
         truth = self._work.truth_errors()
         counts = np.stack([rows["primary"], rows["secondary"]], axis=-1)
         return FieldFrame(
-            self._number, plant.clock.utc().timestamp(),
+            self._number,
+            plant.clock.utc().timestamp(),
             _fixed(np.where(live, rows["state"], STALE_STATE).astype(np.uint8)),
             _fixed(np.where(live, rows["fault"], 0).astype(np.uint8)),
             _fixed(np.where(live, rows["flags"], 0).astype(np.uint32)),
-            _fixed(field.age(now).astype(np.float32)), _fixed(counts.astype(np.int32)),
-            _fixed(book.error.astype(np.float32)), _fixed(book.measured.astype(np.float32)),
-            _fixed(book.calibrated_at.copy()), _fixed(book.sightings.copy()),
-            _fixed(field.cluster.astype(np.int16)), _fixed(self._on(now)),
+            _fixed(field.age(now).astype(np.float32)),
+            _fixed(counts.astype(np.int32)),
+            _fixed(book.error.astype(np.float32)),
+            _fixed(book.measured.astype(np.float32)),
+            _fixed(book.calibrated_at.copy()),
+            _fixed(book.sightings.copy()),
+            _fixed(field.cluster.astype(np.int16)),
+            _fixed(self._on(now)),
             _fixed(self._work.held_rows()),
             None if truth is None else _fixed(truth.astype(np.float32)),
-        )  # fmt: skip
+        )
 
     def _on(self, now: float) -> npt.NDArray[np.uint8]:
         """Return what each beam is on, as a place in `aim_names`, (N,)."""

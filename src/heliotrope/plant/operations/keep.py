@@ -44,9 +44,12 @@ class Keeper:
     """
 
     def __init__(
-        self, plant: PlantController, records: Records | None, book: CalibrationBook,
+        self,
+        plant: PlantController,
+        records: Records | None,
+        book: CalibrationBook,
         cycle: CentringCycle | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._plant, self._records, self._book, self._cycle = plant, records, book, cycle
         self._numbers: dict[str, list[int]] = {}
         self.lost = ""
@@ -125,9 +128,13 @@ class Keeper:
             self.lost = str(error)
 
     def _keep(
-        self, records: Records, entry: CalibrationEntry, begun: float, sigma: float,
+        self,
+        records: Records,
+        entry: CalibrationEntry,
+        begun: float,
+        sigma: float,
         result: CycleResult | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         name, new, version = entry.heliostat, 0, 0
         numbers = self._numbers.setdefault(name, [])
         if result is not None and result.sightings is not None:

@@ -21,10 +21,21 @@ _STEADY = ("lease", "status")
 _LONGEST = 240
 #: Alarms of no row of the safety table, of the plant and of clusters: noted when acknowledged.
 _PLAIN = frozenset(
-    {"records", "work", "camera", "sensor", "order_unacknowledged", "node_silent", "node_fault",
-     "node_unintelligible", "plant_unintelligible", "lease_refused", "autonomy_limited",
-     "state_unwritable"}
-)  # fmt: skip
+    {
+        "records",
+        "work",
+        "camera",
+        "sensor",
+        "order_unacknowledged",
+        "node_silent",
+        "node_fault",
+        "node_unintelligible",
+        "plant_unintelligible",
+        "lease_refused",
+        "autonomy_limited",
+        "state_unwritable",
+    }
+)
 #: Is told once and mended by the plant itself.
 _PASSING = ("parameters_differ",)
 
@@ -48,9 +59,13 @@ class Logbook:
     """
 
     def __init__(
-        self, clock: Clock, records: Records | None = None, *, events: int = 2000,
+        self,
+        clock: Clock,
+        records: Records | None = None,
+        *,
+        events: int = 2000,
         packets: int = 4000,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._clock, self._records = clock, records
         self._alarms: dict[tuple[str, str], AlarmRow] = {}
         self._events: deque[EventRow] = deque(maxlen=events)
@@ -90,17 +105,28 @@ class Logbook:
         by = known.acknowledged_by if known is not None and not new else ""
         at = self._now() if new or known is None else known.at
         self._alarms[key] = AlarmRow(
-            at, alarm.condition, alarm.subject, alarm.severity, alarm.text, alarm.active, by,
+            at,
+            alarm.condition,
+            alarm.subject,
+            alarm.severity,
+            alarm.text,
+            alarm.active,
+            by,
             max(count, 1),
-        )  # fmt: skip
+        )
         if new or (known is not None and known.active != alarm.active):
             over = "" if alarm.active else " (over)"
             self.event("alarm", alarm.subject, f"{alarm.condition}: {alarm.text}{over}")
             if self._records is not None:
                 self._keep(
-                    self._records.record_alarm, alarm.condition, alarm.subject, alarm.severity,
-                    alarm.text, self._now(), active=alarm.active,
-                )  # fmt: skip
+                    self._records.record_alarm,
+                    alarm.condition,
+                    alarm.subject,
+                    alarm.severity,
+                    alarm.text,
+                    self._now(),
+                    active=alarm.active,
+                )
 
     def event(self, kind: str, who: str, text: str) -> None:
         """Take an event; see `EventRow`."""
@@ -176,18 +202,33 @@ class Logbook:
         )
 
     def _cluster_row(
-        self, name: str, age: float, limit: float, count: float, live: float, asked: float,
+        self,
+        name: str,
+        age: float,
+        limit: float,
+        count: float,
+        live: float,
+        asked: float,
         answered: float,
-    ) -> ClusterRow:  # fmt: skip
+    ) -> ClusterRow:
         status, link = self._status(name), self._links.get(name)
         nan = float("nan")
         return ClusterRow(
-            name, age <= limit, age, link is not None and link.connected, int(count), int(live),
-            status.cycle_s if status else nan, answered / asked if asked else nan,
-            self.refused.get(name, 0), status.time_quality if status else "",
-            status.time_error_s if status else nan, status.lease_left if status else nan,
-            status.acts if status else (), link.problem if link is not None else "",
-        )  # fmt: skip
+            name,
+            age <= limit,
+            age,
+            link is not None and link.connected,
+            int(count),
+            int(live),
+            status.cycle_s if status else nan,
+            answered / asked if asked else nan,
+            self.refused.get(name, 0),
+            status.time_quality if status else "",
+            status.time_error_s if status else nan,
+            status.lease_left if status else nan,
+            status.acts if status else (),
+            link.problem if link is not None else "",
+        )
 
     def _status(self, cluster: str) -> Status | None:
         _, data = self._steady.get((cluster, "from", "status"), (0.0, b""))

@@ -106,9 +106,14 @@ class Operations:
         self.plant, self.logbook = plant, logbook
         self._cameras, self._extra = dict(cameras or {}), extra
         self.work = Automat(
-            plant, logbook, cycle, scheduler=scheduler, records=records, truth=truth,
+            plant,
+            logbook,
+            cycle,
+            scheduler=scheduler,
+            records=records,
+            truth=truth,
             settings=settings or WorkSettings(),
-        )  # fmt: skip
+        )
         self._frames = FrameMaker(plant, self.work)
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
@@ -184,12 +189,20 @@ class Operations:
         alive = sum(now - at <= field.limit for at in field.status_at.values())
         extra = dict(self._extra()) if self._extra is not None else {}
         return Summary(
-            self.design.name, self.plant.clock.utc(), len(field), len(field.clusters),
-            field.counted(now), alive,
-            grant.holder.name if grant else "", grant.holder.role.name.lower() if grant else "",
-            self.plant.waiting, self.logbook.open_alarms, self.plant.emergency_on,
-            float(extra.pop("lag", 0.0)), extra,
-        )  # fmt: skip
+            self.design.name,
+            self.plant.clock.utc(),
+            len(field),
+            len(field.clusters),
+            field.counted(now),
+            alive,
+            grant.holder.name if grant else "",
+            grant.holder.role.name.lower() if grant else "",
+            self.plant.waiting,
+            self.logbook.open_alarms,
+            self.plant.emergency_on,
+            float(extra.pop("lag", 0.0)),
+            extra,
+        )
 
     def heliostat(self, name: str) -> HeliostatView:
         """Return one heliostat in detail.
@@ -371,9 +384,13 @@ class Operations:
     # -- commands --------------------------------------------------------------------------
 
     def command(
-        self, person: Person, token: int, name: str, heliostats: Sequence[str] = (),
+        self,
+        person: Person,
+        token: int,
+        name: str,
+        heliostats: Sequence[str] = (),
         values: Sequence[float] = (),
-    ) -> Ticket:  # fmt: skip
+    ) -> Ticket:
         """Give a command; see `PlantController.command`."""
         ticket = self.plant.command(person, token, name, heliostats, values)
         self._meant(name, ticket.heliostats)

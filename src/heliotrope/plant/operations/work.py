@@ -143,10 +143,16 @@ class Automat:
     """
 
     def __init__(
-        self, plant: PlantController, logbook: Logbook, cycle: CentringCycle | None, *,
-        scheduler: Scheduling | None, records: Records | None,
-        truth: Callable[[], FloatArray] | None, settings: WorkSettings,
-    ) -> None:  # fmt: skip
+        self,
+        plant: PlantController,
+        logbook: Logbook,
+        cycle: CentringCycle | None,
+        *,
+        scheduler: Scheduling | None,
+        records: Records | None,
+        truth: Callable[[], FloatArray] | None,
+        settings: WorkSettings,
+    ) -> None:
         self._plant, self._log, self._cycle = plant, logbook, cycle
         self._settings, self._truth = settings, truth
         count = len(plant.field)
@@ -243,11 +249,15 @@ class Automat:
         """Return how far calibration has come."""
         reason = self._why_not()
         return CalibrationView(
-            not reason, reason, self.book.calibrated,
-            len(self._plant.field) - self.book.calibrated, self.book.failed,
-            tuple(self._running.values()), tuple(list(self.book.results)[:-51:-1]),
+            not reason,
+            reason,
+            self.book.calibrated,
+            len(self._plant.field) - self.book.calibrated,
+            self.book.failed,
+            tuple(self._running.values()),
+            tuple(list(self.book.results)[:-51:-1]),
             tuple(self.book.quality),
-        )  # fmt: skip
+        )
 
     def plan(self, limit: int) -> tuple[Planned, ...]:
         """Return the next measurements."""
@@ -508,9 +518,14 @@ class Automat:
         return math.nan if found is None else float(found[row])
 
     def _conclude(
-        self, chosen: Planned, begun: float, truth: float, old: Any,
-        result: CycleResult | None, text: str,
-    ) -> None:  # fmt: skip
+        self,
+        chosen: Planned,
+        begun: float,
+        truth: float,
+        old: Any,
+        result: CycleResult | None,
+        text: str,
+    ) -> None:
         """Note what a visit brought."""
         assert self._cycle is not None
         name, now = chosen.heliostat, self._utc()
@@ -526,11 +541,18 @@ class Automat:
                 self.book.learn(name, result.values, new, result.sightings, now)
         self.book.failed += not good
         entry = CalibrationEntry(
-            now, name, chosen.target, good,
-            result.before if result else math.nan, result.after if result else math.nan,
-            float(self.book.error[row]), truth, self._true_error(row) if good else math.nan,
-            int(self.book.sightings[row]), text,
-        )  # fmt: skip
+            now,
+            name,
+            chosen.target,
+            good,
+            result.before if result else math.nan,
+            result.after if result else math.nan,
+            float(self.book.error[row]),
+            truth,
+            self._true_error(row) if good else math.nan,
+            int(self.book.sightings[row]),
+            text,
+        )
         self.book.results.append(entry)
         self._scheduler.done(entry)
         self._log.event("calibration", name, f"at {chosen.target}: {text}")
@@ -593,9 +615,12 @@ class LeastKnown:
         new = not math.isfinite(book.error[row])
         at = self._plant.clock.utc().timestamp() + 60.0 * (place // max(len(self._slant), 1))
         return Planned(
-            self._plant.field.names[row], target, at, math.nan if new else float(book.error[row]),
+            self._plant.field.names[row],
+            target,
+            at,
+            math.nan if new else float(book.error[row]),
             "never calibrated" if new else "its predicted error has grown",
-        )  # fmt: skip
+        )
 
     def done(self, entry: CalibrationEntry) -> None:
         """Leave a heliostat alone for a while whose measurement failed."""

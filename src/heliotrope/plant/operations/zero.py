@@ -10,9 +10,12 @@ from heliotrope.plant.tickets import Ticket
 
 
 def zero(
-    plant: PlantController, person: Person, token: int, heliostats: Sequence[str],
+    plant: PlantController,
+    person: Person,
+    token: int,
+    heliostats: Sequence[str],
     values: Sequence[float],
-) -> Ticket:  # fmt: skip
+) -> Ticket:
     """Declare the step counts of the two axes of one heliostat that is locked or has a fault.
 
     Nothing moves; its controller stores the counts. It needs an engineer, and the heliostat's key

@@ -100,9 +100,7 @@ class Visited:
         """
         good = result.text.startswith("calibrated")
         error = result.before if measured is None else measured
-        return cls(
-            result.heliostat, target, ended, good, result.sightings, error, result.text
-        )  # fmt: skip
+        return cls(result.heliostat, target, ended, good, result.sightings, error, result.text)
 
 
 @dataclass(frozen=True)
@@ -172,9 +170,10 @@ def compare(finished: Iterable[Finished]) -> Comparison:
         return float(np.sqrt(np.mean(np.square(values)))) if values else nan
 
     spans = [
-        (f.visited.ended - f.planned.at) / (f.planned.until - f.planned.at) for f in made
+        (f.visited.ended - f.planned.at) / (f.planned.until - f.planned.at)
+        for f in made
         if f.planned.until > f.planned.at
-    ]  # fmt: skip
+    ]
     return Comparison(
         visits=len(made),
         calibrated=sum(f.visited.calibrated for f in made),

@@ -75,11 +75,13 @@ class Judge:
         self._settings, self._known, self._names = settings, known, names
         self.sights = {
             t.name: Sight(
-                t, known.position, known.size,
+                t,
+                known.position,
+                known.size,
                 tuple(c for c in design.cameras if t.name in c.targets or not c.targets),
             )
             for t in design.targets
-        }  # fmt: skip
+        }
         self.more = False
         self._again = {name: np.full(len(known), -np.inf) for name in self.sights}
 
@@ -92,9 +94,14 @@ class Judge:
         return other
 
     def decide(
-        self, now: float, sun: FloatArray, ready: Mask, targets: Sequence[str],
-        counts: FloatArray | None = None, weather: Weather | None = None,
-    ) -> tuple[Choice | None, str]:  # fmt: skip
+        self,
+        now: float,
+        sun: FloatArray,
+        ready: Mask,
+        targets: Sequence[str],
+        counts: FloatArray | None = None,
+        weather: Weather | None = None,
+    ) -> tuple[Choice | None, str]:
         """Return the best visit, and why it, or why there is none.
 
         Parameters
@@ -233,6 +240,14 @@ class Judge:
         if overdue:
             reason = f"due: {moment.age[row] / DAY:.1f} days old; {reason}"
         return Assignment(
-            self._names[row], target, moment.now, moment.now + span, before, after,
-            float(np.sqrt(look.square[k])), seen, overdue, reason,
-        )  # fmt: skip
+            self._names[row],
+            target,
+            moment.now,
+            moment.now + span,
+            before,
+            after,
+            float(np.sqrt(look.square[k])),
+            seen,
+            overdue,
+            reason,
+        )

@@ -59,11 +59,16 @@ class FieldKnowledge:
         groups = list(design.groups.values())
         self._groups: list[Knowledge] = [
             Knowledge(
-                group, aim, design.site, year,
-                model=settings.model, priors=settings.priors, creep=settings.creep,
+                group,
+                aim,
+                design.site,
+                year,
+                model=settings.model,
+                priors=settings.priors,
+                creep=settings.creep,
             )
             for group in groups
-        ]  # fmt: skip
+        ]
         # Of each group the rows of its heliostats, and back.
         self._rows = [np.array([self.row[n] for n in g.names], dtype=np.intp) for g in groups]
         self.group, self._place = np.empty((2, count), dtype=np.intp)
@@ -102,15 +107,25 @@ class FieldKnowledge:
         return not np.isnan(self._groups[self.group[row]].since[self._place[row]])
 
     def look(
-        self, rows: npt.NDArray[np.intp], now: float, sun: FloatArray, target: Target,
+        self,
+        rows: npt.NDArray[np.intp],
+        now: float,
+        sun: FloatArray,
+        target: Target,
         counts: FloatArray | None,
-    ) -> Look:  # fmt: skip
+    ) -> Look:
         """Return what visits of heliostats of one group would be; see `Knowledge.look`."""
         settings, known = self._settings, self._groups[int(self.group[rows[0]])]
         return known.look(
-            self._place[rows], now, sun, target, settings.limits,
-            shots=settings.shots, sigma=settings.sigma, counts=counts,
-        )  # fmt: skip
+            self._place[rows],
+            now,
+            sun,
+            target,
+            settings.limits,
+            shots=settings.shots,
+            sigma=settings.sigma,
+            counts=counts,
+        )
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
         """Take it that a visit of that slope (2, P) has been made."""

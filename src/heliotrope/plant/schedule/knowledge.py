@@ -85,9 +85,16 @@ class Knowledge:
     """
 
     def __init__(
-        self, heliostats: Heliostats, aim: FloatArray, site: Site, year: int, *,
-        model: str | tuple[str, ...], priors: Mapping[str, float], creep: float,
-    ) -> None:  # fmt: skip
+        self,
+        heliostats: Heliostats,
+        aim: FloatArray,
+        site: Site,
+        year: int,
+        *,
+        model: str | tuple[str, ...],
+        priors: Mapping[str, float],
+        creep: float,
+    ) -> None:
         self.mechanism = heliostats.calibrated
         known = self.mechanism.parameters
         self.names = parameter_table.model(model, known) if isinstance(model, str) else model
@@ -136,9 +143,17 @@ class Knowledge:
         return np.asarray(grown)
 
     def look(
-        self, rows: Rows, now: float, sun: FloatArray, target: Target, limits: Limits, *,
-        shots: int, sigma: float, counts: FloatArray | None = None,
-    ) -> Look:  # fmt: skip
+        self,
+        rows: Rows,
+        now: float,
+        sun: FloatArray,
+        target: Target,
+        limits: Limits,
+        *,
+        shots: int,
+        sigma: float,
+        counts: FloatArray | None = None,
+    ) -> Look:
         """Return what visits of heliostats at ``rows`` (K,) to a target would be.
 
         Parameters

@@ -39,9 +39,12 @@ def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Sett
     from dataclasses import replace
 
     return replace(
-        settings or Settings(), model=cycle.model, shots=cycle.shots, interval=cycle.interval,
+        settings or Settings(),
+        model=cycle.model,
+        shots=cycle.shots,
+        interval=cycle.interval,
         sigma=cycle.sigma,
-    )  # fmt: skip
+    )
 
 
 class PlantSchedule:
@@ -86,9 +89,12 @@ class PlantSchedule:
             if gone.target == target:
                 self.scheduler.cancel(gone.heliostat)
         told = self.scheduler.next(
-            self._plant.clock.utc(), self._plant.sun_vector(), self._states(ready), (target,),
+            self._plant.clock.utc(),
+            self._plant.sun_vector(),
+            self._states(ready),
+            (target,),
             weather=self.weather,
-        )  # fmt: skip
+        )
         return None if told is None else _planned(told)
 
     def plan(
@@ -119,9 +125,16 @@ class PlantSchedule:
             # The beam is off by twice what the normal is.
             measured = 2.0 * float(self._book.measured[row])
         self.scheduler.done(
-            Visited(entry.heliostat, entry.target, entry.at, entry.good,
-                    self._cycle.known.get(entry.heliostat), measured, entry.text)
-        )  # fmt: skip
+            Visited(
+                entry.heliostat,
+                entry.target,
+                entry.at,
+                entry.good,
+                self._cycle.known.get(entry.heliostat),
+                measured,
+                entry.text,
+            )
+        )
 
     def _recall(self) -> None:
         """Take over what was known before the start."""

@@ -37,8 +37,17 @@ from heliotrope.plant.schedule.choice import Judge, Mask
 from heliotrope.plant.schedule.field import FieldKnowledge
 from heliotrope.plant.schedule.settings import Settings, Weather
 
-__all__ = ["Assignment", "Comparison", "Finished", "Scheduler", "Settings", "States", "Visited",
-           "Weather", "compare"]  # fmt: skip
+__all__ = [
+    "Assignment",
+    "Comparison",
+    "Finished",
+    "Scheduler",
+    "Settings",
+    "States",
+    "Visited",
+    "Weather",
+    "compare",
+]
 
 #: States from which a heliostat can be sent to a target.
 READY = (lcu_states.IDLE, lcu_states.TRACKING)
@@ -96,9 +105,13 @@ class Scheduler:
     """
 
     def __init__(
-        self, design: Plant, settings: Settings | None = None, *, now: datetime,
+        self,
+        design: Plant,
+        settings: Settings | None = None,
+        *,
+        now: datetime,
         names: Sequence[str] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.design, self.settings = design, settings or Settings()
         self.names = tuple(names) if names is not None else design.names
         if not design.targets or not len(design):
@@ -163,9 +176,14 @@ class Scheduler:
     # -- deciding --------------------------------------------------------------------------
 
     def next(
-        self, now_utc: datetime, sun: npt.ArrayLike, states: States,
-        free_targets: Sequence[str], holds: Collection[str] = (), weather: Weather | None = None,
-    ) -> Assignment | None:  # fmt: skip
+        self,
+        now_utc: datetime,
+        sun: npt.ArrayLike,
+        states: States,
+        free_targets: Sequence[str],
+        holds: Collection[str] = (),
+        weather: Weather | None = None,
+    ) -> Assignment | None:
         """Return what to measure now, and note that it is under way; None: nothing, see `reason`.
 
         Call `done` or `cancel` when it has ended.
@@ -194,10 +212,13 @@ class Scheduler:
         now = _unix(now_utc)
         counts = np.asarray(states.counts, dtype=np.float64)
         choice, self.reason = self._judge.decide(
-            now, as_vectors(sun, "sun"), self._ready(now, states, (*holds, *self.running)),
-            free_targets, counts,
+            now,
+            as_vectors(sun, "sun"),
+            self._ready(now, states, (*holds, *self.running)),
+            free_targets,
+            counts,
             weather,
-        )  # fmt: skip
+        )
         if choice is None:
             return None
         told = choice.assignment
@@ -262,9 +283,13 @@ class Scheduler:
     # -- what is to come -------------------------------------------------------------------
 
     def plan(
-        self, now_utc: datetime, horizon: timedelta, states: States | None = None,
-        holds: Collection[str] = (), most: int = 20,
-    ) -> list[Assignment]:  # fmt: skip
+        self,
+        now_utc: datetime,
+        horizon: timedelta,
+        states: States | None = None,
+        holds: Collection[str] = (),
+        most: int = 20,
+    ) -> list[Assignment]:
         """Return the next measurements, if the sky stays clear and each brings what is expected.
 
         Parameters
@@ -280,9 +305,12 @@ class Scheduler:
         return list(islice((told for told in coming if told is not None), most))
 
     def upcoming(
-        self, now_utc: datetime, horizon: timedelta, states: States | None = None,
+        self,
+        now_utc: datetime,
+        horizon: timedelta,
+        states: States | None = None,
         holds: Collection[str] = (),
-    ) -> Iterator[Assignment | None]:  # fmt: skip
+    ) -> Iterator[Assignment | None]:
         """Yield what `plan` returns one by one, None between: each step is one decision at most."""
         now = _unix(now_utc)
         end, known = now + horizon.total_seconds(), self._known.copy()

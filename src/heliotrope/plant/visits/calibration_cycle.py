@@ -229,9 +229,14 @@ class CalibrationCycle:
         utc = plant.clock.utc() - timedelta(seconds=plant.now() - shot.at)
         covariance = np.asarray(shot.covariance, dtype=np.float64)
         return camera_target(
-            0, counts[None], sun.vector(utc, plant.design.site)[None], shot.point[None],
-            time=utc.timestamp(), sigma=self._settings.sigma, centroid_covariance=covariance,
-        )  # fmt: skip
+            0,
+            counts[None],
+            sun.vector(utc, plant.design.site)[None],
+            shot.point[None],
+            time=utc.timestamp(),
+            sigma=self._settings.sigma,
+            centroid_covariance=covariance,
+        )
 
     async def _learn(
         self, visit: Visit, seen: list[Sightings], rejected: tuple[str, ...]
@@ -243,8 +248,9 @@ class CalibrationCycle:
         nominal, present = self.mechanism(name)
         values = self.values.get(name, {})
 
-        def result(text: str, before: float = np.nan, after: float = np.nan,
-                   pushed: tuple[str, ...] = ()) -> CycleResult:  # fmt: skip
+        def result(
+            text: str, before: float = np.nan, after: float = np.nan, pushed: tuple[str, ...] = ()
+        ) -> CycleResult:
             held = self.values.get(name, values)
             return CycleResult(name, every, rejected, before, after, held, pushed, text)
 

@@ -101,10 +101,13 @@ class CentringCycle(CalibrationCycle):
     """
 
     def __init__(
-        self, plant: PlantController, camera: Camera, settings: CycleSettings | None = None,
+        self,
+        plant: PlantController,
+        camera: Camera,
+        settings: CycleSettings | None = None,
         centring: Centring | None = None,
         on_stage: Callable[[str, str, str], None] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(plant, camera, settings)
         self._centring = centring or Centring()
         self.on_stage = on_stage

@@ -136,10 +136,15 @@ class Board:
         self._looked = -math.inf
         try:
             self.node = Node(
-                self.flash, _Timer(self), self._out.extend, self.ticks.at(now),
-                serial=self.outfit.serial, sha256=sha256, key=self.outfit.key,
+                self.flash,
+                _Timer(self),
+                self._out.extend,
+                self.ticks.at(now),
+                serial=self.outfit.serial,
+                sha256=sha256,
+                key=self.outfit.key,
                 sensor=lambda: self.tilt,
-            )  # fmt: skip
+            )
         except PowerCutError:
             self._die()
             return

@@ -44,10 +44,25 @@ Rows = npt.NDArray[np.intp]
 Bools = npt.NDArray[np.bool_]
 
 AXIS = np.dtype(
-    [(name, "<i8") for name in (
-        "count", "goal", "leg", "speed", "phase", "direction", "led", "braking", "low", "high",
-        "top", "change", "backlash")]
-)  # fmt: skip
+    [
+        (name, "<i8")
+        for name in (
+            "count",
+            "goal",
+            "leg",
+            "speed",
+            "phase",
+            "direction",
+            "led",
+            "braking",
+            "low",
+            "high",
+            "top",
+            "change",
+            "backlash",
+        )
+    ]
+)
 #: Of `lcu.config.Config`.
 LEASE_MS, STOW_WAIT_MS, SLOT_MS, AHEAD_MS = 6000, 30_000, 50, 100
 #: A field is advanced by so much at a time, as a board's main loop does at least, ms.
@@ -195,9 +210,12 @@ class Field:
         """Return joint angles (M, 2) at which beams reach aims (M, 3), and whether they do."""
         sun = (self._sun[0] + self._sun[1] * (self._sun_ms + ahead_ms) // 1000) / UNIT
         found = track(
-            self._told[rows], sun / np.linalg.norm(sun), aims,
-            current=self.axes["count"][rows].astype(np.float64), tolerance=2e-10,
-        )  # fmt: skip
+            self._told[rows],
+            sun / np.linalg.norm(sun),
+            aims,
+            current=self.axes["count"][rows].astype(np.float64),
+            tolerance=2e-10,
+        )
         return np.asarray(found.chosen(found.angles)), np.asarray(
             found.chosen(found.status) == Status.OK
         )
@@ -259,9 +277,12 @@ class Field:
         self._ready[rows] = False
         self.kind[rows] = STOW
         kernels.go_rows(
-            self.axes, self._order, rows, np.ascontiguousarray(self._stow[rows]),
+            self.axes,
+            self._order,
+            rows,
+            np.ascontiguousarray(self._stow[rows]),
             np.full(len(rows), kernels.SECONDARY_FIRST),
-        )  # fmt: skip
+        )
 
     def _return(self, rows: Rows) -> None:
         """Back by the way of the approach, and to stow."""

@@ -35,9 +35,19 @@ _SUN_FRESH, _SOUND, _AT_STOW = 1 << 1, 0b1100, 1 << 5
 _NEVER = 0xFFFFFFFF
 #: Commands that the field knows.
 KNOWN = frozenset(
-    {"DEFOCUS", "STOW", "APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "LOCK", "UNLOCK",
-     "CLEAR_FAULT"}
-)  # fmt: skip
+    {
+        "DEFOCUS",
+        "STOW",
+        "APPROACH",
+        "IDLE",
+        "TRACK",
+        "REFOCUS",
+        "AIM",
+        "LOCK",
+        "UNLOCK",
+        "CLEAR_FAULT",
+    }
+)
 
 
 class FieldBus:

@@ -41,9 +41,11 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
     }  # fmt: skip
     if clock:
         found |= {
-            "second": own.clock.second, "millisecond": own.clock.ms, "flags": own.flags(),
+            "second": own.clock.second,
+            "millisecond": own.clock.ms,
+            "flags": own.flags(),
             "sun age": own.sun.age_ms(),
-        }  # fmt: skip
+        }
     if own.gate is not None:
         found |= {"token": own.gate.token, "edition": own.gate.edition}
         if gate and clock:

@@ -356,9 +356,12 @@ class Observer:
             state = states.STATES[board.state]
             what = account.forged.name if account.forged else ""
             self.check(
-                4, board.state not in ON_THE_WAY, now, name,
+                4,
+                board.state not in ON_THE_WAY,
+                now,
+                name,
                 f"it is {state} after {what}, which is for everybody to send",
-            )  # fmt: skip
+            )
         elif sent is not None and sent.addresses(account.address) and good:
             if sent.who not in (messages.ANYONE, messages.ASK):
                 account.taken = max(account.taken, sent.index)
@@ -500,9 +503,10 @@ class Observer:
             self.check(11, claimed <= last + slack, now, name, saw)
             rounding = AGE_ROUNDING + CLOCKS_APART * age
             of_then = [
-                values for at, values in account.told
+                values
+                for at, values in account.told
                 if claimed - slack - rounding <= at <= claimed + rounding
-            ]  # fmt: skip
+            ]
             state = states.STATES[int(row["state"])]
             saw = f"told to be {state} {age:.2f} s ago, which it has not answered then"
             good = any(_row_of(values) == tuple(int(row[n]) for n in _TOLD) for values in of_then)

@@ -98,9 +98,14 @@ class FrameLedger:
             return None
         frame = frames[-1]
         sent = Sent(
-            len(self._order), now, frame.name, messages.who_of(frame.number), frame.to,
-            frame.values() or (), frame.payload,
-        )  # fmt: skip
+            len(self._order),
+            now,
+            frame.name,
+            messages.who_of(frame.number),
+            frame.to,
+            frame.values() or (),
+            frame.payload,
+        )
         self._frames[data] = self.last[frame.name] = sent
         self._order.append(data)
         if sent.who in (messages.AUTHORITY, messages.KEY):
@@ -146,6 +151,7 @@ class OrderLedger:
         """Return the orders of a name for all these addresses that were given before now."""
         wanted = frozenset(addresses)
         return [
-            order for order in self.by_identity.values()
+            order
+            for order in self.by_identity.values()
             if order.name == name and wanted <= order.addresses and order.at <= now
-        ]  # fmt: skip
+        ]

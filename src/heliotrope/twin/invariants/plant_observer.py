@@ -32,8 +32,14 @@ VOID_WITHIN = 4.2
 #: under way, and late on the bus; and how far apart the boards are looked at, s.
 LATE, LOOKS = 1.8, 0.5
 #: What a proof calls done.
-_OFF = (states.DEFOCUSED, states.STOWING, states.STOWED, states.LOCKED, states.FAULT,
-        states.UNCONFIGURED)  # fmt: skip
+_OFF = (
+    states.DEFOCUSED,
+    states.STOWING,
+    states.STOWED,
+    states.LOCKED,
+    states.FAULT,
+    states.UNCONFIGURED,
+)
 _OWN = ("plant", "safety table")
 
 
@@ -60,9 +66,12 @@ class PlantObserver:
     """
 
     def __init__(
-        self, start: float, disk: RecordsDisk, settings: PlantSettings,
+        self,
+        start: float,
+        disk: RecordsDisk,
+        settings: PlantSettings,
         clusters: Sequence[Observer],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.checks: Counter[int] = Counter()
         self.old: dict[int, float] = {}
         self._start, self._disk, self._settings = start, disk, settings
@@ -287,9 +296,10 @@ class PlantObserver:
     def _boards(self, now: float) -> None:
         """Who joins, by the boards themselves."""
         on = {
-            name for name, account in self._accounts.items()
+            name
+            for name, account in self._accounts.items()
             if account.state in (states.TRACKING, states.SEARCHING)
-        }  # fmt: skip
+        }
         new, self._on = len(on - self._on), on
         if new:
             self._joined.append((now, new))

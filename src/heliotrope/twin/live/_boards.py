@@ -52,9 +52,14 @@ class BoardField:
     """
 
     def __init__(
-        self, clock: Clock, names: tuple[str, ...], truth: Mechanism, believed: Mechanism,
-        machine: Machine, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        clock: Clock,
+        names: tuple[str, ...],
+        truth: Mechanism,
+        believed: Mechanism,
+        machine: Machine,
+        seed: int = 0,
+    ) -> None:
         if len(names) > MOST:
             raise InputError(f"boards: {len(names)} heliostats; one process bears {MOST}")
         if machine.stow != STOW:
@@ -105,8 +110,13 @@ class BoardField:
         return np.where(tracks & (off < 0.05), off, np.nan)
 
     def mirrors_near(
-        self, sun: FloatArray, middle: FloatArray, normal: FloatArray, reach: float,
-        names: tuple[str, ...], sizes: FloatArray,
-    ) -> list[Mirror]:  # fmt: skip
+        self,
+        sun: FloatArray,
+        middle: FloatArray,
+        normal: FloatArray,
+        reach: float,
+        names: tuple[str, ...],
+        sizes: FloatArray,
+    ) -> list[Mirror]:
         """Return the mirrors whose rays meet a plane within a distance of its middle, m."""
         return near(self._stand(), sun, middle, normal, reach, names, sizes)

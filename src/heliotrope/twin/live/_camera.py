@@ -35,9 +35,14 @@ class LiveCamera(RenderedCamera):
     """
 
     def __init__(
-        self, sight: Sight, scenes: Sequence[Scene], *, optics: Optics | None = None,
-        seed: int = 0, threads: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        sight: Sight,
+        scenes: Sequence[Scene],
+        *,
+        optics: Optics | None = None,
+        seed: int = 0,
+        threads: int = 1,
+    ) -> None:
         super().__init__(sight, scenes, optics=optics, seed=seed)
         self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
         self._views = Views()
@@ -84,9 +89,13 @@ class LiveCamera(RenderedCamera):
             lit = exposed(replace(scene, beams=beams), PEAK)
             frame = render(lit, seed, name=f"{scene.camera.name} {number}", time=utc).frame
             seen = read_photograph(
-                frame, scene.targets, scene.camera, settings=self._settings,
-                previous=self._known.get(name, ()), without=self._empty.get(name),
-            )  # fmt: skip
+                frame,
+                scene.targets,
+                scene.camera,
+                settings=self._settings,
+                previous=self._known.get(name, ()),
+                without=self._empty.get(name),
+            )
             return seen, frame, picture_of(seen)
 
         if self._pool is None:
@@ -120,10 +129,13 @@ class SeenExactly(ExactCamera):
         shot = await super().photograph(target, heliostat)
         x, y = target.plane_coordinates(shot.point)
         self._views[target.name] = CameraView(
-            target.name, self.view(target.name).version + 1,
-            self._sight.clock.utc().timestamp(), b"", (heliostat, *shot.reasons),
+            target.name,
+            self.view(target.name).version + 1,
+            self._sight.clock.utc().timestamp(),
+            b"",
+            (heliostat, *shot.reasons),
             (float(x), float(y)),
-        )  # fmt: skip
+        )
         return shot
 
     def close(self) -> None:

@@ -62,11 +62,15 @@ class LiveField(Field):
         self, mechanism: Mechanism, believed: Mechanism, machine: Machine, **options: Any
     ) -> None:
         super().__init__(
-            mechanism, believed=believed, stow=machine.stow,
+            mechanism,
+            believed=believed,
+            stow=machine.stow,
             ranges=[(axis.low, axis.high) for axis in machine.axes],
             limits=(machine.axes[0].rate, machine.axes[0].acceleration, machine.axes[0].backlash),
-            standby=machine.standby or (0.0, 0.0, 0.0), defocus=machine.defocus, **options,
-        )  # fmt: skip
+            standby=machine.standby or (0.0, 0.0, 0.0),
+            defocus=machine.defocus,
+            **options,
+        )
         count = len(mechanism)
         self.stored: dict[int, dict[str, bytes]] = {}
         self._nominal, self._machine = believed, machine
@@ -91,9 +95,13 @@ class LiveField(Field):
     ) -> tuple[FloatArray, Bools]:
         """Return joint angles (M, 2) that the controllers would take, and whether they reach."""
         found = track(
-            Armature(self._armatures[rows]), sun, aims, drives=Drive(self._drive_table[rows]),
-            current=self.axes["count"][rows].astype(np.float64), tolerance=2e-10,
-        )  # fmt: skip
+            Armature(self._armatures[rows]),
+            sun,
+            aims,
+            drives=Drive(self._drive_table[rows]),
+            current=self.axes["count"][rows].astype(np.float64),
+            tolerance=2e-10,
+        )
         good = np.asarray(found.chosen(found.status) == Status.OK)
         return np.asarray(found.chosen(found.angles)), good
 
@@ -136,9 +144,14 @@ class LiveField(Field):
         return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def mirrors_near(
-        self, sun: FloatArray, middle: FloatArray, normal: FloatArray, reach: float,
-        names: tuple[str, ...], sizes: FloatArray,
-    ) -> list[Mirror]:  # fmt: skip
+        self,
+        sun: FloatArray,
+        middle: FloatArray,
+        normal: FloatArray,
+        reach: float,
+        names: tuple[str, ...],
+        sizes: FloatArray,
+    ) -> list[Mirror]:
         """Return the mirrors whose rays meet a plane within a distance of its middle, m."""
         return near(self._stand(), sun, middle, normal, reach, names, sizes)
 
@@ -151,9 +164,14 @@ class LiveBus(FieldBus):
         self._live = field
 
     async def transact(
-        self, frame: bytes, timeout: float, *, expires: float | None = None, urgent: bool = False,
+        self,
+        frame: bytes,
+        timeout: float,
+        *,
+        expires: float | None = None,
+        urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
-    ) -> bytes:  # fmt: skip
+    ) -> bytes:
         """As of any bus; in an emergency all buses and the plant have their turns between."""
         if urgent:
             await asyncio.sleep(0)
@@ -177,8 +195,9 @@ class LiveBus(FieldBus):
             return self._answer(place, sequence, "STORED", payload[:1] + data)
         if name == "STANDBY" or messages.who_of(number) == messages.KEY:
             result = self._store(name, number, payload, row)
-            values = struct.pack("<" + messages.codes_of(messages.NUMBER_OF["ACK"]),
-                                 sequence, number, result)  # fmt: skip
+            values = struct.pack(
+                "<" + messages.codes_of(messages.NUMBER_OF["ACK"]), sequence, number, result
+            )
             return self._answer(place, sequence, "ACK", values)
         return super()._command(name, number, payload, place, sequence)
 
@@ -204,9 +223,14 @@ class LiveBus(FieldBus):
 
 
 def near(
-    stand: tuple[FloatArray, FloatArray], sun: FloatArray, middle: FloatArray,
-    normal: FloatArray, reach: float, names: tuple[str, ...], sizes: FloatArray,
-) -> list[Mirror]:  # fmt: skip
+    stand: tuple[FloatArray, FloatArray],
+    sun: FloatArray,
+    middle: FloatArray,
+    normal: FloatArray,
+    reach: float,
+    names: tuple[str, ...],
+    sizes: FloatArray,
+) -> list[Mirror]:
     """Return the mirrors whose rays meet a plane within a distance of its middle.
 
     Parameters

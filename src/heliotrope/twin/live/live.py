@@ -64,7 +64,7 @@ _ASIDE, _LEAST_ASIDE = 3.0, 8.0
 #: Of calibrations: what a quick installation leaves, and what a photograph of the twin is worth.
 CYCLE = CycleSettings(
     shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"), sigma=2e-4
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -163,11 +163,16 @@ class LivePlant:
     """
 
     def __init__(
-        self, design: Plant, clock: VirtualClock, options: LiveOptions | None = None, *,
-        audit: Audit | None = None, records: Records | None = None,
+        self,
+        design: Plant,
+        clock: VirtualClock,
+        options: LiveOptions | None = None,
+        *,
+        audit: Audit | None = None,
+        records: Records | None = None,
         assigned: Assigned | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         chosen = options or LiveOptions()
         if len(design.groups) != 1:
             raise InputError(
@@ -197,10 +202,14 @@ class LivePlant:
         self.links = self._wire(clusters_of(design), {n: i for i, n in enumerate(self.names)})
         self.audit = audit or Forgetful()
         self.plant = PlantController(
-            design, self.logbook.tapped(self.links), clock, self.audit,
-            settings=chosen.plant or PlantSettings(), assigned=assigned,
+            design,
+            self.logbook.tapped(self.links),
+            clock,
+            self.audit,
+            settings=chosen.plant or PlantSettings(),
+            assigned=assigned,
             on_alarm=self.logbook.take_alarm,
-        )  # fmt: skip
+        )
         rest_on(self.plant.standbys, self.machine.standby)
         # The plant's rows go cluster by cluster, the field's as the design has them.
         self._rows = np.array([group.index(name) for name in self.plant.field.names])
@@ -210,11 +219,16 @@ class LivePlant:
         self.cameras = self._new_cameras()
         cycle = CentringCycle(self.plant, self.cameras, chosen.cycle or CYCLE)
         self.operations = Operations(
-            self.plant, self.logbook, cycle if design.targets else None,
+            self.plant,
+            self.logbook,
+            cycle if design.targets else None,
             cameras={target.name: self.cameras for target in design.targets},
-            scheduler=self._scheduler(cycle), records=records, truth=self.errors, extra=extra,
+            scheduler=self._scheduler(cycle),
+            records=records,
+            truth=self.errors,
+            extra=extra,
             settings=chosen.work or WorkSettings(wanted=True),
-        )  # fmt: skip
+        )
 
     # -- putting it together ---------------------------------------------------------------
 
@@ -331,9 +345,11 @@ class LivePlant:
         async with asyncio.TaskGroup() as group:
             turns = group.create_task(self._turn())
             async with (
-                running(*self._parts), running(*self._clusters), running(self.plant),
+                running(*self._parts),
+                running(*self._clusters),
+                running(self.plant),
                 running(self.operations),
-            ):  # fmt: skip
+            ):
                 looks = group.create_task(self._empty())
                 yield self
                 looks.cancel()
@@ -409,6 +425,8 @@ def prototype_plant() -> Plant:
     target = square_target("target", like.targets[0].center, 3.0, np.pi)
     camera = watching_camera(target, "camera", 20.0, 2.0, 3.0)
     return replace(
-        like, groups={"azel": replace(group, mechanism=mechanism)}, targets=(target,),
+        like,
+        groups={"azel": replace(group, mechanism=mechanism)},
+        targets=(target,),
         cameras=(camera,),
-    )  # fmt: skip
+    )

@@ -64,9 +64,11 @@ class PacedLoop(asyncio.SelectorEventLoop):
     """
 
     def __init__(
-        self, speed: float = 1.0, start: float = 1000.0,
+        self,
+        speed: float = 1.0,
+        start: float = 1000.0,
         wall: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not 0.0 < speed <= 1000.0:
             self._closed = True  # its end asks for it
             raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds in a second")

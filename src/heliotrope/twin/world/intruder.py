@@ -12,8 +12,20 @@ from heliotrope.twin.boards.outfit import sha256
 from heliotrope.twin.invariants.ledger import FrameLedger
 
 #: What he would like to command.
-WANTED = ("TRACK", "APPROACH", "REFOCUS", "IDLE", "AIM", "UNLOCK", "CLEAR_FAULT", "LOCK", "GOTO",
-          "SET_BIAS", "ZERO", "SET_DEFOCUS")  # fmt: skip
+WANTED = (
+    "TRACK",
+    "APPROACH",
+    "REFOCUS",
+    "IDLE",
+    "AIM",
+    "UNLOCK",
+    "CLEAR_FAULT",
+    "LOCK",
+    "GOTO",
+    "SET_BIAS",
+    "ZERO",
+    "SET_DEFOCUS",
+)
 #: So many commands are sent in some ten seconds.
 _LATELY = 8
 _NUMBERS: dict[str, tuple[float, ...]] = {
@@ -63,9 +75,12 @@ class Intruder:
         is_key = messages.who_of(messages.NUMBER_OF[name]) == messages.KEY
         head = (token, expires, edition) if is_key else (token, expires)
         return sender.frame(
-            self._addresses[target], name, *head, *_NUMBERS.get(name, ()),
+            self._addresses[target],
+            name,
+            *head,
+            *_NUMBERS.get(name, ()),
             key=b"guessed" if is_key else b"",
-        )  # fmt: skip
+        )
 
     def safe(self, target: int, size: float) -> bytes:
         """Return DEFOCUS or STOW, to one heliostat or to all, after a zero that ends any noise."""

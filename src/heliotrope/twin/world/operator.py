@@ -71,9 +71,14 @@ class Operator:
     """
 
     def __init__(
-        self, clock: Clock, seed: int, observer: PlantObserver, names: Sequence[str],
-        pods: Sequence[Pod], flux: Callable[[], float],
-    ) -> None:  # fmt: skip
+        self,
+        clock: Clock,
+        seed: int,
+        observer: PlantObserver,
+        names: Sequence[str],
+        pods: Sequence[Pod],
+        flux: Callable[[], float],
+    ) -> None:
         self.plant: PlantController | None = None
         self.away = False
         self.counts: Counter[str] = Counter()
@@ -156,18 +161,31 @@ class Operator:
             self._end_emergency(plant)
             self._acknowledge(plant)
             does = self._chance.choices(
-                [self._onward, self._everybody, self._parameters, self._emergency, self._one_safe,
-                 self._lock, self._wrong, self._change, self._astray],
+                [
+                    self._onward,
+                    self._everybody,
+                    self._parameters,
+                    self._emergency,
+                    self._one_safe,
+                    self._lock,
+                    self._wrong,
+                    self._change,
+                    self._astray,
+                ],
                 [60, 14, 8, 4, 2, 3, 5, 4, 4],
-            )[0]  # fmt: skip
+            )[0]
             does(plant)
             if self._chance.random() < 0.06:
                 await self._rogue()
 
     def _give(
-        self, plant: PlantController, what: str, heliostats: Sequence[str] = (),
-        person: Person | None = None, token: int | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        plant: PlantController,
+        what: str,
+        heliostats: Sequence[str] = (),
+        person: Person | None = None,
+        token: int | None = None,
+    ) -> None:
         """Give a command, and tell the observer if it was accepted."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
@@ -233,9 +251,18 @@ class Operator:
 
     def _everybody(self, plant: PlantController) -> None:
         for what in self._chance.choice(
-            [("AIM",), ("APPROACH",), ("TRACK",), ("TRACK",), ("IDLE",), ("REFOCUS",),
-             ("STANDBY",), ("AIM", "APPROACH"), ("DIAGNOSE",)]
-        ):  # fmt: skip
+            [
+                ("AIM",),
+                ("APPROACH",),
+                ("TRACK",),
+                ("TRACK",),
+                ("IDLE",),
+                ("REFOCUS",),
+                ("STANDBY",),
+                ("AIM", "APPROACH"),
+                ("DIAGNOSE",),
+            ]
+        ):
             self._give(plant, what)
 
     def _lock(self, plant: PlantController) -> None:

@@ -73,9 +73,15 @@ class Pod:
     """
 
     def __init__(
-        self, name: str, boards: list[Board], observer: Observer, clock: VirtualClock,
-        start: datetime, site: Site, chance: random.Random,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        boards: list[Board],
+        observer: Observer,
+        clock: VirtualClock,
+        start: datetime,
+        site: Site,
+        chance: random.Random,
+    ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
         self._true, self._site, self._chance = clock, site, chance

@@ -312,10 +312,17 @@ class Simulation:
             links[pod.name] = pod.tap
         audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         plant = self.plant = PlantController(
-            self._design, links, self._clock, audit, clusters=self._homes, settings=SETTINGS,
-            wanted=self._wanted, assigned=self._assigned, table=TABLE,
+            self._design,
+            links,
+            self._clock,
+            audit,
+            clusters=self._homes,
+            settings=SETTINGS,
+            wanted=self._wanted,
+            assigned=self._assigned,
+            table=TABLE,
             entropy=self._chance.randbytes,
-        )  # fmt: skip
+        )
         self.operator.begins(plant)
         self._program = [group.create_task(link.run()) for link in links.values()]
         self._program.append(group.create_task(plant.run()))
@@ -354,8 +361,10 @@ class Simulation:
             for pod in self.pods:
                 pod.start(group)
             self.start_plant(group)
-            others = [group.create_task(self.operator.keep()),
-                      group.create_task(self.operator.work())]  # fmt: skip
+            others = [
+                group.create_task(self.operator.keep()),
+                group.create_task(self.operator.work()),
+            ]
             await self._turn(damage, group)
             self.crash_plant(self._clock.monotonic())
             for pod in self.pods:
