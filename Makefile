@@ -12,7 +12,7 @@ OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test soak lint docs bench firmware clean
+.PHONY: help setup run test soak lint docs bench house firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -47,6 +47,9 @@ docs: $(STAMP)  ## build the documentation into site/
 
 bench: $(STAMP)  ## run all benchmarks and keep their results in benchmarks/results/
 	@$(BIN)/python -m benchmarks all
+
+house: $(STAMP)  ## print packages, floors and what breaks the rules of the house
+	@$(BIN)/python scripts/house.py
 
 firmware: $(STAMP)  ## compile the firmware of a board: BOARD=rp2, esp32 or stm32
 	@$(BIN)/python scripts/firmware.py $(BOARD)

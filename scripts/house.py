@@ -1,0 +1,353 @@
+"""Print how the house is built: packages, floors, imports, and what should not be there.
+
+``python scripts/house.py [ROOT]`` (``make house``) reads the imports of ``src/heliotrope`` from the
+source, without running it, and the floors from import-linter's contract in ``pyproject.toml``.
+With ``--check`` it ends with status 1 if an import runs up, two files import each other, a package
+imports another package's underscore module, or a module has neither a caller nor a place in a
+public face. ``--draw FILE`` writes the picture of ``docs/explanation/architecture.md``.
+"""
+
+import argparse
+import ast
+import re
+import sys
+import tomllib
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+
+NAME = "heliotrope"
+#: Started by name and not by an import: the command line, `python -m heliotrope.warm`, Alembic.
+STARTED = re.compile(rf"{NAME}(\.cli|\.warm|\.store\.migrations(\..*)?|\.lcu\.node)?$")
+
+
+#: Colours, type and the head of an arrow.
+_LOOK = (
+    "<style>rect{fill:#fff3e0;stroke:#e65100}path{fill:none;stroke:#8d6e63;opacity:.7;"
+    "marker-end:url(#a)}text{font-family:sans-serif;text-anchor:middle;fill:#212121}"
+    ".n{font-size:14px;font-weight:600}.r{font-size:10px}</style>"
+    '<defs><marker id="a" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
+    'markerHeight="7" orient="auto"><path d="M0 0L8 4L0 8z" style="fill:#8d6e63;'
+    'stroke:none;marker-end:none"/></marker></defs>'
+)
+
+
+@dataclass
+class Module:
+    """One source file with what it imports of the house."""
+
+    name: str
+    path: Path
+    lines: int
+    face: bool
+    skips: int = 0
+    #: Names it takes from other modules: (module, name or "").
+    taken: list[tuple[str, str]] = field(default_factory=list)
+    #: Where a face's names come from.
+    homes: dict[str, tuple[str, str]] = field(default_factory=dict)
+    #: Public names of a face.
+    offers: list[str] = field(default_factory=list)
+
+    @property
+    def room(self) -> str:
+        """The package it belongs to, or the module itself if it lies at the top."""
+        parts = self.name.split(".")
+        return parts[1] if len(parts) > 1 else ""
+
+
+def modules(root: Path) -> dict[str, Module]:
+    """Read all modules below ``root/src``."""
+    source = root / "src"
+    found: dict[str, Module] = {}
+    for path in sorted((source / NAME).rglob("*.py")):
+        parts = path.relative_to(source).with_suffix("").parts
+        face = parts[-1] == "__init__"
+        name = ".".join(parts[:-1] if face else parts)
+        text = path.read_text(encoding="utf-8")
+        found[name] = Module(name, path, text.count("\n"), face, text.count("# fmt: skip"))
+    for module in found.values():
+        _read(module, found)
+    return found
+
+
+def _read(module: Module, known: dict[str, Module]) -> None:
+    tree = ast.parse(module.path.read_text(encoding="utf-8"))
+    package = module.name if module.face else module.name.rpartition(".")[0]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            module.taken += [(a.name, "") for a in node.names if a.name.split(".")[0] == NAME]
+        elif isinstance(node, ast.ImportFrom):
+            above = package.split(".")[: len(package.split(".")) - node.level + 1]
+            origin = node.module or ""
+            if node.level:
+                origin = ".".join([*above, *([origin] if origin else [])])
+            if origin.split(".")[0] != NAME:
+                continue
+            for alias in node.names:
+                inner = f"{origin}.{alias.name}"
+                taken = (inner, "") if inner in known else (origin, alias.name)
+                module.taken.append(taken)
+                if module.face:
+                    module.homes[alias.asname or alias.name] = taken
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            named = any(isinstance(t, ast.Name) and t.id == "__all__" for t in targets)
+            if named and isinstance(node.value, ast.List | ast.Tuple):
+                module.offers = [e.value for e in node.value.elts if isinstance(e, ast.Constant)]
+
+
+def home(known: dict[str, Module], origin: str, name: str) -> str:
+    """Return the module that a name really comes from, through the faces of packages."""
+    for _ in range(10):
+        module = known.get(origin)
+        if module is None or not name or name not in module.homes:
+            return origin
+        origin, name = module.homes[name]
+    return origin
+
+
+def arrows(known: dict[str, Module], *, through_faces: bool) -> dict[str, set[str]]:
+    """Return which modules each module imports, itself left out."""
+    found: dict[str, set[str]] = {}
+    for module in known.values():
+        ends = {
+            home(known, origin, name) if through_faces else origin for origin, name in module.taken
+        }
+        found[module.name] = {end for end in ends if end in known and end != module.name}
+    return found
+
+
+def circles(known: dict[str, Module]) -> list[tuple[str, ...]]:
+    """Return the sets of files that import each other, also over others (Tarjan 1972)."""
+    graph = {
+        name: {e for e in ends if not known[e].face}
+        for name, ends in arrows(known, through_faces=True).items()
+        if not known[name].face
+    }
+    order: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[tuple[str, ...]] = []
+
+    def visit(name: str) -> None:
+        order[name] = low[name] = len(order)
+        stack.append(name)
+        for end in graph[name]:
+            if end not in order:
+                visit(end)
+                low[name] = min(low[name], low[end])
+            elif end in stack:
+                low[name] = min(low[name], order[end])
+        if low[name] == order[name]:
+            group = []
+            while not group or group[-1] != name:
+                group.append(stack.pop())
+            if len(group) > 1:
+                found.append(tuple(sorted(group)))
+
+    for name in graph:
+        if name not in order:
+            visit(name)
+    return sorted(found)
+
+
+def floors(root: Path) -> list[list[str]]:
+    """Return the floors from the top down, as import-linter holds them."""
+    with (root / "pyproject.toml").open("rb") as file:
+        contracts = tomllib.load(file)["tool"]["importlinter"]["contracts"]
+    layers = next(c["layers"] for c in contracts if c["type"] == "layers")
+    return [[room.strip() for room in layer.split("|")] for layer in layers]
+
+
+def upward(known: dict[str, Module], levels: list[list[str]]) -> list[str]:
+    """Return the imports that run up, or sideways on a floor."""
+    at = {room: i for i, rooms in enumerate(levels) for room in rooms}
+    found = []
+    for name, ends in arrows(known, through_faces=False).items():
+        for end in ends:
+            a, b = known[name].room, known[end].room
+            if a != b and a in at and b in at and at[b] <= at[a]:
+                found.append(f"{name} → {end}")
+    return sorted(found)
+
+
+def foreign(known: dict[str, Module]) -> list[str]:
+    """Return the imports of another package's underscore module or name."""
+    found = []
+    for module in known.values():
+        for origin, name in module.taken:
+            parts = [*origin.split(".")[1:], name]
+            if parts[0] != module.room and any(p.startswith("_") for p in parts):
+                if name == "__version__":
+                    continue
+                found.append(
+                    f"{module.name} → {origin if not name.startswith('_') else f'{origin}.{name}'}"
+                )
+    return sorted(set(found))
+
+
+def orphans(known: dict[str, Module]) -> list[str]:
+    """Return the modules that nothing imports and no face offers."""
+    graph = arrows(known, through_faces=True)
+    used = {end for name, ends in graph.items() for end in ends if not known[name].face}
+    for module in known.values():
+        if module.face:
+            offered = {home(known, *module.homes[n]) for n in module.offers if n in module.homes}
+            used |= offered
+            used |= {f"{module.name}.{n}" for n in module.offers}
+            # The command line's own rooms are put together in their faces.
+            if module.room == "cli":
+                used |= graph[module.name]
+    return sorted(
+        m.name for m in known.values()
+        if not m.face and m.name not in used and not STARTED.match(m.name)
+    )  # fmt: skip
+
+
+def repeated(known: dict[str, Module]) -> dict[str, int]:
+    """Return the names of classes that stand in several modules, with their count."""
+    count: Counter[str] = Counter()
+    for module in known.values():
+        tree = ast.parse(module.path.read_text(encoding="utf-8"))
+        count.update({n.name for n in ast.walk(tree) if isinstance(n, ast.ClassDef)})
+    return {name: n for name, n in sorted(count.items()) if n > 1 and not name.startswith("_")}
+
+
+def rooms(known: dict[str, Module], levels: list[list[str]]) -> list[tuple[str, int, int, int]]:
+    """Return package, inner rooms, files and lines, from the top floor down."""
+    per: dict[str, list[Module]] = defaultdict(list)
+    for module in known.values():
+        per[module.room].append(module)
+    order = [room for rooms_ in levels for room in rooms_]
+    names = [*order, *sorted(set(per) - set(order))]
+    table = []
+    for name in names:
+        own = per.get(name, [])
+        inner = sum(m.face for m in own) - 1 if any(m.face for m in own) else 0
+        if own:
+            table.append((name or "(top)", inner, len(own), sum(m.lines for m in own)))
+    return table
+
+
+def between(known: dict[str, Module]) -> dict[str, set[str]]:
+    """Return which packages each package imports."""
+    found: dict[str, set[str]] = defaultdict(set)
+    for name, ends in arrows(known, through_faces=False).items():
+        for end in ends:
+            a, b = known[name].room, known[end].room
+            if a and b and a != b:
+                found[a].add(b)
+    return found
+
+
+def reduced(graph: dict[str, set[str]]) -> list[tuple[str, str]]:
+    """Return the arrows that no way over other packages implies."""
+
+    def below(name: str) -> set[str]:
+        seen: set[str] = set()
+        ahead = [*graph.get(name, ())]
+        while ahead:
+            here = ahead.pop()
+            if here not in seen:
+                seen.add(here)
+                ahead += graph.get(here, ())
+        return seen
+
+    return sorted(
+        (a, b)
+        for a, ends in graph.items()
+        for b in ends
+        if not any(b in below(other) for other in ends - {b})
+    )
+
+
+def drawing(known: dict[str, Module], levels: list[list[str]]) -> str:
+    """Return the floors as SVG: a box for each package, an arrow for each import not implied."""
+    width, height, gap, tall = 128, 46, 22, 40
+    wide = max(len(rooms_) for rooms_ in levels) * (width + gap) + gap
+    inner = defaultdict(list)
+    for module in known.values():
+        parts = module.name.split(".")
+        if module.face and len(parts) == 3:
+            inner[parts[1]].append(parts[2])
+    places: dict[str, tuple[float, float]] = {}
+    boxes = []
+    for i, names in enumerate(levels):
+        y = gap + i * (height + tall)
+        left = (wide - len(names) * (width + gap) + gap) / 2
+        for k, name in enumerate(names):
+            x = left + k * (width + gap)
+            places[name] = (x + width / 2, y)
+            boxes.append(
+                f'<rect x="{x:g}" y="{y}" width="{width}" height="{height}" rx="6"/>'
+                f'<text x="{x + width / 2:g}" y="{y + 19}" class="n">{name}</text>'
+            )
+            rooms_ = sorted(inner[name])
+            said = " ".join(rooms_) if len(rooms_) < 4 else f"{len(rooms_)} rooms"
+            if said:
+                boxes.append(f'<text x="{x + width / 2:g}" y="{y + 35}" class="r">{said}</text>')
+    lines = []
+    for a, b in reduced(between(known)):
+        if a in places and b in places:
+            (x1, y1), (x2, y2) = places[a], places[b]
+            y1 += height
+            bend = (y2 - y1) / 2
+            curve = f"C{x1:g} {y1 + bend:g} {x2:g} {y2 - bend:g} {x2:g} {y2:g}"
+            lines.append(f'<path d="M{x1:g} {y1:g} {curve}"/>')
+    bottom = gap + len(levels) * (height + tall)
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {wide} {bottom}" role="img">',
+            "<title>The floors of Heliotrope: imports run downwards only</title>",
+            _LOOK,
+            f'<rect width="{wide}" height="{bottom}" style="fill:#fffdf9;stroke:none"/>',
+            *lines,
+            *boxes,
+            "</svg>",
+            "",
+        ]
+    )
+
+
+def main() -> int:
+    """Print the house."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1])
+    parser.add_argument("--check", action="store_true", help="status 1 if something is wrong")
+    parser.add_argument("--verbose", action="store_true", help="name every place")
+    parser.add_argument("--draw", type=Path, metavar="FILE", help="write the floors as SVG")
+    given = parser.parse_args()
+    known, levels = modules(given.root), floors(given.root)
+    if given.draw:
+        given.draw.write_text(drawing(known, levels), encoding="utf-8")
+        return 0
+    print(f"{'package':14} {'rooms':>5} {'files':>5} {'lines':>6}")
+    for name, inner, files, lines in rooms(known, levels):
+        print(f"{name:14} {inner or '':>5} {files:5} {lines:6}")
+    total = sum(m.lines for m in known.values())
+    print(f"{'in all':14} {'':5} {len(known):5} {total:6}")
+    print(f"\nfloors: {len(levels)}, from the top: {'; '.join(' | '.join(f) for f in levels)}")
+    wrong = {
+        "imports that run up or sideways": upward(known, levels),
+        "file circles": [" ↔ ".join(c) for c in circles(known)],
+        "imports of another package's underscore names": foreign(known),
+        "modules without a caller": orphans(known),
+    }
+    for what, places in wrong.items():
+        print(f"{what}: {len(places)}")
+        for place in places if given.verbose or len(places) <= 12 else ():
+            print(f"  {place}")
+    print(f"fmt: skip: {sum(m.skips for m in known.values())}")
+    faces = [m for m in known.values() if m.face]
+    shown = sum(bool(m.offers) for m in faces)
+    print(f"packages and rooms with a public face (__all__): {shown} of {len(faces)}")
+    names = repeated(known)
+    print(f"class names in several modules: {len(names)}")
+    if given.verbose:
+        print("  " + ", ".join(f"{name} {n}" for name, n in names.items()))
+    return 1 if given.check and any(wrong.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
