@@ -179,7 +179,7 @@ def world(number: int, seed: int, size: tuple[int, int] = (1600, 1200)) -> World
         fill=rng.uniform(0.55, 0.8),
         distortion=rng.uniform(0.0, 0.01),
     )
-    known = (camera, replace(camera, position=None, R_camera_enu=None), None)[number % 3]
+    known = (camera, replace(camera, position=None, R_enu_camera=None), None)[number % 3]
     paint = Paint(
         wear=rng.uniform(0.003, 0.012),
         stains=0,

@@ -19,7 +19,6 @@ from heliotrope.airborne.evaluate.reading import Seen, look, read_photo
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import Photo, read_camera, read_photos, rotation_of_gimbal
-from heliotrope.airborne.pinhole import project
 from heliotrope.airborne.simulate import rendering
 from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
 from heliotrope.airborne.standing import Standing, standing
@@ -67,7 +66,7 @@ def true_spots(case: Case, k: int) -> dict[int, np.ndarray]:
         one = mine.of(row)
         point = case.flown.shapes[row].point_at(one.facet, one.xy)
         there = case.flown.truth.vertex[row] + point @ case.flown.truth.rotation[row].T
-        found[row] = project(case.flown.camera, taken.position, taken.rotation, there)
+        found[row] = taken.pixels(case.flown.camera, there)
     return found
 
 
@@ -98,12 +97,8 @@ def test_spots_belong_to_their_mirrors(case: Case) -> None:
         true = true_spots(case, k)
         local = np.concatenate([seen.spot, np.ones((len(seen.spot), 1))], axis=-1)
         taken = case.flown.taken[k]
-        pixels = project(
-            case.flown.camera,
-            taken.position,
-            taken.rotation,
-            taken.position + 10.0 * local @ taken.rotation.T,
-        )
+        away = taken.position + 10.0 * local @ taken.rotation.T
+        pixels = taken.pixels(case.flown.camera, away)
         for row, pixel in zip(seen.spot_mirror.tolist(), pixels, strict=True):
             off = np.linalg.norm(true.get(row, np.full((1, 2), 1e9)) - pixel, axis=-1).min()
             right, wrong = right + (off < 3.0), wrong + (off >= 3.0)
@@ -220,13 +215,13 @@ def test_regular_field_without_edges_is_ambiguous() -> None:
         np.repeat(np.eye(3)[None], n, 0),
         np.repeat([[[-1.0, 1, 0], [1.0, 1, 0], [1.0, -1, 0], [-1.0, -1, 0]]], n, 0),
     )
-    seen = project(lens, photo.position, photo.rotation, many.vertex)
+    seen = photo.pixels(lens, many.vertex)
     inside = (seen > 0).all(axis=1) & (seen < np.array(lens.size) - 1).all(axis=1)
     assert identify(lens, photo, many, seen[inside]).reason.startswith("ambiguous")
     # If it is not quite regular there is but one place.
     off = np.random.default_rng(1).uniform(-0.5, 0.5, (n, 3)) * [1.0, 1.0, 0.0]
     uneven = replace(many, vertex=many.vertex + off)
-    seen = project(lens, photo.position, photo.rotation, uneven.vertex)
+    seen = photo.pixels(lens, uneven.vertex)
     assert identify(lens, photo, uneven, seen[inside]).reason == ""
 
 

@@ -8,12 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliotrope.airborne import pinhole
 from heliotrope.airborne.photo import (
     LedCamera,
     Photo,
     gimbal_of_rotation,
-    look_at,
     read_camera,
     read_photos,
     rotation_of_gimbal,
@@ -21,6 +19,7 @@ from heliotrope.airborne.photo import (
 )
 from heliotrope.airborne.simulate.rendering import write_photo
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.camera import local_rays, look_at
 from support.drone_case import ORIGIN, camera
 
 TIME = datetime(2026, 6, 21, 10, 0, 0, 250_000, tzinfo=UTC)
@@ -64,7 +63,7 @@ def test_gimbal_straight_down() -> None:
 
 def test_look_at_puts_the_point_in_the_middle() -> None:
     lens, place, point = camera(), np.array([3.0, -8.0, 60.0]), np.array([10.0, 40.0, 1.0])
-    seen = pinhole.project(lens, place, look_at(place, point), point)
+    seen = Photo("a", None, place, look_at(place, point)).pixels(lens, point)
     np.testing.assert_allclose(seen, lens.matrix[:2, 2], atol=1e-6)
 
 
@@ -78,15 +77,15 @@ def test_lamp_is_above_the_camera_in_the_picture() -> None:
 def test_pixels_to_rays_and_back(x: float, y: float) -> None:
     lens, turned = camera(), rotation_of_gimbal(0.4, -0.8, 0.03)
     pixel = np.array([x * lens.size[0], y * lens.size[1]])
-    ray = pinhole.rays(lens, turned, pixel)
-    again = pinhole.project(lens, [1.0, 2.0, 3.0], turned, np.array([1.0, 2.0, 3.0]) + 70.0 * ray)
+    taken = Photo("a", None, np.array([1.0, 2.0, 3.0]), turned)
+    again = taken.pixels(lens, taken.position + 70.0 * turned @ local_rays(lens, pixel))
     np.testing.assert_allclose(again, pixel, atol=2e-3)
 
 
 def test_what_is_behind_or_far_outside_is_not_seen() -> None:
-    lens, turned = camera(), np.eye(3)
+    lens, taken = camera(), Photo("a", None, np.zeros(3), np.eye(3))
     points = np.array([[0.0, 0.0, -5.0], [50.0, 0.0, 1.0], [0.0, 0.0, 5.0]])
-    seen = pinhole.project(lens, np.zeros(3), turned, points)
+    seen = taken.pixels(lens, points)
     assert np.isfinite(seen).all(axis=1).tolist() == [False, False, True]
 
 

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from heliotrope.cli import main
+from heliotrope.field.camera import project
 from heliotrope.field.example import prototype
 from heliotrope.field.formats.plant_file import read_plant, write_plant
-from heliotrope.imaging.projection import project
 from imaging.test_lens import HELD, MATRIX, drawn, held
 from imaging.test_teaching import (
     ALL,
@@ -259,9 +259,9 @@ def test_show(call: Any, place: Path) -> None:
     assert found[0]["targets"]["target"]["distance"] == pytest.approx(np.sqrt(665.0))
     assert "there are no cameras; heliotrope camera teach" in call("show", place / "bare.toml")
     assert json.loads(call("show", place / "bare.toml", "--json")) == []
-    bare = replace(prototype(), cameras=(replace(CAMERA, position=None, R_camera_enu=None),))
+    bare = replace(prototype(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
     write_plant(bare, place / "lens.toml")
-    assert "camera south: where it stands is not known" in call("show", place / "lens.toml")
+    assert "camera south: its position is not known" in call("show", place / "lens.toml")
 
 
 # -- bad input -------------------------------------------------------------------------

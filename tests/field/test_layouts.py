@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from heliotrope.cli._field_layout import layout
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field import layouts
+from heliotrope.field.camera import project
 from heliotrope.field.formats.plant_file import check_plant, read_plant, write_plant
 from heliotrope.field.layouts import (
     FREE,
@@ -28,7 +29,6 @@ from heliotrope.field.layouts import (
 )
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, angle_between, direction
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.imaging.targets.finding import find_targets

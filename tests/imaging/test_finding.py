@@ -9,14 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, project
 from heliotrope.field.formats.paint import read_tower
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, rotation
 from heliotrope.imaging.files import read_image
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.synthetic.rendering import (
     Lens,
     Rendered,
@@ -224,7 +223,7 @@ def test_three_of_four_corners_are_enough_where_they_are_certain() -> None:
     frame = covered(("m2",), rendered)
     whole = view_of(only(rendered.frame, target))
     # An earlier view tells the perspective, a lens how large it may be.
-    lens = replace(CAMERA, position=None, R_camera_enu=None)
+    lens = replace(CAMERA, position=None, R_enu_camera=None)
     for found in (only(frame, target, None, whole), only(frame, target, lens)):
         assert sum(m.used for m in found.marks) == 3
         assert off(found, CAMERA, 0.05) < 0.03
@@ -332,8 +331,8 @@ def test_a_camera_or_an_earlier_view_need_no_search(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_camera_that_moved_is_found_again() -> None:
-    turned = rotation([0.0, 1.0, 0.0], 0.02) @ np.asarray(CAMERA.R_camera_enu)
-    moved = replace(CAMERA, R_camera_enu=turned)
+    turned = np.asarray(CAMERA.R_enu_camera) @ rotation([0.0, 1.0, 0.0], -0.02)
+    moved = replace(CAMERA, R_enu_camera=turned)
     old = view_of(only(render(scene(camera=moved), 1).frame))
     assert np.linalg.norm(old.to_pixels(np.zeros(2)) - project(CAMERA, TARGET.center)) > 50.0
     assert off(only(plain().frame, TARGET, moved), CAMERA) < 3e-3

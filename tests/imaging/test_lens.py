@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from heliotrope.errors import InputError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, look_at, project, rays, undistort
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.lens import (
     CENTER_SIGMA,
@@ -22,7 +22,6 @@ from heliotrope.imaging.lens import (
     find_chessboard,
     resection,
 )
-from heliotrope.imaging.projection import look_at, project, rays, undistort
 
 PATTERN, SQUARE = (9, 6), 0.03
 SIZE = (480, 360)
@@ -278,7 +277,7 @@ def camera(
 def errors(true: Camera, fit: CameraFit) -> FloatArray:
     """What the covariance is of."""
     found = fit.camera
-    turn = cv2.Rodrigues(np.asarray(found.R_camera_enu) @ np.asarray(true.R_camera_enu).T)[0]
+    turn = cv2.Rodrigues(np.asarray(found.R_enu_camera).T @ np.asarray(true.R_enu_camera))[0]
     parts = [turn.ravel(), np.asarray(found.position) - true.position]
     if len(fit.names) > 6:
         parts += [

@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import norm
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.camera import project
 from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, direction
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.synthetic import _painting
 from heliotrope.imaging.synthetic.rendering import (
     Lens,
@@ -457,9 +457,9 @@ def test_guards(make: object, text: str) -> None:
 
 def test_cameras_that_cannot_see_the_target() -> None:
     assert CAMERA.position is not None
-    assert CAMERA.R_camera_enu is not None
-    lost = replace(CAMERA, position=None, R_camera_enu=None)
-    with pytest.raises(InputError, match="where it stands is not known"):
+    assert CAMERA.R_enu_camera is not None
+    lost = replace(CAMERA, position=None, R_enu_camera=None)
+    with pytest.raises(InputError, match="its position is not known"):
         render(scene(camera=lost), 0)
     behind = replace(CAMERA, position=CAMERA.position * [1.0, -1.0, 1.0])
     with pytest.raises(InputError, match="does not see the front of target target"):

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, look_at, project, rays
 from heliotrope.field.example import prototype
 from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.field.marks import Mark
@@ -27,7 +27,6 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.projection import look_at, project, rays
 from heliotrope.imaging.targets.click_page import ask, click_points
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.imaging.targets.teaching import (
@@ -190,7 +189,7 @@ def test_the_camera_comes_with_it(frame: Frame) -> None:
 
 
 def test_a_camera_that_is_known_keeps_its_lens(frame: Frame) -> None:
-    known = replace(CAMERA, position=None, R_camera_enu=None, targets=(), deviation=0.3)
+    known = replace(CAMERA, position=None, R_enu_camera=None, targets=(), deviation=0.3)
     plant = replace(BARE, cameras=(known,))
     taught = teach(plant, "target", frame, clicked(ALL), wishes=DRAWN, camera="south")
     camera = taught.plant.camera("south")
@@ -281,7 +280,7 @@ def test_taught_pictures_are_found_in_another_frame(blotted: Frame, tmp_path: Pa
     write_taught(taught, tmp_path / "plant.toml")
     plant = read_plant(tmp_path / "plant.toml")
     # The wind has moved the camera a little, and the light is another.
-    moved = replace(CAMERA, R_camera_enu=look_at(CAMERA.position, (0.03, 0.0, 13.02)))
+    moved = replace(CAMERA, R_enu_camera=look_at(CAMERA.position, (0.03, 0.0, 13.02)))
     later = photograph((), moved, seed=9, leaves=LEAVES)
     later = replace(later, pixels=(later.pixels * 0.7 + 10).astype(np.uint8))
     seen = see_marks(plant, tmp_path, [later], plant.camera("south"))
@@ -361,7 +360,7 @@ def same(a: Plant, b: Plant) -> None:
             (c.matrix, d.matrix),
             (c.distortion, d.distortion),
             (c.position, d.position),
-            (c.R_camera_enu, d.R_camera_enu),
+            (c.R_enu_camera, d.R_enu_camera),
         ):
             assert np.array_equal(np.asarray(one), np.asarray(two))
 
@@ -577,8 +576,8 @@ def test_sights_of_a_camera() -> None:
     assert sight.metres_per_pixel == pytest.approx(np.sqrt(square), rel=2e-3)
     assert (sight.share, sight.marks) == (1.0, 6)
     assert sights(replace(CAMERA, targets=("far",)), [target]) == []
-    assert sights(replace(CAMERA, position=None, R_camera_enu=None), [target]) == []
-    aside = replace(seeing, R_camera_enu=look_at(CAMERA.position, (2.6, 0.0, 13.0)))
+    assert sights(replace(CAMERA, position=None, R_enu_camera=None), [target]) == []
+    aside = replace(seeing, R_enu_camera=look_at(CAMERA.position, (2.6, 0.0, 13.0)))
     assert 0.3 < sights(aside, [target])[0].share < 0.9
 
 

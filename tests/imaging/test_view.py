@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, project
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.synthetic.scenes import example_camera, example_target
 from heliotrope.imaging.targets.view import View, distort, faces, fit_view, homography, unknown_lens
 

@@ -1,7 +1,7 @@
 """Photographs from the air: which camera, from where, looking where.
 
-Camera axes are those of :class:`heliotrope.field.camera.Camera`: x right, y down, z ahead.
-A rotation here turns camera axes into ENU, so ``point = position + rotation @ local``.
+The camera model is that of :mod:`heliotrope.field.camera`, in the same convention: camera axes
+x right, y down, z forward, and rotations from camera axes to ENU.
 """
 
 import csv
@@ -19,13 +19,13 @@ import numpy.typing as npt
 
 from heliotrope.airborne._photo_metadata import Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
+from heliotrope.field.camera import checked_pinhole, checked_pose, local_pixels
 from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import (
     FloatArray,
     as_float,
     as_vectors,
     geodetic_to_enu,
-    normalize,
     rotation,
 )
 
@@ -33,6 +33,8 @@ from heliotrope.geometry import (
 SUFFIXES = (".jpg", ".jpeg")
 #: Of a position that states no deviation of its own: a fixed RTK solution, m.
 RTK_SIGMA = 0.01
+#: Points farther out than this multiple of the frame's corners are not seen.
+REACH = 1.3
 #: Value of RtkFlag for a fixed solution; what is below is known to decimetres or metres.
 RTK_FIXED = 50
 
@@ -59,23 +61,11 @@ class LedCamera:
     led_offset: FloatArray = field(default_factory=lambda: np.array([0.0, -0.1, 0.0]))
 
     def __post_init__(self) -> None:
-        width, height = (int(n) for n in self.size)
-        if not (16 <= width <= 100_000 and 16 <= height <= 100_000):
-            raise InputError(f"camera: photographs of {width} × {height} px; give 16 to 100000")
-        matrix = as_float(self.matrix)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-            raise InputError(f"camera: matrix of shape {matrix.shape} must be (3, 3) and finite")
-        if min(matrix[0, 0], matrix[1, 1]) <= 0.0:
-            raise InputError(
-                f"camera: focal lengths {matrix[0, 0]}, {matrix[1, 1]} px must be above 0"
-            )
-        distortion = as_float(self.distortion)
-        if distortion.shape != (5,) or not np.isfinite(distortion).all():
-            raise InputError("camera: distortion needs k1, k2, p1, p2, k3, each finite")
+        size, matrix, distortion = checked_pinhole("camera", self, smallest=16)
         offset = as_vectors(self.led_offset, "camera: led_offset")
         if offset.shape != (3,) or np.linalg.norm(offset) > 5.0:
             raise InputError(f"camera: led_offset {offset} m; give right, down, ahead within 5 m")
-        object.__setattr__(self, "size", (width, height))
+        object.__setattr__(self, "size", size)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
         object.__setattr__(self, "led_offset", offset)
@@ -114,12 +104,7 @@ class Photo:
     path: Path | None = None
 
     def __post_init__(self) -> None:
-        position = as_vectors(self.position, f"photo {self.name}: position")
-        turned = as_float(self.rotation)
-        if position.shape != (3,) or turned.shape != (3, 3):
-            raise InputError(f"photo {self.name}: needs a position (3,) and a rotation (3, 3)")
-        if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-6) or np.linalg.det(turned) < 0:
-            raise InputError(f"photo {self.name}: its rotation is not a right-handed rotation")
+        position, turned = checked_pose(f"photo {self.name}", self.position, self.rotation)
         sigma = np.array(np.broadcast_to(as_float(self.sigma_position), (3,)))
         if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
             raise InputError(f"photo {self.name}: sigma_position {sigma} m must be above 0")
@@ -132,6 +117,14 @@ class Photo:
     def led_position(self, camera: LedCamera) -> FloatArray:
         """Return where the lamp is, ENU metres, (3,)."""
         return as_float(self.position + self.rotation @ camera.led_offset)
+
+    def pixels(self, camera: LedCamera, points: npt.ArrayLike) -> FloatArray:
+        """Return the pixels (..., 2) at which points, ENU metres (..., 3), are seen.
+
+        NaN behind the camera or beyond :data:`REACH`.
+        """
+        local = (as_vectors(points, "points") - self.position) @ self.rotation
+        return local_pixels(camera, local, REACH)
 
     def moved(self, position: npt.ArrayLike, rotation: npt.ArrayLike) -> "Photo":
         """Return the photograph with another exterior orientation."""
@@ -163,13 +156,6 @@ def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
     if level < 1e-9:
         return math.atan2(-ned[0, 1], ned[1, 1]), pitch, 0.0
     return math.atan2(ned[1, 0], ned[0, 0]), pitch, math.atan2(ned[2, 1], ned[2, 2])
-
-
-def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) of a camera without roll at ``position``, looking at ``point``."""
-    ahead = normalize(as_float(point) - as_float(position), "line of sight")
-    yaw = math.atan2(ahead[0], ahead[1]) if math.hypot(ahead[0], ahead[1]) > 1e-9 else 0.0
-    return rotation_of_gimbal(yaw, math.asin(float(np.clip(ahead[2], -1.0, 1.0))), 0.0)
 
 
 # -- camera file -----------------------------------------------------------------------

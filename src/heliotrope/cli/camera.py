@@ -412,7 +412,7 @@ def show(
     for camera in loaded.cameras:
         if camera.position is None:
             print(
-                f"camera {camera.name}: where it stands is not known; heliotrope camera "
+                f"camera {camera.name}: its position is not known; heliotrope camera "
                 "calibrate (or teach) finds it"
             )
 
@@ -479,7 +479,7 @@ def _field(camera: "Camera") -> Any:
     """Angles of view, across and up, rad, (2,)."""
     import numpy as np
 
-    from heliotrope.imaging.projection import undistort
+    from heliotrope.field.camera import undistort
 
     width, height = camera.size
     cx, cy = camera.matrix[:2, 2]
@@ -491,11 +491,10 @@ def _field(camera: "Camera") -> Any:
 def _document(camera: "Camera") -> dict[str, Any]:
     import numpy as np
 
-    place = (
-        {}
-        if camera.position is None
-        else {"position_m": camera.position, "rotation": camera.R_camera_enu}
-    )
+    place: dict[str, Any] = {}
+    if camera.R_enu_camera is not None:
+        # As in plant files: rows right, down, forward in ENU.
+        place = {"position_m": camera.position, "rotation": camera.R_enu_camera.T}
     return {
         "camera": camera.name,
         "size_px": camera.size,

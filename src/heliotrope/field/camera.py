@@ -1,41 +1,68 @@
-"""Cameras that look at targets: what is known of them."""
+"""The camera model of the house: a pinhole with a distorting lens, posed in ENU.
+
+One convention serves target cameras and drones. Camera axes are x right, y down, z forward.
+``R_enu_camera`` turns them into ENU, so its columns are the camera's axes and
+
+    point = position + R_enu_camera @ local
+
+A point ``local`` is seen at the normalised place ``(x/z, y/z)``, which the lens distorts (Brown
+and Conrady: k1, k2, p1, p2, k3), and ``matrix`` maps to pixels. The centre of the first pixel is
+(0, 0). OpenCV evaluates all of it; it is imported at the first use.
+"""
 
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_vectors
+from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+
+#: Smallest depth in front of a camera at which a point counts as seen, m.
+_NEAREST = 1e-6
+
+
+class Pinhole(Protocol):
+    """Anything with a frame size (px), a camera matrix (3, 3) and a distortion (5,)."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of a frame, px."""
+
+    @property
+    def matrix(self) -> FloatArray:
+        """Focal lengths and principal point, px, (3, 3)."""
+
+    @property
+    def distortion(self) -> FloatArray:
+        """k1, k2, p1, p2, k3, (5,)."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera with a lens that distorts, in the convention of OpenCV.
-
-    A point at ``x = R_camera_enu @ (point - position)``, x right, y down, z forward, is seen
-    at the normalised place ``x/z, y/z``, moved by the distortion, then at the pixel that
-    ``matrix`` gives. The centre of the first pixel is (0, 0).
+    """A camera that looks at targets.
 
     Attributes
     ----------
     name
         Unique in the plant.
     size
-        Width and height of a frame, pixels.
+        Width and height of a frame, px.
     matrix
-        Focal lengths and principal point, pixels, (3, 3).
+        Focal lengths and principal point, px, (3, 3).
     distortion
-        k1, k2, p1, p2, k3 of Brown and Conrady, (5,).
+        k1, k2, p1, p2, k3, (5,).
     position
-        ENU metres, (3,); None if it is not known where the camera stands.
-    R_camera_enu
-        Rows are the camera's axes (right, down, forward), (3, 3); None with ``position``.
+        ENU metres, (3,); None until the camera has been located.
+    R_enu_camera
+        Camera axes to ENU, (3, 3): columns right, down, forward; None with ``position``.
     targets
-        Names of the targets that it sees; none named means any.
+        Names of the targets in view; empty means any.
     source
         Where frames come from: a folder, a video, an address, a device.
     deviation
-        RMS of the calibration's residuals, pixels; 0 if it was never calibrated.
+        RMS residual of the calibration, px; 0 if it was never calibrated.
     """
 
     name: str
@@ -43,36 +70,187 @@ class Camera:
     matrix: FloatArray
     distortion: FloatArray = field(default_factory=lambda: np.zeros(5))
     position: FloatArray | None = None
-    R_camera_enu: FloatArray | None = None
+    R_enu_camera: FloatArray | None = None
     targets: tuple[str, ...] = ()
     source: str = ""
     deviation: float = 0.0
 
     def __post_init__(self) -> None:
-        who = f"camera {self.name}"
-        width, height = self.size
-        if not (1 <= width <= 100_000 and 1 <= height <= 100_000):
-            raise InputError(f"{who}: frames of {width} × {height} px; give 1 to 100000 each")
-        matrix = np.asarray(self.matrix, dtype=np.float64)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
-            raise InputError(f"{who}: matrix {matrix.shape} must be (3, 3) and finite")
-        if min(matrix[0, 0], matrix[1, 1]) <= 0.0:
-            raise InputError(f"{who}: focal lengths {matrix[0, 0]}, {matrix[1, 1]} must be above 0")
-        distortion = np.asarray(self.distortion, dtype=np.float64)
-        if distortion.shape != (5,) or not np.isfinite(distortion).all():
-            raise InputError(f"{who}: distortion needs k1, k2, p1, p2, k3, each finite")
-        if (self.position is None) != (self.R_camera_enu is None):
-            raise InputError(f"{who}: give position and rotation together, or neither")
-        object.__setattr__(self, "size", (int(width), int(height)))
+        name = f"camera {self.name}"
+        size, matrix, distortion = checked_pinhole(name, self)
+        if (self.position is None) != (self.R_enu_camera is None):
+            raise InputError(f"{name}: give position and rotation together, or neither")
+        object.__setattr__(self, "size", size)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
-        if self.position is not None:
-            position = as_vectors(self.position, f"{who}: position")
-            rotation = np.asarray(self.R_camera_enu, dtype=np.float64)
-            if position.shape != (3,) or rotation.shape != (3, 3):
-                raise InputError(f"{who}: position (3,) and rotation (3, 3) are needed")
-            square = rotation @ rotation.T
-            if not np.allclose(square, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
-                raise InputError(f"{who}: rotation is not a right-handed rotation")
+        if self.position is not None and self.R_enu_camera is not None:
+            position, turned = checked_pose(name, self.position, self.R_enu_camera)
             object.__setattr__(self, "position", position)
-            object.__setattr__(self, "R_camera_enu", rotation)
+            object.__setattr__(self, "R_enu_camera", turned)
+
+    @property
+    def pose(self) -> tuple[FloatArray, FloatArray]:
+        """Position (3,), ENU metres, and ``R_enu_camera`` (3, 3).
+
+        Raises
+        ------
+        InputError
+            If the camera has not been located.
+        """
+        if self.position is None or self.R_enu_camera is None:
+            raise InputError(
+                f"camera {self.name}: its position is not known; find its targets in a frame "
+                "first (heliotrope camera calibrate)"
+            )
+        return self.position, self.R_enu_camera
+
+
+def checked_pinhole(
+    name: str, camera: Pinhole, smallest: int = 1
+) -> tuple[tuple[int, int], FloatArray, FloatArray]:
+    """Return size, matrix and distortion of a camera if they are possible.
+
+    Raises
+    ------
+    InputError
+        If a frame's side is outside ``smallest`` to 100,000 px, the matrix is not (3, 3), finite
+        and with focal lengths above 0, or the distortion is not five finite numbers.
+    """
+    width, height = (int(n) for n in camera.size)
+    if not (smallest <= width <= 100_000 and smallest <= height <= 100_000):
+        raise InputError(
+            f"{name}: frames of {width} × {height} px; give {smallest} to 100000 px each way"
+        )
+    matrix = as_float(camera.matrix)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise InputError(f"{name}: matrix {matrix.shape} must be (3, 3) and finite")
+    fx, fy = matrix[0, 0], matrix[1, 1]
+    if min(fx, fy) <= 0.0:
+        raise InputError(f"{name}: focal lengths {fx}, {fy} px must be above 0")
+    distortion = as_float(camera.distortion)
+    if distortion.shape != (5,) or not np.isfinite(distortion).all():
+        raise InputError(f"{name}: distortion needs k1, k2, p1, p2, k3, each finite")
+    return (width, height), matrix, distortion
+
+
+def checked_pose(
+    name: str, position: npt.ArrayLike, R_enu_camera: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return position (3,) and rotation (3, 3) of a camera if they are possible.
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, or the rotation is not a right-handed rotation.
+    """
+    place, turned = as_vectors(position, f"{name}: position"), as_float(R_enu_camera)
+    if place.shape != (3,) or turned.shape != (3, 3):
+        raise InputError(f"{name}: needs a position (3,) and a rotation (3, 3)")
+    square = turned @ turned.T
+    if not np.allclose(square, np.eye(3), atol=1e-6) or np.linalg.det(turned) < 0.0:
+        raise InputError(f"{name}: its rotation is not a right-handed rotation")
+    return place, turned
+
+
+# -- points to pixels and back ---------------------------------------------------------
+
+
+def local_pixels(camera: Pinhole, local: npt.ArrayLike, reach: float = np.inf) -> FloatArray:
+    """Return the pixels (..., 2) at which points in camera axes (..., 3) are seen.
+
+    Parameters
+    ----------
+    camera
+        Frame, matrix and distortion.
+    local
+        Metres, in camera axes.
+    reach
+        Multiple of the undistorted angle to the frame's farthest corner beyond which points
+        are not seen. Far outside the frame the distortion's polynomial may fold back into it;
+        1.3 keeps such points out.
+
+    Returns
+    -------
+    NaN for points behind the camera or beyond ``reach``.
+    """
+    import cv2
+
+    given = as_float(local)
+    points = given.reshape(-1, 3)
+    if len(points) == 0:
+        return np.empty((*given.shape[:-1], 2))
+    depth = points[:, 2]
+    seen = np.asarray(depth > _NEAREST)
+    if np.isfinite(reach):
+        far = np.hypot(points[seen, 0], points[seen, 1]) / depth[seen]
+        seen[seen] = far <= reach * _corner_tangent(camera)
+    safe = np.where(seen[:, None], points, [0.0, 0.0, 1.0])
+    zero = np.zeros(3)
+    pixels, _ = cv2.projectPoints(safe, zero, zero, camera.matrix, camera.distortion)
+    flat = np.where(seen[:, None], pixels.reshape(-1, 2), np.nan)
+    return as_float(flat.reshape(*given.shape[:-1], 2))
+
+
+def _corner_tangent(camera: Pinhole) -> float:
+    """Return the tangent of the angle to the frame's farthest corner, without distortion."""
+    width, height = camera.size
+    corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - camera.matrix[:2, 2]
+    plain = corners / np.diag(camera.matrix)[:2]
+    return float(np.hypot(*plain.T).max())
+
+
+def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:
+    """Return the pixels (..., 2) of points, ENU metres (..., 3); NaN behind the camera.
+
+    Raises
+    ------
+    InputError
+        If the camera has not been located.
+    """
+    position, R_enu_camera = camera.pose
+    return local_pixels(camera, (as_vectors(points, "points") - position) @ R_enu_camera)
+
+
+def undistort(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
+    """Return the normalised places x/z, y/z (..., 2) of pixels (..., 2), without distortion."""
+    import cv2
+
+    given = as_float(pixels)
+    flat = np.ascontiguousarray(given).reshape(-1, 1, 2)
+    if len(flat) == 0:
+        return np.empty(given.shape)
+    # Brown's series has no closed inverse; the iteration ends below a thousandth of a pixel.
+    end = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+    found = cv2.undistortPoints(flat, camera.matrix, camera.distortion, criteria=end)
+    return as_float(found).reshape(given.shape)
+
+
+def local_rays(camera: Pinhole, pixels: npt.ArrayLike) -> FloatArray:
+    """Return the unit directions, camera axes (..., 3), that pixels (..., 2) look along."""
+    plane = undistort(camera, pixels)
+    return normalize(np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1))
+
+
+def rays(camera: Camera, pixels: npt.ArrayLike) -> FloatArray:
+    """Return the unit directions, ENU (..., 3), that pixels (..., 2) look along.
+
+    Raises
+    ------
+    InputError
+        If the camera has not been located.
+    """
+    _, R_enu_camera = camera.pose
+    return local_rays(camera, pixels) @ R_enu_camera.T
+
+
+def look_at(position: npt.ArrayLike, point: npt.ArrayLike) -> FloatArray:
+    """Return R_enu_camera (3, 3) of a camera at ``position`` that looks at ``point``, level.
+
+    Straight down or up, the camera's right is east.
+    """
+    forward = normalize(as_float(point) - as_float(position), "line of sight")
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    if np.linalg.norm(right) < 1e-9:
+        right = np.array([1.0, 0.0, 0.0])
+    right = normalize(right)
+    return np.stack([right, np.cross(forward, right), forward], axis=-1)

@@ -70,8 +70,8 @@ def watching_camera(target: Target, name: str, away: float, height: float, aside
     matrix = np.array(
         [[focal, 0.0, 0.5 * (_SIZE[0] - 1)], [0.0, focal, 0.5 * (_SIZE[1] - 1)], [0.0, 0.0, 1.0]]
     )
-    axes = np.stack([right, np.cross(forward, right), forward])
-    return Camera(name, _SIZE, matrix, position=position, R_camera_enu=axes, targets=(target.name,))
+    axes = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    return Camera(name, _SIZE, matrix, position=position, R_enu_camera=axes, targets=(target.name,))
 
 
 def aperture(name: str, center: FloatArray, side: float, facing: float, down: float) -> Receiver:

@@ -466,11 +466,11 @@ class _Problem:
             matrix=matrix,
             distortion=distortion,
             position=position,
-            R_camera_enu=self.turn(x),
+            R_enu_camera=self.turn(x).T,
         )
 
     def turn(self, x: FloatArray) -> FloatArray:
-        """Return R_camera_enu."""
+        """Return the rotation from ENU to camera axes, (3, 3)."""
         import cv2
 
         return as_float(cv2.Rodrigues(x[:3])[0])

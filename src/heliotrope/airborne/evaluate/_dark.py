@@ -27,9 +27,9 @@ from heliotrope.airborne.evaluate.orientation import differences, turned
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape, measured_normal
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.pinhole import undistort
 from heliotrope.airborne.standing import Standing
 from heliotrope.errors import InputError
+from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float, rotation
 
 #: A photograph whose readings are below this for half of its pixels is dark.

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.pinhole import local_pixels, undistort
 from heliotrope.airborne.standing import Standing
+from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float, rotation
 
 #: Largest error of the gimbal that is looked for, rad.
@@ -186,7 +186,7 @@ def _believe(
         angle = rotation_angle(one[1], photo.rotation)
         if angle > 2.0 * GIMBAL or len(one[2]) < FEWEST:
             continue
-        pixels = local_pixels(camera, (stand.vertex[rows] - photo.position) @ one[1])
+        pixels = photo.moved(photo.position, one[1]).pixels(camera, stand.vertex[rows])
         inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
         # What should be there and is not, and what is there and should not be.
         absent, strange = max(inside - len(one[2]), 0), patches - len(one[2])

@@ -20,9 +20,9 @@ from heliotrope.airborne.evaluate.detection import (
 )
 from heliotrope.airborne.evaluate.identification import Identified, expected_size, identify
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.pinhole import project, undistort
 from heliotrope.airborne.standing import Standing
 from heliotrope.errors import HeliotropeError
+from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float
 
 #: Mirrors of a smaller side are not measured, px.
@@ -233,7 +233,7 @@ def _in_frame(
     photo: Photo, camera: LedCamera, stand: Standing
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Return the mirrors whose corners are all in the frame, and those corners, px."""
-    pixels = project(camera, photo.position, photo.rotation, stand.corners)
+    pixels = photo.pixels(camera, stand.corners)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
         inside = (pixels > 3.0) & (pixels < np.array([width, height]) - 4.0)

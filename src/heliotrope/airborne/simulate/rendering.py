@@ -19,10 +19,10 @@ from heliotrope.airborne._photo_metadata import Metadata, exif_and_xmp
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, write_camera
-from heliotrope.airborne.pinhole import local_pixels, project, undistort
 from heliotrope.airborne.simulate.simulation import Flight, exact_reflections
 from heliotrope.airborne.standing import Standing, write_commands
 from heliotrope.errors import InputError
+from heliotrope.field.camera import undistort
 from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray, as_float, direction, enu_to_geodetic, normalize
 
@@ -212,7 +212,7 @@ def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: Scene) -> Non
     corners = scene.stand.corners
     fall = (corners[..., 2] - scene.ground) / -ray[2]
     for outline in corners + fall[..., None] * ray:
-        seen = project(camera, photo.position, photo.rotation, outline)
+        seen = photo.pixels(camera, outline)
         if np.isfinite(seen).all():
             _cover(image, seen, np.zeros(3), 0.55)
 
@@ -225,7 +225,7 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: Scene, row: in
         return
     corners = vertex + shape.corners @ turned.T
     middle = vertex + shape.center @ turned.T
-    seen = project(camera, photo.position, photo.rotation, corners)
+    seen = photo.pixels(camera, corners)
     width, height = camera.size
     inside = np.isfinite(seen).all()
     if (
@@ -281,12 +281,11 @@ def _spot(
     row, facet = int(lamp.heliostat[k]), lamp.facet[k : k + 1]
     point = scene.shapes[row].point_at(facet, lamp.xy[k : k + 1])[0]
     place = scene.stand.vertex[row] + scene.stand.rotation[row] @ point
-    local = (place - photo.position) @ photo.rotation
-    seen = local_pixels(camera, local)
+    seen = photo.pixels(camera, place)
     width, height = camera.size
     if not np.isfinite(seen).all():
         return
-    distance = float(np.linalg.norm(local))
+    distance = float(np.linalg.norm(place - photo.position))
     # Narrower than a third of a pixel nothing changes any more.
     sigma = max(scene.conditions.led_spread * camera.focal / distance, 0.3)
     reach = math.ceil(4.0 * sigma) + 1

@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.mirror import MirrorShape, ideal, reflection_points
-from heliotrope.airborne.photo import LedCamera, Photo, look_at
+from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.slopes import smooth_slopes
 from heliotrope.airborne.standing import Standing, standing
 from heliotrope.errors import InputError
+from heliotrope.field.camera import look_at
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, rotation
 from heliotrope.mechanism.tracking import Status, track

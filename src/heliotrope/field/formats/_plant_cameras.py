@@ -47,7 +47,8 @@ def build_camera(table: CameraTable) -> Camera:
         matrix=np.array([[fx, table.skew_px, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
         distortion=np.array(table.distortion),
         position=None if table.position_m is None else np.array(table.position_m),
-        R_camera_enu=None if table.rotation is None else np.array(table.rotation),
+        # The file holds the rows of the inverse: right, down, forward in ENU.
+        R_enu_camera=None if table.rotation is None else np.array(table.rotation).T,
         targets=tuple(table.targets),
         source=table.source,
         deviation=table.deviation_px,
@@ -67,7 +68,7 @@ def camera_document(camera: Camera) -> dict[str, Any]:
         "source": camera.source,
         "deviation_px": camera.deviation,
     }
-    if camera.position is not None and camera.R_camera_enu is not None:
+    if camera.position is not None and camera.R_enu_camera is not None:
         document["position_m"] = camera.position.tolist()
-        document["rotation"] = camera.R_camera_enu.tolist()
+        document["rotation"] = camera.R_enu_camera.T.tolist()
     return document

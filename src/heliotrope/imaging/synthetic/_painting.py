@@ -7,11 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, project, undistort
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
-from heliotrope.imaging.projection import project, undistort
 from heliotrope.imaging.synthetic.scenes import Paint, Scene, Surroundings
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.optics.render_kernels import coverage, sample_plane
@@ -55,8 +54,8 @@ class View:
 
 def _key(camera: Camera, targets: tuple[Target, ...]) -> tuple[object, ...]:
     arrays: list[npt.ArrayLike] = [camera.matrix, camera.distortion]
-    if camera.position is not None and camera.R_camera_enu is not None:
-        arrays += [camera.position, camera.R_camera_enu]
+    if camera.position is not None and camera.R_enu_camera is not None:
+        arrays += [camera.position, camera.R_enu_camera]
     parts: list[object] = [camera.size]
     for target in targets:
         arrays += [target.corners, target.center]
@@ -167,15 +166,15 @@ def _plane_map(view: View) -> tuple[Image, Image]:
     camera, target = view.camera, view.targets[0]
     width, height = camera.size
     assert camera.position is not None
-    assert camera.R_camera_enu is not None
+    assert camera.R_enu_camera is not None
     gap = float((target.center - camera.position) @ target.normal)
     x, y = (np.arange(-_KNOTS, n + 4 * _KNOTS, _KNOTS, dtype=np.float64) for n in (width, height))
     knots = undistort(camera, np.stack(np.meshgrid(x, y), axis=-1))
     rows, columns = np.arange(height), np.arange(width)
     a, b = (RectBivariateSpline(y, x, knots[..., k])(rows, columns) for k in (0, 1))
     # A ray p + λ d, d = R_enu_camera (a, b, 1), ends on the plane at λ = gap / (d·N).
-    R = camera.R_camera_enu
-    n, right, up = R @ target.normal, R @ target.axes[0], R @ target.axes[1]
+    R = camera.R_enu_camera
+    n, right, up = target.normal @ R, target.axes[0] @ R, target.axes[1] @ R
     towards = a * n[0] + b * n[1] + n[2]
     meets = towards < 0.0
     length = np.where(meets, gap / np.where(meets, towards, 1.0), 0.0)

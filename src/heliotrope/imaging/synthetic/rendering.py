@@ -11,11 +11,11 @@ from datetime import datetime
 import numpy as np
 
 from heliotrope.errors import InputError
+from heliotrope.field.camera import project
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.imaging.frame import Frame, Pixels
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.synthetic._painting import Image, Plane, background, mark_shapes
 from heliotrope.imaging.synthetic.scenes import (
     Lens,

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, look_at
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import as_float, rotation
-from heliotrope.imaging.projection import look_at
 from heliotrope.optics.mirror_image import Beam
 
 
@@ -401,7 +400,7 @@ def example_camera(
     extent = max(target.width, target.height)
     focal = fill * min(size) * distance / extent
     aim = target.center + 0.02 * extent * (right - up)
-    R = rotation([0.0, 0.0, 1.0], roll) @ look_at(position, aim)
+    R = look_at(position, aim) @ rotation([0.0, 0.0, 1.0], -roll)
     corner = float(np.hypot(0.5 * width, 0.5 * height)) / focal
     lens = [
         -1.2 * distortion / corner**2, 0.2 * distortion / corner**4,

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, project
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.projection import project
 from heliotrope.imaging.targets import constellation, detection
 from heliotrope.imaging.targets._attempt import FEWEST, SURVEY, Attempt, Look, Pictures, Search
 from heliotrope.imaging.targets.view import Face, View, faces

@@ -641,7 +641,7 @@ class Sight:
 
 def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
     """Return how a camera sees the targets that it names, or any, if they face it in its frame."""
-    from heliotrope.imaging.projection import project
+    from heliotrope.field.camera import project
 
     if camera.position is None:
         return []

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.camera import Camera
+from heliotrope.field.camera import Camera, undistort
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.projection import undistort
 
 #: Of a lens of which nothing is known: standard deviation of k1 at a focal length of
 #: the frame's longer side. A lens for photography stays below.
