@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from heliotrope.airborne.plan.airspace import Airspace, KeepOut, inside, path_length, tower
+from heliotrope.airborne.plan.airspace import Airspace, KeepOut, path_length, tower
 from heliotrope.airborne.plan.flight_files import read_airspace
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
@@ -83,7 +84,7 @@ def test_a_bent_fence_is_kept() -> None:
     )
     air = Airspace(fence=fence)
     places = _way(air, np.array([40.0, 180.0, 40.0]), np.array([160.0, 180.0, 40.0]))
-    assert inside(places[:, :2], fence).all()
+    assert shapely.contains_xy(shapely.Polygon(fence), places[:, :2]).all()
     assert places[:, 1].min() < 80.0
     assert air.route(np.array([40.0, 180.0, 40.0]), np.array([300.0, 180.0, 40.0])) is None
 
@@ -159,6 +160,8 @@ def test_file_refusals(tmp_path: Path, text: str, message: str) -> None:
         (lambda: KeepOut("k", as_float([[0.0, 0.0]]), 1.0, 5.0, 5.0), "top 5.0 m must be above"),
         (lambda: Airspace(margin=-1.0), "margin -1.0 m"),
         (lambda: Airspace(fence=as_float([[0.0, 0.0]])), "fence of shape"),
+        (lambda: Airspace(fence=as_float([[0, 0], [9, 9], [9, 0], [0, 9]])), "edges cross"),
+        (lambda: KeepOut("k", as_float([[0, 0], [1, 1], [2, 2]])), "enclose no area"),
     ],
 )
 def test_refusals(make: object, text: str) -> None:

@@ -1,44 +1,53 @@
-"""Airspace: where a drone may fly, and the way around what it must not touch."""
+"""Airspace: where a drone may fly, and routes around what it must stay clear of.
+
+Distances and containment on the ground are computed by shapely; heights are clipped here.
+"""
 
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
+from shapely import Geometry, Point, Polygon
 
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float
 
-#: Corners of the way around a corner of a keep-out.
-_AROUND = 12
-#: Ways around are looked for at multiples of this height, m.
+Mask = npt.NDArray[np.bool_]
+
+#: Segments of a quarter circle in a route around a corner.
+_QUARTER = 3
+#: Detours run this far outside a keep-out, and this far inside the fence, m.
+_OUTSIDE, _INSIDE = 0.5, 1.0
+#: Detours are tried at multiples of this height, m.
 _LEVEL = 5.0
-#: A way that is longer than without keep-outs by less than this factor is good enough.
+#: A detour is accepted at once if it is longer than the unobstructed way by less than this factor.
 _SHORT = 1.1
-#: Heights above ground are looked at in so many places of a leg.
-_PLACES = 9
-#: Nearer than this is on the fence, m.
+#: Points of a leg at which the height above ground is checked.
+_CHECKS = 9
+#: A leg closer to the fence than this counts as touching it, m.
 _TOUCH = 1e-3
 
 
 @dataclass(frozen=True)
 class KeepOut:
-    """A volume that no drone enters: all that is near a polygon, between two heights.
+    """A volume that no drone enters: everything near a polygon, between two heights.
 
     Attributes
     ----------
     name
-        For people.
+        Shown to people.
     corners
-        Of the polygon, in order, ENU metres east and north, (V, 2); one corner with a
+        Of the polygon, in order, ENU metres east and north, (V, 2); a single corner with a
         radius is a cylinder.
     radius
-        All within this distance of the polygon belongs to it, m.
+        Everything within this distance of the polygon belongs to the volume, m.
     bottom, top
         ENU heights, m.
     """
@@ -51,38 +60,50 @@ class KeepOut:
 
     def __post_init__(self) -> None:
         corners = as_float(self.corners)
-        who = f"keep-out {self.name}"
+        what = f"keep-out {self.name}"
         if corners.ndim != 2 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-            raise InputError(f"{who}: corners of shape {corners.shape}; give finite (V, 2)")
+            raise InputError(f"{what}: corners of shape {corners.shape}; give finite (V, 2)")
         if len(corners) < 3 and not (len(corners) == 1 and self.radius > 0.0):
             raise InputError(
-                f"{who}: {len(corners)} corners; give three or more, or one place and a radius"
+                f"{what}: {len(corners)} corners; give three or more, or one place and a radius"
             )
         if not self.radius >= 0.0:
-            raise InputError(f"{who}: radius {self.radius} m must not be below 0")
+            raise InputError(f"{what}: radius {self.radius} m must not be below 0")
         if not self.top > self.bottom:
-            raise InputError(f"{who}: top {self.top} m must be above bottom {self.bottom} m")
+            raise InputError(f"{what}: top {self.top} m must be above bottom {self.bottom} m")
+        if len(corners) > 1:
+            _polygon(corners, what)
         object.__setattr__(self, "corners", corners)
 
     @cached_property
+    def shape(self) -> Geometry:
+        """The point or filled polygon on the ground that :attr:`radius` is measured from."""
+        found = Point(self.corners[0]) if len(self.corners) == 1 else Polygon(self.corners)
+        shapely.prepare(found)
+        return found
+
+    @cached_property
     def _box(self) -> FloatArray:
-        """Its lower and upper corner, (2, 3)."""
+        """Lower and upper corner of the bounding box, (2, 3)."""
         low, high = self.corners.min(axis=0), self.corners.max(axis=0)
         r = self.radius
         return np.array([[*(low - r), self.bottom], [*(high + r), self.top]])
 
     def grown(self, margin: float) -> "KeepOut":
-        """Return it with a margin on all sides."""
+        """Return the volume with a margin on all sides."""
         return KeepOut(
             self.name, self.corners, self.radius + margin, self.bottom - margin, self.top + margin
         )
 
-    def free(self, a: FloatArray, b: FloatArray) -> npt.NDArray[np.bool_]:
-        """Return which straight legs from ``a`` to ``b``, (M, 3) each, stay outside."""
+    def free(self, a: FloatArray, b: FloatArray) -> Mask:
+        """Return which straight legs from ``a`` to ``b``, (M, 3) each, stay outside, (M,)."""
+        found = np.ones(len(a), dtype=np.bool_)
         low, high = np.minimum(a, b), np.maximum(a, b)
-        apart = (high < self._box[0]) | (low > self._box[1])
-        if apart.any(axis=1).all():
-            return np.ones(len(a), dtype=np.bool_)
+        near = np.flatnonzero(~((high < self._box[0]) | (low > self._box[1])).any(axis=1))
+        if not len(near):
+            return found
+        a, b = a[near], b[near]
+        # The part of each leg between bottom and top, as shares of its length.
         rise = b[:, 2] - a[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             ends = np.stack([(self.bottom - a[:, 2]) / rise, (self.top - a[:, 2]) / rise])
@@ -90,15 +111,14 @@ class KeepOut:
         inside = (a[:, 2] >= self.bottom) & (a[:, 2] <= self.top)
         first = np.where(level, np.where(inside, 0.0, 1.0), np.clip(ends.min(axis=0), 0.0, 1.0))
         last = np.where(level, np.where(inside, 1.0, 0.0), np.clip(ends.max(axis=0), 0.0, 1.0))
-        touches = first < last
         way = b[:, :2] - a[:, :2]
-        start, stop = a[:, :2] + first[:, None] * way, a[:, :2] + last[:, None] * way
-        near = distance_to_polygon(start, stop, self.corners) <= self.radius
-        return np.asarray(~(touches & near))
+        legs = _legs(a[:, :2] + first[:, None] * way, a[:, :2] + last[:, None] * way)
+        found[near] = (first >= last) | (shapely.distance(self.shape, legs) > self.radius)
+        return found
 
 
 def tower(plant: Plant, clearance: float = 10.0) -> tuple[KeepOut, ...]:
-    """Return one cylinder a receiver and target, from the ground to ``clearance`` m above it."""
+    """Return a cylinder for each receiver and target, from the ground to ``clearance`` m above."""
     found = []
     surfaces: list[Receiver | Target] = [*plant.receivers, *plant.targets]
     for surface in surfaces:
@@ -123,15 +143,15 @@ class Airspace:
     keep_outs
         Volumes to stay out of.
     fence
-        Polygon to stay inside of, ENU metres east and north, (V, 2); None for none.
+        Polygon to stay inside, ENU metres east and north, (V, 2); None for no fence.
     min_height, max_height
-        Above the ground while measuring and under way, m. Rules for drones limit the
-        greater one, in the European Union's open category to 120 m.
+        Above ground while measuring and in transit, m. Aviation law limits the upper one, to
+        120 m in the European Union's open category.
     margin
         Distance to all keep-outs, m.
     ground
-        Places whose height is known, ENU metres, (N, 3); the nearest one counts. Level
-        at 0 where there are none.
+        Points of known ground height, ENU metres, (N, 3); the nearest one counts. Without
+        any, the ground is level at 0.
     """
 
     keep_outs: tuple[KeepOut, ...] = ()
@@ -144,8 +164,8 @@ class Airspace:
     def __post_init__(self) -> None:
         if not 0.0 <= self.min_height < self.max_height:
             raise InputError(
-                f"heights {self.min_height:g} m to {self.max_height:g} m: the least must be 0 or "
-                "more, and the greatest above it"
+                f"heights {self.min_height:g} m to {self.max_height:g} m: the lower one must be 0 "
+                "or more, and below the upper one"
             )
         if not self.margin >= 0.0:
             raise InputError(f"margin {self.margin} m must not be below 0")
@@ -155,6 +175,7 @@ class Airspace:
                 raise InputError(
                     f"fence of shape {fence.shape}: give three corners or more, (V, 2)"
                 )
+            _polygon(fence, "fence")
             object.__setattr__(self, "fence", fence)
 
     @cached_property
@@ -162,12 +183,20 @@ class Airspace:
         return tuple(k.grown(self.margin) for k in self.keep_outs)
 
     @cached_property
+    def _fenced(self) -> Polygon | None:
+        if self.fence is None:
+            return None
+        found = Polygon(self.fence)
+        shapely.prepare(found)
+        return found
+
+    @cached_property
     def _tree(self) -> cKDTree | None:
         return cKDTree(self.ground[:, :2]) if len(self.ground) else None
 
     @cached_property
     def _level(self) -> float | None:
-        """The height of level ground, which needs no search."""
+        """Height of level ground, which needs no search; None if the ground is not level."""
         if not len(self.ground):
             return 0.0
         return float(self.ground[0, 2]) if np.ptp(self.ground[:, 2]) == 0.0 else None
@@ -179,44 +208,50 @@ class Airspace:
         assert self._tree is not None
         return as_float(self.ground[self._tree.query(points[:, :2])[1], 2])
 
-    def free(self, points: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-        """Return which points (M, 3) a drone may be at, (M,)."""
+    def free(self, points: npt.ArrayLike) -> Mask:
+        """Return at which points (M, 3) a drone may be, (M,)."""
         p = as_float(points).reshape(-1, 3)
         height = p[:, 2] - self.ground_below(p)
         # Rounding must not refuse a point at the limit.
         found = (height >= self.min_height - 1e-6) & (height <= self.max_height + 1e-6)
-        if self.fence is not None:
-            found &= within(p[:, :2], p[:, :2], self.fence)
+        found &= self._within_fence(p, p)
         for volume in self._volumes:
             found &= volume.free(p, p + np.array([0.0, 0.0, 1e-6]))
         return np.asarray(found)
 
-    def free_legs(self, a: npt.ArrayLike, b: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    def free_legs(self, a: npt.ArrayLike, b: npt.ArrayLike) -> Mask:
         """Return which straight legs from ``a`` to ``b``, (M, 3) each, may be flown, (M,).
 
-        Climbs from the ground and down to it are free below the least height.
+        Vertical climbs and descents may start or end below the lower height limit.
         """
         p, q = as_float(a).reshape(-1, 3), as_float(b).reshape(-1, 3)
         found = np.ones(len(p), dtype=np.bool_)
         if not len(p):
             return found
         steep = np.linalg.norm((q - p)[:, :2], axis=-1) < 1e-6
-        share = np.linspace(0.0, 1.0, _PLACES)[:, None, None]
+        share = np.linspace(0.0, 1.0, _CHECKS)[:, None, None]
         place = (p + (q - p) * share).reshape(-1, 3)
-        height = (place[:, 2] - self.ground_below(place)).reshape(_PLACES, -1)
+        height = (place[:, 2] - self.ground_below(place)).reshape(_CHECKS, -1)
         found &= height.max(axis=0) <= self.max_height + 1e-6
         found &= steep | (height.min(axis=0) >= self.min_height - 1e-6)
-        if self.fence is not None:
-            found &= within(p[:, :2], q[:, :2], self.fence)
+        found &= self._within_fence(p, q)
         for volume in self._volumes:
             found &= volume.free(p, q)
         return np.asarray(found)
 
-    def route(self, a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray | None:
-        """Return the points between ``a`` and ``b`` on a short free way, (M, 3).
+    def _within_fence(self, a: FloatArray, b: FloatArray) -> Mask:
+        fence = self._fenced
+        if fence is None:
+            return np.ones(len(a), dtype=np.bool_)
+        legs = _legs(a[:, :2], b[:, :2])
+        clear = shapely.distance(fence.exterior, legs) > _TOUCH
+        return np.asarray(shapely.covers(fence, legs) & clear)
 
-        None if there is no way. It is straight where that is free, else at one height
-        (that of the higher end or above all keep-outs) around their corners.
+    def route(self, a: npt.ArrayLike, b: npt.ArrayLike) -> FloatArray | None:
+        """Return the points between ``a`` and ``b`` on a short free route, (M, 3).
+
+        None if there is no route. The route is straight where that is free. Otherwise it runs
+        around the corners of keep-outs at one height: that of the higher end, or above a keep-out.
         """
         start, stop = as_float(a), as_float(b)
         if self.free_legs(start[None], stop[None])[0]:
@@ -225,7 +260,7 @@ class Airspace:
         base = np.ceil(max(start[2], stop[2], floor) / _LEVEL) * _LEVEL
         levels = {max(start[2], stop[2], floor), base}
         levels |= {v.top + 1e-3 for v in self._volumes if v.top > base and np.isfinite(v.top)}
-        # What the way at one height would be without anything to avoid.
+        # Length of an unobstructed way at the base height.
         climb = float(np.linalg.norm((stop - start)[:2])) + 2.0 * base - start[2] - stop[2]
         best, least = None, np.inf
         for level in sorted(levels):
@@ -239,7 +274,7 @@ class Airspace:
         return best
 
     def _around(self, start: FloatArray, stop: FloatArray, level: float) -> FloatArray | None:
-        """The way at one height, with the climbs at both ends."""
+        """Return the route at one height, with the climbs at both ends."""
         up = np.array([[*start[:2], level], [*stop[:2], level]])
         if not self.free_legs(np.stack([start, up[1]]), np.stack([up[0], stop])).all():
             return None
@@ -261,7 +296,7 @@ class Airspace:
         while way[-1] != 0:
             way.append(int(before[0, way[-1]]))
         found = points[way[::-1]]
-        # Climbs of no length are no points of their own.
+        # Climbs of zero length add no point.
         keep = [
             k
             for k, p in enumerate(found)
@@ -271,9 +306,10 @@ class Airspace:
         return as_float(found[keep].reshape(-1, 3))
 
     def _graph(self, level: float) -> tuple[FloatArray, FloatArray]:
-        """Corners of ways around at a height (M, 3), and lengths of free legs (M, M), 0 if none."""
+        """Return detour corners at a height (M, 3) and lengths of free legs (M, M), 0 if none."""
         if level not in self._graphs:
-            nodes = np.array([(*c, level) for c in self._corners]).reshape(-1, 3)
+            corners = self._corners
+            nodes = np.column_stack([corners, np.full(len(corners), level)])
             nodes = nodes[self.free(nodes)]
             i, j = np.triu_indices(len(nodes), 1)
             free = self.free_legs(nodes[i], nodes[j])
@@ -288,73 +324,36 @@ class Airspace:
         return {}
 
     @cached_property
-    def _corners(self) -> list[FloatArray]:
-        angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
-        ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        rings = [(v.corners, v.radius / np.cos(np.pi / _AROUND) + 0.5) for v in self._volumes]
-        if self.fence is not None:
-            rings.append((self.fence, 1.0))
-        return [c + radius * r for corners, radius in rings for c in corners for r in ring]
+    def _corners(self) -> FloatArray:
+        """Corners that detours turn at, (C, 2)."""
+        # The chords of the arc around a corner must clear the radius.
+        wide = 1.0 / np.cos(0.25 * np.pi / _QUARTER)
+        rings = [
+            v.shape.buffer(v.radius * wide + _OUTSIDE, quad_segs=_QUARTER) for v in self._volumes
+        ]
+        if self._fenced is not None:
+            rings.append(self._fenced.buffer(-_INSIDE, join_style="mitre"))
+        return as_float(shapely.get_coordinates(rings))
 
 
 def path_length(points: FloatArray) -> float:
-    """Return the length of the way through points (M, 3), m."""
+    """Return the length of the path through points (M, 3), m."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=-1).sum())
 
 
-def inside(points: npt.ArrayLike, corners: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Return which points (M, 2) lie in a polygon (V, 2), by the even-odd rule, (M,)."""
-    p, a = as_float(points).reshape(-1, 2), as_float(corners)
-    b = np.roll(a, -1, axis=0)
-    over = (a[:, 1] > p[:, 1, None]) != (b[:, 1] > p[:, 1, None])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        east = a[:, 0] + (p[:, 1, None] - a[:, 1]) * (b[:, 0] - a[:, 0]) / (b[:, 1] - a[:, 1])
-    return np.asarray(np.count_nonzero(over & (p[:, 0, None] < east), axis=1) % 2 == 1)
-
-
-def within(start: FloatArray, stop: FloatArray, corners: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which segments (M, 2) to (M, 2) lie in a polygon (V, 2) and touch no edge, (M,)."""
-    clear = _to_edges(start, stop, corners) > _TOUCH
-    return np.asarray(inside(start, corners) & clear & ~crosses(start, stop, corners))
-
-
-def crosses(start: FloatArray, stop: FloatArray, corners: FloatArray) -> npt.NDArray[np.bool_]:
-    """Return which segments (M, 2) to (M, 2) cross an edge of a polygon (V, 2), (M,)."""
-    a, b = corners, np.roll(corners, -1, axis=0)
-
-    def side(p: FloatArray, q: FloatArray, r: FloatArray) -> FloatArray:
-        return np.asarray(
-            (q[..., 0] - p[..., 0]) * (r[..., 1] - p[..., 1])
-            - (q[..., 1] - p[..., 1]) * (r[..., 0] - p[..., 0])
+def _polygon(corners: FloatArray, what: str) -> None:
+    """Refuse a polygon that encloses no area or whose edges cross."""
+    found = Polygon(corners)
+    if not found.is_valid or found.area <= 0.0:
+        raise InputError(
+            f"{what}: its edges cross or enclose no area ({shapely.is_valid_reason(found)}); give "
+            "the corners in order around it"
         )
 
-    s, t = start[:, None], stop[:, None]
-    apart = (side(s, t, a) * side(s, t, b) < 0.0) & (side(a, b, s) * side(a, b, t) < 0.0)
-    return np.asarray(apart.any(axis=1))
 
-
-def distance_to_polygon(start: FloatArray, stop: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return the distance of segments (M, 2) to (M, 2) from a filled polygon (V, 2), m, (M,)."""
-    near = _to_edges(start, stop, corners)
-    if len(corners) >= 3:
-        near[inside(start, corners) | crosses(start, stop, corners)] = 0.0
-    return near
-
-
-def _to_edges(start: FloatArray, stop: FloatArray, corners: FloatArray) -> FloatArray:
-    """Distance of segments from the edges of a polygon that they do not cross, m, (M,)."""
-    a, b = corners, np.roll(corners, -1, axis=0)
-    parts = (
-        _to_segment(start[:, None], a, b),
-        _to_segment(stop[:, None], a, b),
-        _to_segment(a, start[:, None], stop[:, None]),
-    )
-    return np.asarray(np.minimum.reduce([part.min(axis=1) for part in parts]))
-
-
-def _to_segment(point: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Distance of points from segments, all (..., 2)."""
-    way = b - a
-    square = np.maximum((way**2).sum(axis=-1), 1e-18)
-    along = np.clip(((point - a) * way).sum(axis=-1) / square, 0.0, 1.0)
-    return np.asarray(np.linalg.norm(point - a - along[..., None] * way, axis=-1))
+def _legs(a: FloatArray, b: FloatArray) -> npt.NDArray[np.object_]:
+    """Return lines on the ground from ``a`` to ``b``, (M, 2); points where both are the same."""
+    found = np.atleast_1d(shapely.linestrings(np.stack([a, b], axis=1)))
+    same = (a == b).all(axis=1)
+    found[same] = shapely.points(a[same])
+    return found

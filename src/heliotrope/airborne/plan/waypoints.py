@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import shapely
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.files.json import read_json
@@ -543,10 +544,9 @@ def _fence(fence: Fence) -> dict[str, Any]:
     polygons = []
     for including, shapes in ((True, fence.inside), (False, fence.outside)):
         for shape in shapes:
-            lat, lon = shape[:, 0], shape[:, 1]
-            # The format asks for corners in clockwise order.
-            turn = float(np.sum(lon * np.roll(lat, -1) - np.roll(lon, -1) * lat))
-            corners = np.round(shape if turn < 0.0 else shape[::-1], 9).tolist()
+            # The format asks for corners in clockwise order, with east to the right.
+            anticlockwise = bool(shapely.is_ccw(shapely.linearrings(shape[:, ::-1])))
+            corners = np.round(shape[::-1] if anticlockwise else shape, 9).tolist()
             polygons.append({"inclusion": including, "polygon": corners, "version": 1})
     circles = [
         {
