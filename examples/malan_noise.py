@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from heliotrope import sun
 from heliotrope.calibration.fit.estimator import Calibration, fit
 from heliotrope.calibration.sightings import Sightings, sightings
-from heliotrope.calibration.uncertainty import expected
+from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.geometry import FloatArray, angle_between, reflect
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
@@ -140,7 +140,9 @@ def study(
         error = angle_between(reflect(sky[:, None, :], pose.normal), way)
         actual[label] = float(np.sqrt(np.mean(error**2)))
         squares = [
-            np.mean(expected(learnt[k], found.names, found.covariance[k], sky, TARGET).rms ** 2)
+            np.mean(
+                expected_error(learnt[k], found.names, found.covariance[k], sky, TARGET).rms ** 2
+            )
             for k in range(0, mirrors, 10)
         ]
         predicted[label] = float(np.sqrt(np.mean(squares)))

@@ -16,8 +16,8 @@ from heliotrope.airborne.plan.hover import (
 )
 from heliotrope.airborne.plan.look_points import Choosing, LookPoints, directions, look_points
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.information import precision, suns_of_year
 from heliotrope.calibration.sightings import drone
+from heliotrope.calibration.uncertainty import precision, suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import (

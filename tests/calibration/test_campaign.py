@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from heliotrope import sun
-from heliotrope.calibration.information import Expectation, expectation, precision, suns_of_year
 from heliotrope.calibration.plan._allocation import Option, allocate, exchanged
 from heliotrope.calibration.plan.campaign import Campaign, Fleet, Timing, campaign
 from heliotrope.calibration.plan.planning import Limits
 from heliotrope.calibration.sightings import camera_target
+from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.target import Target
@@ -39,7 +39,7 @@ def _jack_plant() -> Mechanism:
 
 def _fleet(mechanism: Mechanism, names: tuple[str, ...], aim: Any = AIM) -> Fleet:
     suns = suns_of_year(PLANT.site, 2026, days=6, hours=2.0)
-    form = expectation(mechanism, aim, suns, names).form
+    form = error_form(mechanism, aim, suns, names)
     return Fleet(mechanism, names, precision(mechanism, names), form, aim)
 
 
@@ -110,7 +110,7 @@ def test_a_campaign_keeps_its_promise(mixed: tuple[list[Fleet], Campaign]) -> No
     suns = sun.vector(found.time[mine], PLANT.site)
     made = camera_target(found.heliostat[mine], found.counts[mine], suns, centers)
     covariance = np.linalg.inv(precision(FIELD, NAMES, made))
-    rms = Expectation(NAMES, first.form, np.ones(18, dtype=np.int64)).rms(covariance)
+    rms = np.sqrt(np.einsum("npq,nqp->n", first.form, covariance))
     np.testing.assert_allclose(found.expected[:18], rms, rtol=1e-5)
     assert found.error[-1] == pytest.approx(np.sqrt(np.mean(found.expected**2)), rel=1e-9)
     last = {int(h): e for h, e in zip(found.heliostat, found.heliostat_error, strict=True)}
@@ -131,7 +131,7 @@ def test_a_campaign_against_taking_turns() -> None:
         solved = track(FIELD[rows], suns, PLANT.targets[0].center)
         made = camera_target(rows, solved.chosen(solved.counts), suns, PLANT.targets[0].center)
         covariance = np.linalg.inv(precision(FIELD, NAMES, made))
-        rms = Expectation(NAMES, fleet.form, np.ones(18, dtype=np.int64)).rms(covariance)
+        rms = np.sqrt(np.einsum("npq,nqp->n", fleet.form, covariance))
         return float(np.sqrt(np.mean(rms**2)))
 
     full = campaign(

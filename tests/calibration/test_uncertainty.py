@@ -10,15 +10,15 @@ import pytest
 
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.learn.drift import NINETY
 from heliotrope.calibration.learn.learning import learn
 from heliotrope.calibration.sightings import Sightings, sightings
-from heliotrope.calibration.uncertainty import expected, unobservable, year_map
+from heliotrope.calibration.uncertainty import expected_error, unobservable, year_map
 from heliotrope.geometry import FloatArray, direction, reflect
 from heliotrope.mechanism import kinds, parameters
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics.beam import CHI_SQUARE_90
 from support.machines import every_kind
 
 AIM = np.array([0.0, 0.0, 40.0])
@@ -152,7 +152,7 @@ def test_the_ellipse_holds_nine_of_ten() -> None:
     draws = rng.normal(size=(count, 4)) @ root.T
     real = nominal.with_parameters({n: draws[:, p] for p, n in enumerate(names)})
     sun = direction(2.4, 0.7)
-    found = expected(nominal[0], names, root @ root.T, sun, AIM)
+    found = expected_error(nominal[0], names, root @ root.T, sun, AIM)
     wanted = track(nominal, sun, AIM)
     pose = real.pose(wanted.chosen(wanted.counts))
     ray = reflect(sun, pose.normal)
@@ -162,13 +162,13 @@ def test_the_ellipse_holds_nine_of_ten() -> None:
     right /= np.linalg.norm(right, axis=-1, keepdims=True)
     error = np.stack([np.sum(ray * right, -1), np.sum(ray * np.cross(right, way), -1)], axis=-1)
     square = np.einsum("na,ab,nb->n", error, np.linalg.inv(found.covariance[0]), error)
-    assert np.mean(square <= NINETY) == pytest.approx(0.9, abs=0.02)
+    assert np.mean(square <= CHI_SQUARE_90) == pytest.approx(0.9, abs=0.02)
     np.testing.assert_allclose(np.cov(error.T), found.covariance[0], rtol=0.12, atol=1e-9)
     assert found.rms[0] == pytest.approx(np.sqrt(np.mean(np.sum(error**2, -1))), rel=0.05)
     long, short, angle = found.ellipse
     assert long[0] > short[0] > 0
     turned = error @ np.array([np.cos(angle[0]), np.sin(angle[0])])
-    assert turned.std() * np.sqrt(NINETY) == pytest.approx(long[0], rel=0.06)
+    assert turned.std() * np.sqrt(CHI_SQUARE_90) == pytest.approx(long[0], rel=0.06)
 
 
 def test_the_year_has_night_and_summer() -> None:
@@ -186,6 +186,6 @@ def test_out_of_reach_is_no_number() -> None:
     drives = (direct(), direct(min_angle=0.5, max_angle=0.6))
     nominal = kinds.azimuth_elevation([20.0, -60.0, 0.0], pivot_height=2.0, drives=drives)
     suns = direction(np.array([3.0, 3.0]), np.array([0.2, 1.5]))
-    found = expected(nominal, ("elevation_bias",), [[1e-6]], suns, AIM)
+    found = expected_error(nominal, ("elevation_bias",), [[1e-6]], suns, AIM)
     assert not found.reachable.all()
     assert np.isnan(found.rms[~found.reachable]).all()

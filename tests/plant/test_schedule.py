@@ -504,7 +504,7 @@ def test_the_order_of_the_states_may_be_another() -> None:
 
 def test_the_form_of_the_nearest_sample_is_good_enough() -> None:
     # 1000 heliostats, 200 of them computed: the others are within a per cent.
-    from heliotrope.calibration.information import expectation, precision, suns_of_year
+    from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
 
     plant = malan_plant(1000)
     one = Scheduler(plant, now=MORNING)
@@ -521,7 +521,8 @@ def test_the_form_of_the_nearest_sample_is_good_enough() -> None:
         "non_orthogonality",
     )
     suns = suns_of_year(plant.site, 2026, days=6)
-    form = expectation(some, plant.receivers[0].center, suns, names)
-    exact = form.rms(np.linalg.inv(precision(some, names)))
+    form = error_form(some, plant.receivers[0].center, suns, names)
+    covariance = np.linalg.inv(precision(some, names))
+    exact = np.sqrt(np.einsum("npq,nqp->n", form, covariance))
     np.testing.assert_allclose(one.expected(MORNING)[rows], exact, rtol=0.01)
     assert schedule.REMEMBERED > 1000

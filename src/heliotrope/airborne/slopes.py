@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.calibration.report.page import write_beside
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.cells import read_rows
-from heliotrope.files.text import check_file
+from heliotrope.files.text import check_file, write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")
@@ -76,7 +75,7 @@ def write_slopes(path: str | Path, slope: FloatArray) -> None:
     file = Path(path)
     suffix = file.suffix.casefold()
     if suffix == ".npz":
-        write_beside(file, lambda part: np.savez_compressed(part, slope=slope))
+        write_file(file, lambda stream: np.savez_compressed(stream, slope=slope))
         return
     if suffix != ".csv":
         raise FormatError(file, f"the name ends in {file.suffix!r}; slope maps are .npz or .csv")
@@ -88,7 +87,7 @@ def write_slopes(path: str | Path, slope: FloatArray) -> None:
         )
     ]
     text = "\n".join([",".join(_COLUMNS), *lines]) + "\n"
-    write_beside(file, lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(file, text)
 
 
 def smooth_slopes(

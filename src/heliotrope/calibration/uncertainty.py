@@ -1,68 +1,97 @@
-"""How well a mirror is known: the ellipse of its beam for any sun and aim, and what is not seen.
+"""How well mechanisms are known, and how far their beams are expected to miss.
 
-The parameters' covariance C goes through the same derivatives as everything else: the
-normal tracks the bisector but for J δx, and the beam moves by about twice that.
+Priors and sightings give `precision`, the information on the parameters; its inverse is their
+covariance C. With B the derivative of the beam's direction by the parameters, the beam from one
+sun to one aim has the covariance B C Bᵀ (`expected_error`), and over many suns the mean squared
+error tr(F C) with F the mean of BᵀB (`error_form`). `unobservable` names what the sightings leave
+to the prior, `year_map` shows the error for every sun of the year.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope import sun as solar
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.learn.drift import NINETY
-from heliotrope.calibration.sightings import sightings
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.calibration.sightings import Sightings, sightings
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics.beam import ExpectedError
+from heliotrope.sun import Site
 
-#: A combination of parameters whose variance the data have reduced by less than this is
-#: known by the prior only.
+#: Poses evaluated at a time: about 20 MB of derivatives.
+CHUNK = 40_000
+#: Default lowest elevation of the sun, rad.
+MIN_ELEVATION = float(np.radians(10.0))
+#: A combination of parameters is known by the prior only if the sightings leave more than this
+#: share of its prior variance.
 PRIOR_ONLY = 0.9
 
 
-@dataclass(frozen=True)
-class Expected:
-    """The beam's expected error at M pairs of sun and aim.
+def precision(
+    mechanism: Mechanism,
+    names: tuple[str, ...],
+    made: Sightings | None = None,
+    *,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+) -> FloatArray:
+    """Return the information of priors and sightings on the parameters, (N, P, P).
 
-    Attributes
+    Parameters
     ----------
-    covariance
-        To the right of and above the aim as seen from the mirror, rad², (M, 2, 2).
-    reachable
-        Whether the mechanism reaches the pose, (M,).
+    mechanism
+        Best estimates, batch shape (N,); derivatives are taken there.
+    names
+        P parameters of the table.
+    made
+        Sightings made so far, with the standard deviations that they state.
+    priors
+        Standard deviations that replace the table's, by name, (N,) or scalars.
+
+    Returns
+    -------
+    Inverse covariances, 1/unit².
+
+    Raises
+    ------
+    InputError
+        If a sighting is of a heliostat that is not there, or a prior is not above 0.
+    UnknownNameError
+        If a parameter is not in the table.
     """
-
-    covariance: FloatArray
-    reachable: npt.NDArray[np.bool_]
-
-    @property
-    def rms(self) -> FloatArray:
-        """Root of the mean square in two dimensions, rad, (M,)."""
-        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1)))
-
-    @property
-    def ellipse(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Semi-axes of the 90 % ellipse (rad, the longer first) and the longer's angle, (M,).
-
-        The angle is counter-clockwise from the right, rad.
-        """
-        values, vectors = np.linalg.eigh(self.covariance)
-        axes = np.sqrt(NINETY * np.maximum(values, 0.0))
-        angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-        return axes[:, 1], axes[:, 0], np.asarray(np.mod(angle, np.pi))
+    count = _batch(mechanism)
+    given = priors or {}
+    found = np.zeros((count, len(names), len(names)))
+    for p, name in enumerate(names):
+        sigma = as_float(given.get(name, mechanism.parameter(name).prior))
+        if not (np.isfinite(sigma) & (sigma > 0)).all():
+            raise InputError(f"prior of {name}: {sigma} must be above 0 and finite")
+        found[:, p, p] = 1.0 / sigma**2
+    if made is not None and len(made):
+        if int(made.heliostat.max()) >= count:
+            raise InputError(
+                f"a sighting is of heliostat row {int(made.heliostat.max())}; there are "
+                f"{count} heliostats"
+            )
+        slope = linearise(mechanism[made.heliostat], made, names).jacobian
+        np.add.at(found, made.heliostat, np.swapaxes(slope, -1, -2) @ slope)
+    return found
 
 
-def expected(
+def expected_error(
     mechanism: Mechanism,
     names: tuple[str, ...],
     covariance: npt.ArrayLike,
     sun: npt.ArrayLike,
     aim: npt.ArrayLike,
     noise: float = 0.0,
-) -> Expected:
-    """Return the expected error of a beam when the mechanism tracks by its calibration.
+) -> ExpectedError:
+    """Return the expected error of beams of mechanisms that track by their calibration.
 
     Parameters
     ----------
@@ -71,11 +100,15 @@ def expected(
     names
         The P parameters of ``covariance``.
     covariance
-        Of their deviations, (P, P) or (M, P, P).
+        Of the parameters, (P, P) or (M, P, P).
     sun, aim
-        Unit vectors to the sun and aim points (m), ENU, (M, 3).
+        Unit vectors to the sun and aim points (m), ENU, (3,) or (M, 3).
     noise
-        Standard deviation of the beam in each direction on top, rad.
+        Standard deviation in each direction to be added, rad of beam.
+
+    Notes
+    -----
+    First order in the parameters: exact to 1 % for errors of 10 mrad.
     """
     suns, aims = np.atleast_2d(as_float(sun)), np.atleast_2d(as_float(aim))
     count = max(len(suns), len(aims))
@@ -85,29 +118,134 @@ def expected(
     each = each[np.zeros(count, dtype=np.intp)] if len(each) == 1 else each
     found = track(each, suns, aims)
     reachable = found.chosen(found.reachable)
-    safe = np.where(reachable[:, None], found.chosen(found.counts), 0.0)
-    seen = sightings(np.arange(count), safe, suns, aims)
-    line = linearise(each, seen, names)
-    slope = line.beam @ line.jacobian
+    counts = np.where(reachable[:, None], found.chosen(found.counts), 0.0)
+    slope = _beam_slope(each, counts, suns, aims, names)
     spread = slope @ as_float(covariance) @ np.swapaxes(slope, -1, -2)
     spread = spread + noise**2 * np.eye(2)
-    return Expected(np.where(reachable[:, None, None], spread, np.nan), reachable)
+    return ExpectedError(np.where(reachable[:, None, None], spread, np.nan), reachable)
+
+
+def error_form(
+    mechanism: Mechanism, aim: npt.ArrayLike, suns: npt.ArrayLike, names: tuple[str, ...]
+) -> FloatArray:
+    """Return the mean squared beam error over ``suns`` as a form of the parameters, (N, P, P).
+
+    With F the form and C the covariance of the parameters, the expected RMS error of the beam
+    (two-dimensional) is √tr(F C), rad.
+
+    Parameters
+    ----------
+    mechanism
+        Best estimates, batch shape (N,).
+    aim
+        Aim points in operation, ENU metres, (3,) or (N, 3).
+    suns
+        K unit vectors of equal weight, (K, 3), for example `suns_of_year`. Suns that a
+        heliostat cannot serve do not count for it; if it can serve none, its form is 0.
+    names
+        P parameters of the table.
+
+    Notes
+    -----
+    First order in the parameters: exact to 1 % for errors of 10 mrad.
+    """
+    count = _batch(mechanism)
+    aims = np.broadcast_to(as_vectors(aim, "aim"), (count, 3))
+    sky = as_vectors(suns, "suns").reshape(-1, 3)
+    form = np.zeros((count, len(names), len(names)))
+    step = max(1, CHUNK // max(1, len(sky)))
+    for first in range(0, count, step):
+        part = slice(first, min(first + step, count))
+        some = mechanism[part]
+        solved = track(some, sky[:, None], aims[part])
+        able = solved.chosen(solved.reachable).T
+        row, which = np.nonzero(able)
+        if not row.size:
+            continue
+        counts = solved.chosen(solved.counts)[which, row]
+        slope = _beam_slope(some[row], counts, sky[which], aims[part][row], names)
+        poses = able.sum(axis=1)
+        # `nonzero` lists the poses heliostat by heliostat.
+        edges = np.concatenate([[0], np.cumsum(poses)])
+        for i in np.flatnonzero(poses):
+            flat = slope[edges[i] : edges[i + 1]].reshape(-1, len(names))
+            form[first + i] = flat.T @ flat / poses[i]
+    return form
+
+
+def _beam_slope(
+    mechanism: Mechanism,
+    counts: FloatArray,
+    suns: FloatArray,
+    aims: FloatArray,
+    names: tuple[str, ...],
+) -> FloatArray:
+    """Derivative of the beam's direction by the parameters at M poses, (M, 2, P)."""
+    seen = sightings(np.arange(len(counts)), counts, suns, aims)
+    line = linearise(mechanism, seen, names)
+    return np.asarray(line.beam @ line.jacobian)
+
+
+def suns_of_year(
+    site: Site,
+    year: int,
+    *,
+    days: int = 12,
+    hours: float = 1.5,
+    min_elevation: float = MIN_ELEVATION,
+) -> FloatArray:
+    """Return unit vectors to the sun on days spread evenly over a year, (K, 3).
+
+    Parameters
+    ----------
+    site
+        Place and air.
+    year
+        Calendar year (UTC).
+    days
+        Number of days.
+    hours
+        Step within a day, h.
+    min_elevation
+        Lowest apparent elevation, rad.
+
+    Raises
+    ------
+    InputError
+        If the sun never rises above ``min_elevation``.
+    """
+    if days < 1 or not 0.0 < hours <= 24.0:
+        raise InputError(f"{days} days at {hours} h: give a day or more and a step up to 24 h")
+    begin = datetime(year, 1, 1, tzinfo=UTC).timestamp()
+    noon = begin + (np.arange(days) + 0.5) * 365.25 * 86400.0 / days
+    # The golden ratio shifts the hours from day to day; otherwise all days would show the same.
+    shift = np.modf(np.arange(days) * 0.618034)[0]
+    offsets = np.arange(0.0, 24.0, hours)
+    times = noon[:, None] + 3600.0 * (offsets + hours * shift[:, None])
+    found = solar.position(times.ravel(), site)
+    suns = found.vector[found.elevation >= min_elevation]
+    if not len(suns):
+        raise InputError(
+            f"site {site.name!r}: the sun never reaches {np.degrees(min_elevation):g}° in {year}; "
+            "lower the least elevation"
+        )
+    return suns
 
 
 @dataclass(frozen=True)
-class Blind:
-    """A combination of parameters that the sightings say nothing about.
+class BlindSpot:
+    """A combination of parameters on which the sightings give no information.
 
     Attributes
     ----------
     text
-        What it is, in words.
+        One clause for people.
     loadings
-        Parameters with their share, the largest first, in units of their priors.
+        Parameters with their share, largest first, in units of their priors.
     remaining
-        Share of the prior's variance that is left, 0 … 1.
+        Remaining share of the prior variance, 0 to 1.
     beam
-        RMS beam error that it causes where it was asked for, rad; NaN if it was not.
+        RMS beam error that it causes, rad; NaN if no beams were given.
     """
 
     text: str
@@ -122,7 +260,7 @@ def unobservable(
     prior: npt.ArrayLike,
     line_of_sight: npt.ArrayLike | None = None,
     slope: npt.ArrayLike | None = None,
-) -> tuple[Blind, ...]:
+) -> tuple[BlindSpot, ...]:
     """Return the combinations of parameters that are known by the prior only.
 
     Parameters
@@ -132,11 +270,11 @@ def unobservable(
     covariance
         After the sightings, (P, P).
     prior
-        Standard deviations before, (P,); parameters with 0 are passed over.
+        Standard deviations before them, (P,); parameters with 0 are skipped.
     line_of_sight
-        Vector from the heliostat to its target, to recognise it, (3,).
+        Vector from the heliostat to its target, (3,), so that a position along it is named.
     slope
-        Derivatives of beams by the parameters, (M, 2, P), to weigh what it matters.
+        Derivatives of beams by the parameters, (M, 2, P), for the beam error that each causes.
     """
     before = as_float(prior)
     used = np.flatnonzero(before > 0)
@@ -156,7 +294,7 @@ def unobservable(
             shift = as_float(slope)[:, :, used] @ (vector * before[used]) * np.sqrt(value)
             beam = float(np.sqrt(np.mean(np.sum(shift**2, axis=-1))))
         text = _in_words(loadings, line_of_sight)
-        found.append(Blind(text, loadings, float(min(value, 1.0)), beam))
+        found.append(BlindSpot(text, loadings, float(min(value, 1.0)), beam))
     return tuple(found)
 
 
@@ -177,15 +315,15 @@ def _in_words(loadings: tuple[tuple[str, float], ...], line: npt.ArrayLike | Non
 
 @dataclass(frozen=True)
 class YearMap:
-    """Expected RMS of the beam over a year.
+    """Expected RMS error of a beam over the year.
 
     Attributes
     ----------
     declination, hour
-        Centres of the grid, rad: (D,) of the sun's declination, (H,) of the hour angle
-        from true noon, west positive.
+        Centres of the grid, rad: the sun's declination (D,), and its hour angle from true
+        noon, west positive (H,).
     rms
-        Rad, (D, H); NaN where the sun is down or the pose out of reach.
+        rad, (D, H); NaN where the sun is down or the pose out of reach.
     """
 
     declination: FloatArray
@@ -202,14 +340,14 @@ def year_map(
     noise: float = 0.0,
     size: tuple[int, int] = (25, 49),
 ) -> YearMap:
-    """Return the expected error for every place of the sun that a year brings.
+    """Return the expected error for every position of the sun in a year.
 
     Parameters
     ----------
     mechanism
         One, calibrated.
     names, covariance, noise
-        As of :func:`expected`.
+        As for `expected_error`.
     aim
         Aim point, (3,).
     latitude_deg
@@ -227,6 +365,11 @@ def year_map(
     shown = suns[:, 2] > np.sin(np.radians(5.0))
     rms = np.full(len(suns), np.nan)
     if shown.any():
-        goal = np.broadcast_to(as_float(aim), (int(shown.sum()), 3))
-        rms[shown] = expected(mechanism, names, covariance, suns[shown], goal, noise).rms
+        rms[shown] = expected_error(mechanism, names, covariance, suns[shown], aim, noise).rms
     return YearMap(declination, hour, rms.reshape(size))
+
+
+def _batch(mechanism: Mechanism) -> int:
+    if len(mechanism.shape) != 1:
+        raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
+    return len(mechanism)

@@ -61,7 +61,7 @@ def calibrate(
 
 
 def _show(result: "Result", report: Path, as_json: bool) -> None:
-    from heliotrope.calibration.report.page import write_beside
+    from heliotrope.files.text import write_text
 
     page = show_report(result, report, quiet=as_json)
     left_out = result.left_out
@@ -73,7 +73,7 @@ def _show(result: "Result", report: Path, as_json: bool) -> None:
         print(line)
     if left_out:
         listing = report / "left_out.txt"
-        write_beside(listing, lambda p: p.write_text("\n".join(left_out) + "\n", encoding="utf-8"))
+        write_text(listing, "\n".join(left_out) + "\n")
         reasons = Counter(line.split(": ", 1)[-1] for line in left_out)
         for reason, count in reasons.most_common():
             print(f"left out: {count} measurements: {reason} (named in {listing})")

@@ -27,10 +27,11 @@ def demo(
     """Make an example plant, measure it, calibrate it, track a day, and write a report."""
     from heliotrope.calibration import evaluation
     from heliotrope.calibration.learn import assessment, learning
-    from heliotrope.calibration.report.page import Result, write_beside
+    from heliotrope.calibration.report.page import Result
     from heliotrope.cli.calibrate import show_report
     from heliotrope.field.example import prototype, roughly_installed
     from heliotrope.field.formats.plant_file import write_plant
+    from heliotrope.files.text import write_file
 
     say = (lambda _text: None) if as_json else print
     plant = prototype()
@@ -59,7 +60,7 @@ def demo(
     write_plant(calibrated, into / "plant.toml")
     day = _track_day(calibrated, truth)
     picture = _day_picture(day)
-    write_beside(into / "day.png", lambda place: picture.savefig(place, dpi=110, format="png"))
+    write_file(into / "day.png", lambda stream: picture.savefig(stream, dpi=110, format="png"))
     page = show_report(result, into / "report", quiet=as_json)
     figures = _figures(result, day)
     if as_json:

@@ -215,7 +215,7 @@ def _parts(
 ) -> list[_Part]:
     import numpy as np
 
-    from heliotrope.calibration.information import expectation, precision, suns_of_year
+    from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
     from heliotrope.mechanism.parameters import model as model_names
 
     names = list(dict.fromkeys(wanted or plant.names))
@@ -240,7 +240,7 @@ def _parts(
                 mechanism,
                 parameters,
                 precision(mechanism, parameters, seen),
-                expectation(mechanism, aim, suns, parameters).form,
+                error_form(mechanism, aim, suns, parameters),
                 aim,
             )
         )

@@ -14,6 +14,9 @@ SUN_HALF_ANGLE = 4.65e-3
 REACH = 3000.0
 #: Direct normal irradiance that irradiances count with where none is given, W/m².
 SUN = 1000.0
+#: Squared distance within which 90 % of a two-dimensional Gaussian lie, χ² with two degrees of
+#: freedom.
+CHI_SQUARE_90 = 2.0 * float(np.log(10.0))
 
 
 @dataclass(frozen=True)
@@ -232,6 +235,41 @@ def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = SUN) -> Crossi
     each = np.where(lit, seen / (np.pi * (x * SUN_HALF_ANGLE) ** 2), 0.0)
     total = dni * (each @ mirrors.reflectivity)
     return Crossing(each, total, np.count_nonzero(each > 0.0, axis=1))
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """Expected error of M beams, each from one sun to one aim.
+
+    Computed by `heliotrope.calibration.uncertainty.expected_error`.
+
+    Attributes
+    ----------
+    covariance
+        To the right of and above the aim as seen from the mirror, rad², (M, 2, 2); NaN where
+        the pose is out of reach.
+    reachable
+        Whether the mechanism reaches the pose, (M,).
+    """
+
+    covariance: FloatArray
+    reachable: npt.NDArray[np.bool_]
+
+    @property
+    def rms(self) -> FloatArray:
+        """Two-dimensional root mean square, rad, (M,)."""
+        return np.asarray(np.sqrt(np.trace(self.covariance, axis1=-2, axis2=-1)))
+
+    @property
+    def ellipse(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The 90 % ellipse: semi-axes (rad, the longer first) and the longer's angle, (M,).
+
+        The angle is counter-clockwise from the right, rad.
+        """
+        values, vectors = np.linalg.eigh(self.covariance)
+        axes = np.sqrt(CHI_SQUARE_90 * np.maximum(values, 0.0))
+        angle = np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+        return axes[:, 1], axes[:, 0], np.asarray(np.mod(angle, np.pi))
 
 
 def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:

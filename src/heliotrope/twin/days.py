@@ -14,16 +14,16 @@ import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import errors
 from heliotrope.calibration.fit.estimator import fit
-from heliotrope.calibration.learn.drift import NINETY
 from heliotrope.calibration.plan.planning import Limits, aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
-from heliotrope.calibration.uncertainty import expected
+from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.lcu import states
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
+from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.schedule.schedule import Assignment, Scheduler, Visited, Weather
 from heliotrope.sun import vector
 
@@ -231,7 +231,7 @@ class Days:
         sure = np.isfinite(beam).all(axis=-1) & np.isfinite(covariance).all(axis=(-1, -2))
         whitened = np.linalg.solve(covariance[sure], beam[sure][:, :, None])[..., 0]
         near = np.sum(beam[sure] * whitened, axis=-1)
-        within = float(np.mean(near <= NINETY)) if sure.any() else float("nan")
+        within = float(np.mean(near <= CHI_SQUARE_90)) if sure.any() else float("nan")
         spread = np.trace(covariance, axis1=-2, axis2=-1)
         return Truth(chosen, _half(np.sum(beam**2, axis=-1)), _half(spread), within)
 
@@ -245,7 +245,7 @@ class Days:
         off = errors(self.truth[row], seen).offset
         if name not in self.covariances:
             return off, np.full((count, 2, 2), np.nan)
-        found = expected(believed, self._learnt, self.covariances[name], suns, aim)
+        found = expected_error(believed, self._learnt, self.covariances[name], suns, aim)
         return off, found.covariance
 
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.report.page import write_beside
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.cells import Rows, find_heliostats, read_parquet, read_rows
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _VECTORS = ("camera", "led")
@@ -160,9 +160,9 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
             columns[f"{end}_{axis}_m"] = getattr(found, end)[:, k]
     table = pd.DataFrame({**columns, "sigma_m": found.sigma})
     if file.suffix.casefold() == ".csv":
-        write_beside(file, lambda part: table.to_csv(part, index=False))
+        write_text(file, table.to_csv(index=False))
     else:
-        write_beside(file, lambda part: table.to_parquet(part, index=False))
+        write_file(file, lambda stream: table.to_parquet(stream, index=False))
 
 
 def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflections, list[str]]:

@@ -22,8 +22,9 @@ from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
 from heliotrope.airborne.evaluate.reflections import join, write_reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.calibration.report import page as report
-from heliotrope.calibration.report.page import STYLE, picture, write_beside
+from heliotrope.calibration.report.page import STYLE, picture
 from heliotrope.errors import InputError
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 __all__ = [
@@ -154,7 +155,7 @@ def write_campaign_report(
             progress(len(sections), len(shown))
     text = _page(flights, shown, maps, sections, notes)
     page = folder / "index.html"
-    write_beside(page, lambda part: part.write_text(text, encoding="utf-8"))
+    write_text(page, text)
     return page
 
 
@@ -181,8 +182,9 @@ def _write_table(rows: list[dict[str, Any]], place: Path) -> None:
     import pandas as pd
 
     table = pd.DataFrame(rows)
-    write_beside(place.with_suffix(".csv"), lambda part: table.to_csv(part, index=False))
-    write_beside(place.with_suffix(".parquet"), lambda part: table.to_parquet(part, index=False))
+    write_text(place.with_suffix(".csv"), table.to_csv(index=False))
+    parquet = place.with_suffix(".parquet")
+    write_file(parquet, lambda stream: table.to_parquet(stream, index=False))
 
 
 # -- the page --------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from heliotrope.airborne.plan.clusters import Clusters, clusters, tour
 from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station
 from heliotrope.airborne.plan.hover import Mirrors, Sampling, mirrors, pattern
 from heliotrope.airborne.plan.look_points import Choosing, LookPoints, look_points
-from heliotrope.calibration.information import suns_of_year
+from heliotrope.calibration.uncertainty import suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray

@@ -14,9 +14,9 @@ from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.clusters import tour
 from heliotrope.airborne.plan.hover import Facing, Mirrors, Sampling, face
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.information import expectation, precision
 from heliotrope.calibration.plan.planning import Candidates, Criterion, Plan, plan
 from heliotrope.calibration.sightings import drone
+from heliotrope.calibration.uncertainty import error_form, precision
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, direction, tangent_axes
 from heliotrope.mechanism.armature import Armature
@@ -142,7 +142,7 @@ def look_points(
     names
         P parameters of its model.
     suns
-        Of the year, (K, 3), see :func:`~heliotrope.calibration.information.suns_of_year`.
+        Of the year, (K, 3), see `suns_of_year`.
     airspace, sampling, choosing
         What is allowed and wanted.
     label
@@ -177,7 +177,7 @@ def look_points(
             "within the stops; lower the distance, widen the elevations or ask for fewer points"
         )
     information = precision(middle, names, priors=choosing.priors)[0]
-    form = expectation(middle, aim, suns, names).form[0]
+    form = error_form(middle, aim, suns, names)[0]
     chosen = plan(found, choosing.points, information, form, criterion=choosing.criterion)
     index = chosen.chosen.time.astype(np.intp)
     # A short way through the directions is a short way for mirrors and drone.

@@ -23,6 +23,7 @@ from heliotrope.calibration.learn import _drift_kernels as kernels
 from heliotrope.calibration.learn.outliers import ALPHA, critical, generalised_esd
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import run_blocks
 
 DAY = 86400.0
@@ -645,10 +646,6 @@ def fit_population(
     return replace(hyper, mean=all_mean, spread=all_spread)
 
 
-#: The 90th percentile of χ² with two degrees of freedom.
-NINETY = 2.0 * np.log(10.0)
-
-
 def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
     """Return the factor on the noise's variance that puts 90 of 100 left-out sightings in.
 
@@ -666,7 +663,7 @@ def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
     def inside(factor: float) -> float:
         wider = spread + ((factor - 1.0) * noise)[:, None, None] * np.eye(2)
         square = np.einsum("na,nab,nb->n", error, np.linalg.inv(wider), error)
-        return float((square <= NINETY).sum()) / (len(square) + outliers)
+        return float((square <= CHI_SQUARE_90).sum()) / (len(square) + outliers)
 
     low, high = 1.0, 25.0
     if inside(low) >= 0.9:

@@ -27,6 +27,7 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
 
 #: Heliostats with fewer sightings teach nothing about the field.
@@ -168,7 +169,7 @@ class Learned:
         white += noise[:, None, None] * np.eye(2)
         covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
         square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
-        inside = square <= drift.NINETY
+        inside = square <= CHI_SQUARE_90
         return Prediction(found, found.offset, covariance, inside, line.beam)
 
 

@@ -14,8 +14,8 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.information import CHUNK
 from heliotrope.calibration.plan import gain as _gain
+from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.geometry import FloatArray, as_float
 
 #: Beams that are looked at for moves and exchanges, at most; some seconds' worth.

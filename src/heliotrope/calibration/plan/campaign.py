@@ -17,10 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun as solar
-from heliotrope.calibration.information import CHUNK
 from heliotrope.calibration.plan import _allocation
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.planning import Limits, aim_at, sighting_jacobian
+from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors
@@ -78,10 +78,10 @@ class Fleet:
         P parameters of the model.
     information
         What is known before, (N, P, P), see
-        :func:`~heliotrope.calibration.information.precision`.
+        :func:`~heliotrope.calibration.uncertainty.precision`.
     form
         What the beam's error is made of, (N, P, P), see
-        :func:`~heliotrope.calibration.information.expectation`; 0 for a heliostat that
+        :func:`~heliotrope.calibration.uncertainty.error_form`; 0 for a heliostat that
         does not count, which is then never measured.
     aim
         Where each stands between its measurements, ENU metres, (N, 3).

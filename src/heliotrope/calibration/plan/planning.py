@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from heliotrope import sun as solar
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.information import CHUNK, LOWEST
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.sightings import sightings
+from heliotrope.calibration.uncertainty import CHUNK, MIN_ELEVATION
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, as_float
@@ -44,7 +44,7 @@ class Limits:
         Largest angle between the beam and the target's normal, rad.
     """
 
-    min_elevation: float = LOWEST
+    min_elevation: float = MIN_ELEVATION
     max_incidence: float = float(np.radians(75.0))
     max_obliquity: float = float(np.radians(70.0))
 
@@ -380,10 +380,10 @@ def plan(
     count
         How many to choose; fewer are chosen where there are no more.
     information
-        What is known before, (P, P), see :func:`~heliotrope.calibration.information.precision`.
+        What is known before, (P, P), see :func:`~heliotrope.calibration.uncertainty.precision`.
     form
         What the beam's error is made of, (P, P), see
-        :func:`~heliotrope.calibration.information.expectation`.
+        :func:`~heliotrope.calibration.uncertainty.error_form`.
     criterion
         "d": largest determinant of the information; "v": smallest expected squared
         error of the beam.

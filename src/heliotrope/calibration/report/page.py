@@ -3,7 +3,6 @@
 import base64
 import html
 import io
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,9 +23,10 @@ from heliotrope.calibration.report.results import (
     write_json,
     write_parquet,
 )
-from heliotrope.calibration.uncertainty import Blind, unobservable
+from heliotrope.calibration.uncertainty import BlindSpot, unobservable
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.plant import Plant
+from heliotrope.files.text import write_text
 from heliotrope.geometry import FloatArray
 
 if TYPE_CHECKING:
@@ -159,18 +159,7 @@ def write_parameters(result: Result, path: Path) -> None:
         for p in range(len(r.names)):
             cells += [f"{r.values[i, p]:.17g}", f"{sigma[i, p]:.17g}"]
         lines.append(",".join(cells))
-    write_beside(path, lambda place: place.write_text("\n".join(lines) + "\n", encoding="utf-8"))
-
-
-def write_beside(path: Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` make a file beside ``path``, then put it in its place at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part{path.suffix}")
-    try:
-        write(part)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def write_report(
@@ -207,7 +196,7 @@ def write_report(
             progress(k + 1, len(rows) + 1)
     page = folder / "index.html"
     text = _page(result, sections)
-    write_beside(page, lambda place: place.write_text(text, encoding="utf-8"))
+    write_text(page, text)
     if progress:
         progress(len(rows) + 1, len(rows) + 1)
     return page
@@ -225,7 +214,7 @@ def picture(figure: "Figure", alt: str, dpi: int = 80) -> str:
     return f'<img loading="lazy" src="data:image/png;base64,{code}" alt="{html.escape(alt)}">'
 
 
-def blind_spots(result: Result, i: int) -> tuple[Blind, ...]:
+def blind_spots(result: Result, i: int) -> tuple[BlindSpot, ...]:
     """Return what the sightings of heliostat ``i`` say nothing about."""
     r = result.results
     count = len(result.learned.model)

@@ -211,10 +211,10 @@ def _write_orientations(out: Path, measured: list[_Measured]) -> None:
     """Write the table that the report has too."""
     import pandas as pd
 
-    from heliotrope.calibration.report.page import write_beside
+    from heliotrope.files.text import write_text
 
     table = pd.DataFrame([row for one in measured for row in one.rows()])
-    write_beside(out / "orientations.csv", lambda part: table.to_csv(part, index=False))
+    write_text(out / "orientations.csv", table.to_csv(index=False))
 
 
 def _sightings(one: _Measured) -> "Sightings":

@@ -7,9 +7,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import errors
-from heliotrope.calibration.information import precision
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.calibration.uncertainty import expected
+from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
@@ -132,7 +131,7 @@ class CalibrationBook:
             rows = np.array([self._plant.field.place(name) for name in members], dtype=np.intp)
             covariance = np.stack([self._covariance[name] for name in members])
             mechanism = group.mechanism[places].with_parameters(values)
-            found = expected(mechanism, self.model, covariance, light, self._aims(rows))
+            found = expected_error(mechanism, self.model, covariance, light, self._aims(rows))
             self.error[rows] = 0.5 * found.rms
 
     def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
@@ -151,7 +150,8 @@ class CalibrationBook:
             group, place = self._plant.design.find(field.names[row])
             nominal = group.mechanism[np.array([place])]
             prior = np.linalg.inv(precision(nominal, self.model))[0]
-            spread.append(0.5 * float(expected(nominal, self.model, prior, light, aim).rms[0]))
+            found = expected_error(nominal, self.model, prior, light, aim)
+            spread.append(0.5 * float(found.rms[0]))
         good = np.array(spread)[np.isfinite(spread)]
         return float(np.sqrt(np.mean(good**2))) if len(good) else 0.0
 

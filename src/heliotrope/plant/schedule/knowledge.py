@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.information import expectation, precision, suns_of_year
 from heliotrope.calibration.learn.drift import DAY, zeros
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.planning import Aimed, Limits, aim_at, sighting_jacobian
 from heliotrope.calibration.sightings import Sightings
+from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
@@ -107,7 +107,7 @@ class Knowledge:
         self.since = np.full(count, np.nan)
         sample = np.unique(np.linspace(0, count - 1, min(count, SAMPLES)).astype(np.intp))
         suns = suns_of_year(site, year, days=6)
-        self._form = expectation(self.mechanism[sample], aim, suns, self.names).form
+        self._form = error_form(self.mechanism[sample], aim, suns, self.names)
         self._like = _nearest(heliostats.position, heliostats.position[sample])
         self._noise = np.zeros((len(self.names), len(self.names)))
         for zero in set(zeros(self.mechanism)) & set(self.names):
