@@ -22,7 +22,7 @@ from heliotrope.lcu import (
 from heliotrope.links.messages import Stage
 from heliotrope.plant import aims
 from heliotrope.twin.world.faults import Fault
-from heliotrope.twin.world.simulation import Plan
+from heliotrope.twin.world.simulation import RunPlan
 from support import plant_defects
 
 #: The plant stands still for a minute when mirrors track.
@@ -49,9 +49,9 @@ class Defect:
     first: int = 0
     slow: bool = False
 
-    def plan(self, seed: int) -> Plan:
+    def plan(self, seed: int) -> RunPlan:
         """Where it is looked for."""
-        return Plan(seed, self.seconds, 3, self.pause, self.only, self.faults)
+        return RunPlan(seed, self.seconds, 3, self.pause, self.only, self.faults)
 
 
 def _lease_by_any_frame(patch: pytest.MonkeyPatch) -> None:

@@ -365,7 +365,7 @@ def test_what_a_field_refuses() -> None:
     with pytest.raises(InputError, match=r"field: mechanisms of shape \(\) with 2 drives; give"):
         field_of(made.mechanism)
     field = Both().field
-    with pytest.raises(InputError, match="field: 70 ms are no multiple of 50 ms"):
+    with pytest.raises(InputError, match="field: 70 ms is not a multiple of 50 ms"):
         field.advance(70)
     with pytest.raises(InputError, match="field: 'JUMP' with aim None; see Field"):
         field.order("JUMP")

@@ -99,9 +99,9 @@ def test_answers_are_frames_of_the_wire() -> None:
         assert await bus.transact(asked[0], 0.1) == b""
         assert await bus.transmit(asked[0]) is Outcome.DISCONNECTED
         await bus.close()
-        with pytest.raises(LinkClosedError, match="field bus: it is closed"):
+        with pytest.raises(LinkClosedError, match="field bus: closed"):
             await bus.transmit(asked[0])
-        with pytest.raises(LinkClosedError, match="field bus: it is closed"):
+        with pytest.raises(LinkClosedError, match="field bus: closed"):
             await bus.transact(asked[0], 0.1)
         return answers
 

@@ -14,8 +14,8 @@ from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCoun
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import Axis
 from heliotrope.twin.boards.outfit import outfits
-from heliotrope.twin.world.simulation import Plan
-from heliotrope.twin.world.soak import soak
+from heliotrope.twin.world.simulation import RunPlan
+from heliotrope.twin.world.soak import run_many
 
 
 def test_flash_takes_what_came_before_the_cut() -> None:
@@ -131,19 +131,19 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
 
 
 def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    plans = [Plan(seed, 5.0, 1) for seed in range(3)]
+    plans = [RunPlan(seed, 5.0, 1) for seed in range(3)]
     kept = tmp_path / "soak.jsonl"
-    first = soak(plans[:2], progress=kept)
+    first = run_many(plans[:2], progress=kept)
     told = []
-    both = soak(plans, progress=kept, tell=lambda found: told.append(found.runs))
+    both = run_many(plans, progress=kept, tell=lambda found: told.append(found.runs))
     assert (first.runs, both.runs, told) == (2, 3, [3])
-    assert both.checks == soak(plans).checks
-    assert soak(plans, budget=0.0).runs == 0
+    assert both.checks == run_many(plans).checks
+    assert run_many(plans, budget=0.0).runs == 0
     kept.write_text('{"seed": 1}\n')
-    with pytest.raises(FormatError, match=r"soak.jsonl: line 1: no run of a soak; give another"):
-        soak(plans, progress=kept)
+    with pytest.raises(FormatError, match=r"soak.jsonl: line 1: not a run of a soak; name another"):
+        run_many(plans, progress=kept)
     with pytest.raises(InputError, match="soak with 0 processes; give 1 or more"):
-        soak(plans, processes=0)
+        run_many(plans, processes=0)
 
 
 def test_a_bus_carries_no_more() -> None:

@@ -12,14 +12,14 @@ from heliotrope.lcu import states
 from heliotrope.twin.invariants.invariants import TITLES
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
-from heliotrope.twin.world.simulation import Outcome, Plan, run, shrink
+from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
 from support.twin_defects import DEFECTS, Defect
 
 #: Seeds that may be spent on a defect.
 SEEDS = 8
 
 
-def searched(defect: Defect) -> Outcome:
+def searched(defect: Defect) -> RunResult:
     """Run with a defect until it is found."""
     for seed in range(defect.first, defect.first + SEEDS):
         with pytest.MonkeyPatch.context() as patch:
@@ -50,7 +50,7 @@ def test_there_is_a_defect_for_each_invariant() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_no_invariant_is_broken(seed: int) -> None:
-    outcome = run(Plan(seed, 180.0, 3))
+    outcome = run(RunPlan(seed, 180.0, 3))
     assert outcome.good, f"{outcome.text}; {outcome.command}"
     assert sum(outcome.faults.values()) > 5
     assert outcome.counts["accepted"] > 10
@@ -59,7 +59,7 @@ def test_no_invariant_is_broken(seed: int) -> None:
 @pytest.mark.parametrize(("seed", "seconds"), [(30085, 60.0), (30054, 240.0)])
 def test_what_was_found_once_stays_mended(seed: int, seconds: float) -> None:
     """An order told by the answer to an older one; a sun sent by a time that was seconds old."""
-    outcome = run(Plan(seed, seconds, 4, pause=12.0))
+    outcome = run(RunPlan(seed, seconds, 4, pause=12.0))
     assert outcome.good, f"{outcome.text}; {outcome.command}"
 
 
@@ -69,7 +69,7 @@ def test_no_invariant_is_broken_for_long(block: int) -> None:
     reached: set[int] = set()
     checked: set[int] = set()
     for seed in range(10_000 + 6 * block, 10_006 + 6 * block):
-        outcome = run(Plan(seed, 900.0, 4))
+        outcome = run(RunPlan(seed, 900.0, 4))
         assert outcome.good, f"{outcome.text}; {outcome.command}"
         reached |= set(outcome.states)
         checked |= {number for number, count in outcome.checks.items() if count}
@@ -78,13 +78,13 @@ def test_no_invariant_is_broken_for_long(block: int) -> None:
 
 
 def test_a_seed_gives_the_same_run_again() -> None:
-    first, second = run(Plan(5, 60.0, 2)), run(Plan(5, 60.0, 2))
+    first, second = run(RunPlan(5, 60.0, 2)), run(RunPlan(5, 60.0, 2))
     assert (first.checks, first.counts, first.states) == (
         second.checks,
         second.counts,
         second.states,
     )
-    assert run(Plan(6, 60.0, 2)).counts != first.counts
+    assert run(RunPlan(6, 60.0, 2)).counts != first.counts
 
 
 def test_a_failing_seed_is_replayed_by_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,7 +103,7 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
     defect = next(each for each in DEFECTS if each.name == "DEFOCUS refused to strangers")
     defect.plant(monkeypatch)
     others = ("stranger_safe", "noise", "replay", "line_drop")
-    tried = (run(Plan(seed, 90.0, 2, pause=3.0, only=others)) for seed in range(SEEDS))
+    tried = (run(RunPlan(seed, 90.0, 2, pause=3.0, only=others)) for seed in range(SEEDS))
     outcome = next(each for each in tried if not each.good)
     assert outcome.violation is not None
     assert sum(outcome.faults.values()) > 1
@@ -112,7 +112,7 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
     assert less.violation is not None
     assert less.violation.number == 4
     with pytest.raises(InputError, match="seed 3: nothing is broken, so there is nothing to shr"):
-        shrink(run(Plan(3, 5.0, 1, faults=())))
+        shrink(run(RunPlan(3, 5.0, 1, faults=())))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +127,7 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
 )
 def test_a_plan_that_cannot_be_run(arguments: dict[str, object], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        Plan(0, **arguments)  # type: ignore[arg-type]
+        RunPlan(0, **arguments)  # type: ignore[arg-type]
 
 
 def test_faults_are_left_out_as_long_as_it_fails() -> None:

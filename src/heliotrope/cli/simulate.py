@@ -36,15 +36,15 @@ def simulate(
     The eleven safety invariants are checked at every step. The exit code is 1 if one is broken.
     """
     from heliotrope.errors import InputError
-    from heliotrope.twin.world.simulation import Plan
-    from heliotrope.twin.world.soak import soak
+    from heliotrope.twin.world.simulation import RunPlan
+    from heliotrope.twin.world.soak import run_many
 
     if runs < 1 or (minutes is not None and not minutes > 0.0):
         raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
     plans = [
-        Plan(seed + i, 3600.0 * hours, heliostats, pause, tuple(only or ())) for i in range(runs)
+        RunPlan(seed + i, 3600.0 * hours, heliostats, pause, tuple(only or ())) for i in range(runs)
     ]
-    found = soak(
+    found = run_many(
         plans,
         processes=processes,
         budget=float("inf") if minutes is None else 60.0 * minutes,

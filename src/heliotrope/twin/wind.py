@@ -1,10 +1,10 @@
-"""Wind over a field: turbulence and gusts that pass over it, and what they do to mirrors.
+"""Wind over a field: turbulence and passing gusts, and the rotation of mirrors under them.
 
-The wind is a function of place and time, so that boards one by one and a vectorised field feel
-the same. Turbulence is frozen and carried along by the mean wind (Taylor): a sum of waves whose
-spectrum at one place is that of von Kármán. Gusts are fronts of the shape (1 − cos)/2, one at
-a time drawn for each window of time. A mirror turns under it in proportion to the pressure, as a
-flat plate does: towards standing broadside to the wind.
+The wind is a function of place and time, so single boards and a vectorised field feel the same
+wind. Turbulence is frozen and carried along by the mean wind (Taylor): a sum of waves whose
+spectrum at one place is von Kármán's. Gusts are fronts of the shape (1 − cos)/2, one drawn for each
+window of time. A mirror turns in proportion to the dynamic pressure, as a flat plate does: towards
+standing broadside to the wind.
 """
 
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 #: Density of air, kg/m³.
 DENSITY = 1.2
-#: Waves, and the band that they fill, Hz: from quarters of an hour to the half second that a
-#: mirror of some metres feels as one.
+#: Number of waves, and their band, Hz: from a quarter of an hour to half a second, below which a
+#: mirror of some metres averages over them.
 WAVES, SLOWEST, FASTEST = 48, 1e-3, 2.0
-#: How long a gust lasts (IEC 61400-1, extreme operating gust), and the window that has one, s.
+#: Duration of a gust (IEC 61400-1, extreme operating gust), and the window that holds one, s.
 GUST_S, WINDOW_S = 10.5, 120.0
-#: What a reading is taken over, s: a gust is a mean over 3 s, the mean wind one over 600 s.
+#: Averaging times of readings, s: 3 s for a gust, 600 s for the mean wind.
 GUST_MEAN_S, MEAN_S = 3.0, 600.0
 
 
@@ -36,23 +36,23 @@ class Wind:
     speed
         Mean, m/s.
     towards
-        Where it blows to: azimuth clockwise from north, rad.
+        Direction that it blows to: azimuth clockwise from north, rad.
     turbulence
-        Standard deviation over the mean.
+        Intensity: standard deviation over the mean.
     length
-        Of the turbulence, along the wind, m.
+        Length scale of the turbulence along the wind, m.
     gust
-        Mean height of a gust over the mean wind, m/s; they are distributed exponentially.
+        Mean height of a gust above the mean wind, m/s; heights are exponentially distributed.
     compliance
-        How far the pressure turns a mirror, rad/Pa, at an angle of 45° to the wind: 1e-5 is 0.6
-        mrad at 10 m/s.
+        Rotation of a mirror by dynamic pressure at 45° to the wind, rad/Pa; 1e-5 is 0.6 mrad at 10
+        m/s.
     seed
-        Of turbulence and gusts.
+        Seed of turbulence and gusts.
 
     Raises
     ------
     InputError
-        Numbers that no wind has.
+        Values out of range.
     """
 
     speed: float = 5.0
@@ -76,7 +76,7 @@ class Wind:
 
     @property
     def direction(self) -> FloatArray:
-        """Where it blows to, ENU, (3,)."""
+        """Direction that it blows to, ENU, (3,)."""
         return np.array([np.sin(self.towards), np.cos(self.towards), 0.0])
 
     @cached_property
@@ -84,26 +84,26 @@ class Wind:
         """Frequencies (Hz), lateral wave numbers (1/m), phases, amplitudes (m/s), each (W,)."""
         rng = np.random.default_rng((self.seed, 1))
         edges = np.geomspace(SLOWEST, FASTEST, WAVES + 1)
-        # Anywhere in its band: equal steps would repeat.
+        # Random within its band, since equal steps would repeat.
         rate = edges[:-1] + rng.random(WAVES) * np.diff(edges)
         pace = max(self.speed, 0.1)
         scaled = rate * self.length / pace
-        # Von Kármán's longitudinal spectrum, of variance 1.
+        # Von Kármán's longitudinal spectrum, with variance 1.
         spectrum = 4.0 * self.length / pace / (1.0 + 70.8 * scaled**2) ** (5.0 / 6.0)
         height = self.turbulence * self.speed * np.sqrt(2.0 * spectrum * np.diff(edges))
-        # Eddies are as broad as they are long.
+        # Eddies are as wide as they are long.
         across = rng.standard_normal(WAVES) * 2.0 * np.pi * rate / pace
         return rate, across, rng.uniform(0.0, 2.0 * np.pi, WAVES), height
 
     def at(self, place: npt.ArrayLike, time: npt.ArrayLike) -> FloatArray:
-        """Return the speed at places (..., 3) and times (...), m and s, which broadcast; m/s.
+        """Return the speed at places (..., 3), m, and times (...), s, which broadcast; m/s.
 
-        The direction does not change; turbulence never turns the wind back.
+        The direction does not change; turbulence never reverses the wind.
         """
         x = as_vectors(place, "wind: place")
         along = x @ self.direction
         across = x @ np.array([np.cos(self.towards), -np.sin(self.towards), 0.0])
-        # What is here now was upwind before.
+        # The eddy that is here now was upwind before.
         passed = as_float(time) - along / max(self.speed, 0.1)
         rate, lateral, phase, height = self._waves
         turns = 2.0 * np.pi * rate * passed[..., None] + lateral * across[..., None] + phase
@@ -114,7 +114,7 @@ class Wind:
         out = np.zeros_like(passed)
         if self.gust == 0.0 or not passed.size:
             return out
-        # A gust may reach into the window after its own.
+        # A gust may extend into the next window.
         first = int(np.floor(passed.min() / WINDOW_S)) - 1
         for window in range(first, int(np.floor(passed.max() / WINDOW_S)) + 1):
             begin, height = _gust(self.seed, window)
@@ -125,8 +125,8 @@ class Wind:
     def turned(self, normal: npt.ArrayLike, place: npt.ArrayLike, time: float) -> FloatArray:
         """Return normals (..., 3) of mirrors at places (..., 3), m, as the wind turns them.
 
-        The moment on a flat plate goes with sin 2β of the angle β between normal and wind: none
-        when it stands broadside or edge on, as a mirror at stow does. It turns it broadside.
+        The moment on a flat plate goes as sin 2β, where β is the angle between normal and wind:
+        zero broadside and edge on (as at stow). It turns the plate broadside.
         """
         n, w = as_float(normal), self.direction
         pressure = 0.5 * DENSITY * self.at(place, time) ** 2
@@ -136,7 +136,7 @@ class Wind:
         return as_float(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
 
     def readings(self, place: npt.ArrayLike, time: float) -> dict[str, float]:
-        """Return what an anemometer at a place (3,) tells the safety table, m/s, by sensor."""
+        """Return an anemometer's readings at a place (3,) for the safety table, m/s, by sensor."""
         short = time - np.linspace(0.0, GUST_MEAN_S, 13)
         long = time - np.linspace(0.0, MEAN_S, 601)
         return {
@@ -147,7 +147,7 @@ class Wind:
 
 @lru_cache(maxsize=1024)
 def _gust(seed: int, window: int) -> tuple[float, float]:
-    """When the gust of a window begins, s, and its height over the mean height."""
-    # Windows before time 0 have gusts too; a seed may not be negative.
+    """Return when the gust of a window begins, s, and its height relative to the mean height."""
+    # Windows before time 0 have gusts too, but a seed may not be negative.
     rng = np.random.default_rng((seed, 2, window & 0xFFFFFFFF))
     return WINDOW_S * (window + float(rng.random())), float(rng.exponential())

@@ -10,7 +10,7 @@ Bools = npt.NDArray[np.bool_]
 
 @lru_cache(maxsize=64)
 def _table(members: tuple[int, ...]) -> Bools:
-    """Whether a code is one of the members, by its place; the last one is of -1: no supply."""
+    """Whether each code is a member, by index; the last entry stands for -1: no power."""
     table = np.zeros(16, dtype=np.bool_)
     table[list(members)] = True
     return table
@@ -19,6 +19,6 @@ def _table(members: tuple[int, ...]) -> Bools:
 def among(codes: npt.NDArray[np.int8], *members: int) -> Bools:
     """Return whether codes of -1 to 14 are among members of 0 to 14, in the shape of the codes.
 
-    As ``np.isin``, which takes twenty times as long for a single heliostat.
+    Same as ``np.isin``, which takes twenty times as long for a single heliostat.
     """
     return np.asarray(_table(members)[codes])

@@ -1,7 +1,7 @@
-"""Motors and gears of a whole field: what becomes of the steps that are emitted.
+"""Motors and gears of a whole field: from emitted steps to joint positions.
 
-The same as `twin.motors` does for one axis, but for the time within a tick: steps are made when
-they are emitted, which on a board is up to a tenth of a second before its timer plays them.
+Same as `twin.boards.motors` for one axis, except within a tick: steps are made when they are
+emitted, which on a board is up to a tenth of a second before its timer plays them.
 """
 
 import numpy as np
@@ -20,25 +20,25 @@ class Drives:
     Parameters
     ----------
     counts
-        Where they stand, steps, (N, 2).
+        Initial positions, steps, (N, 2).
     play
-        Play of the gears, steps, a number or (N, 2); see `twin.motors.Axis`.
+        Play of the gears, steps, a number or (N, 2); see `twin.boards.motors.Axis`.
     miss
-        Chance of an axis that moves to lose a step, in each tick.
+        Probability that a moving axis loses a step in a tick.
     seed
-        Of the steps that are lost.
+        Seed of the lost steps.
 
     Attributes
     ----------
     turned, joint
-        Where motors and joints stand, steps, (N, 2).
+        Positions of motors and joints, steps, (N, 2).
     missed
         Steps lost so far, (N, 2).
 
     Raises
     ------
     InputError
-        A play below 0, or a chance that none is.
+        A play below 0, or a probability outside 0 to 1.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Drives:
         self._chance = np.random.default_rng(seed)
 
     def next(self) -> tuple[Integers, FloatArray, FloatArray, Bools, Integers]:
-        """Return what the kernel turns in the next tick; draws who will lose a step."""
+        """Return the arrays that the kernel turns in the next tick; draws the steps to lose."""
         if self._miss > 0.0:
             self._lost = self._chance.random(self.turned.shape) < self._miss
         return self.turned, self.joint, self._play, self._lost, self.missed

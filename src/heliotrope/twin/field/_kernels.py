@@ -109,14 +109,14 @@ def go_rows(axes, order, rows, goals, how):
 
 @njit(**OPTIONS)
 def still_rows(axes, queued, out):
-    """Say of each heliostat whether nothing moves: `Stepper.still`."""
+    """Return whether each heliostat is at rest: `Stepper.still`."""
     for i in range(len(axes)):
         out[i] = queued[i] <= 0 and _still(axes, i, 0) and _still(axes, i, 1)
 
 
 @njit(**OPTIONS)
 def _carry(drives, i, k, steps):
-    """Turn a motor by what was emitted; its joint is carried along by the flank that pushes."""
+    """Turn a motor by its emitted steps; the flank of the gear that pushes carries the joint."""
     turned, joint, play, lost, missed = drives
     if steps == 0:
         return
@@ -130,10 +130,10 @@ def _carry(drives, i, k, steps):
 
 @njit(**OPTIONS)
 def advance_rows(axes, order, queued, drives, elapsed_ms, slot_ms, ahead_ms):
-    """Emit what the time has made room for: `Stepper.advance`.
+    """Emit the steps that fit into the time: `Stepper.advance`.
 
-    ``drives`` holds, each (N, 2): where motors and joints stand, the play, whether a step is
-    lost next, and how many were.
+    ``drives`` holds, each (N, 2): positions of motors and joints, the play, whether a step is lost
+    next, and the number lost so far.
     """
     for i in range(len(axes)):
         queued[i] -= elapsed_ms

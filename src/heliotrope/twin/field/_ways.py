@@ -1,4 +1,4 @@
-"""Ways of beams for a whole field: corners with points between, as `lcu.motion` makes them."""
+"""Paths of beams for a whole field: corners with points between, as `lcu.motion` makes them."""
 
 from typing import Any
 
@@ -10,18 +10,18 @@ from heliotrope.lcu.motion import PIECE
 
 
 def pieces(corners: FloatArray, origin: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return ways with points between where a beam would turn by more than `lcu.motion.PIECE`.
+    """Return paths with points added where a beam would turn by more than `lcu.motion.PIECE`.
 
     Parameters
     ----------
     corners
         (N, C, 3), m.
     origin
-        From where the beams go, (N, 3), m.
+        Origins of the beams, (N, 3), m.
 
     Returns
     -------
-    Points (N, P, 3), and how many of them each way has, (N,).
+    Points (N, P, 3), and the number of points of each path, (N,).
     """
     rays = corners - origin[:, None]
     cross = np.linalg.norm(np.cross(rays[:, :-1], rays[:, 1:]), axis=-1)

@@ -1,14 +1,13 @@
 """A whole field of local controllers as arrays: the states and steps of `lcu`, without frames.
 
-What a board does from stow to standby, tracking, defocused and back is done here for all
-heliostats of a field at once, in the same integers: poses come from the vectorised tracking of
-`mechanism`, steps from the kernels of `twin._field_kernels`. Where both overlap, step counts are
-those of the firmware-true board.
+All heliostats of a field do at once what a board does from stow to standby, tracking, defocused and
+back, in the same integers: poses come from the vectorised tracking of `mechanism`, steps from the
+kernels of this room. Step counts equal those of the firmware-true board wherever both exist.
 
-It knows STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and FAULT, the
-lease, and the way by itself to defocus and to stow. Supplies may be cut and come back; gears have
-play, motors lose steps, and the wind turns mirrors. Settings, searching and moving by hand are the
-board's (`twin.board`).
+It models STOWED, APPROACHING, IDLE at standby, TRACKING, DEFOCUSED, STOWING, LOCKED and FAULT, the
+lease, and the autonomous way to defocus and stow. Power may be cut and restored; gears have play,
+motors lose steps, and the wind turns mirrors. Settings, searching and jogging need a board
+(`twin.boards.board`).
 """
 
 import numpy as np
@@ -63,9 +62,9 @@ AXIS = np.dtype(
         )
     ]
 )
-#: Of `lcu.config.Config`.
+#: As `lcu.config.Config`.
 LEASE_MS, STOW_WAIT_MS, SLOT_MS, AHEAD_MS = 6000, 30_000, 50, 100
-#: A field is advanced by so much at a time, as a board's main loop does at least, ms.
+#: Time step of a field, ms: at least as often as a board's main loop turns.
 TICK_MS = 50
 
 
@@ -75,9 +74,9 @@ class Field:
     Parameters
     ----------
     mechanism
-        The true ones, batch shape (N,), each with two drives.
+        True mechanisms, batch shape (N,), each with two drives.
     believed
-        What the controllers are told of them; None: the truth.
+        Mechanisms that the controllers are told of; None: the true ones.
     stow
         Step counts, (2,) or (N, 2).
     ranges
@@ -89,31 +88,31 @@ class Field:
     defocus
         Angles of both axes, rad.
     play, miss, seed
-        Of the drives; see `twin._field_drives.Drives`.
+        See `Drives`.
     wind
-        That turns the mirrors; None: there is none.
+        Turns the mirrors; None: no wind.
 
     Attributes
     ----------
     state, kind
-        Of `lcu.states` (-1 without supply) and `lcu.motion`, (N,).
+        See `lcu.states` (-1 without power) and `lcu.motion`, (N,).
     fault
-        Of `lcu.controller`, 0 for none, (N,).
+        See `lcu.controller`, 0 for none, (N,).
     axes
-        Of dtype `AXIS`, (N, 2): what the controllers count.
+        Counts of the controllers, dtype `AXIS`, (N, 2).
     drives
-        Where motors and joints stand in truth.
+        True positions of motors and joints.
     now_ms
-        Since the beginning.
+        Time since the beginning, ms.
     edition
-        Rises with all that changes: what was read at the same edition is still so.
+        Rises with every change: a reading at the same edition is still valid.
     aim, standby
         (N, 3), m.
 
     Raises
     ------
     InputError
-        Mechanisms that are no array of two drives each.
+        Not an array of mechanisms with two drives each.
     """
 
     def __init__(
@@ -145,7 +144,7 @@ class Field:
         rate, acceleration, backlash = limits
         low, high = np.asarray(ranges, dtype=np.int64).T
         self.axes["low"], self.axes["high"] = low, high
-        # As `lcu.stepper.Axis`: intervals are whole microseconds.
+        # As in `lcu.stepper.Axis`, intervals are whole microseconds.
         room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // rate)
         self.axes["top"] = max(1, min(rate * SLOT_MS * kernels.SCALE // 1000, room))
         self.axes["change"] = max(1, acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000)
@@ -234,7 +233,7 @@ class Field:
         return np.asarray(np.where((low <= one) & (one <= high), one, back))
 
     def still(self, rows: Rows | None = None) -> Bools:
-        """Whether nothing moves, (N,), or (M,) of some rows."""
+        """Whether each heliostat is at rest, (N,), or (M,) for some rows."""
         axes, queued = self.axes, self._queued
         if rows is not None:
             axes, queued = axes[rows], queued[rows]
@@ -243,14 +242,14 @@ class Field:
         return out
 
     def at_stow(self, rows: Rows | None = None) -> Bools:
-        """Whether it stands at stow, (N,), or (M,) of some rows."""
+        """Whether each heliostat stands at stow, (N,), or (M,) for some rows."""
         count, stow = self.axes["count"], self._stow
         if rows is not None:
             count, stow = count[rows], stow[rows]
         there: Bools = (count == stow).all(axis=1)
         return self.still(rows) & there
 
-    # -- what begins -----------------------------------------------------------------------
+    # -- motions ---------------------------------------------------------------------------
 
     def _hold(self, rows: Rows) -> None:
         self.kind[rows] = HOLD
@@ -285,7 +284,7 @@ class Field:
         )
 
     def _return(self, rows: Rows) -> None:
-        """Back by the way of the approach, and to stow."""
+        """Return by the path of the approach, and stow."""
         for i in rows:
             self._set_path(i, self._way_back(i))
         self.kind[rows] = RETURN
@@ -325,16 +324,16 @@ class Field:
     def take_sun(
         self, values: tuple[int, ...], rows: Rows | None = None, delay_ms: int = 0
     ) -> None:
-        """Take SUN of the wire (`control` sends it each second): it renews the lease.
+        """Take SUN of the wire, sent each second: it renews the lease.
 
         Parameters
         ----------
         values
             As in the message: second, direction, rate.
         rows
-            Who hears it; None: all.
+            Heliostats that receive it; None: all.
         delay_ms
-            How long it was under way.
+            Time in transit.
         """
         self.edition += 1
         self._sun[0], self._sun[1] = values[1:4], np.multiply(values[4:7], RATE_FACTOR)
@@ -343,16 +342,16 @@ class Field:
         self._lease[heard[self.state[heard] >= 0]] = LEASE_MS - max(0, delay_ms)
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
-        """Give a command; return who has taken it, (N,).
+        """Give a command; return which heliostats take it, (N,).
 
         Parameters
         ----------
         name
             DEFOCUS, STOW, APPROACH, IDLE, TRACK, REFOCUS, AIM, LOCK, UNLOCK or CLEAR_FAULT.
         rows
-            Whom; None: all.
+            Heliostats; None: all.
         aim
-            Of AIM, (3,) or (M, 3), m.
+            Aim point of AIM, (3,) or (M, 3), m.
 
         Raises
         ------
@@ -385,7 +384,7 @@ class Field:
             tracks = chosen[self.kind[chosen] == TRACK]
             self._target[tracks] = self.aim[tracks]
         else:
-            raise InputError(f"field: {name!r} with aim {aim!r}; see Field.order for what it takes")
+            raise InputError(f"field: {name!r} with aim {aim!r}; see Field.order for the commands")
         taken[chosen] = True
         return taken
 
@@ -401,7 +400,7 @@ class Field:
         self._stow_directly(goes[~fresh])
 
     def _lock(self, rows: Rows, name: str) -> Rows:
-        """LOCK, UNLOCK and CLEAR_FAULT; returns who has taken it."""
+        """LOCK, UNLOCK and CLEAR_FAULT; return which heliostats take it."""
         state = self.state[rows]
         if name == "UNLOCK":
             rows = rows[state == states.LOCKED]
@@ -418,7 +417,7 @@ class Field:
         return rows
 
     def _sun_bound(self, rows: Rows, name: str) -> Rows:
-        """TRACK, REFOCUS and IDLE; returns who has taken it."""
+        """TRACK, REFOCUS and IDLE; return which heliostats take it."""
         state, fresh = self.state[rows], self._lease[rows] > 0
         if name == "IDLE":
             rows = rows[among(state, states.IDLE, states.TRACKING, states.DEFOCUSED)]
@@ -450,22 +449,22 @@ class Field:
         self._stow_directly(rows[state == states.STOWING])
 
     def lease_left(self, row: int) -> int:
-        """Return what is left of the lease of one heliostat, ms."""
+        """Return the remaining lease of one heliostat, ms."""
         return int(self._lease[row])
 
     def leases(self, rows: Rows) -> npt.NDArray[np.int64]:
-        """Return what is left of the leases of some heliostats, ms, (M,)."""
+        """Return the remaining leases of some heliostats, ms, (M,)."""
         return self._lease[rows]
 
-    # -- faults and supplies ---------------------------------------------------------------
+    # -- faults and power ------------------------------------------------------------------
 
     def fail(self, rows: Rows, number: int) -> None:
-        """Let controllers find a fault of `lcu.controller`; it lasts until `mend`.
+        """Give controllers a fault of `lcu.controller`, which lasts until `mend`.
 
         Raises
         ------
         InputError
-            A number that no fault has.
+            An unknown fault number.
         """
         if not NO_FAULT < number <= LATCHED:
             raise InputError(f"field: fault {number}; give 1 to {LATCHED}, as lcu.names has them")
@@ -481,13 +480,13 @@ class Field:
         self._enter(rows[state != states.LOCKED], states.FAULT)
 
     def mend(self, rows: Rows) -> None:
-        """Let the causes of faults be gone: the faults stay until CLEAR_FAULT."""
+        """Remove the causes of faults; the faults themselves stay until CLEAR_FAULT."""
         self._present[rows] = False
 
     def cut(self, rows: Rows, *, warned: bool = False) -> None:
-        """Cut supplies: motors stand, nothing is heard. What was emitted is made yet.
+        """Cut the power: motors stop, nothing is received. Steps already emitted are still made.
 
-        ``warned``: the brown-out detectors see it come, which is a fault that stays.
+        ``warned``: the brown-out detectors see it coming, which leaves a fault.
         """
         rows = rows[self.state[rows] >= 0]
         self.edition += 1
@@ -504,7 +503,7 @@ class Field:
             self.axes[name][rows] = self.axes["count"][rows]
 
     def restore(self, rows: Rows) -> None:
-        """Let supplies come back: locked and faulty ones are so still, others turn away."""
+        """Restore the power: locked and faulty controllers stay so, the others turn away."""
         rows = rows[self.state[rows] < 0]
         self.edition += 1
         before = self._kept[rows]
@@ -520,15 +519,15 @@ class Field:
     # -- time ------------------------------------------------------------------------------
 
     def advance(self, milliseconds: int) -> None:
-        """Let time pass, in ticks of `TICK_MS`.
+        """Advance time, in ticks of `TICK_MS`.
 
         Raises
         ------
         InputError
-            No multiple of `TICK_MS`.
+            Not a multiple of `TICK_MS`.
         """
         if milliseconds % TICK_MS or milliseconds < 0:
-            raise InputError(f"field: {milliseconds} ms are no multiple of {TICK_MS} ms")
+            raise InputError(f"field: {milliseconds} ms is not a multiple of {TICK_MS} ms")
         for _ in range(milliseconds // TICK_MS):
             self._tick()
 
@@ -587,7 +586,7 @@ class Field:
                 self._defocus_now(lost)
 
     def _on_path(self, rows: Rows) -> None:
-        """Go on along the path: `Motion._on_path`."""
+        """Continue along the path: `Motion._on_path`."""
         self._place[rows] += 1
         goes = rows[self._place[rows] < self._length[rows]]
         ends = rows[self._place[rows] >= self._length[rows]]
@@ -604,7 +603,7 @@ class Field:
         self._stow_directly(ends[self.kind[ends] == RETURN])
 
     def _follow(self, rows: Rows) -> Rows:
-        """Keep beams on their aims: `Motion._follow`; returns those that no pose reaches."""
+        """Keep beams on their aims: `Motion._follow`; return those that no pose can serve."""
         new = rows[self._knot[rows] <= 0]
         lost = new[:0]
         if len(new):
@@ -625,7 +624,7 @@ class Field:
         self._go(rows, angles, np.full(len(rows), -1))
         return lost
 
-    # -- what is true ----------------------------------------------------------------------
+    # -- truth -----------------------------------------------------------------------------
 
     def normals(self) -> FloatArray:
         """Return the true normals of the mirrors now, (N, 3)."""
@@ -649,8 +648,8 @@ class Field:
         receiver
             Its middle, (3,), m.
         radius
-            Beams whose axis passes it nearer than this (m) are on it. Each counts with the
-            cosine of its incidence, against the same for all beams aimed at the middle.
+            Beams whose axis passes nearer than this count as on it, m. Each is weighted by the
+            cosine of its incidence, relative to all beams aimed at the middle.
         """
         s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
         normal, vertex = self._stand()

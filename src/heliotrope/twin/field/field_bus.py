@@ -1,8 +1,8 @@
 """A bus whose stations are rows of a vectorised field: frames in, frames out, in microseconds.
 
 One `FieldBus` is one cluster's bus. It answers QUERY_STATUS and QUERY_STEPS, takes SUN, and passes
-commands on to the `twin.field.Field`. There is neither noise nor a gate: for those, and for all
-other messages, there are boards (`twin.board`) on a `twin.bus.TwinBus`.
+commands on to the `Field`. It has no noise and no gate; boards (`twin.boards`) on a `TwinBus` have
+both, and all other messages.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ _SUN, _AIM = struct.Struct("<Iiiihhh"), struct.Struct("<fff")
 _ACK = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["ACK"]))
 _STEPS = struct.Struct("<" + messages.codes_of(messages.NUMBER_OF["STEPS"]))
 _NUMBERS = messages.NUMBER_OF
-#: `messages.name_of` looks through a text, as suits a microcontroller.
+#: `messages.name_of` searches a text, as suits a microcontroller.
 _NAMES = {number: name for name, number in messages.NUMBER_OF.items()}
 #: A STATUS for each heliostat: state, flags, fault, uptime, age of the sun, supply, temperature,
 #: checksum of the armature, boots.
@@ -51,16 +51,16 @@ KNOWN = frozenset(
 
 
 class FieldBus:
-    """The bus of one cluster of a field; a `control.link.Bus`.
+    """The bus of one cluster of a field; a `links.link.Bus`.
 
     Parameters
     ----------
     field
         The whole field.
     rows
-        Heliostats of this cluster, places in the field; their addresses are 1, 2, and so on.
+        Indices of this cluster's heliostats in the field; their addresses are 1, 2, and so on.
     took
-        Called with a command's name and the rows that it was for; None: nobody asks.
+        Called with the name and the rows of each command; None: not called.
 
     Attributes
     ----------
@@ -70,7 +70,7 @@ class FieldBus:
     Raises
     ------
     InputError
-        Rows that are not of the field, or none.
+        Rows outside the field, or none.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class FieldBus:
         self._all = np.array(rows)
         self._took = took
         self._closing = asyncio.Event()
-        #: Payloads of all STATUS, and the edition of the field that they are of.
+        #: Payloads of every STATUS, and the edition of the field that they are valid for.
         self._told: list[bytes] = []
         self._edition = -1
 
@@ -98,7 +98,7 @@ class FieldBus:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the bus is closed for good."""
         return self._closing.is_set()
 
     async def run(self) -> None:
@@ -106,17 +106,17 @@ class FieldBus:
         await self._closing.wait()
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the bus for good."""
         self._closing.set()
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> Outcome:
-        """Send a frame that nobody answers; other buses of the process have their turn besides."""
+        """Send a frame without an answer, and let other buses of the process take their turn."""
         del expires, urgent
         await asyncio.sleep(0)
         if self.closed:
-            raise LinkClosedError("field bus: it is closed")
+            raise LinkClosedError("field bus: closed")
         if not self.plugged:
             return Outcome.DISCONNECTED
         self._hear(frame)
@@ -131,10 +131,10 @@ class FieldBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return what is answered, b"" if nothing is."""
+        """Send a frame and return the answer, b"" if there is none."""
         del timeout, expires, urgent, complete
         if self.closed:
-            raise LinkClosedError("field bus: it is closed")
+            raise LinkClosedError("field bus: closed")
         return self._hear(frame) if self.plugged else b""
 
     def _hear(self, data: bytes) -> bytes:
@@ -170,9 +170,9 @@ class FieldBus:
             self._took(name, rows)
 
     def _statuses(self) -> list[bytes]:
-        """Return the payloads of STATUS of the whole bus.
+        """Return the STATUS payloads of the whole bus.
 
-        A cluster asks for one after the other, and nothing changes between.
+        A cluster asks for them one after another, and nothing changes in between.
         """
         field = self._field
         if self._edition != field.edition:
@@ -190,7 +190,7 @@ class FieldBus:
         return self._told
 
     def _answer(self, place: int, sequence: int, name: str, payload: bytes) -> bytes:
-        """Return a heliostat's frame; nothing if its supply is cut."""
+        """Return a heliostat's frame, b"" if its power is cut."""
         if self._field.state[self._rows[place]] < 0:
             return b""
         head = _HEADER.pack(wire.VERSION, wire.CLUSTER_ADDRESS, place + 1, sequence, _NUMBERS[name])
@@ -204,7 +204,7 @@ class FieldBus:
         result, row = messages.REFUSED_STATE, self._rows[place]
         if name in KNOWN:
             aim = _AIM.unpack_from(payload, 8) if name == "AIM" else None
-            # Most have heard the broadcast before: then nothing happens.
+            # Most have received the broadcast before and do nothing.
             idle = name == "DEFOCUS" and self._field.state[row] == states.DEFOCUSED
             if idle or self._field.order(name, self._all[place : place + 1], aim)[row]:
                 result = messages.DONE
@@ -213,7 +213,7 @@ class FieldBus:
 
 
 def _unstuffed(data: bytes) -> bytes:
-    """Undo `_stuffed` and the zero after it; nothing if that is not possible."""
+    """Undo `_stuffed` and its final zero; b"" if that is not possible."""
     if data.find(0) != len(data) - 1:
         return b""
     out, place, end = bytearray(data), 0, len(data) - 1
@@ -225,20 +225,20 @@ def _unstuffed(data: bytes) -> bytes:
 
 
 def _stuffed(data: bytes) -> bytes:
-    """As `wire.stuff`, block by block instead of byte by byte.
+    """Same as `wire.stuff`, block by block instead of byte by byte.
 
-    No frame is long enough (`wire.FRAME_LIMIT`) for a block of 254 bytes. What a zero separates
-    may be stuffed apart and joined.
+    No frame is long enough (`wire.FRAME_LIMIT`) for a block of 254 bytes, so parts between zeros
+    may be stuffed separately and joined.
     """
     return b"".join([_LENGTHS[len(block)] + block for block in data.split(b"\0")])
 
 
 @lru_cache(maxsize=4096)
 def _parts(payload: bytes) -> tuple[bytes, bytes, bytes]:
-    """Return a payload up to its first zero, what is between stuffed, and what follows its last.
+    """Return a payload up to its first zero, its stuffed middle, and the part after its last zero.
 
-    A field's heliostats do the same for hours: few payloads differ. It has two zeros at least: a
-    STATUS of a field tells no uptime.
+    A field's heliostats do the same for hours, so few payloads differ. Each has at least two zeros,
+    since a STATUS of a field reports no uptime.
     """
     first, _, rest = payload.partition(b"\0")
     middle, _, last = rest.rpartition(b"\0")

@@ -1,1 +1,10 @@
-"""The observer that checks the safety invariants."""
+"""The observers that check the safety invariants.
+
+`Observer` watches one cluster with its boards, `PlantObserver` the plant; `TITLES` names the
+invariants.
+"""
+
+from heliotrope.twin.invariants.invariants import TITLES, InvariantError, Observer, Violation
+from heliotrope.twin.invariants.plant_observer import PlantObserver
+
+__all__ = ["TITLES", "InvariantError", "Observer", "PlantObserver", "Violation"]

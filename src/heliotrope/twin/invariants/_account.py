@@ -1,4 +1,4 @@
-"""What the observer knows of one heliostat."""
+"""The observer's account of one heliostat."""
 
 from collections import deque
 from typing import Any
@@ -9,27 +9,27 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import LIMITS, STOW
 from heliotrope.twin.invariants.ledger import Sent
 
-#: A timer may be given so much more than its rate allows until now, s: what is emitted ahead.
+#: Steps that a timer may be given ahead of its rate, s.
 AHEAD = 0.2
-#: The sun comes every second; served is who had it within this, s.
+#: The sun is sent every second; a heliostat counts as served for this long after, s.
 SERVED = 2.0
-#: Slowing down takes half a second at most; then only the axis whose turn it is may move, s.
+#: Braking takes half a second at most; after this only the axis whose turn it is may move, s.
 BRAKING = 1.0
 
 
 def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
-    """Return all that a refused frame must leave alone.
+    """Return everything that a refused frame must leave unchanged.
 
     Parameters
     ----------
     board
-        With its supply on.
+        A board with power.
     gate
-        Whether the gate's count of frames belongs to it: what a stranger sends, and what is
-        replayed from before a restart of the cluster, may use numbers up.
+        Whether to include the gate's count of frames, which forged frames and frames replayed from
+        before a restart of the cluster may use up.
     clock
-        Whether clock and gate belong to it. Old time may be taken by who has heard no later frame
-        of the same epoch: it makes commands void and ends the lease early, and moves nothing.
+        Whether to include clock and gate. A board that has heard no later frame of the same epoch
+        may take an old time: it voids commands, ends the lease early, and moves nothing.
     """
     node = board.node
     assert node is not None
@@ -54,23 +54,24 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
 
 
 class Account:
-    """One heliostat in the eyes of the observer.
+    """One heliostat as the observer knows it.
 
     Attributes
     ----------
     state
-        As last seen; -1 while the supply is off.
+        State last seen; -1 without power.
     sun_at
-        When the newest sun that it has heard was sent, s.
+        When the cluster sent the newest sun that the heliostat has received, s.
     taken
-        Place of the last frame for it, questions and safe orders aside, that came whole.
+        Index of the last frame received whole, except questions and safe orders.
     in_hand, how, forged, quiet, before, good
-        Of the frame that it is hearing: what the cluster sent, how it came, what a stranger
-        sent, the invariant by which it must change nothing, what was before.
+        The frame being received: the cluster's frame, how it arrived, the forged frame, the
+        invariant by which it must change nothing, the fingerprint before, frames counted as good
+        before.
     told
-        When the cluster heard its last STATUS answers, s, and their values.
+        Times (s) and values of the last STATUS answers that the cluster received.
     from_stow
-        Whether it has left stow and not tracked since.
+        Whether it has left stow and has not tracked since.
     """
 
     def __init__(self, board: Board, now: float) -> None:
@@ -94,7 +95,7 @@ class Account:
         self._ordered: dict[str, float] = {}
         self._level = [0.0, 0.0]
         self._filled_at = [now, now]
-        self._leg = 0  # of leaving stow: 0 none, 1 azimuth expected, 2 it moved, 3 elevation moves
+        self._leg = 0  # leaving stow: 0 no, 1 azimuth expected, 2 azimuth moved, 3 elevation moves
         self._stowing_since: float | None = None
         self._on_since: float | None = None
 
@@ -110,19 +111,19 @@ class Account:
         under_way = (states.APPROACHING, states.TRACKING, states.SEARCHING, states.LOCKED)
         by_itself = state == states.IDLE and self.state == states.APPROACHING
         if state in under_way or (state == states.IDLE and not by_itself):
-            # A later command has taken the place of the order.
+            # A later command has replaced the order.
             self._ordered.clear()
         self.state = state
         self._history.append((now, state))
 
     def was_in(self, wanted: tuple[int, ...], since: float) -> bool:
-        """Whether it was in one of some states at any time since."""
+        """Whether the heliostat was in one of some states at any time since."""
         begun = [state for at, state in self._history if at <= since][-1:]
         later = [state for at, state in self._history if at > since]
         return any(state in wanted for state in begun + later)
 
     def cut(self, now: float) -> None:
-        """Note that the supply is off."""
+        """Note that the power is off."""
         sent = self.in_hand
         self._pending = {}
         if sent is not None and sent.who == messages.KEY:
@@ -137,7 +138,7 @@ class Account:
         self._history.append((now, -1))
 
     def booted(self, now: float) -> None:
-        """Note that it runs again: its times begin anew, and no frame of before counts."""
+        """Note a boot: its times start again, and no earlier frame counts."""
         self.state = self.board.state
         self._history.append((now, self.state))
         self._served_at = now
@@ -149,9 +150,9 @@ class Account:
     # -- the journal -----------------------------------------------------------------------
 
     def keep(self) -> bool:
-        """Note what the journal holds; return whether it is other than before.
+        """Note the contents of the journal; return whether they have changed.
 
-        The reference is kept: a store makes a new dictionary and leaves the old one alone.
+        Comparing references is enough: a store makes a new dictionary and leaves the old one alone.
         """
         node = self.board.node
         assert node is not None
@@ -164,7 +165,7 @@ class Account:
         return changed
 
     def mixture(self, held: dict[str, bytes]) -> str:
-        """Return what a journal holds that is neither the old nor the new record, or ""."""
+        """Return what a journal holds that belongs to neither the old nor the new record, or ""."""
         old = dict(self._items)
         if held in (old, {**old, **self._pending}):
             return ""
@@ -174,12 +175,12 @@ class Account:
     # -- steps -----------------------------------------------------------------------------
 
     def place(self) -> tuple[int, int]:
-        """Return the step counts, as ordered of the timers."""
+        """Return the step counts, as handed to the timers."""
         one, two = (a.emitted - s for a, s in zip(self.board.axes, self.board.slip, strict=True))
         return one, two
 
     def rate(self, axis: int, count: int, now: float) -> str:
-        """Take steps that are ordered now; return what is wrong with their rate, or ""."""
+        """Take steps handed to a timer now; return what is wrong with their rate, or ""."""
         limit = float(LIMITS[0])
         gone = limit * (now - self._filled_at[axis])
         self._filled_at[axis] = now
@@ -189,7 +190,7 @@ class Account:
         return f"axis {axis} is {level:.0f} steps ahead of {limit:.0f} steps/s"
 
     def order(self, axis: int) -> str | None:
-        """Take a segment: what is wrong with the order of the axes, "", or None: any will do."""
+        """Take a segment; return an error in the order of the axes, "", or None if any will do."""
         board = self.board
         if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
             if axis == 1:
@@ -211,18 +212,18 @@ class Account:
         return ""
 
     def jumped(self) -> None:
-        """Note that its counter jumps: what its timers hold it may take for played."""
+        """Note a jump of the counter: the board may take pending steps for done."""
         self._leg = 0
 
-    # -- what is due -----------------------------------------------------------------------
+    # -- deadlines -------------------------------------------------------------------------
 
     def served(self, now: float, leased: bool) -> None:
-        """Note whether plant and cluster are there for it."""
+        """Note whether plant and cluster serve the heliostat."""
         if leased and now - self.sun_at <= SERVED:
             self._served_at = now
 
     def crosses(self, on: bool, now: float) -> float:
-        """Note whether the beam is on the receiver; return for how long, s."""
+        """Note whether the beam is on the receiver; return for how long it has been, s."""
         if not on:
             self._on_since = None
             return 0.0
@@ -236,16 +237,16 @@ class Account:
             self._ordered.setdefault(name, now)
 
     def forget(self) -> None:
-        """Forget the orders: who was to carry them is gone."""
+        """Forget the orders: the cluster that had to carry them out is gone."""
         self._ordered.clear()
 
     def deadlines(self, now: float) -> list[tuple[str, float]]:
-        """Return since when it has to be going away, by cause, s."""
+        """Return the causes for which it has to leave, each with its time, s."""
         found = list(self._ordered.items())
         if now - self._served_at > SERVED:
             found.append(("it was cut off", self._served_at))
         return found
 
     def must_stow(self, why: str) -> bool:
-        """Whether it must go on to stow."""
+        """Whether the cause requires stow, not only defocus."""
         return why != "DEFOCUS"

@@ -1,27 +1,27 @@
-"""The eleven safety invariants, checked by an observer who belongs to nobody.
+"""The eleven safety invariants, checked by an independent observer.
 
-The observer sees the frames on the bus, what each board does, what the plant orders and what it
-is told. It keeps its own accounts and takes nobody's word: the age of a sun counts from when the
-cluster sent it, a heliostat is defocused when its beam passes the receiver, a duplicate is what
-came before, in true time throughout.
+The observer sees the frames on the bus, the actions of each board, and the messages to and from the
+plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
+when the cluster sent it, a heliostat is defocused when its beam misses the receiver, a duplicate is
+a frame that was received before.
 
 ========  ============================================================================
-number    what is checked
+number    check
 ========  ============================================================================
-1         In a state that needs the sun, the last one is not older than the lease.
-2         What is cut off from plant or cluster is off the receiver in 30 s and at stow in
-          5 min; so is what was ordered to.
+1         In a state that needs the sun, the last sun is not older than the lease.
+2         A heliostat that is cut off from plant or cluster, or ordered off, is off the
+          receiver in 30 s and at stow in 5 min.
 3         TRACKING and SEARCHING, and every way out of STOWED and FAULT, begin with a genuine
-          command in that instant.
+          command at that instant.
 4         DEFOCUS and STOW act at once, whoever sends them; nothing else acts without authority.
 5         Duplicate, late, replayed and expired commands change nothing.
 6         A damaged frame changes nothing.
 7         After a boot the state is a safe one, the journal holds the old or the new record, and
-          the step counts are right to within what it says of them.
+          the step counts are right to within their stated uncertainty.
 8         Steps keep to range and rate; counted steps are those that were ordered.
 9         As 1, and the plant's lease too, while a clock or counter has jumped.
-10        Azimuth first from stow, last to stow; no beam on the receiver on the way.
-11        Every command on the bus was accepted and reported once; nothing is told to be younger
+10        Azimuth moves first from stow and last to stow; no beam crosses the receiver on the way.
+11        Every command on the bus was accepted and reported once; no value is reported younger
           or other than it is.
 ========  ============================================================================
 """
@@ -47,17 +47,17 @@ from heliotrope.twin.boards.outfit import (
 from heliotrope.twin.invariants._account import Account, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, Order, OrderLedger, Sent
 
-#: Gives the true direction to the sun, (3,), at a time in s.
+#: Returns the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]
 
 #: Title of each invariant.
 TITLES = {
     1: "no tracking on an old sun",
-    2: "what is cut off defocuses and stows",
+    2: "a heliostat that is cut off defocuses and stows",
     3: "no way to tracking without a command",
-    4: "defocus and stow always, all else by authority",
-    5: "what is old moves nothing",
-    6: "what is damaged changes nothing",
+    4: "DEFOCUS and STOW always, everything else by authority",
+    5: "an old command moves nothing",
+    6: "a damaged frame changes nothing",
     7: "safe after a reset, journal whole",
     8: "steps within limits, and counted",
     9: "no jump of time extends a lease",
@@ -65,29 +65,29 @@ TITLES = {
     11: "every command once, every value true",
 }
 
-#: Local lease, and how much later a board may look, s.
+#: Local lease, and how late a board may notice its end, s.
 LEASE, LOOK = 6.0, 0.15
-#: The plant's lease to a cluster, s, and how late the last sun of it may go out.
+#: The plant's lease to a cluster, and how late its last sun may go out, s.
 PLANT_LEASE, SUN_AFTER = 3.0, 1.2
-#: Time to be off the receiver, and at stow, s.
+#: Time limits to be off the receiver and at stow, s.
 DEFOCUS_WITHIN, STOW_WITHIN = 30.0, 300.0
-#: A beam this far (m) from its middle is off the receiver.
+#: A beam this far from the middle of the receiver is off it, m.
 OFF = 4.0
-#: A mirror that goes to stow without knowing where the sun is may carry its beam across the
-#: receiver; it must not stay for longer, s.
+#: A mirror that stows without knowing the sun may carry its beam across the receiver, for no
+#: longer than this, s.
 CROSSING = 2.0
-#: After a jump the checks of the leases count as those of number 9 for so long, s.
+#: For this long after a jump, checks of leases count as number 9, s.
 JUMP_COUNTS = 60.0
 #: From an order to its first frame on a healthy bus, s.
 ORDER_WITHIN = 1.0
-#: A value may be told this much (s) younger than it is: the rounding of its age.
+#: A value may be reported this much younger than it is, by the rounding of its age, s.
 AGE_ROUNDING = 0.1
-#: The cluster's clock may run so much faster or slower than true time.
+#: Largest relative difference in rate between the cluster's clock and true time.
 CLOCKS_APART = 1e-3
-#: A status is made every second, and not delivered later than this after it was sent, s.
+#: A status is made every second, and is delivered no later than this after it was sent, s.
 STATUS_LIFE = 1.0
 
-#: What a controller may do by itself, or by DEFOCUS and STOW: state before, state after.
+#: Transitions that a controller may make by itself, or by DEFOCUS and STOW: state before, after.
 FREE = {
     *((before, states.DEFOCUSED) for before in (
         states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)),
@@ -96,22 +96,22 @@ FREE = {
     *((before, states.FAULT) for before in range(len(states.STATES)) if before not in (
         states.UNCONFIGURED, states.LOCKED)),
     (states.STOWING, states.STOWED), (states.APPROACHING, states.IDLE),
-    (states.DEFOCUSED, states.STOWED),  # on its way for no time: it had hardly left
+    (states.DEFOCUSED, states.STOWED),  # arrived at once: it had hardly left
     (states.SEARCHING, states.IDLE), (states.UNCONFIGURED, states.LOCKED),
 }  # fmt: skip
-#: What else needs which command, by the state that is entered.
+#: Commands that every other transition needs, by the state that is entered.
 BY_COMMAND = {
     states.TRACKING: ("TRACK", "REFOCUS"), states.SEARCHING: ("SEARCH",),
     states.APPROACHING: ("APPROACH",), states.LOCKED: ("LOCK",),
     states.IDLE: ("IDLE", "UNLOCK", "CLEAR_FAULT"),
     states.STOWED: ("UNLOCK", "CLEAR_FAULT"), states.FAULT: ("UNLOCK",),
 }  # fmt: skip
-#: States that a boot may lead to.
+#: States that a boot may end in.
 AFTER_BOOT = (states.UNCONFIGURED, states.STOWED, states.DEFOCUSED, states.LOCKED, states.FAULT)
-#: What DEFOCUS and STOW never leave a mirror in: its beam is out by command, and no way of it may
-#: lead through a keep-out volume.
+#: States that DEFOCUS and STOW always end: the beam is out by command, and no return path may lead
+#: through a keep-out volume.
 ON_THE_WAY = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
-#: States that a command asks for: what DONE must mean.
+#: State that each command asks for, which is what DONE must mean.
 ASKED = {
     "APPROACH": (states.IDLE,), "IDLE": (states.IDLE,), "TRACK": (states.TRACKING,),
     "REFOCUS": (states.TRACKING,), "LOCK": (states.LOCKED,), "SEARCH": (states.SEARCHING,),
@@ -124,7 +124,7 @@ class InvariantError(HeliotropeError):
     Attributes
     ----------
     violation
-        Which, when, where and what was seen.
+        The violation, with number, time, subject and observation.
     """
 
     def __init__(self, violation: "Violation") -> None:
@@ -134,18 +134,18 @@ class InvariantError(HeliotropeError):
 
 @dataclass(frozen=True)
 class Violation:
-    """What broke an invariant.
+    """Violation of an invariant.
 
     Attributes
     ----------
     number
         1 to 11.
     at
-        s since the start.
+        Time since the start, s.
     subject
         Name of the heliostat, or "cluster".
     saw
-        What was seen, with values and limits.
+        The observation, with values and limits.
     """
 
     number: int
@@ -161,29 +161,30 @@ class Violation:
 class Observer:
     """Listens to bus, boards and plant, and raises at the first broken invariant.
 
-    It is a `twin.bus.Tap` and a `twin.board.Witness`; `look` is called every half second.
+    It is a `twin.boards.bus.Tap` and a `twin.boards.board.Witness`; `look` is called every half
+    second.
 
     Parameters
     ----------
     boards
-        In the order of their places on the bus.
+        Boards in the order of their places on the bus.
     start
-        Time that counts as 0 s in what it says.
+        Zero of the times that it reports, s.
     sun
-        Gives the true direction to the sun, (3,), at a time in s.
+        Returns the true direction to the sun, (3,), at a time in s.
 
     Attributes
     ----------
     checks
-        How often each invariant was checked.
+        Number of checks of each invariant.
     frames, orders
         The ledgers.
     leased_at
-        When the plant last sent a lease on a line that was whole, s.
+        When the plant last sent a lease on a healthy line, s.
     jumped_at, disturbed_at
         When a clock or counter last jumped; when line, bus or cluster last failed; s.
     autonomy
-        Of the plant's leases, s.
+        Autonomy that the plant's leases grant, s.
     entered
         How often each state was entered.
     start
@@ -207,7 +208,7 @@ class Observer:
         for account in self.accounts:
             account.board.witness = self
 
-    # -- saying so -------------------------------------------------------------------------
+    # -- verdicts --------------------------------------------------------------------------
 
     def check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
         """Count a check, and raise if it fails.
@@ -227,10 +228,10 @@ class Observer:
     # -- the bus (Tap) ---------------------------------------------------------------------
 
     def sent(self, frame: bytes, now: float) -> None:
-        """Judge what the cluster sends."""
+        """Judge a frame that the cluster sends."""
         sent = self.frames.note(frame, now)
         if sent is None:
-            self.check(6, False, now, "cluster", f"it sent {len(frame)} bytes that are no frame")
+            self.check(6, False, now, "cluster", f"it sent {len(frame)} bytes that are not a frame")
             return
         if sent.name == "SUN":
             age = now - self.leased_at
@@ -243,7 +244,7 @@ class Observer:
             self._emergencies = [(name, at) for name, at in self._emergencies if name != sent.name]
 
     def _authorised(self, sent: Sent, now: float) -> None:
-        """A command on the bus: from an order, in time, of the authority, and reported."""
+        """Check a command on the bus: ordered with authority, in time, and reported."""
         name = "PARAMETERS" if sent.who == messages.KEY else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
@@ -258,11 +259,11 @@ class Observer:
             self._unreported.append((now, where, addresses, fresh))
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Take note of what a board is about to hear, and of what it then was."""
+        """Note the bytes that a board is about to receive, and its state before them."""
         account = self.accounts[place]
         sent = self.frames.of(data)
         if how == "damaged" and sent is not None:
-            how = "whole"  # the noise has hit nothing
+            how = "whole"  # the noise hit nothing
         account.in_hand, account.how = sent, how
         account.forged = None
         if account.board.node is None:
@@ -271,7 +272,7 @@ class Observer:
             account.forged = _first(data)
         account.quiet = self._expects_quiet(account, sent, how)
         if account.quiet:
-            # Its own time first, so that nothing but the frame is left to change anything.
+            # Bring the board up to date first, so that only the frame can change anything.
             account.board.step(now)
             if account.board.state < 0:
                 account.quiet = 0
@@ -294,7 +295,7 @@ class Observer:
             return 5
         node = account.board.node
         if sent.name == "SESSION" and node is not None and node.controller.gate is not None:
-            # A late one of a cluster that has started again since is news.
+            # A late SESSION of a cluster that has restarted since is news to the board.
             return 5 if sent.values[0] < node.controller.gate.replay.epoch else 0
         return 5 if sent.index <= account.taken else 0
 
@@ -304,9 +305,9 @@ class Observer:
         return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not told)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Note what the master has heard from whom."""
+        """Note an answer that the master has received."""
         frames = wire.Reader().feed(data)
-        # Where an answer of before came first, the last frame alone is of now.
+        # If a late answer came first, only the last frame is current.
         for frame in frames[-1:] if how == "late" else frames:
             account = self._by_address.get(frame.sender)
             values = frame.values() if frame.name == "STATUS" else None
@@ -316,7 +317,7 @@ class Observer:
     # -- the boards (Witness) --------------------------------------------------------------
 
     def acted(self, board: Board, what: str, now: float) -> None:
-        """Judge what a board has done."""
+        """Judge an action of a board."""
         account = self._by_address[board.outfit.address]
         node = board.node
         if what == "cut" or node is None:
@@ -360,7 +361,7 @@ class Observer:
                 board.state not in ON_THE_WAY,
                 now,
                 name,
-                f"it is {state} after {what}, which is for everybody to send",
+                f"it is {state} after {what}, which anybody may send",
             )
         elif sent is not None and sent.addresses(account.address) and good:
             if sent.who not in (messages.ANYONE, messages.ASK):
@@ -374,7 +375,7 @@ class Observer:
         account.quiet = 0
 
     def _changed(self, account: Account, now: float, heard: bool) -> None:
-        """A state was left: by a command in this instant, or as the table of `FREE` allows."""
+        """Check a transition: by a command at this instant, or allowed by `FREE`."""
         before, after = account.state, account.board.state
         account.entered(after, now)
         self.entered[after] += 1
@@ -388,7 +389,7 @@ class Observer:
         self.check(3, good, now, account.name, saw)
 
     def _leases(self, account: Account, now: float) -> None:
-        """A state that needs the sun has one that is young enough."""
+        """Check that a state that needs the sun has a fresh one."""
         if account.board.state in states.NEED_SUN:
             age = now - account.sun_at
             state = states.STATES[account.board.state]
@@ -407,14 +408,16 @@ class Observer:
         self.check(7, not wrong, now, name, f"after a boot its journal holds {wrong}")
         doubt = node.journal.doubt
         slip = max(abs(s) for s in board.slip)
-        saw = f"step counts are {slip} steps wrong after a boot, and doubted by {doubt}"
+        saw = (
+            f"step counts are {slip} steps wrong after a boot, with a stated uncertainty of {doubt}"
+        )
         self.check(7, doubt < 0 or slip <= doubt, now, name, saw)
         account.booted(now)
 
     def stepped(
         self, board: Board, axis: int, direction: int, count: int, interval_us: int
     ) -> None:
-        """Judge a segment: range, rate, and the order of the axes."""
+        """Judge a segment of steps: range, rate, and the order of the axes."""
         account, now = self._by_address[board.outfit.address], board.now
         name, which = account.name, ("azimuth", "elevation")[axis]
         rate = 1e6 / max(1, interval_us)
@@ -434,7 +437,7 @@ class Observer:
     # -- the plant -------------------------------------------------------------------------
 
     def leased(self, now: float) -> None:
-        """Note that the plant has sent a lease on a line that carries it."""
+        """Note a lease that the plant has sent on a working line."""
         self.leased_at = now
 
     def ordered(self, order: Order) -> None:
@@ -444,7 +447,7 @@ class Observer:
     def emergency(
         self, name: str, now: float, *, carried: bool, heliostats: Iterable[str] = ()
     ) -> None:
-        """Note DEFOCUS or STOW for some (none: all); ``carried``: line and cluster are there."""
+        """Note DEFOCUS or STOW of heliostats (() for all); ``carried``: line and cluster work."""
         if carried:
             self._emergencies.append((name, now))
         whom = set(heliostats)
@@ -453,13 +456,13 @@ class Observer:
                 account.must(name, now)
 
     def jumped(self, now: float, place: int | None = None) -> None:
-        """Note that a clock jumps, or the counter of the board at a place."""
+        """Note a jump of a clock, or of the counter of the board at a place."""
         self.jumped_at = now
         if place is not None:
             self.accounts[place].jumped()
 
     def disturbed(self, now: float, *, crashed: bool = False) -> None:
-        """Note that line, bus or cluster fail: what was due from the cluster is not."""
+        """Note a failure of line, bus or cluster, which cancels what was due from the cluster."""
         self.disturbed_at = now
         self._emergencies.clear()
         if crashed:
@@ -467,7 +470,7 @@ class Observer:
                 account.forget()
 
     def progress(self, message: Progress, now: float) -> None:
-        """Judge what the plant is told of a command."""
+        """Judge a report to the plant about a command."""
         order = self.orders.by_identity.get(message.identity)
         if order is None:
             return
@@ -487,7 +490,7 @@ class Observer:
                     self.check(11, reached, now, subject, saw)
 
     def status(self, message: Status, names: Iterable[str], now: float) -> None:
-        """Judge what the plant is told of each heliostat: no younger, no other than it is."""
+        """Judge a report to the plant about each heliostat: no younger and no other than it is."""
         by_name = {account.name: account for account in self.accounts}
         for name, row in zip(names, message.nodes(), strict=True):
             account = by_name.get(name)
@@ -496,10 +499,10 @@ class Observer:
             age = int(row["heard_ms"]) / 1000.0
             claimed = now - age
             last = account.told[-1][0] if account.told else float("-inf")
-            # The age is that of when it was written: it waits for a connection until the next one
-            # is made, and may then be under way for as long as it lives.
+            # The age counts from when it was written: it waits for a connection until the next
+            # status is made, and may then be in transit for its lifetime.
             slack = 2.0 * STATUS_LIFE + AGE_ROUNDING
-            saw = f"its state is told to be {age:.2f} s old, it is {now - last:.2f} s old"
+            saw = f"its state is reported as {age:.2f} s old and is {now - last:.2f} s old"
             self.check(11, claimed <= last + slack, now, name, saw)
             rounding = AGE_ROUNDING + CLOCKS_APART * age
             of_then = [
@@ -508,14 +511,14 @@ class Observer:
                 if claimed - slack - rounding <= at <= claimed + rounding
             ]
             state = states.STATES[int(row["state"])]
-            saw = f"told to be {state} {age:.2f} s ago, which it has not answered then"
+            saw = f"reported as {state} {age:.2f} s ago, which it did not answer then"
             good = any(_row_of(values) == tuple(int(row[n]) for n in _TOLD) for values in of_then)
             self.check(11, good, now, name, saw)
 
     # -- time ------------------------------------------------------------------------------
 
     def look(self, now: float) -> None:
-        """Judge what must have come true by now."""
+        """Judge everything that must have happened by now."""
         for name, at in self._emergencies:
             saw = f"{name} was ordered {now - at:.2f} s ago and is not on the bus"
             self.check(4, now - at <= ORDER_WITHIN, now, "cluster", saw)
@@ -529,7 +532,7 @@ class Observer:
                 self._due(account, sun, now, leased)
 
     def _reported(self, now: float) -> None:
-        """What went out on the bus was told to the plant, if line and cluster were whole."""
+        """Check that the plant was told of every command on the bus, if line and cluster worked."""
         while self._unreported and now - self._unreported[0][0] > ORDER_WITHIN:
             at, where, addresses, orders = self._unreported.popleft()
             if min(order.at for order in orders) <= self.disturbed_at:
@@ -540,7 +543,7 @@ class Observer:
             self.check(11, told, now, "cluster", saw)
 
     def _counted(self, account: Account, now: float) -> None:
-        """Counted steps are those that were ordered of the timers."""
+        """Check that counted steps are those that were handed to the timers."""
         board = account.board
         assert board.node is not None
         motion = board.node.controller.motion
@@ -551,7 +554,7 @@ class Observer:
             self.check(8, ordered == counted, now, account.name, saw)
 
     def _due(self, account: Account, sun: FloatArray, now: float, leased: bool) -> None:
-        """What is cut off, or was ordered to, is off the receiver, and at stow, in time."""
+        """Check that heliostats that are cut off or ordered off leave, and stow, in time."""
         board, name = account.board, account.name
         account.served(now, leased)
         assert board.node is not None
@@ -578,7 +581,8 @@ class Observer:
         if board.state in ON_THE_WAY:
             miss = board.miss(sun, KEEP_OUT, believed=True)
             saw = (
-                f"{states.STATES[board.state]}, its beam is {miss:.1f} m from the middle of a house"
+                f"{states.STATES[board.state]}, its beam is {miss:.1f} m from the middle of a "
+                "keep-out volume"
             )
             self.check(10, miss > KEEP_OUT_RADIUS, now, name, saw)
         if on_way:
@@ -587,12 +591,12 @@ class Observer:
             self.check(10, miss > OFF, now, name, saw)
 
 
-#: Columns of a row that are told as STATUS has them.
+#: Columns of a row that are reported as STATUS has them.
 _TOLD = ("state", "flags", "fault", "armature_crc", "boots")
 
 
 def _row_of(values: "tuple[Any, ...]") -> tuple[int, ...]:
-    """Return what a row must tell of the values of a STATUS; see `_TOLD`."""
+    """Return what a row must report of the values of a STATUS; see `_TOLD`."""
     state, flags, fault, *_, armature_crc, boots = values
     return state, flags, fault, armature_crc, boots
 
@@ -603,7 +607,7 @@ def _first(data: bytes) -> wire.Frame | None:
 
 
 def _difference(before: "dict[str, object]", after: "dict[str, object]") -> str:
-    """Name what differs."""
+    """Return the differences in words."""
     return ", ".join(
         f"{key} from {before[key]!r} to {after[key]!r}"
         for key in before

@@ -1,4 +1,4 @@
-"""What was said, kept by somebody who only listens: frames of the bus and orders of the plant."""
+"""Ledgers of a listener: the frames of the bus and the orders of the plant."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -14,11 +14,11 @@ class Sent:
     Attributes
     ----------
     index
-        Its place among all frames of the bus.
+        Index among all frames of the bus.
     at
-        When, in s.
+        Time, s.
     name, who
-        Of `lcu.messages`.
+        See `lcu.messages`.
     to
         Address.
     values, payload
@@ -34,26 +34,26 @@ class Sent:
     payload: bytes
 
     def addresses(self, address: int) -> bool:
-        """Whether it is meant for an address."""
+        """Whether the frame is meant for an address."""
         return self.to in (address, wire.BROADCAST)
 
 
 @dataclass
 class Order:
-    """A command that the plant gave.
+    """A command of the plant.
 
     Attributes
     ----------
     identity, name
-        Of the command; a set of parameters has the name of no command.
+        Identity and name; a set of parameters has no command's name.
     addresses
-        Of the heliostats that it is for.
+        Addresses of the heliostats that it is for.
     at, until
-        When it was given and when it expires, in s.
+        When it was given and when it expires, s.
     authorised
         Whether it carried the token of the authority.
     token
-        That it carried.
+        The token.
     accepted
         How often it was reported as accepted, by heliostat.
     """
@@ -76,7 +76,7 @@ class FrameLedger:
     last
         The last frame of each name.
     commands
-        Places of the frames that need authority.
+        Indices of the frames that need authority.
     """
 
     def __init__(self) -> None:
@@ -89,7 +89,7 @@ class FrameLedger:
         return len(self._order)
 
     def note(self, data: bytes, now: float) -> Sent | None:
-        """Keep a frame; None if the bytes hold none."""
+        """Keep a frame; return None if the bytes hold none."""
         found = self._frames.get(data)
         if found is not None:
             return found
@@ -117,32 +117,32 @@ class FrameLedger:
         return self._frames.get(data)
 
     def data(self, index: int) -> bytes:
-        """Return the bytes of a frame by its place."""
+        """Return the bytes of a frame by its index."""
         return self._order[index]
 
 
-#: Orders are forgotten so long after they have expired, s.
+#: Orders are forgotten this long after they expire, s.
 _KEPT = 60.0
 
 
 class OrderLedger:
-    """The orders of the plant of late."""
+    """The recent orders of the plant."""
 
     def __init__(self) -> None:
         self.by_identity: dict[str, Order] = {}
 
     def note(self, order: Order) -> None:
-        """Keep an order; the second one of an identity is the same order, sent again."""
+        """Keep an order; a second one with the same identity is the same order, sent again."""
         self.by_identity.setdefault(order.identity, order)
 
     def void(self, token: int, until: float) -> None:
-        """Let orders of a token end: the authority that gave them is over."""
+        """End the orders of a token: its authority is over."""
         for order in self.by_identity.values():
             if order.token == token:
                 order.until = min(order.until, until)
 
     def drop(self, now: float) -> None:
-        """Forget what has expired long ago."""
+        """Forget orders that expired long ago."""
         old = [i for i, order in self.by_identity.items() if order.until + _KEPT < now]
         for identity in old:
             del self.by_identity[identity]

@@ -1,10 +1,10 @@
 """The observer of the plant: what it accepts, records, shows and lets join, in true time.
 
-He stands beside `twin.invariants.Observer`, one of which watches each cluster, and like them takes
-nobody's word: who holds the authority he knows from those who took it, what has a record from the
-disk, how old a value is from when the bus carried it, and who joins from what is sent and from the
-boards. He checks the plant's part of three invariants: 4 (authority), 10 (joining) and 11 (records,
-values and proofs).
+It works beside one `twin.invariants.Observer` for each cluster and, like them, trusts no report: it
+knows the holder of the authority from those who took it, the records from the disk, the age of a
+value from when the bus carried it, and the mirrors that join from the messages and the boards. It
+checks the plant's part of three invariants: 4 (authority), 10 (joining) and 11 (records, values and
+proofs).
 """
 
 from collections import Counter, deque
@@ -20,18 +20,18 @@ from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
 from heliotrope.twin.world.records import RecordsDisk
 
-#: A status waits for up to a second, may be under way for one more, and ages are rounded: a value
-#: may be taken for so much younger than it is, s.
+#: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
+#: be shown this much younger than it is, s.
 YOUNGER = 2.2
-#: A record that may follow is there within this, s.
+#: A record that may follow its command is there within this, s.
 RECORD_WITHIN = 2.0
-#: How long a cluster may go by a token that is void: until the last lease with it came, and is
-#: over, s.
+#: How long a cluster may accept a void token: until the last lease with it has arrived and has
+#: expired, s.
 VOID_WITHIN = 4.2
-#: From when a command to join is posted to when it is carried out at the latest, beyond its life:
-#: under way, and late on the bus; and how far apart the boards are looked at, s.
+#: Longest time from posting a command to join to its execution, beyond its lifetime: in transit and
+#: late on the bus; and the interval between looks at the boards, s.
 LATE, LOOKS = 1.8, 0.5
-#: What a proof calls done.
+#: States that a proof may call done.
 _OFF = (
     states.DEFOCUSED,
     states.STOWING,
@@ -44,25 +44,25 @@ _OWN = ("plant", "safety table")
 
 
 class PlantObserver:
-    """See the head of this module.
+    """Observes the plant.
 
     Parameters
     ----------
     start
-        Time that counts as 0 s in what it says.
+        Zero of the times that it reports, s.
     disk
-        Where records are kept.
+        Holds the records.
     settings
-        Of the plant.
+        Settings of the plant.
     clusters
-        The observers of its clusters.
+        Observers of its clusters.
 
     Attributes
     ----------
     checks
-        How often each invariant was checked.
+        Number of checks of each invariant.
     old
-        Tokens that are void, and since when, s.
+        Void tokens, and since when, s.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class PlantObserver:
         self._holder: tuple[Person, int, float] | None = None
         self._accepted: Counter[tuple[str, str]] = Counter()
         self._recorded: Counter[tuple[str, str]] = Counter()
-        self._looked = 0  # records that were counted
+        self._looked = 0  # records already counted
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
         self._own: dict[str, float] = {}  # the plant's own records without a message yet
@@ -106,10 +106,10 @@ class PlantObserver:
         if not good:
             raise InvariantError(Violation(number, now - self._start, "plant", saw))
 
-    # -- the authority ---------------------------------------------------------------------
+    # -- authority -------------------------------------------------------------------------
 
     def _live(self, now: float) -> tuple[Person, int, float] | None:
-        """Return who holds the authority; what nobody has kept up is over."""
+        """Return the holder of the authority; an authority that nobody renews is over."""
         holder = self._holder
         if holder is not None and now - holder[2] >= self._settings.authority:
             self._end(holder[2] + self._settings.authority)
@@ -124,7 +124,7 @@ class PlantObserver:
         self._holder = None
 
     def granted(self, person: Person, token: int, now: float, *, seized: bool) -> None:
-        """Judge who was given the authority."""
+        """Judge a grant of the authority."""
         before = self._live(now)
         saw = f"{person.name} ({person.role.name.lower()}) was given the authority"
         good = person.role >= Role.OPERATOR
@@ -139,44 +139,44 @@ class PlantObserver:
         self._holder = (person, token, now)
 
     def kept(self, now: float) -> None:
-        """Note that the holder has kept it up."""
+        """Note that the holder has renewed it."""
         if self._holder is not None:
             self._holder = (*self._holder[:2], now)
 
     def released(self, person: Person, now: float) -> None:
-        """Note that it was given back."""
+        """Note that it was released."""
         self._noted(person.name, "AUTHORITY", now)
         self._end(now)
 
     def until(self, token: int, until: float) -> float:
-        """Return when an order with a token is void."""
+        """Return when an order with a token becomes void."""
         void = self.old.get(token)
         return until if void is None else min(until, void + VOID_WITHIN)
 
     def known(self, token: int) -> bool:
-        """Whether somebody was ever given a token."""
+        """Whether a token was ever issued."""
         return token in self.old or (self._holder is not None and self._holder[1] == token)
 
-    # -- what the plant accepts ------------------------------------------------------------
+    # -- accepted commands -----------------------------------------------------------------
 
     def accepted(self, person: Person, token: int, ticket: Ticket, what: str, now: float) -> None:
         """Judge a command that the plant has accepted."""
         holder = self._live(now)
         held = holder is not None and holder[:2] == (person, token)
-        saw = f"{what} of {person.name} was accepted, who has not the authority"
+        saw = f"{what} by {person.name} was accepted without the authority"
         self.check(4, held, now, saw)
         enough = person.role >= (Role.OPERATOR if what in OPERATOR_COMMANDS else Role.ENGINEER)
-        saw = f"{what} was accepted of {person.name}, who is {person.role.name.lower()}"
+        saw = f"{what} was accepted from {person.name}, role {person.role.name.lower()}"
         self.check(4, enough, now, saw)
         self.kept(now)
         record = self._disk.records.get(ticket.identity)
         right = record is not None and (record.who, record.what) == (person.name, what)
-        self.check(11, right, now, f"{what} of {person.name} was accepted without its record")
+        self.check(11, right, now, f"{what} by {person.name} was accepted without its record")
         self._accepted[person.name, what] += 1
         self._count(now)
 
     def obeyed(self, who: str, what: str, now: float) -> None:
-        """Note what the plant must take of anybody, and may record later."""
+        """Note a command that the plant must take from anybody, and may record later."""
         self._noted(who, what, now)
 
     def _noted(self, who: str, what: str, now: float) -> None:
@@ -184,7 +184,7 @@ class PlantObserver:
         self._noted_at[who, what] = now
 
     def ended(self, now: float) -> None:
-        """Note that the plant's program has ended: what it owed to the disk is lost."""
+        """Note that the plant's program has ended: records that it still owed are lost."""
         self._end(now)
         self._count(now)
         self._accepted = Counter(self._recorded)
@@ -193,15 +193,15 @@ class PlantObserver:
         self._hangs = False
 
     def hangs(self, now: float, *, on: bool) -> None:
-        """Note that what the plant posts waits, and may go out together; or goes again."""
+        """Note that the plant's messages wait, and may later go out together; or that they flow."""
         if on or self._hangs:
             self._hung_at = now
         self._hangs = on
 
-    # -- what it sends ---------------------------------------------------------------------
+    # -- messages --------------------------------------------------------------------------
 
     def posted(self, members: int, message: Message, now: float) -> None:
-        """Judge a message before it goes to a cluster with so many heliostats."""
+        """Judge a message before it goes to a cluster with a number of heliostats."""
         if not isinstance(message, Command | Parameters | Emergency):
             return
         identity = message.identity.rpartition(".")[0]
@@ -222,10 +222,10 @@ class PlantObserver:
     def _bounded(
         self, joined: "deque[tuple[float, int]]", slack: float, now: float, how: str
     ) -> None:
-        """In any span that ends now, no more mirrors join than the settings allow.
+        """Check that no more mirrors join in any span that ends now than the settings allow.
 
-        What goes out when the plant goes on after it stood still may have been admitted earlier by
-        the life of the command: at the end of a span, and at its begin.
+        Commands that leave when the plant goes on after a freeze may have been admitted earlier by
+        the lifetime of a command, both at the end of a span and at its beginning.
         """
         rate, burst = self._settings.join_rate, self._settings.join_burst
         life = self._settings.join_life
@@ -240,14 +240,14 @@ class PlantObserver:
             if span > 60.0:
                 break
 
-    # -- what it shows ---------------------------------------------------------------------
+    # -- displayed values ------------------------------------------------------------------
 
     def heard(self, name: str, state: int, now: float) -> None:
-        """Note what a heliostat has told its cluster."""
+        """Note a heliostat's report to its cluster."""
         self._heard[name].append((now, state))
 
     def look(self, plant: PlantController | None, now: float) -> None:
-        """Judge what must have come true by now; None: the plant does not run."""
+        """Judge everything that must have happened by now; None: the plant does not run."""
         self.hangs(now, on=self._hangs)
         self._live(now)
         self._count(now)
@@ -260,7 +260,7 @@ class PlantObserver:
         self._proofs(plant, now)
 
     def _count(self, now: float) -> None:
-        """Each record belongs to one command, and no command has two."""
+        """Check that each record belongs to one command, and that no command has two."""
         records = self._disk.records
         for record in islice(records.values(), self._looked, None):
             if record.who in _OWN:
@@ -271,17 +271,17 @@ class PlantObserver:
             self._recorded[key] += 1
         for key in self._recorded if self._looked < len(records) else ():
             count, most = self._recorded[key], self._accepted[key]
-            saw = f"{count} records of {key[1]} by {key[0]}, who gave it {most} times"
+            saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
             self.check(11, count <= most, now, saw)
         self._looked = len(records)
 
     def _complete(self, now: float) -> None:
-        """What may be recorded later has been by now."""
+        """Check that late records have been written by now."""
         for key, at in list(self._noted_at.items()):
             if now - at > RECORD_WITHIN:
                 del self._noted_at[key]
                 count, most = self._recorded[key], self._accepted[key]
-                saw = f"{count} records of {key[1]} by {key[0]}, who gave it {most} times"
+                saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
                 self.check(11, count == most, now, saw)
         for identity, at in list(self._following.items()):
             if now - at > RECORD_WITHIN:
@@ -294,7 +294,7 @@ class PlantObserver:
                 self.check(11, False, now, f"record {identity} belongs to nothing that was sent")
 
     def _boards(self, now: float) -> None:
-        """Who joins, by the boards themselves."""
+        """Note the mirrors that join, by the boards themselves."""
         on = {
             name
             for name, account in self._accounts.items()
@@ -307,7 +307,7 @@ class PlantObserver:
             self._bounded(self._joined, slack, now, "have joined")
 
     def _shown(self, plant: PlantController, now: float) -> None:
-        """A value that is shown as live is young, and is what was told."""
+        """Check that a value shown as live is fresh, and is what was reported."""
         live = plant.field.live(now)
         limit = self._settings.stale + YOUNGER
         for name, heard in self._heard.items():
@@ -321,11 +321,11 @@ class PlantObserver:
             saw = f"{name} is shown as live, last heard {age:.2f} s ago, limit {limit:.2f} s"
             self.check(11, age <= limit, now, saw)
             told = {states.STATES[state] for at, state in heard if now - at <= limit}
-            saw = f"{name} is shown as {shown.state}; it told {', '.join(sorted(told))}"
+            saw = f"{name} is shown as {shown.state}; it reported {', '.join(sorted(told))}"
             self.check(11, shown.state in told, now, saw)
 
     def _proofs(self, plant: PlantController, now: float) -> None:
-        """What a proof calls done was done."""
+        """Check that everything a proof calls done was done."""
         order = plant.emergency
         if order is None:
             return

@@ -1,53 +1,82 @@
-"""Makes the faults of a run happen to a simulated plant, and ends them."""
+"""Apply the faults of a run to a simulated plant, and end them."""
 
 import asyncio
 import math
 import random
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from heliotrope.links.in_process import Faults
+from heliotrope.plant.controller import PlantController
+from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import Pod
+from heliotrope.twin.world.records import RecordsDisk
 
-if TYPE_CHECKING:
-    from heliotrope.twin.world.simulation import Simulation
-
-#: While one of these lasts, an order need not be carried out.
+#: An order need not be carried out while a fault of these kinds lasts.
 _HINDERS = ("line", "bus", "plant")
 
 
+class World(Protocol):
+    """The simulated plant that faults happen to; see `Simulation` for its attributes."""
+
+    begin: float
+    boards: list[Board]
+    pods: list[Pod]
+    plant: PlantController | None
+    disk: RecordsDisk
+    operator: Operator
+    faults: Counter[str]
+
+    def pod_of(self, fault: Fault) -> Pod:
+        """Return the cluster that a fault happens to."""
+        ...
+
+    def start_plant(self, group: asyncio.TaskGroup) -> None:
+        """Start the plant's program."""
+        ...
+
+    def crash_plant(self, now: float) -> None:
+        """End the plant's program at once."""
+        ...
+
+    def hang_plant(self, now: float, *, on: bool) -> None:
+        """Freeze the plant's program, or let it go on."""
+        ...
+
+
 class Damage:
-    """See the head of this module.
+    """Applies faults to a simulated plant.
 
     Parameters
     ----------
-    simulation
-        What they happen to.
+    world
+        The simulated plant.
     faults
-        In the order of their times.
+        Faults of the run, sorted by time.
 
     Attributes
     ----------
     next
-        When it has to look again, s.
+        Time of the next change, s.
     """
 
-    def __init__(self, simulation: "Simulation", faults: Sequence[Fault]) -> None:
-        self._of = simulation
-        self._begin = simulation.begin
+    def __init__(self, world: World, faults: Sequence[Fault]) -> None:
+        self._of = world
+        self._begin = world.begin
         self._left = deque(sorted(faults, key=lambda fault: fault.at))
         self._active: list[tuple[float, Fault]] = []
-        self._off: dict[int, float] = {}  # boards without supply, and when it comes back
-        self._pause = 1.0  # until a board that died within a write starts again
+        self._off: dict[int, float] = {}  # boards without power, and when it returns
+        self._pause = 1.0  # until a board that died during a write restarts
         self.next = -math.inf
 
     def hinders(self, pod: Pod) -> bool:
-        """Whether plant, line, bus or cluster are not whole."""
+        """Whether a fault stands between the plant's orders and the heliostats of a cluster."""
         return not pod.runs or any(
             fault.kind.startswith("plant")
             or (fault.kind.startswith(_HINDERS) and self._of.pod_of(fault) is pod)
@@ -55,7 +84,7 @@ class Damage:
         )
 
     def look(self, now: float, group: asyncio.TaskGroup) -> None:
-        """Begin and end what is due."""
+        """Begin and end the faults that are due."""
         changed = False
         while self._left and self._begin + self._left[0].at <= now:
             fault = self._left.popleft()
@@ -103,7 +132,7 @@ class Damage:
             _strangers(pod, pod.boards.index(board), fault)
 
     def _apply(self, group: asyncio.TaskGroup, now: float) -> None:
-        """Set everything that lasts as the active faults say."""
+        """Apply every lasting fault that is active now."""
         of = self._of
         everywhere = {fault.kind for _, fault in self._active}
         of.operator.away = "nobody_there" in everywhere
@@ -113,13 +142,13 @@ class Damage:
             if "cluster_crash" not in active and not pod.runs:
                 pod.start(group)
             _apply_to(pod, active)
-        # Without room for its records the plant does not start.
+        # The plant does not start without room for its records.
         if "plant_crash" not in everywhere and not of.disk.full and of.plant is None:
             of.start_plant(group)
         of.hang_plant(now, on="plant_silent" in everywhere)
 
     def _supply(self, now: float) -> None:
-        """Give boards their supply back, those too that died within a write of flash."""
+        """Restore power to boards, including those that died during a flash write."""
         for place, board in enumerate(self._of.boards):
             if board.node is not None:
                 continue

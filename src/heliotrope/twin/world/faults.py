@@ -1,7 +1,7 @@
-"""Faults of a simulated run: drawn from a seed as a list, so that some can be left out.
+"""Faults of a simulated run, drawn from a seed as a list.
 
-A fault is data: what happens, when, for how long, to which heliostat, how large. The same seed
-gives the same list; a list that breaks an invariant is shrunk by leaving faults out (`shrunk`).
+A fault is data: kind, time, duration, heliostat, severity. The same seed gives the same list; a
+list that breaks an invariant is shrunk by leaving faults out (`shrunk`).
 """
 
 import random
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
 
-#: What can go wrong: kind, weight in the drawing, meaning.
+#: Everything that can go wrong: kind, weight in the draw, meaning.
 KINDS = {
     "line_cut": (3, "plant and cluster do not hear each other"),
     "line_one_way": (1, "one of them does not hear the other"),
@@ -43,7 +43,7 @@ _LONGEST = {
     "cluster_crash": 40.0, "bus_bad": 60.0, "bus_stuck": 40.0, "bus_unplugged": 30.0,
     "power_cut": 20.0, "brown_out": 20.0, "flash_cut": 5.0, "time_lost": 60.0,
 }  # fmt: skip
-#: A cut-off this long must have led to stow, s.
+#: A heliostat that is cut off for this long must be at stow, s.
 _LONG = 330.0
 
 
@@ -54,13 +54,13 @@ class Fault:
     Attributes
     ----------
     kind
-        Of `KINDS`.
+        One of `KINDS`.
     at, lasts
-        s since the start; duration in s, 0 for what happens at once.
+        Start since the beginning of the run, s; duration, s, 0 for an instantaneous fault.
     target
-        Place of the heliostat, where it is one's.
+        Index of the heliostat, for faults of a single heliostat.
     size
-        0 to 1: how bad; each kind reads it in its way.
+        Severity, 0 to 1; each kind interprets it in its own way.
     """
 
     kind: str
@@ -77,25 +77,25 @@ class Fault:
 def drawn(
     seed: int, seconds: float, heliostats: int, *, pause: float = 12.0, only: Sequence[str] = ()
 ) -> list[Fault]:
-    """Return the faults of a run, in the order of their times.
+    """Return the faults of a run, sorted by time.
 
     Parameters
     ----------
     seed
-        Of the drawing.
+        Seed of the draw.
     seconds
         Length of the run.
     heliostats
-        Number of targets.
+        Number of possible targets.
     pause
-        Mean time between two faults, s.
+        Mean time between faults, s.
     only
         Kinds to draw from; () for all.
 
     Raises
     ------
     InputError
-        A kind that there is not, or a pause that is not above 0.
+        An unknown kind, or a pause that is not above 0.
     """
     for kind in only:
         if kind not in KINDS:
@@ -119,7 +119,7 @@ def drawn(
 
 
 def tick_jump(size: float) -> int:
-    """Return a jump of a counter, ms: small, large, and up to half its period."""
+    """Return a jump of a tick counter, ms: small, large, or up to half its period."""
     chance = random.Random(f"jump {size}")
     return chance.choice(
         [-1, 1, -900, 3000, -5000, 40_000, 10**6, -(10**7), ticks.HALF - 1, -ticks.HALF + 1]
@@ -127,7 +127,7 @@ def tick_jump(size: float) -> int:
 
 
 def time_jump(size: float) -> float:
-    """Return a jump of the cluster's time, s: less than a second up to years."""
+    """Return a jump of the cluster's time, s: from less than a second to years."""
     chance = random.Random(f"jump {size}")
     return chance.choice([-0.4, 0.4, -1.5, 2.5, -4.0, 7.0, -30.0, 100.0, -3600.0, 86400.0, -3e7])
 
@@ -142,9 +142,9 @@ def shrunk(
     faults
         A list that fails.
     fails
-        Whether a run with a list fails.
+        Whether a run with the given list fails.
     most
-        Runs to spend.
+        Maximum number of runs.
     """
     left, parts, spent = list(faults), 2, 0
     if spent < most and left and fails([]):

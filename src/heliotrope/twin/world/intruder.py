@@ -1,7 +1,7 @@
-"""A stranger at the bus: he records and replays, forges without token and key, and makes noise.
+"""An intruder on the bus: records and replays frames, forges them without token or key, adds noise.
 
-Against somebody who can speak at the right moment with recorded time and sun only the MAC
-protects, and only what is stored (see `lcu.wire`). This one speaks at any moment, one frame at a
+Only the MAC protects against an intruder who can replay recorded time and sun at the right moment,
+and only what is stored (see `lcu.wire`). This intruder speaks at random moments, one frame at a
 time.
 """
 
@@ -11,7 +11,7 @@ from heliotrope.lcu import messages, wire
 from heliotrope.twin.boards.outfit import sha256
 from heliotrope.twin.invariants.ledger import FrameLedger
 
-#: What he would like to command.
+#: Commands that the intruder forges.
 WANTED = (
     "TRACK",
     "APPROACH",
@@ -26,7 +26,7 @@ WANTED = (
     "ZERO",
     "SET_DEFOCUS",
 )
-#: So many commands are sent in some ten seconds.
+#: Number of commands sent in about ten seconds.
 _LATELY = 8
 _NUMBERS: dict[str, tuple[float, ...]] = {
     "AIM": (0.0, 0.0, 50.0), "GOTO": (1000, 1000), "SET_BIAS": (0.1, 0.1), "ZERO": (0, 0),
@@ -35,14 +35,14 @@ _NUMBERS: dict[str, tuple[float, ...]] = {
 
 
 class Intruder:
-    """What a stranger puts on the bus.
+    """Frames that an intruder puts on the bus.
 
     Parameters
     ----------
     frames
-        What he has recorded.
+        Frames recorded so far.
     addresses
-        Of the heliostats.
+        Addresses of the heliostats.
     """
 
     def __init__(self, frames: FrameLedger, addresses: list[int]) -> None:
@@ -50,9 +50,9 @@ class Intruder:
         self._addresses = addresses
 
     def recorded(self, size: float) -> bytes:
-        """Return a frame of before, b"" if there is none; ``size`` (0 to 1) says which.
+        """Return an earlier frame chosen by ``size`` (0 to 1), b"" if there is none.
 
-        Every second one is one of the last commands, which may not have expired.
+        Every second choice is one of the last commands, which may not have expired yet.
         """
         commands, part = self._frames.commands[-_LATELY:], 2.0 * size % 1.0
         if size >= 0.5 and commands:
@@ -61,14 +61,14 @@ class Intruder:
         return self._frames.data(int(part * count)) if count else b""
 
     def forged(self, target: int, size: float) -> bytes:
-        """Return a command to a heliostat by its place, with a token and a key of his own."""
+        """Return a command to the heliostat at an index, with an invented token and key."""
         chance = random.Random(f"forgery {size}")
         name = chance.choice(WANTED)
         token, edition = chance.getrandbits(32) | 1, chance.randrange(1, 2**31)
         last = self._frames.last.get("SESSION")
         epoch = int(last.values[0]) if last is not None else 0
         sender = wire.Sender(chance.choice([0, 0, 99]), epoch, sha256)
-        # As if he had counted along with the cluster.
+        # As if the intruder had counted along with the cluster.
         sender.count = chance.choice([len(self._frames), chance.randrange(1 << 16)])
         time = self._frames.last.get("SUN")
         expires = int(time.values[0]) + 5 if time is not None else 0
@@ -83,13 +83,13 @@ class Intruder:
         )
 
     def safe(self, target: int, size: float) -> bytes:
-        """Return DEFOCUS or STOW, to one heliostat or to all, after a zero that ends any noise."""
+        """Return DEFOCUS or STOW for one heliostat or all, after a zero that ends any noise."""
         chance = random.Random(f"safe {size}")
         to = chance.choice([self._addresses[target], wire.BROADCAST])
         sender = wire.Sender(chance.choice([0, 77]), chance.getrandbits(16))
         return b"\0" + sender.frame(to, chance.choice(["DEFOCUS", "STOW"]))
 
     def noise(self, size: float) -> bytes:
-        """Return bytes of any kind, ended."""
+        """Return random bytes, terminated."""
         chance = random.Random(f"noise {size}")
         return bytes(chance.randrange(256) for _ in range(chance.randint(1, 300))) + b"\0"

@@ -1,9 +1,10 @@
-"""Scripted persons at a real plant: duty, commands and mistakes, by a seed.
+"""Scripted persons at a real plant: shifts, commands and mistakes, drawn from a seed.
 
-An operator and an engineer lead the heliostats onwards from state to state, change aims, order
-emergencies and end them, push parameters, and break each other's authority. They also command
-with an authority that they have lost, and a viewer tries what he may not. What the plant accepts
-of them they tell its observer. A rogue has a plant's end of a line, and tokens of before.
+An operator and an engineer move the heliostats from state to state, change aims, raise and clear
+emergencies, push parameters, and break each other's authority. They also command with an authority
+that they have lost, and a viewer tries commands that the role does not allow. Every command that
+the plant accepts is reported to its observer. A rogue holds a plant's end of a line, with old
+tokens.
 """
 
 import asyncio
@@ -27,9 +28,9 @@ from heliotrope.twin.world.pod import PlantEar, Pod
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)
 VIEWER = Person("viewer", Role.VIEWER)
-#: Between two things that they do, on average, s.
+#: Mean time between two actions, s.
 PAUSE = 2.0
-#: What leads on from a state.
+#: Command that leads on from each state.
 ONWARDS = {
     "": ("APPROACH",), "STOWED": ("APPROACH",),
     "IDLE": ("TRACK", "TRACK", "TRACK", "SEARCH", "JOG"),
@@ -43,31 +44,31 @@ LATCHING = frozenset(
 
 
 class Operator:
-    """The persons.
+    """The persons at the plant.
 
     Parameters
     ----------
     clock
         True time.
     seed
-        Of what they do.
+        Seed of their actions.
     observer
-        Is told of what is accepted.
+        Told of each accepted command.
     names
-        Of the heliostats.
+        Names of the heliostats.
     pods
-        Whose lines the rogue uses.
+        Clusters whose lines the rogue uses.
     flux
-        Measures the share of the beams that are on the receiver.
+        Returns the share of the beams on the receiver.
 
     Attributes
     ----------
     plant
-        Set by who owns it; None while it does not run.
+        Set by the owner; None while the plant does not run.
     away
-        Whether nobody is there.
+        Whether nobody is on duty.
     counts
-        Of what they did.
+        Number of actions of each kind.
     """
 
     def __init__(
@@ -92,14 +93,14 @@ class Operator:
         self._number = 0
 
     def begins(self, plant: PlantController | None) -> None:
-        """Note that the plant has started, or (None) ended: who called an emergency is free."""
+        """Note that the plant has started or (None) ended, which also ends a called emergency."""
         self.plant = plant
         self._called = False
 
-    # -- the authority ---------------------------------------------------------------------
+    # -- authority -------------------------------------------------------------------------
 
     async def keep(self) -> None:
-        """Keep the authority up and measure the flux, each second."""
+        """Renew the authority and measure the flux once a second."""
         while True:
             due = self._clock.monotonic() + 1.0
             plant = self.plant
@@ -141,7 +142,7 @@ class Operator:
         self._observer.granted(person, token, self._clock.monotonic(), seized=seized)
 
     def _change(self, plant: PlantController) -> None:
-        """Somebody else comes on duty: by breaking it, or after it was given back."""
+        """Let another person take over, by breaking the authority or after it was released."""
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
         if self._chance.random() < 0.5:
             with contextlib.suppress(RefusedError):
@@ -149,10 +150,10 @@ class Operator:
                 self._observer.released(self._duty, self._clock.monotonic())
         self._seize(plant, self._chance.choice([other, other, VIEWER]))
 
-    # -- what they do ----------------------------------------------------------------------
+    # -- actions ---------------------------------------------------------------------------
 
     async def work(self) -> None:
-        """Command, for ever."""
+        """Command without end."""
         while True:
             await asyncio.sleep(self._chance.expovariate(1 / PAUSE))
             plant = self.plant
@@ -186,7 +187,7 @@ class Operator:
         person: Person | None = None,
         token: int | None = None,
     ) -> None:
-        """Give a command, and tell the observer if it was accepted."""
+        """Give a command, and tell the observer if the plant accepts it."""
         who = person or self._duty
         mine = self._tokens.get(who.name, 0) if token is None else token
         names = heliostats or self._names
@@ -208,7 +209,7 @@ class Operator:
         self._observer.accepted(who, token, ticket, what, self._clock.monotonic())
 
     def _astray(self, plant: PlantController) -> None:
-        """Ask for what would lead a beam through the house, which is to be refused."""
+        """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
         name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
         point = self._points((name,), KEEP_OUT, 0.5)
         what = self._chance.choice(["AIM", "STANDBY", "SEARCH"])
@@ -269,7 +270,7 @@ class Operator:
         self._give(plant, "LOCK", (self._chance.choice(self._names),))
 
     def _wrong(self, plant: PlantController) -> None:
-        """Without the authority: with that of before, with another's, or as a viewer."""
+        """Command without authority: with an old token, with another person's, or as a viewer."""
         what = self._chance.choice(["TRACK", "APPROACH", "AIM", "REFOCUS", "STANDBY"])
         name = self._chance.choice(self._names)
         other = OPERATOR if self._duty is ENGINEER else ENGINEER
@@ -280,7 +281,7 @@ class Operator:
         self._give(plant, what, (name,), who, token)
 
     def _parameters(self, plant: PlantController) -> None:
-        """Push two items of the calibration to one heliostat."""
+        """Push two calibration items to one heliostat."""
         self.counts["parameters"] += 1
         chance, who = self._chance, self._duty
         items = {
@@ -301,7 +302,7 @@ class Operator:
         self.counts["emergencies"] += 1
         act = self._chance.choice([Act.DEFOCUS, Act.STOW])
         now = self._clock.monotonic()
-        # Nothing else until what was ordered is done, or is overdue.
+        # Wait until the order is done or overdue.
         self._rest_until = now + self._chance.choice([2.0, 33.0, 33.0, 310.0])
         who = self._chance.choice([VIEWER, self._duty])
         plant.raise_emergency(who.name, act)
@@ -309,7 +310,7 @@ class Operator:
         self._called = True
 
     def _one_safe(self, plant: PlantController) -> None:
-        """Take one heliostat off, which anybody may."""
+        """Defocus or stow one heliostat, which anybody may do."""
         what = self._chance.choice([plant.defocus, plant.stow])
         what(VIEWER.name, (self._chance.choice(self._names),))
         self._observer.obeyed(VIEWER.name, what.__name__.upper(), self._clock.monotonic())
@@ -321,7 +322,7 @@ class Operator:
             self._called = False
 
     def _acknowledge(self, plant: PlantController) -> None:
-        """Acknowledge what waits for it; the engineer stands in for the supervisor."""
+        """Acknowledge every latched condition; the engineer stands in for the supervisor."""
         waiting: dict[tuple[str, str], bool] = {}
         for alarm in plant.alarms:
             if alarm.condition in LATCHING:
@@ -337,7 +338,7 @@ class Operator:
     # -- the rogue -------------------------------------------------------------------------
 
     async def _rogue(self) -> None:
-        """Command past the plant, with a token that is void, or guessed."""
+        """Command past the plant, with a void or guessed token."""
         now = self._clock.monotonic()
         void = [token for token, at in self._observer.old.items() if now - at > VOID_WITHIN]
         token = self._chance.choice([0, self._chance.getrandbits(32), *void[-2:], *void[-2:]])

@@ -1,4 +1,4 @@
-"""One cluster of a simulation: its program, its bus with boards, its line to the plant."""
+"""One cluster of a simulation: its program, its bus with boards, and its line to the plant."""
 
 import asyncio
 import random
@@ -34,42 +34,42 @@ from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.intruder import Intruder
 from heliotrope.twin.world.tapped import TappedLink
 
-#: A cluster counts a command's life from when it comes: so long it may have been under way, s.
+#: A cluster counts a command's lifetime from its arrival, so the command may be this much older, s.
 UNDER_WAY = 0.8
-#: Line, bus and cluster count as whole after so long without a fault, s.
+#: Line, bus and cluster count as healthy after this long without a fault, s.
 SETTLED = 4.0
 
 
 class Pod:
-    """One cluster; it may crash and start again, with what was on its disk.
+    """One cluster, which may crash and restart with the contents of its disk.
 
     Parameters
     ----------
     name
-        Of the cluster.
+        Name of the cluster.
     boards
-        On its bus.
+        Boards on its bus.
     observer
-        Of this cluster.
+        Observer of this cluster.
     clock, start
         True time, and UTC at its beginning.
     site
-        Of the plant.
+        Site of the plant.
     chance
         Draws clocks and seeds.
 
     Attributes
     ----------
     bus, line
-        As they are now.
+        Those in use now.
     clock, time
-        The cluster's own; ``time`` is None where it goes by its system's clock.
+        The cluster's own; ``time`` is None where it uses its system clock.
     tap
         The plant's end of the line; None while no plant runs.
     plant
-        Who observes the plant; set by the owner.
+        Observer of the plant; set by the owner.
     counts
-        Of what the plant was told.
+        Messages to the plant, by kind.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Pod:
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
         self.clock = DriftingClock(clock.monotonic, start, drift)
         self.time = SimulatedTime(self.clock) if chance.random() < 0.5 else None
-        self._kept = Kept(None)  # what a cluster has on its disk outlasts its crashes
+        self._kept = Kept(None)  # the cluster's disk survives its crashes
         self.line = MemoryLine(clock, seed=chance.getrandbits(31))
         self.bus = self._new_bus()
         self.link: CarriedLink | None = None
@@ -110,7 +110,7 @@ class Pod:
         return bool(self._running)
 
     def start(self, group: asyncio.TaskGroup) -> None:
-        """Start the program anew, with a bus and an end of the line: nothing of before is left."""
+        """Start the program with a new bus and a new end of the line; nothing is carried over."""
         self.bus = self._new_bus()
         seed = self._chance.getrandbits(31)
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
@@ -122,17 +122,17 @@ class Pod:
         self._running = [group.create_task(link.run()), group.create_task(cluster.run())]
 
     def crash(self) -> None:
-        """End the program at once, wherever it is; the network tells the plant."""
+        """Kill the program wherever it is; the network tells the plant."""
         for task in self._running:
             task.cancel()
         self._running = []
         self.link = None
         self.line.drop()
 
-    # -- whether it is whole ---------------------------------------------------------------
+    # -- health ----------------------------------------------------------------------------
 
     def look(self, now: float, *, hindered: bool) -> None:
-        """Note whether an order of now would surely be carried out."""
+        """Note whether an order given now would surely be carried out."""
         tap, link = self.tap, self.link
         whole = tap is not None and link is not None and tap.connected and link.connected
         if hindered or not whole:
@@ -140,21 +140,21 @@ class Pod:
             self.observer.disturbed(now)
 
     def carried(self, now: float) -> bool:
-        """Whether an order of now must be carried out."""
+        """Whether an order given now must be carried out."""
         return now - self._whole_since > SETTLED
 
     # -- the bus (Tap) ---------------------------------------------------------------------
 
     def sent(self, frame: bytes, now: float) -> None:
-        """Pass on what the cluster sends."""
+        """Pass on a frame that the cluster sends."""
         self.observer.sent(frame, now)
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Pass on what a board is about to hear."""
+        """Pass on bytes that a board is about to receive."""
         self.observer.heard(place, data, how, now)
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Pass on what the cluster hears, and keep the states that it was told."""
+        """Pass on an answer to the cluster, and keep the states that it reports."""
         self.observer.answered(data, how, now)
         if self.plant is None:
             return
@@ -171,9 +171,9 @@ class PlantEar:
     Parameters
     ----------
     pod
-        Whose line.
+        Cluster of the line.
     plant
-        Who observes the plant.
+        Observer of the plant.
     """
 
     def __init__(self, pod: Pod, plant: PlantObserver) -> None:
@@ -182,11 +182,11 @@ class PlantEar:
         self._names: tuple[str, ...] = ()
 
     def posted(self, data: bytes, now: float) -> None:
-        """Judge what the plant hands to the link."""
+        """Judge a message that the plant hands to the link."""
         self._plant.posted(len(self._addresses), decode(data), now)
 
     def sent(self, data: bytes, now: float) -> None:
-        """Note what has gone out to the cluster."""
+        """Note a message that has left for the cluster."""
         message, observer = decode(data), self._pod.observer
         if isinstance(message, Lease):
             observer.leased(now)
@@ -197,7 +197,7 @@ class PlantEar:
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> Order:
-        """Return a command for the books; ``known``: its token is one of an authority."""
+        """Return an order for the ledger; ``known``: its token was once issued."""
         if isinstance(message, Command):
             name, whom = message.name, message.heliostats or tuple(self._addresses)
         else:
@@ -207,7 +207,7 @@ class PlantEar:
         return Order(message.identity, name, addresses, now, until, known, message.token)
 
     def received(self, data: bytes, now: float) -> None:
-        """Judge what the plant is told."""
+        """Judge a message to the plant."""
         message: Message = decode(data)
         observer, counts = self._pod.observer, self._pod.counts
         if isinstance(message, Status):

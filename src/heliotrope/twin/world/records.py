@@ -1,4 +1,4 @@
-"""Records of commands on a simulated disk, which may be full and outlasts the plant."""
+"""Command records on a simulated disk, which may be full and which survives the plant."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -9,16 +9,16 @@ from heliotrope.plant.audit import STOPPED, AuditError, Record
 
 
 class RecordsDisk:
-    """What is written, and whether more can be.
+    """A disk with records.
 
     Attributes
     ----------
     records
-        By identity, in the order of their beginning.
+        Records by identity, in the order in which they began.
     full
         Whether nothing can be written.
     well_since
-        Since when it has not been full, s.
+        Time since which the disk has had room, s.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class RecordsDisk:
         self.full = full
 
     def check(self) -> None:
-        """See that something can be written.
+        """Check that the disk has room.
 
         Raises
         ------
@@ -45,14 +45,14 @@ class RecordsDisk:
 
 
 class SimulatedAudit:
-    """A `control.audit.Audit` of one run of the plant.
+    """A `plant.audit.Audit` of one run of the plant.
 
     Parameters
     ----------
     disk
-        Where records lie.
+        Holds the records.
     started
-        UTC, ISO 8601, for the records that are ended now since the plant stopped before.
+        UTC, ISO 8601; closes the records that an earlier run of the plant left open.
 
     Raises
     ------
@@ -67,14 +67,14 @@ class SimulatedAudit:
                 self.finish(identity, STOPPED, started)
 
     def begin(self, record: Record) -> None:
-        """Keep a record without result.
+        """Keep a record without a result.
 
         Raises
         ------
         AuditError
             If the disk is full.
         InputError
-            An identity that was used before.
+            If the identity has been used before.
         """
         self._disk.check()
         if record.identity in self._disk.records:
@@ -89,7 +89,7 @@ class SimulatedAudit:
         AuditError
             If the disk is full.
         InputError
-            A record that was not begun, or has its result.
+            If the record was not begun, or already has a result.
         """
         self._disk.check()
         known = self._disk.records.get(identity)
@@ -98,7 +98,7 @@ class SimulatedAudit:
         self._disk.records[identity] = replace(known, result=result, finished=at)
 
     def confirm(self) -> None:
-        """See that a record could be written now.
+        """Check that a record could be written now.
 
         Raises
         ------
@@ -108,19 +108,19 @@ class SimulatedAudit:
         self._disk.check()
 
     def close(self) -> None:
-        """End it: everything is on the disk."""
+        """Close the audit; everything is on the disk already."""
 
 
 class AssignedDisk:
-    """Assigned points on a disk that outlasts the plant's program; an `assigned.Assigned`."""
+    """Assigned points on a disk that survives the plant's program; an `assigned.Assigned`."""
 
     def __init__(self) -> None:
         self._points: dict[str, Places] = {}
 
     def read(self) -> dict[str, Places]:
-        """Return what is kept, by kind."""
+        """Return the points that are kept, by kind."""
         return {kind: dict(places) for kind, places in self._points.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Keep all points in place of those before."""
+        """Replace all points that are kept."""
         self._points = {kind: dict(places) for kind, places in points.items()}

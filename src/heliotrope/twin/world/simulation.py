@@ -1,9 +1,9 @@
-"""Deterministic simulation: a real plant, clusters and nodes in virtual time, and all that fails.
+"""Deterministic simulation: a real plant, clusters and nodes in virtual time, with faults.
 
-One run is a seed and a length. The seed gives the heliostats and clusters, what persons do, the
-list of faults, the clocks' drifts, and the order in which the event loop takes ready callbacks. The
-same seed gives the same run, so what broke an invariant is replayed by one command
-(`Outcome.command`). The observers (`twin.invariants`, `twin.plant_observer`) judge every step.
+A seed and a length define a run. The seed gives the heliostats and clusters, the actions of
+persons, the list of faults, the drift of the clocks, and the order in which the event loop takes
+ready callbacks. The same seed gives the same run, so one command replays a broken invariant
+(`RunResult.command`). The observers (`twin.invariants`) judge every step.
 """
 
 import asyncio
@@ -53,29 +53,29 @@ from heliotrope.twin.world.tapped import TappedLink
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
 START = datetime(2026, 6, 21, 9, tzinfo=UTC)
-#: The world looks at the boards at least so often, and the observers at everything, s.
+#: Longest interval between two looks at the boards, and between two judgements of everything, s.
 LOOK, JUDGE = 0.2, 0.5
-#: The true sun is computed so far apart (s), and between it goes straight: 1e-6 rad off.
+#: The true sun is computed this often (s) and interpolated linearly, to within 1e-6 rad.
 _SUN_EVERY = 30.0
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
-#: Few mirrors: they join one after the other.
+#: With so few mirrors they join one at a time.
 SETTINGS = PlantSettings(join_rate=0.5, join_burst=1)
-#: Without the rows on the share of failed nodes: one of three or four is more than they allow.
+#: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
 
 
 def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: Site) -> Plant:
-    """Return the plant of some heliostats, calibrated to the truth.
+    """Return a plant of some heliostats, calibrated to the truth.
 
     Parameters
     ----------
     fits
-        Its heliostats.
+        Heliostats.
     homes
-        Their names by the name of their cluster.
+        Names of the heliostats of each cluster.
     site
-        Where it is.
+        Site of the plant.
     """
     home = {name: cluster for cluster, names in homes.items() for name in names}
     names = tuple(each.name for each in fits)
@@ -91,28 +91,28 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: 
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a run is.
+class RunPlan:
+    """Definition of a run.
 
     Parameters
     ----------
     seed
-        Of everything.
+        Seed of every random choice.
     seconds
         Length in simulated time.
     heliostats
-        Of the plant, 1 to 32; by the seed on one bus or on two.
+        Number, 1 to 32; the seed puts them on one bus or on two.
     pause
-        Mean time between two faults, s.
+        Mean time between faults, s.
     only
         Kinds of faults to draw from, () for all.
     faults
-        None: drawn by the seed.
+        Faults of the run; None: drawn from the seed.
 
     Raises
     ------
     InputError
-        A length or a number that cannot be simulated.
+        A length or a number of heliostats that cannot be simulated.
     """
 
     seed: int
@@ -135,12 +135,12 @@ class Plan:
 
     @property
     def clusters(self) -> int:
-        """How many clusters there are: two with every third seed."""
+        """Number of clusters: two with every third seed."""
         return 2 if self.seed % 3 == 2 and self.heliostats > 1 else 1
 
     @property
     def drawn(self) -> tuple[Fault, ...]:
-        """The faults of the run."""
+        """Faults of the run."""
         if self.faults is not None:
             return self.faults
         return tuple(
@@ -149,30 +149,30 @@ class Plan:
 
 
 @dataclass
-class Outcome:
-    """What a run has shown.
+class RunResult:
+    """Result of a run.
 
     Attributes
     ----------
     plan
-        What was run.
+        Definition of the run.
     violation
         The first broken invariant, or None.
     problem
-        An exception of the code that was run, "" if there was none.
+        An exception of the code under test, "" if there was none.
     checks
-        How often each invariant was checked.
+        Number of checks of each invariant.
     faults
-        How often each kind of fault came.
+        Number of faults of each kind.
     counts
-        Of what persons did and the plant was told.
+        Numbers of actions by persons and of messages to the plant.
     states
         How often each state was entered.
     seconds
         Simulated time.
     """
 
-    plan: Plan
+    plan: RunPlan
     violation: Violation | None = None
     problem: str = ""
     checks: Counter[int] = field(default_factory=Counter)
@@ -183,12 +183,12 @@ class Outcome:
 
     @property
     def good(self) -> bool:
-        """Whether nothing was broken."""
+        """Whether nothing broke."""
         return self.violation is None and not self.problem
 
     @property
     def command(self) -> str:
-        """The one command that replays it."""
+        """The command that replays the run."""
         plan = self.plan
         return (
             f"heliotrope simulate --seed {plan.seed} --hours {plan.seconds / 3600.0!r} "
@@ -198,7 +198,7 @@ class Outcome:
 
     @property
     def text(self) -> str:
-        """One line on what went wrong, "" if nothing did."""
+        """What went wrong in one line, "" if nothing did."""
         if self.violation is not None:
             return str(self.violation)
         return self.problem
@@ -210,27 +210,27 @@ class Simulation:
     Parameters
     ----------
     plan
-        What to run.
+        Definition of the run.
     loop
-        Its virtual time is the true one.
+        Its virtual time is true time.
 
     Attributes
     ----------
     begin
-        Time at which it began, s.
+        Start, s.
     boards, pods
-        All heliostats, and the clusters that they hang on.
+        All heliostats, and the clusters that they belong to.
     plant
         The plant's program; None while it does not run.
     disk
-        With the plant's records.
+        Holds the plant's records.
     operator
         The persons at the plant.
     faults
-        How often each kind came.
+        Number of faults of each kind so far.
     """
 
-    def __init__(self, plan: Plan, loop: VirtualLoop) -> None:
+    def __init__(self, plan: RunPlan, loop: VirtualLoop) -> None:
         self.plan = plan
         self.faults: Counter[str] = Counter()
         self._chance = random.Random(f"simulation {plan.seed}")
@@ -242,7 +242,7 @@ class Simulation:
         self.pods = self._new_pods()
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         self._design, self._homes = design_of(fits, homes, SITE), homes
-        # What is wanted of the boards, and assigned to them, outlasts the plant's program.
+        # The boards' wanted items and assigned points survive the plant's program.
         self._wanted, self._assigned = Wanted(), AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
@@ -277,7 +277,7 @@ class Simulation:
         return pods
 
     def sun(self, now: float) -> FloatArray:
-        """Return the true direction to the sun, (3,), at a time of the loop."""
+        """Return the true direction to the sun at a time of the loop, (3,)."""
         place, part = divmod(now - self.begin, _SUN_EVERY)
         first, second = self._sun_at(int(place)), self._sun_at(int(place) + 1)
         mixed = first + (second - first) * (part / _SUN_EVERY)
@@ -291,7 +291,7 @@ class Simulation:
         return found
 
     def _flux(self) -> float:
-        """Return the share of the beams that are on the receiver."""
+        """Return the share of the beams on the receiver."""
         sun = self.sun(self._clock.monotonic())
         return float(np.mean([board.miss(sun, RECEIVER) <= OFF for board in self.boards]))
 
@@ -303,7 +303,7 @@ class Simulation:
     # -- the plant -------------------------------------------------------------------------
 
     def start_plant(self, group: asyncio.TaskGroup) -> None:
-        """Start the plant's program anew: of before only disk and wanted parameters are left."""
+        """Start the plant's program; only the disk and the wanted parameters are carried over."""
         links = {}
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
@@ -328,7 +328,7 @@ class Simulation:
         self._program.append(group.create_task(plant.run()))
 
     def crash_plant(self, now: float) -> None:
-        """End the plant's program at once, wherever it is; the network tells the clusters."""
+        """Kill the plant's program wherever it is; the network tells the clusters."""
         for task in self._program:
             task.cancel()
         self._program, self.plant = [], None
@@ -340,7 +340,7 @@ class Simulation:
             pod.observer.disturbed(now, crashed=True)
 
     def hang_plant(self, now: float, *, on: bool) -> None:
-        """Let the plant's program stand still, or go on."""
+        """Freeze the plant's program, or let it go on."""
         self.observer.hangs(now, on=on and self.plant is not None)
         for pod in self.pods:
             if pod.tap is not None:
@@ -349,12 +349,12 @@ class Simulation:
     # -- the world -------------------------------------------------------------------------
 
     async def live(self) -> None:
-        """Run it to its end.
+        """Run to the end.
 
         Raises
         ------
         InvariantError
-            In a group: an invariant is broken.
+            Within an exception group, if an invariant is broken.
         """
         damage = Damage(self, self.plan.drawn)
         async with asyncio.TaskGroup() as group:
@@ -373,10 +373,10 @@ class Simulation:
                 task.cancel()
 
     async def _turn(self, damage: Damage, group: asyncio.TaskGroup) -> None:
-        """Let boards, faults and observers go on until the end."""
+        """Advance boards, faults and observers to the end."""
         end, judged = self.begin + self.plan.seconds, self.begin
         while (now := self._clock.monotonic()) < end:
-            # What ends now has hindered until now.
+            # A fault that ends now has been in the way until now.
             hindered = [damage.hinders(pod) for pod in self.pods]
             damage.look(now, group)
             for board in self.boards:
@@ -397,9 +397,9 @@ class Simulation:
 # -- running -----------------------------------------------------------------------------------
 
 
-def run(plan: Plan) -> Outcome:
-    """Run a plan; what goes wrong is told in the outcome, not raised."""
-    outcome = Outcome(plan, seconds=plan.seconds)
+def run(plan: RunPlan) -> RunResult:
+    """Run a plan; failures are part of the outcome and are not raised."""
+    outcome = RunResult(plan, seconds=plan.seconds)
     with asyncio.Runner(loop_factory=lambda: VirtualLoop(plan.seed)) as runner:
         loop = runner.get_loop()
         assert isinstance(loop, VirtualLoop)
@@ -419,7 +419,7 @@ def run(plan: Plan) -> Outcome:
     return outcome
 
 
-def _blame(error: BaseException, outcome: Outcome) -> None:
+def _blame(error: BaseException, outcome: RunResult) -> None:
     """Find what broke first among all that a task group raises."""
     found = list(_leaves(error))
     for each in found:
@@ -440,15 +440,15 @@ def _leaves(error: BaseException) -> Iterator[BaseException]:
         yield error
 
 
-def shrink(outcome: Outcome, most: int = 60) -> Outcome:
+def shrink(outcome: RunResult, most: int = 60) -> RunResult:
     """Return a failed run with fewer faults that breaks the same invariant.
 
     Parameters
     ----------
     outcome
-        Of a run that failed.
+        A failed run.
     most
-        Runs to spend.
+        Maximum number of runs.
 
     Raises
     ------

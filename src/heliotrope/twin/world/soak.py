@@ -1,4 +1,4 @@
-"""Many runs: over processes, within a time, going on where an earlier one stopped."""
+"""Many runs: over several processes, within a time limit, resumed where an earlier soak stopped."""
 
 import json
 from collections import Counter
@@ -12,21 +12,21 @@ from typing import Any
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.links.clock import Clock, SystemClock
-from heliotrope.twin.world.simulation import Outcome, Plan, run
+from heliotrope.twin.world.simulation import RunPlan, RunResult, run
 
 
 @dataclass
-class Soaked:
-    """What many runs have shown.
+class SoakResult:
+    """Result of many runs.
 
     Attributes
     ----------
     runs, seconds
-        Their number, and their simulated time.
+        Number of runs and their simulated time.
     checks, faults, states
-        As in `twin.simulation.Outcome`, added up.
+        Sums over all runs; see `twin.world.simulation.RunResult`.
     broken
-        One line for each run that failed: what broke, and the command that replays it.
+        One line for each failed run: what broke, and the command that replays it.
     """
 
     runs: int = 0
@@ -47,8 +47,8 @@ class Soaked:
             self.broken.append(line["broken"])
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
-    """Return a run in plain JSON."""
+def summary(outcome: RunResult) -> dict[str, Any]:
+    """Return a run as plain JSON."""
     return {
         "seed": outcome.plan.seed,
         "seconds": outcome.seconds,
@@ -59,46 +59,46 @@ def summary(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _one(plan: Plan) -> dict[str, Any]:
+def _one(plan: RunPlan) -> dict[str, Any]:
     return summary(run(plan))
 
 
-def soak(
-    plans: Iterable[Plan],
+def run_many(
+    plans: Iterable[RunPlan],
     *,
     processes: int = 1,
     budget: float = float("inf"),
     progress: Path | None = None,
-    tell: Callable[[Soaked], None] = lambda _: None,
+    tell: Callable[[SoakResult], None] = lambda _: None,
     clock: Clock | None = None,
-) -> Soaked:
-    """Run plans until all are done or the time is over.
+) -> SoakResult:
+    """Run plans until all are done or the time is up.
 
     Parameters
     ----------
     plans
-        What to run, each with a seed of its own.
+        Plans, each with its own seed.
     processes
-        How many at a time.
+        Number of processes.
     budget
-        After this wall time no further run is begun, s.
+        Wall time after which no further run begins, s.
     progress
-        A file of one line a run: what stands in it is not run again.
+        File with one line for each run; a run that is in it is skipped.
     tell
         Called after each run.
     clock
-        Of the budget; None: this machine's.
+        Clock of the budget; None: the system's.
 
     Raises
     ------
     InputError
-        No processes.
+        Fewer than one process.
     FormatError
-        A file that holds something else.
+        A progress file with other contents.
     """
     if processes < 1:
         raise InputError(f"soak with {processes} processes; give 1 or more")
-    found = Soaked()
+    found = SoakResult()
     known = {}
     if progress is not None and progress.exists():
         known = _read(progress)
@@ -120,7 +120,7 @@ def soak(
 
 
 def _results(
-    plans: list[Plan], processes: int, goes_on: Callable[[], bool]
+    plans: list[RunPlan], processes: int, goes_on: Callable[[], bool]
 ) -> Iterator[dict[str, Any]]:
     if processes == 1:
         for plan in plans:
@@ -149,9 +149,9 @@ def _read(path: Path) -> dict[int, dict[str, Any]]:
         try:
             line = json.loads(text)
             found[int(line["seed"])] = line
-            Soaked().add(line)
+            SoakResult().add(line)
         except (ValueError, KeyError, TypeError, AttributeError):
             raise FormatError(
-                path, "no run of a soak; give another file or remove it", f"line {number}"
+                path, "not a run of a soak; name another file, or remove this one", f"line {number}"
             ) from None
     return found

@@ -1,4 +1,4 @@
-"""A link that somebody listens to: what its owner sends and hears, and what hangs with him."""
+"""A link with a listener: it hears all traffic of the link's owner, and can freeze the owner."""
 
 import asyncio
 from typing import Protocol
@@ -8,23 +8,23 @@ from heliotrope.links.link import Link, Outcome, Statistics
 
 
 class Listener(Protocol):
-    """Who listens at one end of a link."""
+    """Listener at one end of a link."""
 
     def posted(self, data: bytes, now: float) -> None:
-        """Note what the owner hands to the link, whatever becomes of it."""
+        """Note a message that the owner hands to the link, whether or not it is delivered."""
         ...
 
     def sent(self, data: bytes, now: float) -> None:
-        """Note what has gone out, and when it was handed to the transport."""
+        """Note a message that has left, and when it was handed to the transport."""
         ...
 
     def received(self, data: bytes, now: float) -> None:
-        """Note what the owner is told."""
+        """Note a message that the owner receives."""
         ...
 
 
 class TappedLink:
-    """A `control.link.Link` with a listener.
+    """A `links.link.Link` with a listener.
 
     Parameters
     ----------
@@ -33,12 +33,12 @@ class TappedLink:
     clock
         True time.
     listener
-        Is told of every message.
+        Told of every message.
 
     Attributes
     ----------
     inner
-        As given: what is sent by it goes past the listener.
+        Messages sent through it directly bypass the listener.
     """
 
     def __init__(self, inner: Link, clock: Clock, listener: Listener) -> None:
@@ -48,7 +48,7 @@ class TappedLink:
         self._goes.set()
 
     def hang(self, *, on: bool) -> None:
-        """Let the owner's program stand still, while the connection lives on."""
+        """Freeze the owner's program, or let it go on, while the connection stays up."""
         if on:
             self._goes.clear()
         else:
@@ -56,32 +56,32 @@ class TappedLink:
 
     @property
     def name(self) -> str:
-        """Whom it leads to."""
+        """Name of the other end."""
         return self.inner.name
 
     @property
     def connected(self) -> bool:
-        """Whether the other end is there."""
+        """Whether the link is connected."""
         return self.inner.connected
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the link is closed for good."""
         return self.inner.closed
 
     @property
     def silent_for(self) -> float:
-        """How long ago the other end was surely alive, s."""
+        """Time since the other end was last known to be alive, s."""
         return self.inner.silent_for
 
     @property
     def problem(self) -> str:
-        """Why it is not connected, "" if it is."""
+        """Why the link is not connected, "" if it is."""
         return self.inner.problem
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since it was made."""
+        """Counts since the link was made."""
         return self.inner.statistics
 
     async def run(self) -> None:
@@ -91,7 +91,7 @@ class TappedLink:
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> Outcome:
-        """Send a message; see `control.link.Link`."""
+        """Send a message; see `links.link.Link`."""
         self._listener.posted(data, self._clock.monotonic())
         await self._goes.wait()
         begin = self._clock.monotonic()
@@ -108,5 +108,5 @@ class TappedLink:
         return data
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the link for good."""
         await self.inner.close()
