@@ -25,8 +25,7 @@ from heliotrope.links.link import LinkClosedError, Outcome, Statistics, running
 from heliotrope.links.messages import Acknowledge, Command, Emergency, Lease, Message, encode
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
-from heliotrope.sun import Site, vector
-from heliotrope.sun.line import sun_values
+from heliotrope.sun import Site, broadcast_values, vector
 from heliotrope.twin.boards.clocks import SimulatedTime
 from heliotrope.twin.boards.outfit import LIMITS, RANGES, STEPS_PER_TURN, STOW
 from heliotrope.twin.field.field import Field
@@ -156,7 +155,7 @@ def _on_receiver(field: Field, clock: VirtualClock) -> None:
     field.order("AIM", aim=RECEIVER)
     for second in range(130):
         utc = clock.utc().timestamp() - 130 + second
-        values = sun_values(int(gps_seconds(clock.utc())) - 130 + second, utc, SITE)
+        values = broadcast_values(int(gps_seconds(clock.utc())) - 130 + second, utc, SITE)
         assert values is not None
         field.take_sun(values)
         if second == 0:

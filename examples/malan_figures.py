@@ -15,10 +15,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from heliotrope import sun
-from heliotrope.field.image import image_offsets
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
-from heliotrope.optics.intercept import beam_sigma, intercept_circle
+from heliotrope.optics import beam_sigma, image_offsets, intercept_circle
 
 SITE = sun.Site(-33.93, 18.87, 120.0)
 AIM = np.array([0.0, 0.0, 13.0])

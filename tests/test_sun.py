@@ -1,3 +1,4 @@
+import math
 import subprocess
 import sys
 from datetime import UTC, date, datetime, timedelta, timezone
@@ -14,9 +15,11 @@ from pvlib import solarposition
 from heliotrope import sun
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.geometry import MRAD, angle_between, direction
+from heliotrope.lcu import wire
 from heliotrope.sun import ephemeris
 from support import data
 
+URAD = 1e-6
 NOON = datetime(2024, 6, 21, 12, 0, tzinfo=UTC)
 JUELICH = sun.Site(50.913421122592574, 6.387824755874856, 87.0, name="Jülich")
 STELLENBOSCH = sun.Site(-33.93, 18.87, 120.0, name="Stellenbosch")
@@ -494,3 +497,37 @@ def test_measurements_are_skipped_or_asked_for(
         data.juelich()
     (tmp_path / "measurements.csv").touch()
     assert data.juelich() == tmp_path
+
+
+# The sun as clusters broadcast it
+
+
+@pytest.mark.parametrize("begin", [1782036000.0, 1798000000.0])  # a day of June, one of December
+def test_the_sun_between_its_knots_is_that_of_spa(begin: float) -> None:
+    times = begin + np.random.default_rng(7).uniform(0.0, 86400.0, 120)
+    exact = sun.vector(times, SEVILLE)
+    up = exact[:, 2] > sun.LOWEST_BROADCAST + 1e-3
+    assert 30 < up.sum() < 110
+    later = sun.vector(times + 1.0, SEVILLE)
+    for time, vector, there in zip(times[up], exact[up], later[up], strict=True):
+        here, rate = sun.vector_and_rate(float(time), SEVILLE)
+        assert np.linalg.norm(np.subtract(here, vector)) < 0.01 * URAD
+        assert abs(math.hypot(*here) - 1.0) < 1e-9
+        assert np.linalg.norm(np.add(here, rate) - there) < 0.1 * URAD
+        assert sun.fast_vector(float(time), SEVILLE) == pytest.approx(vector, abs=1e-8)
+    night = float(times[np.argmin(exact[:, 2])])
+    assert (sun.fast_vector(night, SEVILLE) == sun.vector(night, SEVILLE)).all()
+
+
+def test_sun_on_the_wire_is_within_a_nanoradian_and_none_is_sent_at_night() -> None:
+    noon = 1782043200.0
+    values = sun.broadcast_values(1_466_078_418, noon, SEVILLE)
+    assert values is not None
+    assert values[0] == 1_466_078_418
+    vector = np.array(values[1:4]) / 2**30
+    assert np.linalg.norm(vector - sun.vector(noon, SEVILLE)) < 2e-9
+    ahead = vector + np.array(values[4:7]) / 2**28
+    assert np.linalg.norm(ahead - sun.vector(noon + 1.0, SEVILLE)) < 1e-8
+    assert wire.pack("SUN", *values)
+    assert sun.broadcast_values(1, noon + 43200.0, SEVILLE) is None
+    assert sun.broadcast_values(1, noon, sun.Site(-89.0, 0.0, 2800.0)) is None  # the polar night

@@ -44,6 +44,21 @@ def as_vectors(value: npt.ArrayLike, name: str) -> FloatArray:
     return array
 
 
+def common_shape(**arrays: FloatArray) -> tuple[int, ...]:
+    """Return the shape that arrays broadcast to; their names are for the error.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not broadcast together.
+    """
+    try:
+        return np.broadcast_shapes(*(a.shape for a in arrays.values()))
+    except ValueError:
+        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
+        raise InputError(f"shapes do not broadcast together: {shapes}") from None
+
+
 def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
     """Return unit vectors.
 
@@ -52,7 +67,7 @@ def normalize(vectors: npt.ArrayLike, name: str = "vector") -> FloatArray:
     vectors
         Shape (..., 3), any non-zero length.
     name
-        What an error calls them.
+        Name of the vectors in an error.
 
     Raises
     ------
@@ -154,7 +169,7 @@ def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
     Raises
     ------
     InputError
-        Where both are opposite, so that no mirror can do it.
+        If source and destination are opposite, so that no normal exists.
     """
     total = as_float(source) + as_float(destination)
     length = np.linalg.norm(total, axis=-1, keepdims=True)
@@ -166,7 +181,7 @@ def bisector(source: npt.ArrayLike, destination: npt.ArrayLike) -> FloatArray:
 
 
 def reflect(direction_in: npt.ArrayLike, normal: npt.ArrayLike) -> FloatArray:
-    """Return where light from unit direction ``direction_in`` leaves: 2 (n·s) n − s."""
+    """Return the direction in which light from ``direction_in`` leaves: 2 (n·s) n − s."""
     s, n = as_float(direction_in), as_float(normal)
     return as_float(2.0 * np.sum(s * n, axis=-1, keepdims=True) * n - s)
 
@@ -175,7 +190,7 @@ def tangent_axes(normals: npt.ArrayLike) -> FloatArray:
     """Return two unit axes perpendicular to each normal, shape (..., 2, 3).
 
     The first is horizontal (to the right of someone looking along the normal), the
-    second completes it upwards; for a vertical normal they are east and north.
+    second points up; for a vertical normal they are east and north.
     """
     n = as_float(normals)
     horizontal = np.stack([n[..., 1], -n[..., 0], np.zeros(n.shape[:-1])], axis=-1)

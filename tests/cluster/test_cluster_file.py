@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope import sun
 from heliotrope.cli.cluster import _link
 from heliotrope.cluster import timekeeping
 from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Node, rows
@@ -23,8 +22,6 @@ from heliotrope.cluster.timekeeping import Time
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import SystemClock, VirtualClock
-from heliotrope.sun import Site
-from heliotrope.sun.line import HORIZON, sun_at, sun_now, sun_values
 from support.clusters import SITE, config_of
 from support.nmea_talk import rmc
 
@@ -196,40 +193,6 @@ def test_an_edition_that_cannot_be_kept_is_not_used(tmp_path: Path) -> None:
         with pytest.raises(FileNotFoundError):
             kept.start(5)
     assert kept.epoch == 0
-
-
-# -- the sun ---------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("begin", [1782036000.0, 1798000000.0])  # a day of June, one of December
-def test_the_sun_between_its_knots_is_that_of_spa(begin: float) -> None:
-    times = begin + np.random.default_rng(7).uniform(0.0, 86400.0, 120)
-    exact = sun.vector(times, SITE)
-    up = exact[:, 2] > HORIZON + 1e-3
-    assert 30 < up.sum() < 110
-    later = sun.vector(times + 1.0, SITE)
-    for time, vector, there in zip(times[up], exact[up], later[up], strict=True):
-        here, rate = sun_at(float(time), SITE)
-        assert np.linalg.norm(np.subtract(here, vector)) < 0.01 * URAD
-        assert abs(math.hypot(*here) - 1.0) < 1e-9
-        assert np.linalg.norm(np.add(here, rate) - there) < 0.1 * URAD
-        assert sun_now(float(time), SITE) == pytest.approx(vector, abs=1e-8)
-    night = float(times[np.argmin(exact[:, 2])])
-    assert (sun_now(night, SITE) == sun.vector(night, SITE)).all()
-
-
-def test_sun_on_the_wire_is_within_a_nanoradian_and_none_is_sent_at_night() -> None:
-    noon = 1782043200.0
-    values = sun_values(1_466_078_418, noon, SITE)
-    assert values is not None
-    assert values[0] == 1_466_078_418
-    vector = np.array(values[1:4]) / 2**30
-    assert np.linalg.norm(vector - sun.vector(noon, SITE)) < 2e-9
-    ahead = vector + np.array(values[4:7]) / 2**28
-    assert np.linalg.norm(ahead - sun.vector(noon + 1.0, SITE)) < 1e-8
-    assert wire.pack("SUN", *values)
-    assert sun_values(1, noon + 43200.0, SITE) is None
-    assert sun_values(1, noon, Site(-89.0, 0.0, 2800.0)) is None  # the polar night
 
 
 # -- reading answers -------------------------------------------------------------------

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.path import Path as Polygon
 
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume, outline
-from heliotrope.optics.keep_out import clearance
+from heliotrope.optics import clearance
 
 
 @pytest.mark.parametrize(

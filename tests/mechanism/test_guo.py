@@ -20,7 +20,8 @@ from heliotrope.geometry import (
     rotation,
     wrap_signed,
 )
-from heliotrope.mechanism.azel import (
+from heliotrope.mechanism.drives import linear_guo
+from heliotrope.mechanism.guo import (
     MALAN_NAMES,
     REACHED,
     GuoParameters,
@@ -35,7 +36,6 @@ from heliotrope.mechanism.azel import (
     to_malan,
     track,
 )
-from heliotrope.mechanism.drives import linear_guo
 
 EAST, NORTH, UP = np.eye(3)
 PI = np.pi

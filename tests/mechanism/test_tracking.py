@@ -15,7 +15,7 @@ from heliotrope.geometry import (
     reflect,
     wrap_signed,
 )
-from heliotrope.mechanism import azel, kinds
+from heliotrope.mechanism import guo, kinds
 from heliotrope.mechanism.armature import armature
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import Status, track
@@ -265,18 +265,18 @@ def test_guo_is_the_special_case() -> None:
     rng = np.random.default_rng(11)
     machine = kinds.azimuth_elevation((0, 0, 0), pivot_offset=0.3)
     for _ in range(40):
-        guo = azel.GuoParameters(
+        errors = guo.GuoParameters(
             tilt=rng.uniform(0, 0.05),
             tilt_azimuth=rng.uniform(0, 6),
             tau_1=rng.normal(0, 0.02),
             mu=rng.normal(0, 0.02),
             offset=0.3,
         )
-        ours = azel.to_heliotrope(guo)
+        ours = guo.to_heliotrope(errors)
         assert ours.pop("pivot_offset") == pytest.approx(0.3)
         sun = direction(rng.uniform(0, 6), rng.uniform(0.2, 1.2))
         aim = np.array([rng.uniform(-80, 80), rng.uniform(20, 90), rng.uniform(10, 60)])
-        closed = azel.track(aim, sun, guo, exact=True)
+        closed = guo.track(aim, sun, errors, exact=True)
         found = track(machine.with_parameters(ours), sun, aim, tolerance=1e-13)
         bias = np.array([ours["azimuth_bias"], 0.0])
         theirs = np.stack([closed.gamma, closed.alpha], axis=-1) + bias

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import normalize
+from heliotrope.optics import SUN_RADIUS, Mirrors, beams, concentration, mean_concentration
 from heliotrope.optics import glare as eye
 from heliotrope.optics.glare import Eye, Hazard
-from heliotrope.optics.keep_out import SUN_HALF_ANGLE, Mirrors, beams, concentration
 
 #: One watt per square centimetre.
 CM2 = 1e4
@@ -23,7 +23,7 @@ def test_a_look_into_the_bare_sun() -> None:
     """Ho et al.: 0.1 W/cm² under 9.3 mrad: about 8 W/cm² on the retina; an after-image, no burn."""
     assert eye.retinal_irradiance(0.1 * CM2, SUN_ANGLE) == pytest.approx(8.0 * CM2, rel=1e-3)
     assert eye.burn_threshold(SUN_ANGLE) == pytest.approx(12.69 * CM2, rel=1e-3)
-    seen = eye.glare(0.1 * CM2, SUN_ANGLE)
+    seen = eye.glare_of_one(0.1 * CM2, SUN_ANGLE)
     assert int(seen.hazard) == Hazard.AFTER_IMAGE
     assert "temporary after-image" in Hazard.AFTER_IMAGE.text
     assert seen.burn == pytest.approx(8.0 / 12.69, rel=2e-3)
@@ -39,7 +39,7 @@ def test_thresholds_by_hand() -> None:
         assert eye.burn_threshold(angle) == pytest.approx(1.0 * CM2)
     assert eye.burn_threshold(0.1179) == pytest.approx(1.0 * CM2, rel=1e-3)
     # A candle-like 1 mW/m² under 1 mrad does nothing.
-    assert int(eye.glare(1e-3, 1e-3).hazard) == Hazard.LOW
+    assert int(eye.glare_of_one(1e-3, 1e-3).hazard) == Hazard.LOW
 
 
 def test_the_retina_sees_a_radiance() -> None:
@@ -54,10 +54,10 @@ def test_the_retina_sees_a_radiance() -> None:
 
 @given(st.floats(0.0, 1e5), st.floats(1e-4, 3.0), st.floats(1.0, 10.0))
 def test_more_light_is_never_milder(corneal: float, angle: float, factor: float) -> None:
-    one, more = eye.glare(corneal, angle), eye.glare(factor * corneal, angle)
+    one, more = eye.glare_of_one(corneal, angle), eye.glare_of_one(factor * corneal, angle)
     assert more.hazard >= one.hazard
     # At one radiance a larger source is never milder either.
-    larger = eye.glare(corneal * factor**2, min(angle * factor, math.pi))
+    larger = eye.glare_of_one(corneal * factor**2, min(angle * factor, math.pi))
     assert larger.hazard >= one.hazard or angle * factor > math.pi
 
 
@@ -78,7 +78,7 @@ def test_many_sources_are_bounded_by_their_worst_selection(
             lit = [k for k in pick if corneal[k] > 0.0 and angle[k] > 0.0]
             if not lit or (together := math.sqrt(sum(angle[k] ** 2 for k in lit))) == 0.0:
                 continue
-            one = eye.glare(sum(corneal[k] for k in lit), together)
+            one = eye.glare_of_one(sum(corneal[k] for k in lit), together)
             worst = [max(worst[0], float(one.burn)), max(worst[1], float(one.flash))]
     assert found.burn >= worst[0] * (1.0 - 1e-9)
     assert found.flash >= worst[1] * (1.0 - 1e-9)
@@ -89,10 +89,10 @@ def test_the_worst_selection_may_leave_out_a_brighter_one() -> None:
     angle = np.array([0.1, math.sqrt(0.02), math.sqrt(0.118**2 - 0.01)])
     corneal = 1e4 * np.array([1.0, 0.5, 0.49]) * angle**2
     found = float(eye.glare_of_many(corneal, angle).burn)
-    pair = float(eye.glare(corneal[0] + corneal[2], 0.118).burn)
+    pair = float(eye.glare_of_one(corneal[0] + corneal[2], 0.118).burn)
     for others in ([0], [0, 1], [0, 1, 2]):
         together = math.sqrt(float((angle[others] ** 2).sum()))
-        assert float(eye.glare(corneal[others].sum(), together).burn) < pair
+        assert float(eye.glare_of_one(corneal[others].sum(), together).burn) < pair
     assert pair <= found < 1.01 * pair
 
 
@@ -110,9 +110,9 @@ def test_a_further_source_is_never_milder(
 def test_equal_sources_add_their_solid_angles() -> None:
     """Four suns side by side: the same retinal irradiance under twice the angle."""
     four = eye.glare_of_many(np.full(4, 1000.0), np.full(4, SUN_ANGLE))
-    one = eye.glare(4000.0, 2.0 * SUN_ANGLE)
+    one = eye.glare_of_one(4000.0, 2.0 * SUN_ANGLE)
     assert four.burn == pytest.approx(float(one.burn))
-    assert four.burn == pytest.approx(2.0 * float(eye.glare(1000.0, SUN_ANGLE).burn))
+    assert four.burn == pytest.approx(2.0 * float(eye.glare_of_one(1000.0, SUN_ANGLE).burn))
     assert int(four.hazard) == Hazard.DAMAGE
     assert four.corneal == 4000.0
     assert four.subtended == pytest.approx(2.0 * SUN_ANGLE)
@@ -141,16 +141,16 @@ def test_on_the_axis_the_mirror_shows_the_sun(focus: float) -> None:
         c = float(concentration(distance, 25.0, focus))
         assert seen.corneal[0] == pytest.approx(950.0 * 0.9 * c, rel=1e-4)
         radiance = seen.corneal[0] / seen.subtended[0] ** 2
-        assert radiance == pytest.approx(950.0 * 0.9 / (2.0 * SUN_HALF_ANGLE) ** 2, rel=1e-6)
+        assert radiance == pytest.approx(950.0 * 0.9 / (2.0 * SUN_RADIUS) ** 2, rel=1e-6)
 
 
 def test_the_mean_of_the_paper_is_below_the_axis() -> None:
     x = np.linspace(1.0, 3000.0, 5000)
     for focus in (math.inf, 700.0, 100.0):
-        mean, axis = eye.mean_concentration(x, 40.0, focus), concentration(x, 40.0, focus)
+        mean, axis = mean_concentration(x, 40.0, focus), concentration(x, 40.0, focus)
         assert (mean <= axis * (1.0 + 1e-12)).all()
     # In the focus both are mirror over image area.
-    assert eye.mean_concentration(700.0, 40.0, 700.0) == pytest.approx(
+    assert mean_concentration(700.0, 40.0, 700.0) == pytest.approx(
         float(concentration(700.0, 40.0, 700.0))
     )
 
@@ -171,7 +171,7 @@ def test_the_range_of_a_beam_agrees_with_a_scan_of_it(
     near, far = eye.safe_range(area, focus, dni=dni)
     x = np.linspace(1.0, 3000.0, 60_000)
     c = concentration(x, area, focus)
-    burns = eye.glare(dni * c, 2.0 * SUN_HALF_ANGLE * np.sqrt(c)).hazard == Hazard.DAMAGE
+    burns = eye.glare_of_one(dni * c, 2.0 * SUN_RADIUS * np.sqrt(c)).hazard == Hazard.DAMAGE
     if not burns.any():
         assert far - near < 0.1
         return
@@ -246,9 +246,9 @@ def test_a_map_shows_where_the_standby_point_burns() -> None:
 def test_what_cannot_be_is_refused() -> None:
     given_, center = _standby(2)
     refusals = (
-        (lambda: eye.glare(-1.0, 0.01), "corneal irradiance must be 0 W/m² or more"),
-        (lambda: eye.glare(math.nan, 0.01), "corneal irradiance must be 0"),
-        (lambda: eye.glare(1.0, 0.0), "subtended angle must be above 0 and at most π"),
+        (lambda: eye.glare_of_one(-1.0, 0.01), "corneal irradiance must be 0 W/m² or more"),
+        (lambda: eye.glare_of_one(math.nan, 0.01), "corneal irradiance must be 0"),
+        (lambda: eye.glare_of_one(1.0, 0.0), "subtended angle must be above 0 and at most π"),
         (lambda: eye.burn_threshold(4.0), "subtended angle must be above 0 and at most π"),
         (lambda: eye.glare_of_many(1.0, 0.01), "give finite irradiances and angles"),
         (lambda: eye.glare_of_many([math.inf], [0.01]), "give finite irradiances and angles"),

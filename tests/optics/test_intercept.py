@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
-from heliotrope.optics.intercept import beam_sigma, intercept_circle, intercept_rectangle
+from heliotrope.optics import beam_sigma, intercept_circle, intercept_rectangle
 
 DRAWS = 200_000
 

@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from heliotrope import optics
 from heliotrope.errors import InputError
+from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, direction, normalize, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.tracking import track
-from heliotrope.optics import keep_out as bp
-from heliotrope.optics.keep_out import Box, Cylinder, Mirrors, Prism, Sphere, Volume
+from heliotrope.optics import Mirrors
 
 L_SHAPE = ((0.0, 0.0), (20.0, 0.0), (20.0, 8.0), (8.0, 8.0), (8.0, 20.0), (0.0, 20.0))
 ZOO: tuple[Volume, ...] = (
@@ -50,10 +51,10 @@ def test_clearance_has_the_sign_of_the_definition(k: int) -> None:
     rng = np.random.default_rng(k)
     points = rng.uniform((-110, -40, -10), (110, 110, 130), (20000, 3))
     # Half of them close to the volume.
-    near = np.argsort(np.abs(bp.clearance(points, ZOO)[:, k]))[:200]
+    near = np.argsort(np.abs(optics.clearance(points, ZOO)[:, k]))[:200]
     points = np.concatenate([points, *(points[near] + rng.normal(0, 3, (200, 3)),) * 20])
     points[20000:] += rng.normal(0.0, 2.0, (4000, 3))
-    signed = bp.clearance(points, ZOO)[:, k]
+    signed = optics.clearance(points, ZOO)[:, k]
     assert np.array_equal(signed < 0.0, _inside(ZOO[k], points))
     assert 100 < (signed < 0.0).sum() < 20000
 
@@ -63,11 +64,13 @@ def test_clearance_is_a_distance(k: int) -> None:
     """A ball of that radius does not reach the surface; one a little larger does."""
     rng = np.random.default_rng(10 + k)
     points = rng.uniform((-110, -40, -10), (110, 110, 130), (300, 3))
-    signed = bp.clearance(points, ZOO)[:, k]
+    signed = optics.clearance(points, ZOO)[:, k]
     step = 1e-4
     slope = np.stack(
         [
-            (bp.clearance(points + step * e, ZOO) - bp.clearance(points - step * e, ZOO))[:, k]
+            (optics.clearance(points + step * e, ZOO) - optics.clearance(points - step * e, ZOO))[
+                :, k
+            ]
             for e in np.eye(3)
         ],
         axis=-1,
@@ -78,17 +81,17 @@ def test_clearance_is_a_distance(k: int) -> None:
     smooth = steepness > 1.0 - 1e-6
     assert smooth.mean() > 0.9
     foot = points - signed[:, None] * slope
-    assert np.abs(bp.clearance(foot[smooth], ZOO)[:, k]).max() < 1e-4
+    assert np.abs(optics.clearance(foot[smooth], ZOO)[:, k]).max() < 1e-4
 
 
-def _beam(origin: tuple[float, ...], aim: tuple[float, ...], **shape: float) -> bp.Beams:
-    return bp.beams(origin, aim, Mirrors.of(2.0, 2.0, **shape))
+def _beam(origin: tuple[float, ...], aim: tuple[float, ...], **shape: float) -> optics.Beams:
+    return optics.beams(origin, aim, Mirrors.of(2.0, 2.0, **shape))
 
 
 def test_entry_into_a_ball_by_hand() -> None:
     # The beam's edge: r = √2 + (4.65 + 5) mrad · t; the ball's centre is 10 m off the axis.
     ball = Sphere("ball", (10.0, 500.0, 0.0), 4.0)
-    entry = bp.enter(_beam((0, 0, 0), (0, 1, 0)), [ball])
+    entry = optics.find_entries(_beam((0, 0, 0), (0, 1, 0)), [ball])
     t = float(entry.first[0, 0])
 
     def gap(t: float) -> float:
@@ -100,18 +103,22 @@ def test_entry_into_a_ball_by_hand() -> None:
     assert abs(gap(float(entry.last[0, 0]))) < 2e-3
     assert entry.last[0, 0] > 500.0
     # Without the spread it passes.
-    narrow = bp.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 2.0, error=0.0))
-    assert not bp.enter(narrow, [Sphere("ball", (10.0, 500.0, 0.0), 4.0)]).entered[0, 0]
+    narrow = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 2.0, error=0.0))
+    assert not optics.find_entries(narrow, [Sphere("ball", (10.0, 500.0, 0.0), 4.0)]).entered[0, 0]
 
 
 def test_beams_end_at_their_reach_and_begin_at_the_mirror() -> None:
     ball = [Sphere("ball", (0.0, 200.0, 0.0), 5.0)]
     mirror = Mirrors.of(2.0, 2.0)
-    ahead = bp.beams((0, 0, 0), (0, 100, 0), mirror, reach=190.0)
-    assert not bp.enter(ahead, ball).entered.any()
-    assert bp.enter(bp.beams((0, 0, 0), (0, 100, 0), mirror, reach=195.0), ball).entered.all()
-    assert not bp.enter(bp.beams((0, 0, 0), (0, -100, 0), mirror), ball).entered.any()
-    inside = bp.enter(bp.beams((0, 200, 0), (0, 300, 0), mirror), ball)
+    ahead = optics.beams((0, 0, 0), (0, 100, 0), mirror, reach=190.0)
+    assert not optics.find_entries(ahead, ball).entered.any()
+    assert optics.find_entries(
+        optics.beams((0, 0, 0), (0, 100, 0), mirror, reach=195.0), ball
+    ).entered.all()
+    assert not optics.find_entries(
+        optics.beams((0, 0, 0), (0, -100, 0), mirror), ball
+    ).entered.any()
+    inside = optics.find_entries(optics.beams((0, 200, 0), (0, 300, 0), mirror), ball)
     assert inside.first[0, 0] == 0.0
 
 
@@ -121,8 +128,8 @@ def test_entries_agree_with_points_of_the_beam(focus: float) -> None:
     rng = np.random.default_rng(3)
     origin = rng.uniform((-120, -120, 2), (120, -60, 4), (40, 3))
     aim = rng.uniform((-60, -40, 0), (60, 60, 90), (40, 3))
-    given_ = bp.beams(origin, aim, Mirrors.of(3.0, 2.0, focus=focus, error=1e-9), reach=300.0)
-    entered = bp.enter(given_, ZOO).entered
+    given_ = optics.beams(origin, aim, Mirrors.of(3.0, 2.0, focus=focus, error=1e-9), reach=300.0)
+    entered = optics.find_entries(given_, ZOO).entered
     # Rays: any point of the mirror, bent to the focus, plus any direction within the sun.
     rays = 150
     tangent = rng.normal(size=(40, rays, 3))
@@ -148,32 +155,34 @@ def test_entries_agree_with_points_of_the_beam(focus: float) -> None:
 
 def test_strength_is_that_of_the_focus_if_it_lies_in_the_volume() -> None:
     mirror = Mirrors.of(10.0, 10.0, focus=300.0, reflectivity=0.9, error=0.0)
-    given_ = bp.beams((0, 0, 0), (0, 300, 0), mirror)
+    given_ = optics.beams((0, 0, 0), (0, 300, 0), mirror)
     volumes = [Box("at focus", (0, 300, 0), (50, 60, 50)), Box("far", (0, 900, 0), (50, 60, 50))]
-    strength = bp.enter(given_, volumes, dni=900.0).irradiance[0]
+    strength = optics.find_entries(given_, volumes, dni=900.0).irradiance[0]
     # The solid reaches a radius ahead of its section, so the entry counts a little earlier.
-    line = bp.concentration(np.linspace(270.0, 330.0, 4001), 100.0, 300.0).max()
-    ahead = bp.concentration(np.linspace(260.0, 330.0, 4001), 100.0, 300.0).max()
+    line = optics.concentration(np.linspace(270.0, 330.0, 4001), 100.0, 300.0).max()
+    ahead = optics.concentration(np.linspace(260.0, 330.0, 4001), 100.0, 300.0).max()
     assert 900.0 * 0.9 * line <= strength[0] <= 900.0 * 0.9 * ahead
-    peak = bp.enter(given_, [Box("all", (0, 300, 0), (50, 500, 50))], dni=900.0).irradiance
-    whole = bp.concentration(np.linspace(1.0, 600.0, 100_001), 100.0, 300.0).max()
+    peak = optics.find_entries(
+        given_, [Box("all", (0, 300, 0), (50, 500, 50))], dni=900.0
+    ).irradiance
+    whole = optics.concentration(np.linspace(1.0, 600.0, 100_001), 100.0, 300.0).max()
     assert peak[0, 0] == pytest.approx(900.0 * 0.9 * whole, rel=1e-4)
     # Behind the focus C = (x/b − 1)⁻²: at the face, 870 m, 1/1.9²; the solid, 21 m wide, is
     # there a radius earlier.
     assert 900.0 * 0.9 / 1.9**2 < strength[1] < 900.0 * 0.9 / 1.8**2
-    assert bp.enter(given_, [Sphere("aside", (0, 0, 80), 1)]).irradiance[0, 0] == 0.0
+    assert optics.find_entries(given_, [Sphere("aside", (0, 0, 80), 1)]).irradiance[0, 0] == 0.0
 
 
 def test_concentration_by_hand() -> None:
     # Flat: never more than one sun; far away R² / (x β)².
-    assert bp.concentration(5.0, 4.0, math.inf) == 1.0
-    far = bp.concentration(2000.0, 4.0, math.inf)
+    assert optics.concentration(5.0, 4.0, math.inf) == 1.0
+    far = optics.concentration(2000.0, 4.0, math.inf)
     assert far == pytest.approx((4.0 / math.pi) / (2000.0 * 4.65e-3) ** 2)
     # In the focus the mirror is all sun: area over image area.
-    at_focus = bp.concentration(300.0, 100.0, 300.0)
+    at_focus = optics.concentration(300.0, 100.0, 300.0)
     assert at_focus == pytest.approx(100.0 / (math.pi * (300.0 * 4.65e-3) ** 2))
     # Half-way a beam of half the diameter is four suns.
-    assert bp.concentration(150.0, 100.0, 300.0) == pytest.approx(4.0)
+    assert optics.concentration(150.0, 100.0, 300.0) == pytest.approx(4.0)
 
 
 # Motion
@@ -194,16 +203,16 @@ def test_motion_misses_nothing_that_fine_samples_find() -> None:
     field, start, goal = _field(80, seed=5)
     mirrors = Mirrors.of(3.0, 2.0, focus=150.0)
     path = np.stack([start, goal], axis=1)
-    motion = bp.move(field.armature, path, SUN, mirrors, ZOO, reach=400.0)
+    motion = optics.sweep(field.armature, path, SUN, mirrors, ZOO, reach=400.0)
     found = np.zeros((80, len(ZOO)), dtype=bool)
     first = np.full((80, len(ZOO)), np.inf)
     for share in np.linspace(0.0, 1.0, 401):
         normal, vertex = field.armature.pose(start + share * (goal - start))
         cosine = normal @ SUN
-        beam = bp.Beams(
+        beam = optics.Beams(
             vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(80), np.full(80, 400.0)
         )
-        now = bp.enter(beam, ZOO).entered & (cosine > 0.0)[:, None]
+        now = optics.find_entries(beam, ZOO).entered & (cosine > 0.0)[:, None]
         first = np.where(now & ~found, share, first)
         found |= now
     assert found.sum() > 25
@@ -223,11 +232,12 @@ def test_a_flash_between_two_samples_is_found() -> None:
     sun = direction(0.0, 0.4)
     mirror = Mirrors.of(0.2, 0.2, error=0.0)
     angles = np.radians([[-40.0, 11.46], [40.0, 11.46]])
-    motion = bp.move(mechanism.armature, angles, sun, mirror, [pole])
+    motion = optics.sweep(mechanism.armature, angles, sun, mirror, [pole])
     assert motion.entered[0, 0]
     coarse = [
-        bp.enter(
-            bp.Beams(v[None], (2 * (n @ sun) * n - sun)[None], mirror, np.array([3000.0])), [pole]
+        optics.find_entries(
+            optics.Beams(v[None], (2 * (n @ sun) * n - sun)[None], mirror, np.array([3000.0])),
+            [pole],
         ).entered.any()
         for n, v in (
             mechanism.armature.pose(angles[0] + s * (angles[1] - angles[0]))
@@ -242,7 +252,8 @@ def test_a_finer_resolution_only_removes_entries() -> None:
     path = np.stack([start, goal], axis=1)
     mirrors = Mirrors.of(3.0, 2.0)
     coarse, fine = (
-        bp.move(field.armature, path, SUN, mirrors, ZOO, resolution=r).entered for r in (0.05, 1e-3)
+        optics.sweep(field.armature, path, SUN, mirrors, ZOO, resolution=r).entered
+        for r in (0.05, 1e-3)
     )
     assert (coarse | ~fine).all()
     assert coarse.sum() > fine.sum()
@@ -254,8 +265,8 @@ def test_a_mirror_that_shows_its_back_sends_no_beam() -> None:
     everything = [Sphere("all", (0.0, 0.0, 0.0), 500.0)]
     mirrors = Mirrors.of(3.0, 3.0)
     noon = direction(0.0, math.radians(80.0))
-    assert not bp.move(mechanism.armature, down, noon, mirrors, everything).entered.any()
-    assert bp.move(mechanism.armature, -down, noon, mirrors, everything).entered.all()
+    assert not optics.sweep(mechanism.armature, down, noon, mirrors, everything).entered.any()
+    assert optics.sweep(mechanism.armature, -down, noon, mirrors, everything).entered.all()
 
 
 def test_a_grazing_beam_at_the_end_of_a_turn_is_found() -> None:
@@ -266,21 +277,21 @@ def test_a_grazing_beam_at_the_end_of_a_turn_is_found() -> None:
     # The normal passes the plane across the sun's direction at an elevation of −30°.
     turn = np.radians([[0.0, -33.4], [0.0, -27.7]])
     mirrors = Mirrors.of(2.0, 2.0)
-    assert bp.move(mechanism.armature, turn, noon, mirrors, behind).entered.all()
+    assert optics.sweep(mechanism.armature, turn, noon, mirrors, behind).entered.all()
     back = np.radians([[0.0, -36.0], [0.0, -30.5]])
-    assert not bp.move(mechanism.armature, back, noon, mirrors, behind).entered.any()
+    assert not optics.sweep(mechanism.armature, back, noon, mirrors, behind).entered.any()
 
 
 def test_a_path_of_one_pose_is_that_pose() -> None:
     field, start, _ = _field(40, seed=9)
     mirrors = Mirrors.of(3.0, 2.0)
-    motion = bp.move(field.armature, start[:, None], SUN, mirrors, ZOO)
+    motion = optics.sweep(field.armature, start[:, None], SUN, mirrors, ZOO)
     normal, vertex = field.armature.pose(start)
     cosine = normal @ SUN
-    beam = bp.Beams(
+    beam = optics.Beams(
         vertex, 2 * cosine[:, None] * normal - SUN, mirrors.broadcast(40), np.full(40, 3000.0)
     )
-    rest = bp.enter(beam, ZOO)
+    rest = optics.find_entries(beam, ZOO)
     lit = cosine > 0.0
     assert lit.sum() > 20
     assert np.array_equal(motion.entered[lit], rest.entered[lit])
@@ -297,10 +308,10 @@ RECEIVER = Sphere("receiver", (0.0, 0.0, 50.0), 5.0)
 FOOT, STANDBY = (14.0, 0.0, 0.0), (14.0, 0.0, 48.0)
 
 
-def _way(volumes: tuple[Volume, ...], east: float = 30.0) -> bp.Way:
+def _way(volumes: tuple[Volume, ...], east: float = 30.0) -> optics.Way:
     mechanism = kinds.azimuth_elevation((east, -80.0, 0.0), pivot_height=2.0, pivot_offset=0.2)
     noon = direction(math.radians(190.0), math.radians(55.0))
-    return bp.safe_way(
+    return optics.safe_way(
         mechanism.armature, (0.0, math.pi / 2), noon, FOOT, STANDBY, Mirrors.of(2.0, 2.0), volumes
     )
 
@@ -339,9 +350,9 @@ def test_the_way_leaves_the_tower_aside_where_straight_ahead_is_not_clear() -> N
     straight = track(mechanism, sun, (70.0, 0.0, 0.0))
     goal = straight.chosen(straight.angles)
     path = np.array([[goal[0], math.pi / 2], goal])
-    assert bp.move(mechanism.armature, path, sun, mirror, [RECEIVER]).entered.any()
+    assert optics.sweep(mechanism.armature, path, sun, mirror, [RECEIVER]).entered.any()
     foot, standby = (14.0, 3.0, 0.0), (14.0, 12.0, 48.0)
-    way = bp.safe_way(mechanism.armature, stow, sun, foot, standby, mirror, [RECEIVER])
+    way = optics.safe_way(mechanism.armature, stow, sun, foot, standby, mirror, [RECEIVER])
     assert way.clear, way.text
     ahead = way.aims[0] - place
     assert abs(math.degrees(math.atan2(ahead[1], -ahead[0]))) > 15.0
@@ -366,7 +377,7 @@ def test_aims_out_of_reach_are_told() -> None:
     short = direct(min_angle=-0.2, max_angle=0.2)
     high = direct(min_angle=0.0, max_angle=1.6)
     drives = Drive(np.stack([short.table, high.table]))
-    way = bp.safe_way(
+    way = optics.safe_way(
         mechanism.armature,
         (0.0, 1.57),
         direction(1.5, 0.6),
@@ -405,21 +416,21 @@ def _shining(
 def test_crossing_agrees_with_sampled_mirrors(focus: float, off: float) -> None:
     rng = np.random.default_rng(11)
     mirror = Mirrors.of(2.0, 2.0, focus=focus)
-    given_ = bp.beams((0, 0, 0), (0, 1, 0), mirror)
+    given_ = optics.beams((0, 0, 0), (0, 1, 0), mirror)
     point = np.array([off, 100.0, 0.0])
-    found = bp.crossing(given_, point)
-    wanted = _shining(math.sqrt(4.0 / math.pi), focus, point, rng, bp.SUN_HALF_ANGLE)
+    found = optics.crossing(given_, point)
+    wanted = _shining(math.sqrt(4.0 / math.pi), focus, point, rng, optics.SUN_RADIUS)
     assert found.concentration[0, 0] == pytest.approx(wanted, abs=0.03)
 
 
 @pytest.mark.parametrize("focus", [math.inf, 150.0, 60.0])
 def test_no_light_is_lost_or_made(focus: float) -> None:
     """Over a section of the beam the concentration adds up to the mirror's area."""
-    given_ = bp.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 1.5, focus=focus))
+    given_ = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 1.5, focus=focus))
     line = np.linspace(-4.0, 4.0, 161)
     x, z = np.meshgrid(line, line)
     points = np.stack([x, np.full_like(x, 120.0), z], axis=-1).reshape(-1, 3)
-    total = bp.crossing(given_, points).concentration.sum() * (line[1] - line[0]) ** 2
+    total = optics.crossing(given_, points).concentration.sum() * (line[1] - line[0]) ** 2
     assert total == pytest.approx(3.0, rel=0.01)
 
 
@@ -427,12 +438,12 @@ def test_crossing_sums_the_beams_that_are_there() -> None:
     origin = np.array([[0.0, -100.0, 0.0], [20.0, -100.0, 0.0], [-20.0, -100.0, 0.0]])
     aims = np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 40.0], [300.0, 0.0, 40.0]])
     mirrors = Mirrors.of(2.0, 2.0, reflectivity=[1.0, 0.5, 1.0])
-    here = bp.crossing(
-        bp.beams(origin, aims, mirrors), [[0.0, 0.0, 40.0], [0.0, 0.0, 90.0]], dni=800.0
+    here = optics.crossing(
+        optics.beams(origin, aims, mirrors), [[0.0, 0.0, 40.0], [0.0, 0.0, 90.0]], dni=800.0
     )
     assert here.count.tolist() == [2, 0]
     slant = math.hypot(100.0, 40.0), math.sqrt(100**2 + 40**2 + 20**2)
-    each = [float(bp.concentration(s, 4.0, math.inf)) for s in slant]
+    each = [float(optics.concentration(s, 4.0, math.inf)) for s in slant]
     assert here.irradiance[0] == pytest.approx(800.0 * (each[0] + 0.5 * each[1]))
     assert here.irradiance[1] == 0.0
 
@@ -441,9 +452,9 @@ def test_crossing_sums_the_beams_that_are_there() -> None:
 def test_beside_the_axis_it_is_never_stronger(
     size: float, focus: float, distance: float, off: float
 ) -> None:
-    given_ = bp.beams((0, 0, 0), (0, 1, 0), Mirrors.of(size, size, focus=focus))
-    found = bp.crossing(given_, (off, distance, 0.0)).concentration[0, 0]
-    axis = float(bp.concentration(distance, size * size, focus))
+    given_ = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(size, size, focus=focus))
+    found = optics.crossing(given_, (off, distance, 0.0)).concentration[0, 0]
+    axis = float(optics.concentration(distance, size * size, focus))
     assert 0.0 <= found <= axis * (1.0 + 1e-6) + 1e-9 or abs(1 - distance / focus) < 2e-4
 
 
@@ -465,24 +476,24 @@ def test_what_cannot_be_is_refused() -> None:
         (lambda: Mirrors.of(1.0, 1.0, error=0.6), "an error must be from 0 to 0.5 rad"),
         (lambda: Mirrors.of(np.ones((2, 2)), 1.0), "give numbers or"),
         (lambda: Mirrors.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: 2 for 3 beams"),
-        (lambda: bp.beams((0, 0, 0), (0, 0, 0), Mirrors.of(1, 1)), "length 0 has no direction"),
-        (lambda: bp.beams(np.zeros((2, 2, 3)), (0, 1, 0), Mirrors.of(1, 1)), "give .N, 3."),
-        (lambda: bp.beams((0, 0, 0), (0, 1, 0), Mirrors.of(1, 1), reach=-1.0), "reach -1.0 m"),
+        (lambda: optics.beams((0, 0, 0), (0, 0, 0), Mirrors.of(1, 1)), "length 0 has no direction"),
+        (lambda: optics.beams(np.zeros((2, 2, 3)), (0, 1, 0), Mirrors.of(1, 1)), "give .N, 3."),
+        (lambda: optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(1, 1), reach=-1.0), "reach -1.0 m"),
     )
     for call, text in refusals:
         with pytest.raises(InputError, match=text):
             call()
     arm, mirror = kinds.azimuth_elevation((0, 0, 0)).armature, Mirrors.of(1, 1)
     with pytest.raises(InputError, match="give finite joint angles"):
-        bp.move(arm, (0.0, 1.0), SUN, mirror, ZOO)
+        optics.sweep(arm, (0.0, 1.0), SUN, mirror, ZOO)
     with pytest.raises(InputError, match=r"resolution 0\.0 rad must be above 0"):
-        bp.move(arm, [(0.0, 1.0)], SUN, mirror, ZOO, resolution=0.0)
+        optics.sweep(arm, [(0.0, 1.0)], SUN, mirror, ZOO, resolution=0.0)
     many = kinds.azimuth_elevation(np.zeros((2, 3))).armature
     with pytest.raises(InputError, match="3 paths for 2 heliostats"):
-        bp.move(many, np.zeros((3, 2, 2)), SUN, mirror, ZOO)
+        optics.sweep(many, np.zeros((3, 2, 2)), SUN, mirror, ZOO)
     with pytest.raises(InputError, match="give one heliostat"):
-        bp.safe_way(many, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO)
+        optics.safe_way(many, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO)
     with pytest.raises(InputError, match="give the 2 joint angles"):
-        bp.safe_way(arm, (0, 1, 2), SUN, FOOT, STANDBY, mirror, ZOO)
+        optics.safe_way(arm, (0, 1, 2), SUN, FOOT, STANDBY, mirror, ZOO)
     with pytest.raises(InputError, match=r"first_distance 0\.0 m must be above 0"):
-        bp.safe_way(arm, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO, first_distance=0.0)
+        optics.safe_way(arm, (0, 1), SUN, FOOT, STANDBY, mirror, ZOO, first_distance=0.0)

@@ -5,10 +5,10 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.field.example import prototype, roughly_installed
-from heliotrope.field.image import image_offsets, target_offsets
 from heliotrope.geometry import MRAD, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
+from heliotrope.optics import image_offsets, target_offsets
 
 AIM = np.array([0.0, 0.0, 13.0])
 UPRIGHT = (direct(), direct(min_angle=-0.1, max_angle=1.65))

@@ -19,8 +19,7 @@ from heliotrope.geometry import normalize
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import Outcome, Statistics
 from heliotrope.links.messages import Alarm, Ask, Lease, Status, encode
-from heliotrope.optics.flux import air_loss, predicted
-from heliotrope.optics.intercept import intercept_rectangle
+from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.log import Logbook
 from heliotrope.plant.operations.operations import WorkSettings
@@ -45,7 +44,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 def test_a_beam_along_the_axis_has_the_known_intercept_and_power() -> None:
     vertex, light = np.array([[0.0, -200.0, 60.0]]), normalize(np.array([0.0, 1.0, 1.0]))
-    view = predicted(RECEIVER, vertex, RECEIVER.center[None], [5.0], [2e-3], sun=light)
+    view = predict_flux(RECEIVER, vertex, RECEIVER.center[None], [5.0], [2e-3], sun=light)
     sigma = 200.0 * math.sqrt(2.325e-3**2 + (2 * 1e-3) ** 2 + (2 * 2e-3 / math.sqrt(2)) ** 2)
     assert view.intercept == pytest.approx(float(intercept_rectangle(6.0, 5.0, sigma)), abs=1e-5)
     # The ray goes north and the sun is 45° above it: the mirror sees it under 22.5°.
@@ -59,7 +58,7 @@ def test_a_beam_along_the_axis_has_the_known_intercept_and_power() -> None:
 
 def test_an_oblique_beam_is_as_wide_as_rays_say() -> None:
     vertex, light = np.array([[90.0, -80.0, 2.0]]), normalize(np.array([0.2, -0.5, 0.8]))
-    view = predicted(RECEIVER, vertex, RECEIVER.center[None], [5.0], [1e-3], sun=light)
+    view = predict_flux(RECEIVER, vertex, RECEIVER.center[None], [5.0], [1e-3], sun=light)
     ray = normalize(RECEIVER.center - vertex[0])
     slant = float(np.linalg.norm(RECEIVER.center - vertex[0]))
     sigma = slant * math.sqrt(2.325e-3**2 + 4e-6 + 2e-6)
@@ -80,7 +79,7 @@ def test_the_map_is_mirrored_with_the_aim(right: float, up: float, error: float)
     light = normalize(np.array([0.0, -0.6, 0.8]))
     vertex = np.array([[0.0, -150.0, 60.0]])
     views = [
-        predicted(
+        predict_flux(
             RECEIVER, vertex, RECEIVER.center + [[side * right, 0.0, up]], [5.0], [error], sun=light
         )
         for side in (1.0, -1.0)
@@ -91,20 +90,22 @@ def test_the_map_is_mirrored_with_the_aim(right: float, up: float, error: float)
 
 def test_light_that_is_none() -> None:
     light = normalize(np.array([0.0, -0.6, 0.8]))
-    nothing = predicted(RECEIVER, np.empty((0, 3)), np.empty((0, 3)), [], [], sun=light)
+    nothing = predict_flux(RECEIVER, np.empty((0, 3)), np.empty((0, 3)), [], [], sun=light)
     assert nothing.power == 0.0
     assert math.isnan(nothing.intercept)
     assert not nothing.flux.any()
-    behind = predicted(
+    behind = predict_flux(
         RECEIVER, [[0.0, 100.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=light
     )
     assert behind.heliostats == 0
-    night = predicted(RECEIVER, [[0.0, -100.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=-UP)
+    night = predict_flux(
+        RECEIVER, [[0.0, -100.0, 2.0]], RECEIVER.center[None], [5.0], [0.0], sun=-UP
+    )
     assert night.power == 0.0
     with pytest.raises(InputError, match="2 vertices, 1 aims"):
-        predicted(RECEIVER, np.zeros((2, 3)), np.zeros((1, 3)), [1.0], [0.0], sun=UP)
-    with pytest.raises(InputError, match=r"a reflectivity of 1\.5"):
-        predicted(
+        predict_flux(RECEIVER, np.zeros((2, 3)), np.zeros((1, 3)), [1.0], [0.0], sun=UP)
+    with pytest.raises(InputError, match=r"the reflectivity 1\.5"):
+        predict_flux(
             RECEIVER,
             [[0.0, -9.0, 2.0]],
             RECEIVER.center[None],

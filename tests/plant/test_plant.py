@@ -11,6 +11,7 @@ import pytest
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype
+from heliotrope.field.volumes import Sphere
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.in_process import Faults
@@ -29,7 +30,6 @@ from heliotrope.links.messages import (
 )
 from heliotrope.mechanism.board_items import Axis, Machine, Wanted, items_of
 from heliotrope.mechanism.tracking import track
-from heliotrope.optics.keep_out import Sphere
 from heliotrope.plant.audit import AuditError, read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from heliotrope.field.example import prototype
+from heliotrope.field.volumes import Sphere
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
 from heliotrope.mechanism.tracking import track
-from heliotrope.optics.keep_out import Sphere
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from heliotrope.geometry import MRAD, FloatArray, angle_between, direction, wrap_signed
-from heliotrope.mechanism.azel import (
+from heliotrope.mechanism.guo import (
     GuoParameters,
     forward,
     from_malan,

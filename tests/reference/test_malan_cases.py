@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from heliotrope.field.image import image_offsets
 from heliotrope.geometry import direction, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import direct
+from heliotrope.optics import image_offsets
 from reference.cases import OWN, params
 
 # The file gives (zenith, east, north).

@@ -13,7 +13,7 @@ from hypothesis.stateful import (
 
 from heliotrope.lcu import states, ticks, wire
 from heliotrope.links.clock import gps_seconds
-from heliotrope.sun.line import sun_values
+from heliotrope.sun import broadcast_values
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import RECEIVER, outfits, sha256
@@ -77,7 +77,7 @@ class Deadlines(RuleBasedStateMachine):
     @rule()
     def second(self) -> None:
         self.time()
-        values = sun_values(int(self.gps), START.timestamp() + self.ms / 1000.0, SITE)
+        values = broadcast_values(int(self.gps), START.timestamp() + self.ms / 1000.0, SITE)
         assert values is not None
         self.hear("SUN", *values)
         # A second sun of the same second renews nothing.

@@ -12,8 +12,7 @@ from heliotrope.links.clock import gps_seconds
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.sun import vector
-from heliotrope.sun.line import sun_values
+from heliotrope.sun import broadcast_values, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import (
     CAUSES,
@@ -125,7 +124,7 @@ class Both:
 
     def second(self) -> None:
         gps = round(gps_seconds(START)) + self.ticks // 20
-        values = sun_values(gps, START.timestamp() + self.ticks / 20, SITE)
+        values = broadcast_values(gps, START.timestamp() + self.ticks / 20, SITE)
         assert values is not None
         self.hear(self.sender.session(TOKEN))
         week, second = divmod(gps, 604_800)
@@ -260,7 +259,7 @@ def test_flux_follows_the_beams() -> None:
     def shine(seconds: int, *, lit: bool = True) -> None:
         nonlocal second
         for _ in range(seconds):
-            values = sun_values(second, START.timestamp() + second - gps_seconds(START), SITE)
+            values = broadcast_values(second, START.timestamp() + second - gps_seconds(START), SITE)
             assert values is not None
             if lit:
                 field.take_sun(values)
@@ -293,7 +292,7 @@ def test_lost_steps_are_in_the_mirrors_and_not_in_the_counts() -> None:
     made = Both().field.mechanism
     perfect, lossy = field_of(made), field_of(made, miss=0.2, seed=8)
     second = round(gps_seconds(START))
-    values = sun_values(second, START.timestamp(), SITE)
+    values = broadcast_values(second, START.timestamp(), SITE)
     assert values is not None
     moved = np.zeros((COUNT, 2))
     for field in (perfect, lossy):
@@ -325,7 +324,7 @@ def test_the_wind_turns_the_mirrors_of_a_field() -> None:
     calm, windy = field_of(made), field_of(made, wind=wind)
     # At stow a mirror is nearly edge on: its normal is off the zenith by its imperfections alone.
     assert np.abs(calm.normals() - windy.normals()).max() < 0.1e-3
-    values = sun_values(round(gps_seconds(START)), START.timestamp(), SITE)
+    values = broadcast_values(round(gps_seconds(START)), START.timestamp(), SITE)
     assert values is not None
     for field in (calm, windy):
         field.take_sun(values)
@@ -346,7 +345,7 @@ def test_the_wind_turns_the_mirrors_of_a_field() -> None:
 
 def test_without_a_supply_nothing_is_heard() -> None:
     field = Both().field
-    values = sun_values(round(gps_seconds(START)), START.timestamp(), SITE)
+    values = broadcast_values(round(gps_seconds(START)), START.timestamp(), SITE)
     assert values is not None
     field.cut(np.array([1]))
     field.take_sun(values)

@@ -56,7 +56,7 @@ from heliotrope.links.messages import (
     encode,
 )
 from heliotrope.safety.evaluation import Act, Role
-from heliotrope.sun.line import sun_values
+from heliotrope.sun import broadcast_values
 
 #: Of TIME on the wire.
 _QUALITIES = ("none", "gps", "holdover", "system")
@@ -144,7 +144,7 @@ class Cluster:
         )
         self._asked = Asked(config, self.nodes, self._exchange, self._reports, clock.monotonic)
         # The first call loads the libraries, which takes longer than a second may.
-        sun_values(0, present.utc_s if self._epoch_of_time else 0.0, config.site)
+        broadcast_values(0, present.utc_s if self._epoch_of_time else 0.0, config.site)
         self._started = now
         self._number = 0  # of the second
         self._next = 0  # whom the last round did not reach
@@ -291,7 +291,7 @@ class Cluster:
         if sound and not self._watch.verdict.dark and not self._watch.alone(now):
             second = round(present.gps_s - self.config.phase)
             utc_s = present.utc_s - (present.gps_s - second)
-            values = sun_values(second, utc_s, self.config.site)
+            values = broadcast_values(second, utc_s, self.config.site)
             if values is not None:
                 await exchange.broadcast("SUN", *values)
 

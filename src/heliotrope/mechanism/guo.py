@@ -33,6 +33,7 @@ from heliotrope.geometry import (
     as_float,
     as_vectors,
     bisector,
+    common_shape,
     direction,
     normalize,
     rotation,
@@ -112,7 +113,7 @@ class GuoParameters:
             array = _numbers(value, f"Guo's parameter {field.name}").copy()
             array.flags.writeable = False
             object.__setattr__(self, field.name, array)
-        _common_shape(**vars(self))
+        common_shape(**vars(self))
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +225,7 @@ def mirror_normal(
     _refuse(distance == 0.0, "to_target", lambda _: at_pivot)
     s, t = normalize(sun, "sun"), normalize(target, "to_target")
     height = _numbers(offset, "offset")
-    shape = _common_shape(to_target=t[..., 0], sun=s[..., 0], offset=height)
+    shape = common_shape(to_target=t[..., 0], sun=s[..., 0], offset=height)
     distance, height = np.broadcast_to(distance, shape), np.broadcast_to(height, shape)
     _refuse(
         np.abs(height) >= distance,
@@ -277,7 +278,7 @@ def forward(alpha: npt.ArrayLike, gamma: npt.ArrayLike, parameters: GuoParameter
     """
     p = parameters
     a, g = _numbers(alpha, "alpha"), _numbers(gamma, "gamma")
-    _common_shape(alpha=a, gamma=g, **vars(p))
+    common_shape(alpha=a, gamma=g, **vars(p))
     a, g = a + p.elevation_zero, g + p.azimuth_zero
     x = np.sin(p.mu) * np.cos(p.tau_1) - np.cos(p.mu) * np.sin(a) * np.sin(p.tau_1)
     y = np.cos(p.mu) * np.cos(a)
@@ -312,7 +313,7 @@ def angles(normal: npt.ArrayLike, parameters: GuoParameters) -> GuoTracking:
     """
     p = parameters
     n = normalize(normal, "normal")
-    shape = _common_shape(normal=n[..., 0], **vars(p))
+    shape = common_shape(normal=n[..., 0], **vars(p))
     tau_1, mu = np.broadcast_to(p.tau_1, shape), np.broadcast_to(p.mu, shape)
     _refuse(
         np.abs(np.cos(mu) * np.cos(tau_1)) < LEAST_COSINE,
@@ -481,7 +482,7 @@ def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
         if name not in _HELIOTROPE_NAMES:
             raise UnknownNameError("parameter of Guo's model", name, _HELIOTROPE_NAMES)
     v = {name: _numbers(values.get(name, 0.0), name) for name in _HELIOTROPE_NAMES}
-    _common_shape(**v)
+    common_shape(**v)
     tilt_north, tilt_east = v["tilt_north"], v["tilt_east"]
     east = np.sin(tilt_east)
     north = np.cos(tilt_east) * np.sin(tilt_north)
@@ -562,7 +563,7 @@ def axis_accuracy(
     values = (measured_alpha, measured_gamma, ideal_alpha, ideal_gamma, azimuth_weight)
     names = ("measured_alpha", "measured_gamma", "ideal_alpha", "ideal_gamma", "azimuth_weight")
     given = {k: _numbers(v, k) for k, v in zip(names, values, strict=True)}
-    shape = _common_shape(**given)
+    shape = common_shape(**given)
     if not shape or shape[-1] < 2:
         raise InputError(f"axis accuracy: shape {shape}; the last axis must hold 2 or more")
     alpha, gamma, alpha_i, gamma_i, weight = (np.broadcast_to(a, shape) for a in given.values())
@@ -623,14 +624,6 @@ def _numbers(value: npt.ArrayLike, name: str) -> FloatArray:
         raise InputError(f"{name}: {value!r} is not an array of numbers") from None
     _refuse(~np.isfinite(array), name, lambda i: f"{array[i]} is not finite; give a number")
     return array
-
-
-def _common_shape(**arrays: FloatArray) -> tuple[int, ...]:
-    try:
-        return np.broadcast_shapes(*(a.shape for a in arrays.values()))
-    except ValueError:
-        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
-        raise InputError(f"shapes do not broadcast together: {shapes}") from None
 
 
 def _refuse(

@@ -1,1 +1,114 @@
-"""Light: beams, their images and flux, keep-out volumes, glare."""
+"""Light between the sun, the mirrors and what they shine on.
+
+- `beam`: the sun's angular radius, the width of a beam and its strength along its axis. Every other
+  module takes these from there.
+- `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
+- `intercept` and `flux`: the share of a beam, and the flux of a field, on a receiver.
+- `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation; its
+  kernels stand in `render_kernels`.
+- `keep_out` and `glare`: beams that enter forbidden volumes, and the hazard to eyes.
+
+Begin with `image_offsets` for a tracking error, `predict_flux` for a receiver.
+"""
+
+from heliotrope.optics.beam import (
+    CHI_SQUARE_90,
+    NOMINAL_DNI,
+    REACH,
+    SUN_RADIUS,
+    SUN_SIGMA,
+    Beams,
+    Crossing,
+    ExpectedError,
+    Mirrors,
+    beam_sigma,
+    beams,
+    concentration,
+    crossing,
+    mean_concentration,
+)
+from heliotrope.optics.flux import CELLS, FluxView, air_loss, predict_flux
+from heliotrope.optics.glare import (
+    DAYLIGHT,
+    Eye,
+    Glare,
+    GlareMap,
+    Hazard,
+    glare_at,
+    glare_map,
+    glare_of_many,
+    glare_of_one,
+    safe_distance,
+    safe_range,
+)
+from heliotrope.optics.intercept import intercept_circle, intercept_rectangle
+from heliotrope.optics.keep_out import (
+    Entries,
+    Sweep,
+    Way,
+    clearance,
+    find_entries,
+    ground_way,
+    safe_way,
+    sweep,
+)
+from heliotrope.optics.mirror_image import (
+    Beam,
+    equal_facets,
+    flat_top_beam,
+    gaussian_beam,
+    reflected_beam,
+    sun_profile,
+)
+from heliotrope.optics.offsets import ImageOffsets, image_offsets, target_offsets
+
+__all__ = [
+    "CELLS",
+    "CHI_SQUARE_90",
+    "DAYLIGHT",
+    "NOMINAL_DNI",
+    "REACH",
+    "SUN_RADIUS",
+    "SUN_SIGMA",
+    "Beam",
+    "Beams",
+    "Crossing",
+    "Entries",
+    "ExpectedError",
+    "Eye",
+    "FluxView",
+    "Glare",
+    "GlareMap",
+    "Hazard",
+    "ImageOffsets",
+    "Mirrors",
+    "Sweep",
+    "Way",
+    "air_loss",
+    "beam_sigma",
+    "beams",
+    "clearance",
+    "concentration",
+    "crossing",
+    "equal_facets",
+    "find_entries",
+    "flat_top_beam",
+    "gaussian_beam",
+    "glare_at",
+    "glare_map",
+    "glare_of_many",
+    "glare_of_one",
+    "ground_way",
+    "image_offsets",
+    "intercept_circle",
+    "intercept_rectangle",
+    "mean_concentration",
+    "predict_flux",
+    "reflected_beam",
+    "safe_distance",
+    "safe_range",
+    "safe_way",
+    "sun_profile",
+    "sweep",
+    "target_offsets",
+]

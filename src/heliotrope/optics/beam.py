@@ -1,4 +1,14 @@
-"""Mirrors and their beams: how strong they are along their axes, beside them, together."""
+r"""Beams: the sun's angular radius, the width of a beam, and its strength along its axis.
+
+Every other module takes these from here. There are two models of a beam:
+
+- `beam_sigma` gives the standard deviation of a Gaussian beam, for what falls on a receiver. The
+  angular variances of the sun's disk, of the mirror's slope and of the tracking add up; a mirror
+  doubles the latter two:
+  $σ_{beam}^2 = σ_{sun}^2 + (2 σ_{slope})^2 + (2 σ_{tracking})^2$.
+- `Mirrors` and `Beams` describe a solid that surely holds the beam, for what must stay dark:
+  keep-out volumes and eyes.
+"""
 
 from dataclasses import dataclass
 
@@ -6,32 +16,87 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
+from heliotrope.geometry import FloatArray, as_float, as_vectors, common_shape, normalize
 
-#: Half of the angle under which the sun's disk is seen, rad.
-SUN_HALF_ANGLE = 4.65e-3
-#: How far beams are followed where nothing else is said, m.
+#: Angular radius of the sun's disk, rad.
+SUN_RADIUS = 4.65e-3
+#: Standard deviation per axis of a uniform solar disk, rad: half of its radius.
+SUN_SIGMA = 0.5 * SUN_RADIUS
+#: Default distance up to which a beam is followed, m.
 REACH = 3000.0
-#: Direct normal irradiance that irradiances count with where none is given, W/m².
-SUN = 1000.0
+#: Default direct normal irradiance, W/m².
+NOMINAL_DNI = 1000.0
 #: Squared distance within which 90 % of a two-dimensional Gaussian lie, χ² with two degrees of
 #: freedom.
 CHI_SQUARE_90 = 2.0 * float(np.log(10.0))
 
 
+def beam_sigma(
+    slant: npt.ArrayLike,
+    *,
+    tracking: npt.ArrayLike = 0.0,
+    slope: npt.ArrayLike = 0.0,
+    sun_shape: npt.ArrayLike = SUN_SIGMA,
+) -> FloatArray:
+    """Return the standard deviation per axis of a beam on a plane across it, m, (...).
+
+    Parameters
+    ----------
+    slant
+        Distance from mirror to aperture, m, (...).
+    tracking, slope
+        Standard deviations per axis of the *normal*, of the whole mirror and over its
+        surface, rad, (...). Each counts twice in the beam.
+    sun_shape
+        Standard deviation per axis of the sun's disk, rad, (...).
+
+    Raises
+    ------
+    InputError
+        If a value is negative or not finite, the slant is 0, or shapes do not broadcast.
+
+    Notes
+    -----
+    The mirror is taken as focused on the aperture, so its size adds nothing, and its
+    astigmatism away from normal incidence is left out. Malan (3.2), reconstructed.
+    """
+    d = checked("slant", slant, "m", positive=True)
+    t = checked("tracking", tracking, "rad")
+    s = checked("slope", slope, "rad")
+    sun = checked("sun_shape", sun_shape, "rad")
+    common_shape(slant=d, tracking=t, slope=s, sun_shape=sun)
+    return as_float(d * np.sqrt(sun**2 + (2.0 * s) ** 2 + (2.0 * t) ** 2))
+
+
+def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = False) -> FloatArray:
+    """Return ``value`` as an array if it is finite and not negative.
+
+    Raises
+    ------
+    InputError
+        If a number is not finite, negative, or 0 where ``positive`` is set.
+    """
+    given = as_float(value)
+    wrong = ~(np.isfinite(given) & ((given > 0.0) if positive else (given >= 0.0)))
+    if wrong.any():
+        limit = "above 0" if positive else "0 or more"
+        raise InputError(f"{name}: {given[wrong].flat[0]:g} {unit} must be {limit} and finite")
+    return given
+
+
 @dataclass(frozen=True)
 class Mirrors:
-    """What a beam's shape depends on, for N mirrors.
+    """The properties of N mirrors that shape their beams.
 
     Attributes
     ----------
     width, height
-        Of the mirror, m, (N,).
+        m, (N,).
     focus
         Focal distance of canting and curvature together, m, (N,); infinite if flat.
     error
-        Half angle added to the sun's: all that may turn or widen the beam (slope, tracking,
-        the sun's motion meanwhile), as a bound, rad, (N,).
+        Bound on everything that turns or widens the beam beyond the sun's radius (slope,
+        tracking, the sun's motion meanwhile), half angle, rad, (N,).
     reflectivity
         (N,).
     """
@@ -105,10 +170,10 @@ class Mirrors:
     @property
     def spread(self) -> FloatArray:
         """Half angle of the solid that holds the beam, rad, (N,)."""
-        return SUN_HALF_ANGLE + self.error
+        return SUN_RADIUS + self.error
 
     def broadcast(self, count: int) -> "Mirrors":
-        """Return ``count`` mirrors; one mirror stands for all."""
+        """Return ``count`` mirrors, repeating a single one."""
         if len(self) not in (1, count):
             raise InputError(f"mirrors: {len(self)} for {count} beams; give one, or one for each")
         return Mirrors(
@@ -122,7 +187,19 @@ class Mirrors:
 
 @dataclass(frozen=True)
 class Beams:
-    """N beams: where they leave, whereto (unit), of which mirrors, followed how far (m)."""
+    """N beams.
+
+    Attributes
+    ----------
+    origin
+        ENU, m, (N, 3).
+    direction
+        Unit vectors, ENU, (N, 3).
+    mirrors
+        N mirrors.
+    reach
+        Distance up to which each beam is followed, m, (N,).
+    """
 
     origin: FloatArray
     direction: FloatArray
@@ -147,7 +224,7 @@ def beams(
     Raises
     ------
     InputError
-        If shapes do not fit, or an aim lies in its vertex.
+        If shapes do not fit, or an aim coincides with its vertex.
     """
     origin = np.atleast_2d(as_vectors(vertex, "vertex"))
     way = np.atleast_2d(as_vectors(aim, "aim")) - origin
@@ -166,7 +243,7 @@ def concentration(
     distance: npt.ArrayLike,
     area: npt.ArrayLike,
     focus: npt.ArrayLike,
-    half_angle: npt.ArrayLike = SUN_HALF_ANGLE,
+    half_angle: npt.ArrayLike = SUN_RADIUS,
 ) -> FloatArray:
     """Return the irradiance on a beam's axis over that on the mirror times reflectivity.
 
@@ -174,9 +251,8 @@ def concentration(
     From a point at distance x the part of the mirror within √(area/π) and within
     x β / |1 − x/b| of its centre shows the sun, at the sun's radiance, so C is the square of
     min(√(area/π) / (x β), 1 / |1 − x/b|). Ho et al. give the mean over the beam's section,
-    which is less everywhere (:func:`heliotrope.optics.glare.mean_concentration`). An oblique
-    mirror may be up to that much stronger near its line foci as the radiance allows: the
-    first of the two terms bounds it.
+    which is less everywhere (`mean_concentration`). An oblique mirror may be stronger near its
+    line foci, up to the limit that the sun's radiance sets: the first of the two terms.
 
     Parameters
     ----------
@@ -195,18 +271,41 @@ def concentration(
     return as_float(np.minimum(radius / (x * as_float(half_angle)), 1.0 / gap) ** 2)
 
 
+def mean_concentration(
+    distance: npt.ArrayLike,
+    area: npt.ArrayLike,
+    focus: npt.ArrayLike,
+    half_angle: npt.ArrayLike = SUN_RADIUS,
+) -> FloatArray:
+    """Return the mean over a beam's section of its irradiance over that on the mirror.
+
+    The estimate of Ho, Ghanbari and Diver (2011) for specular reflection by a focused mirror:
+    mirror area over beam area, C = (|1 − x/b| + x β / R)⁻², R being the radius of a disk of
+    the mirror's area.
+    Eyes are judged by the irradiance on the axis, which is larger.
+
+    Parameters
+    ----------
+    distance, area, focus, half_angle
+        As for `concentration`.
+    """
+    x = as_float(distance)
+    radius = np.sqrt(as_float(area) / np.pi)
+    return as_float((np.abs(1.0 - x / as_float(focus)) + x * as_float(half_angle) / radius) ** -2)
+
+
 @dataclass(frozen=True)
 class Crossing:
-    """What N beams do together at P points.
+    """The light of N beams at P points.
 
     Attributes
     ----------
     concentration
-        Of each beam there, as :func:`concentration`, (P, N).
+        Concentration of each beam, (P, N).
     irradiance
         Sum over the beams, W/m², on a surface that faces each of them, (P,).
     count
-        How many beams are there, (P,).
+        Number of beams that reach the point, (P,).
     """
 
     concentration: FloatArray
@@ -214,12 +313,12 @@ class Crossing:
     count: npt.NDArray[np.int64]
 
 
-def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = SUN) -> Crossing:
+def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI) -> Crossing:
     """Return the irradiance of all beams at points (P, 3), such as standby points.
 
-    Of a mirror that is a disk with an ideal focus the part is seen to shine that lies within
-    x β / |1 − x/b| of d / |1 − x/b|, d being the point's distance from the axis: two disks,
-    whose common area is known in closed form. On the axis it is :func:`concentration`.
+    The mirror is a disk with an ideal focus. From a point at distance d from the axis, the part
+    of it within x β / |1 − x/b| of d / |1 − x/b| shines: two disks, whose common area is known in
+    closed form. On the axis the result is that of `concentration`.
     """
     p = np.atleast_2d(as_vectors(points, "points"))
     to = p[:, None, :] - given.origin
@@ -228,11 +327,11 @@ def crossing(given: Beams, points: npt.ArrayLike, *, dni: float = SUN) -> Crossi
     mirrors = given.mirrors
     lit = (along > 0.0) & (along <= given.reach)
     x = np.where(lit, along, 1.0)
-    # Closer to the focus the seen disk is so large that nothing changes any more.
+    # Closer to the focus the seen disk covers the mirror anyway.
     gap = np.maximum(np.abs(1.0 - x / mirrors.focus), 1e-4)
     radius = np.broadcast_to(np.sqrt(mirrors.area / np.pi), x.shape)
-    seen = _common_area(radius, x * SUN_HALF_ANGLE / gap, off / gap)
-    each = np.where(lit, seen / (np.pi * (x * SUN_HALF_ANGLE) ** 2), 0.0)
+    seen = _common_area(radius, x * SUN_RADIUS / gap, off / gap)
+    each = np.where(lit, seen / (np.pi * (x * SUN_RADIUS) ** 2), 0.0)
     total = dni * (each @ mirrors.reflectivity)
     return Crossing(each, total, np.count_nonzero(each > 0.0, axis=1))
 
@@ -273,9 +372,9 @@ class ExpectedError:
 
 
 def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
-    """Return the area that disks of radii r and s share whose centres are d apart."""
+    """Return the common area of two disks with radii r and s and centres d apart."""
     small = np.minimum(r, s)
-    # Concentric disks take the branch of one inside the other.
+    # For concentric disks the branch of one inside the other counts.
     safe = np.maximum(d, 1e-9)
     a = np.clip((d * d + r * r - s * s) / (2.0 * safe * r), -1.0, 1.0)
     b = np.clip((d * d + s * s - r * r) / (2.0 * safe * s), -1.0, 1.0)
@@ -286,7 +385,7 @@ def _common_area(r: FloatArray, s: FloatArray, d: FloatArray) -> FloatArray:
 
 
 def reaches(reach: npt.ArrayLike, count: int) -> FloatArray:
-    """Check the reach of each beam, m: one number, or one for each of `count` beams."""
+    """Return the reach of each beam, m, (count,), from one number or one for each beam."""
     given = as_float(reach)
     if not (np.isfinite(given) & (given > 0.0)).all() or given.shape not in ((), (1,), (count,)):
         raise InputError(f"reach {reach!r} m: give numbers above 0, one or one for each beam")

@@ -1,20 +1,20 @@
-r"""The light that a field is expected to bring to a receiver: a map, its power, the intercept.
+r"""The flux that a field is expected to bring to a receiver: a map, its power, the intercept.
 
-A beam is a Gaussian about its aim. Its width follows from sun, mirror, and how well the mirror
-is calibrated (:func:`heliotrope.optics.intercept.beam_sigma`). Across the ray it is round; on the
-aperture, which the ray with components :math:`d_r, d_u` meets under the cosine c, its variances are
+A beam is a Gaussian about its aim, as wide as the sun, the mirror and the mirror's calibration make
+it (`beam_sigma`). Across the ray it is round. On the aperture, which the ray with components
+$d_r, d_u$ meets at an angle of cosine c, its variances are
 
-.. math:: σ_r^2 = σ^2 (1 + (d_r / c)^2), \qquad σ_u^2 = σ^2 (1 + (d_u / c)^2),
+$$σ_r^2 = σ^2 (1 + (d_r / c)^2), \qquad σ_u^2 = σ^2 (1 + (d_u / c)^2),$$
 
-and the correlation of the two axes is left out: then each cell's share is a product, and a field
-of 10,000 beams is one product of two matrices. The power of a beam is
+and the correlation of the two axes is left out: then each cell's share is a product, and the map of
+a field of 10,000 beams is one product of two matrices. The power of a beam is
 
-.. math:: P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),
+$$P = A \, E \, ρ \, \sqrt{(1 + s·t)/2} \, (1 - l(d)),$$
 
 with the loss l in clear air after Vittitoe and Biggs as in DELSOL3 (Kistler 1986):
-:math:`l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3`, d in km. Shading and blocking of
-neighbours are left out, and so is the shape of the sun's limb. A receiver that is no plane is
-shown by the plane of its aperture.
+$l = 0.006789 + 0.1046 d - 0.017 d^2 + 0.002845 d^3$, d in km. Shading and blocking by neighbours
+are left out, and so is the shape of the sun's limb. A curved receiver is represented by the plane
+of its aperture.
 """
 
 from dataclasses import dataclass
@@ -25,24 +25,25 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.target import Receiver
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize
-from heliotrope.optics.intercept import beam_sigma
+from heliotrope.optics.beam import beam_sigma
+from heliotrope.optics.intercept import intercept_rectangle
 
-#: Cells across and up.
+#: Default number of cells across and up.
 CELLS = (24, 24)
-#: The map is wider than the aperture by this factor: what misses it is to be seen.
+#: Width of the map over that of the aperture, so that it shows the spillage too.
 MARGIN = 1.5
 
 
 @dataclass(frozen=True)
 class FluxView:
-    """Predicted light on a receiver.
+    """The predicted flux on a receiver.
 
     Attributes
     ----------
     receiver
         Name.
     right, up
-        Middles of the cells, m from the centre of the aperture as seen from the field, (W,), (H,).
+        Centres of the cells, m from the centre of the aperture as seen from the field, (W,), (H,).
     flux
         W/m², (H, W), lowest row first.
     power
@@ -50,7 +51,7 @@ class FluxView:
     intercept
         Share of the reflected light that falls into the aperture; NaN without beams.
     heliostats
-        Whose beams are counted.
+        Number of beams counted.
     """
 
     receiver: str
@@ -63,12 +64,12 @@ class FluxView:
 
 
 def air_loss(distance: npt.ArrayLike) -> FloatArray:
-    """Return the share of the light that clear air takes on a way in m; see the head."""
+    """Return the share of the light that clear air absorbs and scatters over a distance in m."""
     d = 1e-3 * as_float(distance)
     return as_float(np.clip(0.006789 + 0.1046 * d - 0.017 * d**2 + 0.002845 * d**3, 0.0, 1.0))
 
 
-def predicted(
+def predict_flux(
     receiver: Receiver,
     vertices: npt.ArrayLike,
     aims: npt.ArrayLike,
@@ -81,33 +82,33 @@ def predicted(
     slope: float = 1e-3,
     cells: tuple[int, int] = CELLS,
 ) -> FluxView:
-    """Return the light of N beams that are on a receiver.
+    """Return the flux of N beams on a receiver.
 
     Parameters
     ----------
     receiver
         Its aperture is taken as the rectangle of its width and height.
     vertices, aims
-        Of the mirrors, and where their beams go, ENU, m, (N, 3).
+        Mirror vertices and aim points, ENU, m, (N, 3).
     areas
-        Of the mirrors, m², (N,).
+        Mirror areas, m², (N,).
     error
-        Standard deviation of the normals, two-dimensional, rad, (N,).
+        Two-dimensional standard deviation of the normals, rad, (N,).
     sun
         Unit vector, (3,).
     dni
         W/m².
     reflectivity
-        A share.
+        0 to 1.
     slope
         Standard deviation of the mirrors' surface per axis, rad.
     cells
-        Across and up.
+        Number across and up.
 
     Raises
     ------
     InputError
-        If shapes do not fit, or numbers are out of their range.
+        If shapes do not fit or a number is out of range.
     """
     places = as_vectors(np.reshape(as_float(vertices), (-1, 3)), "vertices")
     points = as_vectors(np.reshape(as_float(aims), (-1, 3)), "aims")
@@ -115,11 +116,11 @@ def predicted(
     if not len(places) == len(points) == len(area) == len(sigma):
         raise InputError(
             f"flux: {len(places)} vertices, {len(points)} aims, {len(area)} areas and "
-            f"{len(sigma)} errors; give as many of each"
+            f"{len(sigma)} errors; give the same number of each"
         )
     if not (np.isfinite(dni) and dni >= 0.0 and 0.0 <= reflectivity <= 1.0):
         raise InputError(
-            f"flux: {dni} W/m² and a reflectivity of {reflectivity}: 0 or more, 0 to 1"
+            f"flux: {dni} W/m² must be 0 or more and the reflectivity {reflectivity} from 0 to 1"
         )
     light = as_vectors(sun, "sun")
     right, up, normal = _axes(receiver)
@@ -133,20 +134,22 @@ def predicted(
     with np.errstate(invalid="ignore", divide="ignore"):
         ray = way / slant[:, None]
     cosine = -(ray @ normal)
-    # What comes from behind, or along the plane, is no light in it.
+    # Beams from behind, or nearly along the plane, do not enter the aperture.
     good = np.isfinite(cosine) & (cosine > 0.05) & (light[2] > 0.0)
     ray, slant, cosine = ray[good], slant[good], cosine[good]
     narrow = beam_sigma(np.maximum(slant, 1e-3), tracking=sigma[good] / np.sqrt(2.0), slope=slope)
     power = area[good] * dni * reflectivity * np.sqrt(np.maximum(0.0, 0.5 * (1.0 + ray @ light)))
     power = power * (1.0 - air_loss(slant))
     off = points[good] - receiver.center
-    shares, inside = [], np.ones(len(power))
-    for axis, edge, side in zip((right, up), edges, size, strict=True):
-        wide = narrow * np.sqrt(1.0 + ((ray @ axis) / cosine) ** 2)
-        at = (off @ axis)[:, None]
-        shares.append(np.diff(_below((edge - at) / wide[:, None]), axis=-1))
-        half = 0.5 * side * np.array([-1.0, 1.0])
-        inside = inside * np.diff(_below((half - at) / wide[:, None]), axis=-1)[:, 0]
+    wide = [narrow * np.sqrt(1.0 + ((ray @ axis) / cosine) ** 2) for axis in (right, up)]
+    at = [off @ axis for axis in (right, up)]
+    shares = [
+        np.diff(_below((edge - center[:, None]) / width[:, None]), axis=-1)
+        for edge, center, width in zip(edges, at, wide, strict=True)
+    ]
+    inside = intercept_rectangle(
+        receiver.width, receiver.height, wide[0], sigma_up=wide[1], right=at[0], up=at[1]
+    )
     flux = (shares[1] * power[:, None]).T @ shares[0]
     cell = (edges[0][1] - edges[0][0]) * (edges[1][1] - edges[1][0])
     total, caught = float(power.sum()), float(power @ inside)
@@ -166,14 +169,14 @@ def _axes(receiver: Receiver) -> tuple[FloatArray, FloatArray, FloatArray]:
     normal = normalize(receiver.normal)
     level = np.cross(np.array([0.0, 0.0, 1.0]), normal)
     if np.linalg.norm(level) < 1e-6:
-        # An aperture that looks straight down or up has no right of its own: east.
+        # For an aperture that faces straight down or up, right is east.
         level = np.array([1.0, 0.0, 0.0])
     right = normalize(level)
     return right, np.asarray(np.cross(normal, right)), normal
 
 
 def _below(z: FloatArray) -> FloatArray:
-    """Return the share of a normal distribution below z; single precision is plenty for a map."""
+    """Return the share of a normal distribution below z, in single precision: plenty for a map."""
     from scipy import special
 
     return np.asarray(special.ndtr(z.astype(np.float32)), dtype=np.float64)

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
-from heliotrope.optics.beam import SUN, SUN_HALF_ANGLE, Beams, crossing
+from heliotrope.optics.beam import NOMINAL_DNI, SUN_RADIUS, Beams, crossing
 
 #: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and
 #: the angle from which on the irradiance alone counts, rad; 1 W/cm² there.
@@ -131,12 +131,12 @@ class Glare:
 
     @property
     def hazard(self) -> npt.NDArray[np.int8]:
-        """:class:`Hazard` as integers; reaching a threshold counts as beyond it."""
+        """`Hazard` as integers; reaching a threshold counts as beyond it."""
         worse = np.where(self.flash >= 1.0, Hazard.AFTER_IMAGE, Hazard.LOW)
         return np.asarray(np.where(self.burn >= 1.0, Hazard.DAMAGE, worse), dtype=np.int8)
 
 
-def glare(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
+def glare_of_one(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
     """Return the hazard of one source: corneal irradiance (W/m²) and subtended angle (rad)."""
     retinal = retinal_irradiance(corneal, subtended, eye)
     w = np.broadcast_to(as_float(subtended), retinal.shape)
@@ -180,7 +180,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     # More than the half space there is not; a smaller angle errs to the safe side.
     angle = np.minimum(np.sqrt(np.concatenate([room, corner_room[..., None]], axis=-1)), math.pi)
     dark = angle == 0.0
-    one = glare(every_light, np.where(dark, 1.0, angle), eye)
+    one = glare_of_one(every_light, np.where(dark, 1.0, angle), eye)
     total = np.sqrt(room[..., -1]) if e.shape[-1] else np.zeros(e.shape[:-1])
     return Glare(
         np.max(np.where(dark, 0.0, one.burn), axis=-1),
@@ -203,30 +203,8 @@ def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray
     return as_float(at), as_float(np.where(passes.any(axis=-1), wide, 0.0))
 
 
-def mean_concentration(
-    distance: npt.ArrayLike,
-    area: npt.ArrayLike,
-    focus: npt.ArrayLike,
-    half_angle: npt.ArrayLike = SUN_HALF_ANGLE,
-) -> FloatArray:
-    """Return the mean over a beam's section of its irradiance over that on the mirror.
-
-    Ho et al.'s estimate for specular reflection by a focused mirror: mirror area over
-    beam area, C = (|1 − x/b| + x β / R)⁻², R being the radius of a disk of the mirror's area.
-    Eyes are judged by the irradiance on the axis, which is larger.
-
-    Parameters
-    ----------
-    distance, area, focus, half_angle
-        As of :func:`heliotrope.optics.keep_out.concentration`.
-    """
-    x = as_float(distance)
-    radius = np.sqrt(as_float(area) / np.pi)
-    return as_float((np.abs(1.0 - x / as_float(focus)) + x * as_float(half_angle) / radius) ** -2)
-
-
 def glare_at(
-    given: Beams, points: npt.ArrayLike, *, dni: float = SUN, eye: Eye = DAYLIGHT
+    given: Beams, points: npt.ArrayLike, *, dni: float = NOMINAL_DNI, eye: Eye = DAYLIGHT
 ) -> Glare:
     """Return the hazard to an eye at points (P, 3) that looks into the beams.
 
@@ -236,14 +214,14 @@ def glare_at(
     _irradiance(dni)
     seen = crossing(given, points, dni=dni).concentration
     corneal = dni * given.mirrors.reflectivity * seen
-    return glare_of_many(corneal, 2.0 * SUN_HALF_ANGLE * np.sqrt(seen), eye)
+    return glare_of_many(corneal, 2.0 * SUN_RADIUS * np.sqrt(seen), eye)
 
 
 def safe_range(
     area: float,
     focus: float = math.inf,
     *,
-    dni: float = SUN,
+    dni: float = NOMINAL_DNI,
     reflectivity: float = 1.0,
     eye: Eye = DAYLIGHT,
 ) -> tuple[float, float]:
@@ -269,12 +247,12 @@ def safe_range(
             "must be above 0, reflectivity above 0 and at most 1"
         )
     image = reflectivity * dni * eye.pupil**2 * eye.transmission
-    gain = image / (4.0 * SUN_HALF_ANGLE**2 * eye.focal_length**2 * BURN)
+    gain = image / (4.0 * SUN_RADIUS**2 * eye.focal_length**2 * BURN)
     if gain * WIDE < 1.0:
         return 0.0, 0.0
     wide = 1.0 / gain
     # |1 − x/b| ≤ 2 β / ω bounds the distance from both sides, R / x ≥ ω / 2 from above.
-    slack = 2.0 * SUN_HALF_ANGLE / wide
+    slack = 2.0 * SUN_RADIUS / wide
     near = 0.0 if slack >= 1.0 else focus * (1.0 - slack)
     far = min(focus * (1.0 + slack), 2.0 * math.sqrt(area / math.pi) / wide)
     return (near, far) if far > near else (0.0, 0.0)
@@ -315,7 +293,7 @@ def glare_map(
     cells: int,
     *,
     normal: npt.ArrayLike = (0.0, 0.0, 1.0),
-    dni: float = SUN,
+    dni: float = NOMINAL_DNI,
     eye: Eye = DAYLIGHT,
 ) -> GlareMap:
     """Return the hazards on a square about a standby point.
@@ -361,13 +339,13 @@ def safe_distance(
     limit: Hazard = Hazard.DAMAGE,
     reach: float = 200.0,
     step: float = 0.5,
-    dni: float = SUN,
+    dni: float = NOMINAL_DNI,
     eye: Eye = DAYLIGHT,
 ) -> float:
     """Return the radius about a standby point beyond which no beam's axis reaches ``limit``.
 
     The axes of all beams are sampled on both sides of the point: there a beam is strongest.
-    Points between the axes are not; :func:`glare_map` looks at those.
+    Points between the axes are not; `glare_map` looks at those.
 
     Parameters
     ----------

@@ -1,70 +1,26 @@
-r"""Intercept ratio: the share of a heliostat's beam that falls into the receiver's aperture.
+r"""Intercept: the share of a heliostat's beam that falls into the receiver's aperture.
 
-The beam is taken as Gaussian. Its angular variance is that of the sun's disk plus that of
-the mirror's slope and of the tracking, both of which a mirror doubles:
+The beam is Gaussian, with the standard deviation σ of `beam_sigma` on the plane of the aperture.
+A centred circle of radius R takes up
 
-.. math:: σ_{beam}^2 = σ_{sun}^2 + (2 σ_{slope})^2 + (2 σ_{tracking})^2
+$$1 - \exp\left(-\frac{R^2}{2 σ^2}\right).$$
 
-On a plane at distance d it is :math:`d \, σ_{beam}` wide, and a centred circle of radius R
-takes up
-
-.. math:: 1 - \exp\left(-\frac{R^2}{2 d^2 σ_{beam}^2}\right).
-
-Source: Malan (3.2)-(3.3), reconstructed: his text was not at hand, and these are the two
-relations that the matter itself demands. All σ are standard deviations *per axis*; the
-two-dimensional RMS is √2 times as large.
+Source: Malan (3.3), reconstructed: his text was not at hand, and the relation follows from the
+Gaussian itself. Every σ is a standard deviation *per axis*; the two-dimensional RMS is √2 times as
+large.
 """
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray, as_float
-
-#: Per-axis standard deviation (rad) of a uniform solar disk of 4.65 mrad radius: half of it.
-SUN_SHAPE = 0.5 * 4.65e-3
+from heliotrope.geometry import FloatArray, as_float, common_shape
+from heliotrope.optics.beam import checked
 
 # Nodes of the integral over a circle, and how many σ of the beam it covers: what it leaves
 # out is 2e-17.
 _NODES = 128
 _REACH = 8.5
-
-
-def beam_sigma(
-    slant: npt.ArrayLike,
-    *,
-    tracking: npt.ArrayLike = 0.0,
-    slope: npt.ArrayLike = 0.0,
-    sun_shape: npt.ArrayLike = SUN_SHAPE,
-) -> FloatArray:
-    """Return the standard deviation per axis of a beam on a plane across it, m, (...).
-
-    Parameters
-    ----------
-    slant
-        Distance from mirror to aperture, m, (...).
-    tracking, slope
-        Standard deviations per axis of the *normal*, of the whole mirror and over its
-        surface, rad, (...). Each counts twice in the beam.
-    sun_shape
-        Standard deviation per axis of the sun's disk, rad, (...).
-
-    Raises
-    ------
-    InputError
-        If a value is negative or not finite, the slant is 0, or shapes do not broadcast.
-
-    Notes
-    -----
-    The mirror is taken as focused on the aperture, so its size adds nothing, and its
-    astigmatism away from normal incidence is left out. Malan (3.2), reconstructed.
-    """
-    d = _checked("slant", slant, "m", positive=True)
-    t = _checked("tracking", tracking, "rad")
-    s = _checked("slope", slope, "rad")
-    sun = _checked("sun_shape", sun_shape, "rad")
-    _together(slant=d, tracking=t, slope=s, sun_shape=sun)
-    return as_float(d * np.sqrt(sun**2 + (2.0 * s) ** 2 + (2.0 * t) ** 2))
 
 
 def intercept_circle(
@@ -83,7 +39,7 @@ def intercept_circle(
         Of the aperture, m, (...).
     sigma
         Standard deviation per axis of the beam on the aperture's plane, m, (...), as
-        :func:`beam_sigma` gives it; with ``sigma_up`` that of the horizontal axis.
+        `beam_sigma` gives it; with ``sigma_up`` that of the horizontal axis.
     sigma_up
         That of the other axis if the beam is elliptical, m, (...).
     right, up
@@ -102,16 +58,16 @@ def intercept_circle(
     are computed by one Gauss-Legendre integral: within 1e-10 up to R = 200 σ for elliptical
     beams, and for circular ones within 1e-11 of SciPy's ``chndtr``, which ends at R = 10⁵ σ.
     """
-    r = _checked("radius", radius, "m", positive=True)
-    s = _checked("sigma", sigma, "m", positive=True)
+    r = checked("radius", radius, "m", positive=True)
+    s = checked("sigma", sigma, "m", positive=True)
     x, y = _offset("right", right), _offset("up", up)
     if sigma_up is None:
-        _together(radius=r, sigma=s, right=x, up=y)
+        common_shape(radius=r, sigma=s, right=x, up=y)
         # A circular beam may be turned until its offset lies across the chords, where the
         # integral converges fastest.
         return _chords(r, s, s, np.zeros(()), as_float(np.hypot(x, y)))
-    s_up = _checked("sigma_up", sigma_up, "m", positive=True)
-    _together(radius=r, sigma=s, sigma_up=s_up, right=x, up=y)
+    s_up = checked("sigma_up", sigma_up, "m", positive=True)
+    common_shape(radius=r, sigma=s, sigma_up=s_up, right=x, up=y)
     return _chords(r, s, s_up, x, y)
 
 
@@ -131,7 +87,7 @@ def intercept_rectangle(
     width, height
         Of the aperture, m, (...).
     sigma, sigma_up, right, up
-        As for :func:`intercept_circle`.
+        As for `intercept_circle`.
 
     Raises
     ------
@@ -142,12 +98,12 @@ def intercept_rectangle(
     -----
     The product of two one-dimensional shares, each a difference of error functions; exact.
     """
-    w = _checked("width", width, "m", positive=True)
-    h = _checked("height", height, "m", positive=True)
-    s = _checked("sigma", sigma, "m", positive=True)
-    s_up = s if sigma_up is None else _checked("sigma_up", sigma_up, "m", positive=True)
+    w = checked("width", width, "m", positive=True)
+    h = checked("height", height, "m", positive=True)
+    s = checked("sigma", sigma, "m", positive=True)
+    s_up = s if sigma_up is None else checked("sigma_up", sigma_up, "m", positive=True)
     x, y = _offset("right", right), _offset("up", up)
-    _together(width=w, height=h, sigma=s, sigma_up=s_up, right=x, up=y)
+    common_shape(width=w, height=h, sigma=s, sigma_up=s_up, right=x, up=y)
     return as_float(_within(0.5 * w, s, x) * _within(0.5 * h, s_up, y))
 
 
@@ -183,25 +139,8 @@ def _chords(
     return as_float(np.clip(0.5 * (last - first) * (share @ weights), 0.0, 1.0))
 
 
-def _checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = False) -> FloatArray:
-    given = as_float(value)
-    wrong = ~(np.isfinite(given) & ((given > 0.0) if positive else (given >= 0.0)))
-    if wrong.any():
-        limit = "above 0" if positive else "0 or more"
-        raise InputError(f"{name}: {given[wrong].flat[0]:g} {unit} must be {limit} and finite")
-    return given
-
-
 def _offset(name: str, value: npt.ArrayLike) -> FloatArray:
     given = as_float(value)
     if np.isinf(given).any():
         raise InputError(f"{name}: an offset is infinite; give metres, or NaN for no beam")
     return given
-
-
-def _together(**arrays: FloatArray) -> None:
-    try:
-        np.broadcast_shapes(*(a.shape for a in arrays.values()))
-    except ValueError:
-        shapes = ", ".join(f"{name} {a.shape}" for name, a in arrays.items() if a.ndim)
-        raise InputError(f"shapes do not broadcast together: {shapes}") from None

@@ -2,7 +2,7 @@
 
 A beam is followed as a solid of revolution about its axis that surely holds it: as wide as
 the mirror's diagonal, wider with the sun's half angle and a stated error, and wider again
-beyond the mirror's focus (see ``_beam_kernels``). "Clear" is therefore proven; "enters" means
+beyond the mirror's focus (see `_keep_out_kernels`). "Clear" is therefore proven; "enters" means
 that this solid comes within a millimetre of the volume. The solid is made of balls, so it
 reaches half a mirror's diagonal behind and before its ends: what lies within the swing of a
 mirror counts as entered. Nothing shades a beam here: neither the ground nor other mirrors nor
@@ -23,28 +23,18 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, track
 from heliotrope.optics import _keep_out_kernels as kernels
-from heliotrope.optics._volumes import packed
 from heliotrope.optics.beam import (
+    NOMINAL_DNI,
     REACH,
-    SUN,
-    SUN_HALF_ANGLE,
+    SUN_RADIUS,
     Beams,
-    Crossing,
     Mirrors,
-    beams,
     concentration,
-    crossing,
     reaches,
 )
 
-__all__ = [
-    "SUN_HALF_ANGLE", "Beams", "Box", "Crossing", "Cylinder", "Entries", "Mirrors", "Motion",
-    "Prism", "Sphere", "Volume", "Way", "beams", "clearance", "concentration", "crossing",
-    "enter", "ground_way", "move", "safe_way",
-]  # fmt: skip
-
-#: Finest turn of a beam that :func:`move` looks at, rad: half of the sun's disk.
-RESOLUTION = SUN_HALF_ANGLE
+#: Smallest turn of a beam that `sweep` resolves, rad: half of the sun's disk.
+RESOLUTION = SUN_RADIUS
 #: Turn of the line of sight between two waypoints of a safe way, rad.
 WAY_STEP = 0.02
 
@@ -52,7 +42,7 @@ WAY_STEP = 0.02
 def clearance(points: npt.ArrayLike, volumes: Sequence[Volume]) -> FloatArray:
     """Return signed distances (..., V) of points (..., 3) from volumes, m; negative inside."""
     p = as_vectors(points, "points")
-    table, corners = packed(volumes)
+    table, corners = _packed(volumes)
     flat = np.ascontiguousarray(p.reshape(-1, 3))
     out = np.empty((len(flat), len(volumes)))
     kernels.distances(table, corners, flat, out)
@@ -87,7 +77,7 @@ class Entries:
         return np.asarray(np.isfinite(self.first))
 
 
-def enter(given: Beams, volumes: Sequence[Volume], *, dni: float = SUN) -> Entries:
+def find_entries(given: Beams, volumes: Sequence[Volume], *, dni: float = NOMINAL_DNI) -> Entries:
     """Return where beams at rest enter volumes, and how strongly.
 
     Parameters
@@ -99,7 +89,7 @@ def enter(given: Beams, volumes: Sequence[Volume], *, dni: float = SUN) -> Entri
     dni
         Direct normal irradiance, W/m².
     """
-    table, corners = packed(volumes)
+    table, corners = _packed(volumes)
     shape = (len(given), len(volumes))
     first, last = np.empty(shape), np.empty(shape)
     radius, near, spread = given.mirrors.arrays()
@@ -125,14 +115,14 @@ def _strongest(mirrors: Mirrors, first: FloatArray, last: FloatArray, dni: float
     area, focus = mirrors.area[:, None], mirrors.focus[:, None]
     radius = np.sqrt(area / np.pi)
     # Up to here 1 / (1 − x/b) grows; from here on everything falls.
-    peak = radius / (SUN_HALF_ANGLE + radius / focus)
+    peak = radius / (SUN_RADIUS + radius / focus)
     at = np.maximum(np.clip(peak, first, np.fmax(first, last)), 1e-6)
     strength = dni * mirrors.reflectivity[:, None] * concentration(at, area, focus)
     return as_float(np.where(np.isfinite(first), strength, 0.0))
 
 
 @dataclass(frozen=True)
-class Motion:
+class Sweep:
     """Where the beams of N moving heliostats first enter V volumes; NaN where they are clear.
 
     Attributes
@@ -165,7 +155,7 @@ class Motion:
         return np.asarray(np.isfinite(self.at))
 
 
-def move(
+def sweep(
     armatures: Armature,
     path: npt.ArrayLike,
     sun: npt.ArrayLike,
@@ -174,11 +164,11 @@ def move(
     *,
     reach: npt.ArrayLike = REACH,
     resolution: float = RESOLUTION,
-    dni: float = SUN,
-) -> Motion:
+    dni: float = NOMINAL_DNI,
+) -> Sweep:
     """Return where beams enter volumes while the joints move along a path.
 
-    The whole path is proven, not samples of it: see ``_beam_kernels``. Where nothing can be
+    The whole path is proven, not samples of it: see `_keep_out_kernels`. Where nothing can be
     proven at the given resolution, the beam counts as entering.
 
     Parameters
@@ -216,7 +206,7 @@ def move(
     if not (np.isfinite(resolution) and resolution > 0.0):
         raise InputError(f"resolution {resolution} rad must be above 0")
     s = np.ascontiguousarray(np.broadcast_to(normalize(sun, "sun"), (count, 3)))
-    table, corners = packed(volumes)
+    table, corners = _packed(volumes)
     every = mirrors.broadcast(count)
     found = np.empty((count, len(volumes), 8))
     radius, near, spread = every.arrays()
@@ -235,7 +225,7 @@ def move(
     )
     first = found[..., 1]
     last = _leaving(found, table, corners, every, reaches(reach, count))
-    return Motion(
+    return Sweep(
         tuple(v.name for v in volumes),
         found[..., 0],
         first,
@@ -293,7 +283,7 @@ class Way:
     aims: FloatArray
     path: FloatArray
     clear: bool
-    motion: Motion
+    motion: Sweep
     text: str
 
     @property
@@ -405,7 +395,7 @@ def _verified(
     """Return the way over given aims with its check."""
     poses, status = _angles(armature, stow, aims, sun, drives)
     path = np.stack([stow, np.array([poses[0, 0], stow[1]]), *poses])
-    motion = move(armature, path, sun, mirrors, volumes, reach=reach)
+    motion = sweep(armature, path, sun, mirrors, volumes, reach=reach)
     blocked = np.flatnonzero(motion.entered[0])
     lost = np.flatnonzero(status != Status.OK)
     text = "every beam on the way is proven to stay out of every volume"
@@ -445,6 +435,45 @@ def _angles(
         before = angles[k] = options[best]
         status[k] = found.status[k, best]
     return angles, status
+
+
+def _packed(volumes: Sequence[Volume]) -> tuple[FloatArray, FloatArray]:
+    """Return the rows (V, SIZE) and corners (C, 2) that the kernels read of volumes."""
+    table = np.zeros((len(volumes), kernels.SIZE))
+    corners: list[FloatArray] = []
+    count = 0
+    for row, volume in zip(table, volumes, strict=True):
+        match volume:
+            case Sphere():
+                _head(row, kernels.SPHERE, as_float(volume.center), volume.radius)
+            case Box():
+                half = 0.5 * as_float(volume.size)
+                _head(row, kernels.BOX, as_float(volume.center), float(np.linalg.norm(half)))
+                row[5:8] = half
+                # To the right is (cos, −sin) of the azimuth, forwards (sin, cos).
+                row[8:10] = np.cos(volume.azimuth), -np.sin(volume.azimuth)
+            case Cylinder():
+                start, end = as_float(volume.start), as_float(volume.end)
+                length = float(np.linalg.norm(end - start))
+                bound = float(np.hypot(0.5 * length, volume.radius))
+                _head(row, kernels.CYLINDER, 0.5 * (start + end), bound)
+                row[5:8] = (end - start) / length
+                row[8:10] = 0.5 * length, volume.radius
+            case Prism():
+                given = as_float(volume.corners)
+                middle = 0.5 * (given.min(axis=0) + given.max(axis=0))
+                half_height = 0.5 * (volume.top - volume.bottom)
+                wide = float(np.linalg.norm(given - middle, axis=1).max())
+                center = np.array([*middle, 0.5 * (volume.top + volume.bottom)])
+                _head(row, kernels.PRISM, center, float(np.hypot(wide, half_height)))
+                row[5:8] = half_height, count, len(given)
+                corners.append(given)
+                count += len(given)
+    return table, np.concatenate(corners) if corners else np.empty((0, 2))
+
+
+def _head(row: FloatArray, kind: int, center: FloatArray, bound: float) -> None:
+    row[0], row[1:4], row[4] = kind, center, bound
 
 
 def _rows(array: FloatArray, count: int) -> FloatArray:

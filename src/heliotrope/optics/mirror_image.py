@@ -18,10 +18,11 @@ from heliotrope.geometry import (
     reflect,
     tangent_axes,
 )
+from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.optics.render_kernels import coverage
 
-#: Angular radius of the sun's disk, and where Buie's aureole ends, rad.
-SUN_RADIUS, AUREOLE_RADIUS = 4.65e-3, 43.6e-3
+#: Where Buie's aureole ends, rad.
+AUREOLE_RADIUS = 43.6e-3
 SUN_SHAPES = ("pillbox", "limb", "buie")
 
 #: A Gaussian is drawn to this many σ: beyond lie 4e-6 of a two-dimensional one.

@@ -1,12 +1,12 @@
-"""Where an imperfect heliostat throws its beam: the error model of Malan as a forward model.
+"""Image offsets: where an imperfect heliostat throws its beam, Malan's error model run forwards.
 
 A controller knows the *nominal* mechanism and moves the drives so that this one would send
-the sun to the aim. The *actual* mechanism, which has imperfections, stands at the same
-counts. Its beam misses the aim by what this module returns. Nothing here depends on the
-kind of mechanism or of imperfection: both are data of the chain.
+the sun to the aim. The *actual* mechanism, with its imperfections, stands at the same
+counts, and its beam misses the aim by the offsets that this module returns. Nothing here
+depends on the kind of mechanism or of imperfection: both are data of the chain.
 
-Source: Malan, §4.2 (nine steps), for azimuth-elevation heliostats; his steps as readings
-of the chain stand in ``docs/explanation/malan.md``.
+Source: Malan, §4.2 (nine steps), for azimuth-elevation heliostats;
+`docs/explanation/malan.md` reads his steps as operations on the chain.
 """
 
 from dataclasses import dataclass
@@ -23,10 +23,10 @@ from heliotrope.mechanism.tracking import Status, track
 
 @dataclass(frozen=True)
 class ImageOffsets:
-    """Where beams cross the plane through the aim that is perpendicular to the line of sight.
+    """Where beams cross the plane through the aim perpendicular to the line of sight.
 
-    NaN stands where there is nothing to compare: the nominal mechanism cannot send the sun
-    to the aim, or the beam never reaches the plane.
+    NaN where the nominal mechanism cannot send the sun to the aim, or the beam never
+    reaches the plane.
 
     Attributes
     ----------
@@ -35,8 +35,7 @@ class ImageOffsets:
     slant
         Distance from the nominal vertex to the aim, m, (...).
     normal, beam
-        Unit normal of the actual mirror, and the direction that its beam takes, ENU,
-        (..., 3).
+        Unit normal of the actual mirror and direction of its beam, ENU, (..., 3).
     """
 
     right: FloatArray
@@ -54,8 +53,8 @@ class ImageOffsets:
     def beam_error(self) -> FloatArray:
         """Beam error to the right and upwards, rad, (..., 2).
 
-        Offset over slant range, as Malan divides; it is the tangent of the angle where the
-        heliostat stands where it should.
+        Offset over slant range, as Malan divides; for a heliostat at its nominal position
+        this is the tangent of the angle.
         """
         return np.stack([self.right / self.slant, self.up / self.slant], axis=-1)
 
@@ -66,7 +65,7 @@ class ImageOffsets:
         ----------
         axis
             Batch axes to average over, such as that of the times; default all. NaN are
-            left out, and the RMS of nothing is NaN.
+            left out; the RMS of no value is NaN.
         """
         square = (self.distance / self.slant) ** 2
         known = np.isfinite(square)
@@ -79,7 +78,7 @@ class ImageOffsets:
 def image_offsets(
     nominal: Mechanism, actual: Mechanism, sun: npt.ArrayLike, aim: npt.ArrayLike
 ) -> ImageOffsets:
-    """Return where the beams of actual heliostats fall that are driven as nominal ones.
+    """Return where the beams of actual heliostats fall when driven as nominal ones.
 
     All batch shapes broadcast: a day of suns with one heliostat, (times, 1) suns with
     (heliostats,) mechanisms, or one nominal mechanism with many actual ones.
@@ -87,9 +86,9 @@ def image_offsets(
     Parameters
     ----------
     nominal
-        What the controller believes.
+        The mechanism that the controller assumes.
     actual
-        What is there: a mechanism of the same kind, as ``nominal.with_parameters`` gives it.
+        The real mechanism, of the same kind: ``nominal.with_parameters(...)``.
     sun
         Unit vectors to the sun, ENU, (..., 3).
     aim
@@ -103,12 +102,12 @@ def image_offsets(
 
     Notes
     -----
-    Of two poses that reach the aim the controller takes the one within the stops of the
+    If two poses reach the aim, the controller takes the one within the stops of the
     nominal drives. An azimuth-elevation mechanism without stops may go over the top,
-    where an elevation bias acts the other way round.
+    where the sign of an elevation bias is reversed.
 
-    Malan, §4.2 with (4.26) resolved: +right and +up are those of someone who stands at the
-    heliostat and looks at the aim. Accuracy: 1e-13 m at 40 m against an independent
+    Malan, §4.2 with (4.26) resolved: +right and +up are as seen from the
+    heliostat, looking at the aim. Accuracy: 1e-13 m at 40 m against an independent
     implementation of his model.
     """
     towards, pose, beam = _stand(nominal, actual, sun, as_vectors(aim, "aim"))
@@ -137,12 +136,12 @@ def target_offsets(
     target: Target,
     aim: npt.ArrayLike | None = None,
 ) -> FloatArray:
-    """Return where the same beams fall on a real target, as its camera sees them.
+    """Return where these beams fall on a real target, as a camera sees them.
 
     Parameters
     ----------
     nominal, actual, sun
-        As for :func:`image_offsets`, with its errors.
+        As for `image_offsets`, with its errors.
     target
         The target whose plane they fall on.
     aim
@@ -151,7 +150,7 @@ def target_offsets(
     Returns
     -------
     Metres to the right of and above the target's centre as seen from its front,
-    (..., 2). NaN as for :func:`image_offsets`, and where the beam comes from behind.
+    (..., 2). NaN as for `image_offsets`, and where the beam comes from behind.
     """
     point = target.center if aim is None else as_vectors(aim, "aim")
     _, pose, beam = _stand(nominal, actual, sun, point)

@@ -20,8 +20,7 @@ from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety.evaluation import Act
 from heliotrope.safety.proof import Reading, proof_readings
-from heliotrope.sun import Site
-from heliotrope.sun.line import sun_now
+from heliotrope.sun import Site, fast_vector
 
 #: Who was sent off the receiver shows it after this time at the latest, s.
 OFF_SHOWS = 10.0
@@ -91,7 +90,7 @@ class Sentinel:
         """Return what the plant itself knows for its rows."""
         if now - self._sun_at >= SUN_PERIOD:
             self._sun_at = now
-            self._sun = sun_now(self._clock.utc().timestamp(), self._site)
+            self._sun = fast_vector(self._clock.utc().timestamp(), self._site)
         order = self.order if self.on else None
         own = {
             **proof_readings(None if order is None else order.proof, now),

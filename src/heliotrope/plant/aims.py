@@ -12,9 +12,7 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, Tracking, track
-from heliotrope.optics.beam import crossing
-from heliotrope.optics.glare import Hazard, glare_at
-from heliotrope.optics.keep_out import Mirrors, beams, enter, move
+from heliotrope.optics import Hazard, Mirrors, beams, crossing, find_entries, glare_at, sweep
 
 #: How far a beam that nothing stops is followed, m.
 FAR = 3000.0
@@ -183,7 +181,7 @@ class BeamCheck:
         vertex = solved.chosen(solved.vertex)
         part = _rows_of(self.mirrors, rows)
         reach = np.linalg.norm(aims - vertex, axis=-1) if stopped else np.full(len(rows), FAR)
-        rest = enter(beams(vertex, aims, part, reach=reach), self.volumes)
+        rest = find_entries(beams(vertex, aims, part, reach=reach), self.volumes)
         self._tell(found, rows, rest.entered, rest.first, "at the aim")
         swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == Status.OK))
         if swept.size and sun[2] > 0.0:
@@ -281,7 +279,9 @@ class BeamCheck:
             points = _disc(vertices[k], aims[k], radius, apart)
             many = Mirrors(**{name: np.repeat(v, len(points), 0) for name, v in vars(part).items()})
             vertex = np.broadcast_to(vertices[k], points.shape)
-            rest = enter(beams(vertex, points, many, reach=np.full(len(points), FAR)), self.volumes)
+            rest = find_entries(
+                beams(vertex, points, many, reach=np.full(len(points), FAR)), self.volumes
+            )
             hit = np.flatnonzero(rest.entered.any(axis=-1))[:1]
             same = np.repeat(rows[k : k + 1], len(hit))
             self._tell(found, same, rest.entered[hit], rest.first[hit], "while it searches")
@@ -327,7 +327,7 @@ class BeamCheck:
         self, found: dict[str, str], rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
     ) -> None:
         armature, mirrors = Armature(self.armature.table[rows]), _rows_of(self.mirrors, rows)
-        motion = move(armature, path, sun, mirrors, self.volumes, reach=FAR)
+        motion = sweep(armature, path, sun, mirrors, self.volumes, reach=FAR)
         self._tell(found, rows, motion.entered, motion.distance, "on its way there")
 
     def _tell(

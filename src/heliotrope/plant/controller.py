@@ -57,7 +57,7 @@ from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety.evaluation import Act, Condition, conditions
-from heliotrope.sun.line import sun_now
+from heliotrope.sun import fast_vector
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
@@ -400,7 +400,7 @@ class PlantController:
 
     def sun_vector(self) -> FloatArray:
         """Return the unit vector to the sun now, ENU, (3,)."""
-        return sun_now(self._clock.utc().timestamp(), self.design.site)
+        return fast_vector(self._clock.utc().timestamp(), self.design.site)
 
     @property
     def clock(self) -> Clock:

@@ -1,9 +1,16 @@
-"""The sun: where it stands, as angles and as a vector, and when it rises and sets.
+"""The sun: its position as angles and as a vector, and when it rises and sets.
 
-`position`, `vector`, `events` and `daylight` take any number of times; `sun_at`, `sun_now` and
-`sun_values` follow the sun of one site second by second, as controllers broadcast it.
+Begin with `vector` (or `position` for the angles); `events` and `daylight` give the times of a day.
+These take any number of times. `vector_and_rate`, `fast_vector` and `broadcast_values` follow the
+sun of one site second by second, as cluster controllers broadcast it.
 """
 
+from heliotrope.sun.broadcast import (
+    LOWEST_BROADCAST,
+    broadcast_values,
+    fast_vector,
+    vector_and_rate,
+)
 from heliotrope.sun.ephemeris import (
     UPPER_LIMB,
     Site,
@@ -15,20 +22,19 @@ from heliotrope.sun.ephemeris import (
     position,
     vector,
 )
-from heliotrope.sun.line import HORIZON, sun_at, sun_now, sun_values
 
 __all__ = [
-    "HORIZON",
+    "LOWEST_BROADCAST",
     "UPPER_LIMB",
     "Site",
     "SunEvents",
     "SunPosition",
     "Times",
+    "broadcast_values",
     "daylight",
     "events",
+    "fast_vector",
     "position",
-    "sun_at",
-    "sun_now",
-    "sun_values",
     "vector",
+    "vector_and_rate",
 ]

@@ -10,7 +10,7 @@ from heliotrope.calibration.evaluation import Summary, summary
 from heliotrope.calibration.learn.learning import Learned, Prediction
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
-from heliotrope.mechanism.azel import AxisAccuracy, axis_accuracy
+from heliotrope.mechanism.guo import AxisAccuracy, axis_accuracy
 
 #: Heliostats with fewer sightings are shown but do not enter the overall figures.
 ENOUGH = 20

@@ -20,7 +20,7 @@ from heliotrope import sun
 from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
-from heliotrope.optics.flux import FluxView, predicted
+from heliotrope.optics import FluxView, predict_flux
 from heliotrope.plant.authority import Grant, Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
@@ -239,7 +239,7 @@ class Operations:
         receiver = self.design.receiver(name or self.receivers[0])
         now, known = self.plant.now(), self._flux.get(receiver.name)
         if known is None or now - known.at >= _FLUX_EVERY:
-            view = predicted(
+            view = predict_flux(
                 receiver, *self._frames.beams(receiver.name), sun=self.plant.sun_vector()
             )
             known = self._flux[receiver.name] = _Cached(now, view)

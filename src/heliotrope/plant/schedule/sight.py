@@ -12,13 +12,12 @@ from heliotrope.calibration.plan.planning import Limits
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, tangent_axes
+from heliotrope.optics import SUN_RADIUS
 
 #: The screening forgives so much: a pivot is not at the foot, rad.
 SLACK = float(np.radians(4.0))
 #: Neighbours that can shade or block a mirror.
 NEIGHBOURS = 32
-#: Half the angle that the sun is seen under, rad.
-SUN_RADIUS = 4.65e-3
 
 Mask = npt.NDArray[np.bool_]
 
