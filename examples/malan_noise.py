@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliotrope import sun
-from heliotrope.calibration.fit.estimator import Calibration, fit
+from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.sightings import Sightings, sightings
 from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.geometry import FloatArray, angle_between, reflect
@@ -93,7 +93,7 @@ class Study:
 
     actual: dict[str, float]
     predicted: dict[str, float]
-    found: Calibration
+    found: FieldFit
     truth: dict[str, FloatArray]
 
 

@@ -38,7 +38,7 @@ def load(folder: Path) -> tuple[Heliostats, Sightings]:
 def robust(group: Heliostats, seen: Sightings, train: FloatArray, model: tuple[str, ...]) -> float:
     """Return the median of the held-out medians of a plain robust fit, mrad."""
     found = fit(group.mechanism, seen, model, keep=train)
-    beam = evaluation.errors(group.mechanism.with_parameters(found.parameters), seen).beam
+    beam = evaluation.beam_errors(group.mechanism.with_parameters(found.parameters), seen).beam
     counts = np.bincount(seen.heliostat, minlength=len(group))
     return 1e3 * float(
         np.median(

@@ -6,7 +6,7 @@ import pytest
 from heliotrope.airborne.evaluate.sightings import _by_turn, _turned_back, fit_together
 from heliotrope.airborne.mirror import orientation
 from heliotrope.calibration import sightings as kinds
-from heliotrope.calibration.fit.estimator import Calibration, fit
+from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, direction, normalize, reflect
@@ -53,7 +53,7 @@ def aimed(true: Mechanism, count: int, seed: int, noise: float = 3e-4):
     return kinds.camera_target(np.zeros(count, int), counts, sun, seen, sigma=noise)
 
 
-def error(told: Calibration, true: Mechanism) -> float:
+def error(told: FieldFit, true: Mechanism) -> float:
     """RMS of the normal's error in poses all over the sky, rad."""
     rng = np.random.default_rng(7)
     counts = np.stack([rng.uniform(2.0, 4.6, 60), rng.uniform(0.3, 1.4, 60)], axis=-1)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from heliotrope.calibration import evaluation
-from heliotrope.calibration.fit.estimator import Outcome, fit
+from heliotrope.calibration.fit.estimator import FitOutcome, fit
 from heliotrope.calibration.sightings import Sightings, of_measurements, sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.formats import measurements, paint
@@ -61,7 +61,7 @@ def test_truth_without_noise_is_recovered() -> None:
     seen = _seen(nominal, nominal.with_parameters(TRUTH), 0.0)
     weak = dict.fromkeys(TRUTH, 1.0)
     found = fit(nominal, seen, "guo6", priors=weak, adapt_scale=False, loss="square")
-    assert (found.outcome == Outcome.CONVERGED).all()
+    assert (found.outcome == FitOutcome.CONVERGED).all()
     for name, value in TRUTH.items():
         np.testing.assert_allclose(found.parameters[name], value, rtol=0, atol=1e-6 * MRAD)
 
@@ -104,7 +104,7 @@ def test_far_zeros_are_found() -> None:
     aimed = nominal.with_parameters({k: far[k] for k in ("azimuth_bias", "elevation_bias")})
     seen = _seen(aimed, truth, 1e-5)
     found = fit(nominal, seen, "guo6", priors=dict.fromkeys(far, 0.05))
-    assert (found.outcome == Outcome.CONVERGED).all()
+    assert (found.outcome == FitOutcome.CONVERGED).all()
     for name, value in far.items():
         np.testing.assert_allclose(found.parameters[name], value, rtol=0, atol=0.5 * MRAD)
 
@@ -126,7 +126,7 @@ def test_far_strokes_of_jacks_are_found() -> None:
     pose = truth.pose(counts)
     seen = sightings(0, counts, sun, pose.vertex + 60.0 * reflect(sun, pose.normal), sigma=1e-5)
     found = fit(one[None], seen, (*names, "canting"))
-    after = evaluation.errors(one[None].with_parameters(found.parameters), seen)
+    after = evaluation.beam_errors(one[None].with_parameters(found.parameters), seen)
     assert np.median(after.beam) < 0.05 * MRAD
 
 
@@ -167,7 +167,7 @@ def test_no_sightings_leave_the_prior() -> None:
     nominal = _field(3)
     seen = _seen(nominal, nominal, 1e-4).take(np.arange(0))
     found = fit(nominal, seen, "guo6")
-    assert (found.outcome == Outcome.TOO_FEW).all()
+    assert (found.outcome == FitOutcome.TOO_FEW).all()
     assert (found.values == 0.0).all()
     np.testing.assert_allclose(found.sigma, found.prior)
 
@@ -231,7 +231,7 @@ def _real():  # type: ignore[no-untyped-def]
 def test_juelich_before_calibration() -> None:
     """The nominal chain and the published motor positions give the known errors."""
     group, _, seen = _real()
-    before = 1e3 * evaluation.errors(group.mechanism, seen).beam
+    before = 1e3 * evaluation.beam_errors(group.mechanism, seen).beam
     aa39 = before[seen.heliostat == group.index("AA39")]
     assert aa39.min() > 16.5
     assert aa39.max() < 36.5
@@ -247,7 +247,7 @@ def test_juelich_held_out() -> None:
     for seed in range(5):
         training = evaluation.split(seen, "random", 0.7, seed)
         found = fit(group.mechanism, seen, "jacks", keep=training)
-        after = evaluation.errors(group.mechanism.with_parameters(found.parameters), seen).beam
+        after = evaluation.beam_errors(group.mechanism.with_parameters(found.parameters), seen).beam
         medians = [np.median(after[(seen.heliostat == i) & ~training]) for i in enough]
         figures.append(1e3 * float(np.median(medians)))
         # BF41, whose file is wrong by more than a radian, is not lost.
@@ -259,5 +259,5 @@ def test_juelich_held_out() -> None:
 def test_juelich_mirror_six_of_aa39_few_mrad_after() -> None:
     group, _, seen = _real()
     found = fit(group.mechanism, seen, "jacks")
-    after = evaluation.errors(group.mechanism.with_parameters(found.parameters), seen).beam
+    after = evaluation.beam_errors(group.mechanism.with_parameters(found.parameters), seen).beam
     assert np.median(after[seen.heliostat == group.index("AA39")]) < 4 * MRAD

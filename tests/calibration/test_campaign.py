@@ -8,8 +8,8 @@ import pytest
 
 from heliotrope import sun
 from heliotrope.calibration.plan._allocation import Option, allocate, exchanged
-from heliotrope.calibration.plan.campaign import Campaign, Fleet, Timing, campaign
-from heliotrope.calibration.plan.planning import Limits
+from heliotrope.calibration.plan.campaign import CalibrationCampaign, Fleet, Timing, campaign
+from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.calibration.sightings import camera_target
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
 from heliotrope.errors import InputError
@@ -43,7 +43,7 @@ def _fleet(mechanism: Mechanism, names: tuple[str, ...], aim: Any = AIM) -> Flee
     return Fleet(mechanism, names, precision(mechanism, names), form, aim)
 
 
-def _check(found: Campaign, fleets: list[Fleet], timing: Timing, targets: Any) -> None:
+def _check(found: CalibrationCampaign, fleets: list[Fleet], timing: Timing, targets: Any) -> None:
     """No conflict, computed anew from the schedule alone."""
     for k in range(len(targets)):
         mine = np.flatnonzero(found.target == k)
@@ -59,7 +59,7 @@ def _check(found: Campaign, fleets: list[Fleet], timing: Timing, targets: Any) -
     )
     suns = sun.position(found.time, PLANT.site)
     edges = [sun.position(t, PLANT.site).elevation for t in (found.leave, found.arrive, found.done)]
-    assert all((e >= Limits().min_elevation - 1e-3).all() for e in edges)
+    assert all((e >= SightingLimits().min_elevation - 1e-3).all() for e in edges)
     offsets = np.concatenate([[0], np.cumsum([len(f) for f in fleets])])
     for k, fleet in enumerate(fleets):
         mine = np.flatnonzero((found.heliostat >= offsets[k]) & (found.heliostat < offsets[k + 1]))
@@ -77,7 +77,7 @@ def _check(found: Campaign, fleets: list[Fleet], timing: Timing, targets: Any) -
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["ahead", "by slot"])
-def mixed(request: Any) -> tuple[list[Fleet], Campaign]:
+def mixed(request: Any) -> tuple[list[Fleet], CalibrationCampaign]:
     """Two kinds of heliostats with models of different sizes, two targets, two days."""
     fleets = [_fleet(FIELD, NAMES), _fleet(_jack_plant(), (*MODELS["guo6"], "pivot_offset"))]
     return fleets, campaign(
@@ -91,7 +91,7 @@ def mixed(request: Any) -> tuple[list[Fleet], Campaign]:
     )
 
 
-def test_a_campaign_has_no_conflicts(mixed: tuple[list[Fleet], Campaign]) -> None:
+def test_a_campaign_has_no_conflicts(mixed: tuple[list[Fleet], CalibrationCampaign]) -> None:
     fleets, found = mixed
     assert len(found) > 100
     assert set(found.heliostat) == set(range(19))
@@ -100,7 +100,7 @@ def test_a_campaign_has_no_conflicts(mixed: tuple[list[Fleet], Campaign]) -> Non
     _check(found, fleets, Timing(10.0, 3.0, 7.0), TARGETS)
 
 
-def test_a_campaign_keeps_its_promise(mixed: tuple[list[Fleet], Campaign]) -> None:
+def test_a_campaign_keeps_its_promise(mixed: tuple[list[Fleet], CalibrationCampaign]) -> None:
     """The expected errors are those of the sightings it lists."""
     fleets, found = mixed
     assert (np.diff(np.append(found.before, found.error)) < 0.0).all()

@@ -12,7 +12,14 @@ import pytest
 
 from heliotrope import sun
 from heliotrope.calibration.fit.estimator import fit
-from heliotrope.calibration.plan.planning import Candidates, Limits, Plan, candidates, grid, plan
+from heliotrope.calibration.plan.planning import (
+    CandidateSightings,
+    SightingLimits,
+    SightingPlan,
+    candidates,
+    grid,
+    plan,
+)
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
@@ -29,7 +36,7 @@ from support.planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
 
 
 @pytest.fixture(scope="module")
-def possible() -> Candidates:
+def possible() -> CandidateSightings:
     """Three days of the whole field on two targets."""
     return candidates(FIELD, PLANT.site, TARGETS, grid(START, START + 3 * DAY, 3600.0), NAMES)
 
@@ -43,8 +50,8 @@ def year() -> FloatArray:
 # --- candidates -----------------------------------------------------------------------
 
 
-def test_candidates_keep_to_sun_stops_and_limits(possible: Candidates) -> None:
-    limits = Limits()
+def test_candidates_keep_to_sun_stops_and_limits(possible: CandidateSightings) -> None:
+    limits = SightingLimits()
     assert set(possible.heliostat) == set(range(18))
     assert set(possible.target) == {0, 1}
     above = sun.position(possible.time, PLANT.site)
@@ -67,12 +74,12 @@ def test_candidates_keep_to_sun_stops_and_limits(possible: Candidates) -> None:
     np.testing.assert_allclose(incidence, possible.incidence, rtol=0, atol=1e-9)
 
 
-def test_nothing_that_is_possible_is_left_out(possible: Candidates) -> None:
+def test_nothing_that_is_possible_is_left_out(possible: CandidateSightings) -> None:
     """Counted again, one heliostat and one time after the other."""
     times = grid(START, START + 3 * DAY, 3600.0)
     count = 0
     for moment, vector in zip(times, sun.vector(times, PLANT.site), strict=True):
-        if sun.position(moment, PLANT.site).elevation < Limits().min_elevation:
+        if sun.position(moment, PLANT.site).elevation < SightingLimits().min_elevation:
             continue
         for target in TARGETS:
             solved = track(FIELD, vector, target.center)
@@ -83,9 +90,9 @@ def test_nothing_that_is_possible_is_left_out(possible: Candidates) -> None:
     assert len(possible) == count
 
 
-def test_limits_narrow_the_choice(possible: Candidates) -> None:
+def test_limits_narrow_the_choice(possible: CandidateSightings) -> None:
     times = grid(START, START + 3 * DAY, 3600.0)
-    narrow = Limits(np.radians(30.0), np.radians(35.0), np.radians(40.0))
+    narrow = SightingLimits(np.radians(30.0), np.radians(35.0), np.radians(40.0))
     found = candidates(FIELD, PLANT.site, TARGETS, times, NAMES, limits=narrow)
     assert 0 < len(found) < len(possible)
     assert found.incidence.max() <= narrow.max_incidence
@@ -150,7 +157,7 @@ def test_beam_variance_against_moved_mirrors(year: FloatArray) -> None:
 # --- plan -----------------------------------------------------------------------------
 
 
-def _log_det(found: Candidates, rows: Any, information: FloatArray) -> float:
+def _log_det(found: CandidateSightings, rows: Any, information: FloatArray) -> float:
     slope = found.jacobian[list(rows)].reshape(-1, information.shape[-1])
     scale = 1.0 / np.sqrt(np.diagonal(information))
     total = (information + slope.T @ slope) * scale[:, None] * scale
@@ -159,17 +166,23 @@ def _log_det(found: Candidates, rows: Any, information: FloatArray) -> float:
     )
 
 
-def _square(found: Candidates, rows: Any, information: FloatArray, form: FloatArray) -> float:
+def _square(
+    found: CandidateSightings, rows: Any, information: FloatArray, form: FloatArray
+) -> float:
     slope = found.jacobian[list(rows)].reshape(-1, information.shape[-1])
     return float(np.trace(form @ np.linalg.inv(information + slope.T @ slope)))
 
 
-def _planned(possible: Candidates, year: FloatArray, i: int, count: int, **options: Any) -> Plan:
+def _planned(
+    possible: CandidateSightings, year: FloatArray, i: int, count: int, **options: Any
+) -> SightingPlan:
     return plan(possible.of(i), count, precision(FIELD, NAMES)[i], year[i], **options)
 
 
 @pytest.mark.parametrize("criterion", ["d", "v"])
-def test_never_worse_than_random(possible: Candidates, year: FloatArray, criterion: Any) -> None:
+def test_never_worse_than_random(
+    possible: CandidateSightings, year: FloatArray, criterion: Any
+) -> None:
     rng = np.random.default_rng(0)
     for i in (0, 8, 15):
         own, information = possible.of(i), precision(FIELD, NAMES)[i]
@@ -184,7 +197,7 @@ def test_never_worse_than_random(possible: Candidates, year: FloatArray, criteri
                 assert found.error[-1] ** 2 <= _square(own, rows, information, year[i]) * 1.001
 
 
-def test_monotone_and_consistent(possible: Candidates, year: FloatArray) -> None:
+def test_monotone_and_consistent(possible: CandidateSightings, year: FloatArray) -> None:
     information = precision(FIELD, NAMES)[4]
     before = 0.0
     for count in (1, 2, 4, 8):
@@ -209,7 +222,9 @@ def test_monotone_and_consistent(possible: Candidates, year: FloatArray) -> None
 
 
 @pytest.mark.parametrize("criterion", ["d", "v"])
-def test_against_exhaustive_search(possible: Candidates, year: FloatArray, criterion: Any) -> None:
+def test_against_exhaustive_search(
+    possible: CandidateSightings, year: FloatArray, criterion: Any
+) -> None:
     """Efficiency: the P-th root of the ratio of determinants; the ratio of squared errors."""
     worst = 1.0
     for i in (0, 5, 11, 17):
@@ -229,7 +244,7 @@ def test_against_exhaustive_search(possible: Candidates, year: FloatArray, crite
     assert 0.95 <= worst <= 1.0 + 1e-9
 
 
-def test_exchange_improves(possible: Candidates, year: FloatArray) -> None:
+def test_exchange_improves(possible: CandidateSightings, year: FloatArray) -> None:
     gained = 0.0
     for i in range(18):
         plain = _planned(possible, year, i, 5, exchange=False)
@@ -239,7 +254,9 @@ def test_exchange_improves(possible: Candidates, year: FloatArray) -> None:
     assert gained > 0.0
 
 
-def test_v_serves_the_beam_and_d_the_parameters(possible: Candidates, year: FloatArray) -> None:
+def test_v_serves_the_beam_and_d_the_parameters(
+    possible: CandidateSightings, year: FloatArray
+) -> None:
     errors, gains = [], []
     for i in range(18):
         both = [_planned(possible, year, i, 4, criterion=c) for c in ("d", "v")]
@@ -250,12 +267,12 @@ def test_v_serves_the_beam_and_d_the_parameters(possible: Candidates, year: Floa
     assert total[1] < total[0]
 
 
-def test_the_gap_is_kept(possible: Candidates, year: FloatArray) -> None:
+def test_the_gap_is_kept(possible: CandidateSightings, year: FloatArray) -> None:
     found = _planned(possible, year, 2, 5, gap=4 * 3600.0)
     assert (np.diff(found.chosen.time) > 4 * 3600.0).all()
 
 
-def test_what_is_known_already_counts(possible: Candidates, year: FloatArray) -> None:
+def test_what_is_known_already_counts(possible: CandidateSightings, year: FloatArray) -> None:
     first = _planned(possible, year, 9, 5)
     c = first.chosen
     centers = np.array([t.center for t in TARGETS])[c.target]
@@ -270,7 +287,7 @@ def test_what_is_known_already_counts(possible: Candidates, year: FloatArray) ->
     assert second.log_det < first.log_det
 
 
-def test_the_expected_error_comes_true(possible: Candidates, year: FloatArray) -> None:
+def test_the_expected_error_comes_true(possible: CandidateSightings, year: FloatArray) -> None:
     """Mirrors drawn from the prior, measured as planned, fitted, and tracked for a year."""
     i, draws = 12, 150
     found = _planned(possible, year, i, 8)
@@ -306,7 +323,7 @@ def test_the_expected_error_comes_true(possible: Candidates, year: FloatArray) -
     assert found.error[-1] < 0.8 * MRAD < 20 * MRAD < found.before
 
 
-def test_refusals(possible: Candidates, year: FloatArray) -> None:
+def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     information = precision(FIELD, NAMES)[0]
     own = possible.of(0)
     with pytest.raises(InputError, match="give 1 or more"):
@@ -333,7 +350,7 @@ def test_refusals(possible: Candidates, year: FloatArray) -> None:
     with pytest.raises(InputError, match="more than 200,000"):
         grid(START, START + 30 * DAY, 1.0)
     with pytest.raises(InputError, match="max_incidence"):
-        Limits(max_incidence=2.0)
+        SightingLimits(max_incidence=2.0)
     with pytest.raises(InputError, match="never reaches 80°"):
         suns_of_year(sun.Site(60.0, 0.0, 0.0), 2026, min_elevation=np.radians(80.0))
     with pytest.raises(InputError, match="give a day or more"):

@@ -1,4 +1,4 @@
-"""Results in files and back, models compared, learning on a cluster, splits, the real field."""
+"""Parameters in files and back, models compared, learning on a cluster, splits, a real field."""
 
 import dataclasses
 import json
@@ -13,7 +13,7 @@ from heliotrope.calibration.learn import learning, models
 from heliotrope.calibration.learn import on_dask as cluster
 from heliotrope.calibration.learn.assessment import assess
 from heliotrope.calibration.report import results
-from heliotrope.calibration.report.page import Result, blind_spots, write_report
+from heliotrope.calibration.report.page import CalibrationReport, blind_spots, write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
@@ -87,7 +87,9 @@ def test_report_is_one_page_that_reads_back(learnt: learning.Learned, tmp_path: 
     plant = dataclasses.replace(plant, groups={"azel": group})
     train = evaluation.split(learnt.sightings, "neighbour", 0.7, 1)
     tested = learning.learn(learnt.mechanism, learnt.sightings, "guo6", used=train)
-    result = Result(NAMES, learnt, plant, "azel", assess(NAMES, tested), note="neighbour split")
+    result = CalibrationReport(
+        NAMES, learnt, plant, "azel", assess(NAMES, tested), note="neighbour split"
+    )
     steps: list[tuple[int, int]] = []
     page = write_report(result, tmp_path / "out", lambda a, b: steps.append((a, b)))
     text = page.read_text(encoding="utf-8")
@@ -118,16 +120,16 @@ def test_the_simplest_model_that_explains_is_chosen() -> None:
         "more": (*PRIORS, "azimuth_scale", "elevation_scale", "sag", "pivot_offset"),
     }
     tried: list[str] = []
-    scored = models.compare(nominal, seen, trials, progress=tried.append)
+    scored = models.compare_models(nominal, seen, trials, progress=tried.append)
     assert tried == list(trials)
-    assert models.choose(scored).name == "guo6"
+    assert models.choose_model(scored).name == "guo6"
     by_name = {c.name: c for c in scored}
     assert by_name["two"].log_evidence < by_name["guo6"].log_evidence
-    known = models.candidates(nominal)
+    known = models.candidate_models(nominal)
     assert next(iter(known)) == "guo6"
     assert "full" in known
     with pytest.raises(InputError, match="name the model instead of auto"):
-        models.compare(nominal, seen.take(range(3)))
+        models.compare_models(nominal, seen.take(range(3)))
 
 
 def test_neighbourhoods_are_held_out_whole(learnt: learning.Learned) -> None:

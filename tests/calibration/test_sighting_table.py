@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from heliotrope.calibration import sighting_table
-from heliotrope.calibration.fit.estimator import Outcome, fit
+from heliotrope.calibration.fit.estimator import FitOutcome, fit
 from heliotrope.calibration.fit.residuals import whitening
 from heliotrope.calibration.sighting_table import read_malan, read_sightings, write_sightings
 from heliotrope.calibration.sightings import (
@@ -248,7 +248,7 @@ def test_all_kinds_in_one_fit_recover_the_truth(tmp_path: Path) -> None:
     assert found_kinds == kinds
     assert not left_out
     found = fit(nominal, read, "guo6", priors=WEAK, adapt_scale=False, loss="square")
-    assert (found.outcome == Outcome.CONVERGED).all()
+    assert (found.outcome == FitOutcome.CONVERGED).all()
     for name, value in TRUTH.items():
         np.testing.assert_allclose(found.parameters[name], value, rtol=0, atol=0.01 * MRAD)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import InputError, UnknownNameError
@@ -184,7 +184,7 @@ class TestParameters:
         assert made.before == pytest.approx(2.0 * 0.004, rel=0.5)
         assert made.outcome == "converged"
         np.testing.assert_allclose(
-            np.hypot(*made.residual_before.T), errors(nominal, seen).beam, rtol=1e-6
+            np.hypot(*made.residual_before.T), beam_errors(nominal, seen).beam, rtol=1e-6
         )
         assert made.parameters["tilt_north"] == pytest.approx(0.004, abs=1e-6)
         np.testing.assert_allclose(made.sigma**2, np.diagonal(made.covariance))

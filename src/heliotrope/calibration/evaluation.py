@@ -1,4 +1,4 @@
-"""How well parameters predict: beam and normal errors, and splits of the sightings."""
+"""How well parameters predict: errors of beam and normal, and splits of the sightings."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -18,7 +18,7 @@ NEIGHBOURHOOD = 0.1
 
 
 @dataclass(frozen=True)
-class Errors:
+class BeamErrors:
     """Errors of M sightings under a mechanism.
 
     Attributes
@@ -41,7 +41,7 @@ class Errors:
     plane: FloatArray
 
 
-def errors(mechanism: Mechanism, sightings: Sightings) -> Errors:
+def beam_errors(mechanism: Mechanism, sightings: Sightings) -> BeamErrors:
     """Return the errors of sightings under mechanisms of batch shape (N,)."""
     pose = mechanism[sightings.heliostat].pose(sightings.counts)
     source, way = ray_directions(sightings, pose.vertex)
@@ -57,7 +57,7 @@ def errors(mechanism: Mechanism, sightings: Sightings) -> Errors:
     beam = angle_between(ray, way)
     # The same direction, with the angle's length: sines fold back beyond a right angle.
     size = np.maximum(np.linalg.norm(across, axis=-1), 1e-300)
-    return Errors(
+    return BeamErrors(
         beam=beam,
         normal=angle_between(pose.normal, bisector(source, way)),
         offset=across * (beam / size)[:, None],
@@ -135,7 +135,7 @@ def _by_neighbourhood(
 
 
 @dataclass(frozen=True)
-class Summary:
+class ErrorSummary:
     """Beam errors of one heliostat, rad."""
 
     count: int
@@ -144,11 +144,11 @@ class Summary:
     p95: float
 
 
-def summary(beam: FloatArray) -> Summary:
+def summarise(beam: FloatArray) -> ErrorSummary:
     """Return median, RMS and 95th percentile of beam errors (M,), NaN if there are none."""
     if not len(beam):
-        return Summary(0, np.nan, np.nan, np.nan)
-    return Summary(
+        return ErrorSummary(0, np.nan, np.nan, np.nan)
+    return ErrorSummary(
         len(beam),
         float(np.median(beam)),
         float(np.sqrt(np.mean(beam**2))),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from heliotrope.calibration.learn.learning import Learned, Progress
-    from heliotrope.calibration.learn.models import Candidate
+    from heliotrope.calibration.learn.models import ScoredModel
     from heliotrope.calibration.sightings import Sightings
     from heliotrope.field.heliostats import Heliostats
     from heliotrope.field.plant import Plant
@@ -170,7 +170,7 @@ def parse_model(text: str) -> str | tuple[str, ...]:
 
 def choose_model(
     loaded: Loaded, model: str, quiet: bool, used: "object" = None
-) -> "tuple[str | tuple[str, ...], tuple[Candidate, ...]]":
+) -> "tuple[str | tuple[str, ...], tuple[ScoredModel, ...]]":
     """Return the model to use; for "auto" the simplest that explains the sightings."""
     if model != "auto":
         return parse_model(model), ()
@@ -182,26 +182,26 @@ def choose_model(
     counts = np.bincount(loaded.seen.heliostat[keep], minlength=len(loaded.heliostats))
     if counts.max(initial=0) < learning.FEWEST:
         # Too little to compare anything: the smallest model of this kind of mechanism.
-        return next(iter(models.candidates(loaded.heliostats.mechanism).values())), ()
+        return next(iter(models.candidate_models(loaded.heliostats.mechanism).values())), ()
     with progress("comparing models", quiet) as advance:
-        trials = models.candidates(loaded.heliostats.mechanism)
+        trials = models.candidate_models(loaded.heliostats.mechanism)
         tried: list[str] = []
 
         def next_model(name: str) -> None:
             advance(len(tried), len(trials))
             tried.append(name)
 
-        scored = models.compare(
+        scored = models.compare_models(
             loaded.heliostats.mechanism, loaded.seen, trials, used=keep, progress=next_model
         )
-    return models.choose(scored).parameters, scored
+    return models.choose_model(scored).parameters, scored
 
 
-def describe(scored: "tuple[Candidate, ...]") -> tuple[str, ...]:
+def describe(scored: "tuple[ScoredModel, ...]") -> tuple[str, ...]:
     """Return a line on the comparison of models."""
     if not scored:
         return ()
-    from heliotrope.calibration.learn.models import choose
+    from heliotrope.calibration.learn.models import choose_model as choose
 
     best = choose(scored)
     listed = ", ".join(f"{c.name} {c.behind:.3f}±{c.behind_error:.3f}" for c in scored)

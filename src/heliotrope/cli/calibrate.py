@@ -10,7 +10,7 @@ from heliotrope.cli import _calibration as shared
 from heliotrope.cli._common import print_json, print_table
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.report.page import Result
+    from heliotrope.calibration.report.page import CalibrationReport
 
 
 def calibrate(
@@ -31,7 +31,7 @@ def calibrate(
     """Learn every heliostat from all its sightings, test on held-out ones, write a report."""
     from heliotrope.calibration import evaluation
     from heliotrope.calibration.learn import assessment
-    from heliotrope.calibration.report.page import Result
+    from heliotrope.calibration.report.page import CalibrationReport
 
     priors = shared.parse_priors(prior or [])
     if fraction != 1.0:
@@ -46,7 +46,7 @@ def calibrate(
         assessed = assessment.assess(loaded.heliostats.names, tested)
     learned = shared.learn(loaded, chosen, **options)
     note = f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}"
-    result = Result(
+    result = CalibrationReport(
         loaded.heliostats.names,
         learned,
         loaded.plant,
@@ -60,7 +60,7 @@ def calibrate(
     _show(result, report, as_json)
 
 
-def _show(result: "Result", report: Path, as_json: bool) -> None:
+def _show(result: "CalibrationReport", report: Path, as_json: bool) -> None:
     from heliotrope.files.text import write_text
 
     page = show_report(result, report, quiet=as_json)
@@ -80,7 +80,7 @@ def _show(result: "Result", report: Path, as_json: bool) -> None:
     print(f"report: {page}")
 
 
-def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
+def show_report(result: "CalibrationReport", folder: Path, quiet: bool) -> Path:
     """Write the report behind a progress bar."""
     from heliotrope.calibration.report.page import write_report
 
@@ -88,7 +88,7 @@ def show_report(result: "Result", folder: Path, quiet: bool) -> Path:
         return write_report(result, folder, advance)
 
 
-def as_document(result: "Result") -> dict[str, Any]:
+def as_document(result: "CalibrationReport") -> dict[str, Any]:
     """Return the figures of a calibration for JSON."""
     learned, found = result.learned, result.results
     tested = {h.name: h for h in result.assessment.heliostats} if result.assessment else {}
@@ -117,7 +117,7 @@ def as_document(result: "Result") -> dict[str, Any]:
     return document
 
 
-def print_result(result: "Result") -> None:
+def print_result(result: "CalibrationReport") -> None:
     """Print the table of a calibration and its overall figures."""
     import numpy as np
 

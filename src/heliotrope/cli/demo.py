@@ -9,7 +9,7 @@ import typer
 from heliotrope.cli._common import print_json
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.report.page import Result
+    from heliotrope.calibration.report.page import CalibrationReport
     from heliotrope.field.plant import Plant
     from heliotrope.geometry import FloatArray
 
@@ -27,7 +27,7 @@ def demo(
     """Make an example plant, measure it, calibrate it, track a day, and write a report."""
     from heliotrope.calibration import evaluation
     from heliotrope.calibration.learn import assessment, learning
-    from heliotrope.calibration.report.page import Result
+    from heliotrope.calibration.report.page import CalibrationReport
     from heliotrope.cli.calibrate import show_report
     from heliotrope.field.example import prototype, roughly_installed
     from heliotrope.field.formats.plant_file import write_plant
@@ -48,7 +48,7 @@ def demo(
     training = evaluation.split(seen, "random", 0.7, seed)
     tested = learning.learn(group.mechanism, seen, model, used=training)
     learned = learning.learn(group.mechanism, seen, model)
-    result = Result(
+    result = CalibrationReport(
         group.names,
         learned,
         plant,
@@ -146,7 +146,7 @@ def _track_day(plant: "Plant", truth: Any) -> dict[str, Any]:
     }
 
 
-def _figures(result: "Result", day: dict[str, Any]) -> dict[str, Any]:
+def _figures(result: "CalibrationReport", day: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     rows = result.rows()

@@ -19,7 +19,7 @@ from heliotrope.cli._common import (
 )
 
 if TYPE_CHECKING:
-    from heliotrope.calibration.plan.planning import Candidates, Plan
+    from heliotrope.calibration.plan.planning import CandidateSightings, SightingPlan
     from heliotrope.calibration.sightings import Sightings
     from heliotrope.field.heliostats import Heliostats
     from heliotrope.field.plant import Plant
@@ -315,7 +315,7 @@ def _plans(plant: "Plant", parts: list[_Part], order: _Order) -> None:
 
 def _all_plans(
     plant: "Plant", parts: list[_Part], order: _Order, step: Callable[[int, int], None]
-) -> "tuple[dict[str, Plan], Candidates]":
+) -> "tuple[dict[str, SightingPlan], CandidateSightings]":
     import numpy as np
 
     from heliotrope.calibration.plan import planning
@@ -324,7 +324,7 @@ def _all_plans(
     start, stop = (t.timestamp() for t in order.span)
     times, slot = planning.grid(start, stop, order.every), order.timing.slot
     rows = [(part, i) for part in parts for i in range(len(part.labels))]
-    plans: dict[str, Plan] = {}
+    plans: dict[str, SightingPlan] = {}
     taken: set[tuple[int, float]] = set()
     possible = None
     for number, (part, i) in enumerate(rows):
@@ -364,7 +364,7 @@ def _all_plans(
     return plans, possible
 
 
-def _print_plan(name: str, one: "Plan", rows: list[dict[str, Any]]) -> None:
+def _print_plan(name: str, one: "SightingPlan", rows: list[dict[str, Any]]) -> None:
     print_table(
         ["time", "target", "sun azimuth", "elevation", "rank", "error"],
         [

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import __version__
-from heliotrope.calibration.evaluation import errors
-from heliotrope.calibration.fit.estimator import Calibration, Outcome
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.geometry import FloatArray
@@ -158,7 +158,7 @@ class ParameterVersion:
 def version_of(
     heliostat: str,
     at: float,
-    fitted: Calibration,
+    fitted: FieldFit,
     nominal: Mechanism,
     seen: Sightings,
     identities: npt.ArrayLike,
@@ -196,8 +196,8 @@ def version_of(
             f"parameters of {heliostat}: {len(numbers)} numbers of {len(seen)} sightings; keep "
             "the sightings first"
         )
-    first = errors(nominal, seen)
-    last = errors(nominal.with_parameters(fitted.parameters), seen)
+    first = beam_errors(nominal, seen)
+    last = beam_errors(nominal.with_parameters(fitted.parameters), seen)
     rms = [float(np.sqrt(np.mean(e.beam**2))) if len(seen) else np.nan for e in (first, last)]
     return ParameterVersion(
         heliostat,
@@ -209,7 +209,7 @@ def version_of(
         rms[0],
         rms[1],
         float(fitted.scale[0]),
-        Outcome(int(fitted.outcome[0])).text,
+        FitOutcome(int(fitted.outcome[0])).text,
         numbers,
         first.offset,
         last.offset,

@@ -12,9 +12,9 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import fit
-from heliotrope.calibration.plan.planning import Limits, aim_at
+from heliotrope.calibration.plan.planning import SightingLimits, aim_at
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
 from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.example import roughly_installed
@@ -178,7 +178,7 @@ class Days:
         surface = self.plant.target(target)
         suns = vector(times, self.plant.site)
         many = believed[np.zeros(len(times), dtype=np.intp)]
-        counts = aim_at(many, suns, surface, Limits()).counts
+        counts = aim_at(many, suns, surface, SightingLimits()).counts
         pose = self.truth[np.full(len(times), row)].pose(counts)
         # The plane goes on beyond the target: a search would have found the beam.
         seen = surface.intersect(pose.vertex, reflect(suns, pose.normal))
@@ -199,7 +199,7 @@ class Days:
             return Visited(name, told.target, told.until, False, text="no beam")
         times = told.until - _APART * np.arange(settings.shots, 0.0, -1.0)
         seen = self.photographs(name, told.target, times)
-        measured = float(np.sqrt(np.mean(errors(self.mechanism(name), seen).beam ** 2)))
+        measured = float(np.sqrt(np.mean(beam_errors(self.mechanism(name), seen).beam ** 2)))
         before = [self.known[name]] if name in self.known else []
         self.known[name] = join([*before, seen])
         row = np.array([self.group.index(name)])
@@ -242,7 +242,7 @@ class Days:
         counts = solved.chosen(solved.counts)
         row = np.full(count, self.group.index(name))
         seen = sightings(np.arange(count), counts, suns, np.broadcast_to(aim, (count, 3)))
-        off = errors(self.truth[row], seen).offset
+        off = beam_errors(self.truth[row], seen).offset
         if name not in self.covariances:
             return off, np.full((count, 2, 2), np.nan)
         found = expected_error(believed, self._learnt, self.covariances[name], suns, aim)

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.orientation import FEWEST, Orientation, Orientations, turned
 from heliotrope.airborne.mirror import measured_normal, orientation
-from heliotrope.calibration.fit.estimator import Calibration, fit
+from heliotrope.calibration.fit.estimator import FieldFit, fit
 from heliotrope.calibration.fit.residuals import linearise, whitening
 from heliotrope.calibration.sightings import Sightings, drone, join, ray_directions
 from heliotrope.errors import InputError
@@ -158,7 +158,7 @@ class Together:
         1 where there are too few poses to tell.
     """
 
-    calibration: Calibration
+    calibration: FieldFit
     turn: FloatArray
     turn_covariance: FloatArray
     noise: FloatArray
@@ -227,7 +227,7 @@ def _shared_spread(flights: Sightings, count: int) -> FloatArray:
     return np.where(number > 0, 0.5 * np.sqrt(square / np.maximum(number, 1)), _UNTOLD)
 
 
-def _scatter(alone: Calibration, flights: Sightings) -> FloatArray:
+def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
     """Return what poses scatter about their own fit, in units of their sigma, (N,)."""
     count = len(alone.values)
     free = 2 * np.bincount(flights.heliostat, minlength=count) - len(alone.names)
@@ -252,7 +252,7 @@ def _joint_step(
     mechanism: Mechanism,
     seen: Sightings,
     first: int,
-    told: Calibration,
+    told: FieldFit,
     turn: FloatArray,
     spread: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.clusters import tour
 from heliotrope.airborne.plan.hover import Facing, Mirrors, Sampling, face
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.plan.planning import Candidates, Criterion, Plan, plan
+from heliotrope.calibration.plan.planning import CandidateSightings, Criterion, SightingPlan, plan
 from heliotrope.calibration.sightings import drone
 from heliotrope.calibration.uncertainty import error_form, precision
 from heliotrope.errors import InputError
@@ -98,7 +98,7 @@ class LookPoints:
     direction: FloatArray
     point: FloatArray
     facing: Facing
-    plan: Plan
+    plan: SightingPlan
 
     def __len__(self) -> int:
         return len(self.direction)
@@ -225,7 +225,7 @@ def _candidates(
     points: FloatArray,
     names: tuple[str, ...],
     sigma: float,
-) -> Candidates:
+) -> CandidateSightings:
     """Sightings of the drone by one mirror; their "time" is the row of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
@@ -238,7 +238,7 @@ def _candidates(
     else:
         jacobian = np.empty((0, 2, len(names)))
     angle = np.zeros(len(rows))
-    return Candidates(
+    return CandidateSightings(
         names,
         ("drone",),
         zero,

@@ -41,7 +41,7 @@ _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.C
 FAR = 0.15
 
 
-class Outcome(IntEnum):
+class FitOutcome(IntEnum):
     """How the fit of a heliostat ended."""
 
     CONVERGED = kernels.CONVERGED
@@ -56,15 +56,15 @@ class Outcome(IntEnum):
 
 
 _TEXTS = {
-    Outcome.CONVERGED: "converged",
-    Outcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
-    Outcome.TOO_FEW: "no sightings: the parameters are the prior's",
-    Outcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
+    FitOutcome.CONVERGED: "converged",
+    FitOutcome.NOT_CONVERGED: "the iteration did not settle; the parameters may not be the best",
+    FitOutcome.TOO_FEW: "no sightings: the parameters are the prior's",
+    FitOutcome.FAILED: "the residuals are not finite from the start; check the nominal mechanism",
 }
 
 
 @dataclass(frozen=True)
-class Calibration:
+class FieldFit:
     """What was learnt of N heliostats in P parameters.
 
     Attributes
@@ -121,7 +121,7 @@ def fit(
     adapt_scale: bool = True,
     keep: npt.ArrayLike | None = None,
     max_iterations: int = 100,
-) -> Calibration:
+) -> FieldFit:
     """Return the maximum a posteriori parameters of each mechanism.
 
     Parameters
@@ -160,7 +160,7 @@ def fit(
     pose = mechanism[ordered.heliostat].pose(ordered.counts)
     begin = _far_starts(mechanism, ordered, used[order], pose, names)
     shape = (count, len(names))
-    result = Calibration(
+    result = FieldFit(
         names=names,
         values=np.empty(shape),
         covariance=np.empty((*shape, len(names))),

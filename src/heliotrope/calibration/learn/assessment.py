@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.evaluation import Summary, summary
+from heliotrope.calibration.evaluation import ErrorSummary, summarise
 from heliotrope.calibration.learn.learning import Learned, Prediction
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
@@ -41,8 +41,8 @@ class HeliostatFigures:
 
     name: str
     count: int
-    beam: Summary
-    normal: Summary
+    beam: ErrorSummary
+    normal: ErrorSummary
     mean: float
     coverage: float
     axes: AxisAccuracy | None
@@ -101,7 +101,7 @@ class Assessment:
     median_of_medians: float
     mean_of_means: float
     coverage: float
-    beam: Summary
+    beam: ErrorSummary
     fewest: int
     blunders: int
 
@@ -154,7 +154,7 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
         float(np.median([h.beam.median for h in enough])) if enough else np.nan,
         float(np.mean([h.mean for h in enough])) if enough else np.nan,
         float(found.inside[inside].mean()) if inside.any() else np.nan,
-        summary(found.errors.beam[inside]),
+        summarise(found.errors.beam[inside]),
         fewest,
         int((far[inside] > BLUNDER**2).sum()),
     )
@@ -173,8 +173,8 @@ def _one(
     return HeliostatFigures(
         name=name,
         count=count,
-        beam=summary(beam),
-        normal=summary(found.errors.normal[rows]),
+        beam=summarise(beam),
+        normal=summarise(found.errors.normal[rows]),
         mean=float(beam.mean()) if len(rows) else np.nan,
         coverage=float(found.inside[rows].mean()) if len(rows) else np.nan,
         axes=_axes(learned, np.flatnonzero(~learned.used)[rows]) if len(rows) > 1 else None,

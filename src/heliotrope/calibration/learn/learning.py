@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from heliotrope.calibration.evaluation import Errors, errors
-from heliotrope.calibration.fit.estimator import Calibration, Loss, canonical_order, fit
+from heliotrope.calibration.evaluation import BeamErrors, beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit, Loss, canonical_order, fit
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.learn import drift
 from heliotrope.calibration.learn.drift import DAY, Hyperparameters, Linear, Posterior
@@ -68,7 +68,7 @@ class Prediction:
         Turns a whitened residual into ``plane``, (M, 2, 2).
     """
 
-    errors: Errors
+    errors: BeamErrors
     plane: FloatArray
     covariance: FloatArray
     inside: npt.NDArray[np.bool_]
@@ -108,7 +108,7 @@ class Learned:
     sightings: Sightings
     model: tuple[str, ...]
     used: npt.NDArray[np.bool_]
-    static: Calibration
+    static: FieldFit
     hyper: Hyperparameters
     members: tuple[Posterior, ...]
     regime: npt.NDArray[np.int64]
@@ -162,7 +162,7 @@ class Learned:
         values, spread = self.parameters_at(rows, sightings.time)
         moved = _moved(self.mechanism, rows, self.names, values)
         alone = replace(sightings, heliostat=np.arange(len(rows)))
-        found = errors(moved, alone)
+        found = beam_errors(moved, alone)
         line = linearise(moved, sightings, self.names)
         noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in self.members])[rows]
         white = line.jacobian @ spread @ np.swapaxes(line.jacobian, -1, -2)
@@ -200,7 +200,7 @@ def left_out_errors(learned: Learned) -> FloatArray:
 class Prepared:
     """Steps 1 and 2 for some heliostats."""
 
-    static: Calibration
+    static: FieldFit
     regime: npt.NDArray[np.int64]
     field: tuple[Linear, ...]
     rows: tuple[npt.NDArray[np.intp], ...]
@@ -533,10 +533,10 @@ def _join(
     fits = [part.prepared.static for part in parts]
     whole = {
         f.name: np.concatenate([getattr(fit, f.name) for fit in fits])
-        for f in fields(Calibration)
+        for f in fields(FieldFit)
         if f.name not in ("names", "lengths")
     }
-    static = Calibration(names=model, lengths=lengths, **whole)
+    static = FieldFit(names=model, lengths=lengths, **whole)
     members = tuple(m for part in parts for m in part.members)
     return Learned(
         mechanism, sightings, model, used, static, hyper, members, regime, outlier, tuple(rows)

@@ -29,7 +29,7 @@ WORST = -25.0
 
 
 @dataclass(frozen=True)
-class Candidate:
+class ScoredModel:
     """A model with its score.
 
     Attributes
@@ -53,7 +53,7 @@ class Candidate:
     log_evidence: float
 
 
-def candidates(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
+def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
     """Return the models that this kind of mechanism can have, by name, the simplest first."""
     known = mechanism.parameters
     found: dict[str, tuple[str, ...]] = {}
@@ -87,14 +87,14 @@ def _extras(mechanism: Mechanism) -> list[tuple[str, tuple[str, ...]]]:
     return extras
 
 
-def compare(
+def compare_models(
     mechanism: Mechanism,
     sightings: Sightings,
     models: Mapping[str, tuple[str, ...]] | None = None,
     *,
     used: npt.ArrayLike | None = None,
     progress: Callable[[str], None] | None = None,
-) -> tuple[Candidate, ...]:
+) -> tuple[ScoredModel, ...]:
     """Return the candidates with their scores, the simplest first.
 
     Parameters
@@ -104,7 +104,7 @@ def compare(
     sightings
         M of these heliostats.
     models
-        Parameters by name, by default :func:`candidates`.
+        Parameters by name, by default `candidate_models`.
     used
         Mask of the sightings to learn from, (M,).
     progress
@@ -115,7 +115,7 @@ def compare(
     InputError
         If no heliostat has enough sightings, or there are no models.
     """
-    trials = candidates(mechanism) if models is None else dict(models)
+    trials = candidate_models(mechanism) if models is None else dict(models)
     keep = np.ones(len(sightings), np.bool_) if used is None else np.asarray(used, np.bool_)
     counts = np.bincount(sightings.heliostat[keep], minlength=len(mechanism))
     chosen = np.argsort(-counts, kind="stable")[:HELIOSTATS]
@@ -142,11 +142,13 @@ def compare(
     for name, names in trials.items():
         gap = scores[best][good] - scores[name][good]
         error = float(gap.std() / np.sqrt(max(len(gap), 1)))
-        result.append(Candidate(name, names, means[name], float(gap.mean()), error, evidence[name]))
+        result.append(
+            ScoredModel(name, names, means[name], float(gap.mean()), error, evidence[name])
+        )
     return tuple(result)
 
 
-def choose(scored: tuple[Candidate, ...]) -> Candidate:
+def choose_model(scored: tuple[ScoredModel, ...]) -> ScoredModel:
     """Return the simplest candidate within one standard error of the best, or within ``WORTH``."""
     able = [c for c in scored if c.behind <= max(c.behind_error, WORTH)]
     return min(able, key=lambda c: len(c.parameters))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from heliotrope import sun as solar
 from heliotrope.calibration.plan import _allocation
 from heliotrope.calibration.plan import gain as _gain
-from heliotrope.calibration.plan.planning import Limits, aim_at, sighting_jacobian
+from heliotrope.calibration.plan.planning import SightingLimits, aim_at, sighting_jacobian
 from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
@@ -112,7 +112,7 @@ class Fleet:
 
 
 @dataclass(frozen=True)
-class Campaign:
+class CalibrationCampaign:
     """M sightings in order of time, and what they are expected to bring.
 
     Heliostats are numbered through all fleets. Times are unix seconds (UTC).
@@ -164,13 +164,13 @@ def campaign(
     stop: float,
     *,
     timing: Timing | None = None,
-    limits: Limits | None = None,
+    limits: SightingLimits | None = None,
     every: float = 1800.0,
     ahead: bool = True,
     worth: float = 0.05,
     count: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> Campaign:
+) -> CalibrationCampaign:
     """Return the measurements of a field from ``start`` to ``stop``.
 
     Parameters
@@ -226,7 +226,7 @@ def campaign(
         site,
         tuple(targets),
         timing or Timing(),
-        limits or Limits(),
+        limits or SightingLimits(),
         ahead,
         worth,
         count,
@@ -293,7 +293,7 @@ class _Work:
         site: Site,
         targets: tuple[Target, ...],
         timing: Timing,
-        limits: Limits,
+        limits: SightingLimits,
         ahead: bool,
         worth: float,
         count: int | None,
@@ -460,14 +460,14 @@ class _Work:
             )
         )
 
-    def result(self, slots: int, drives: int) -> Campaign:
+    def result(self, slots: int, drives: int) -> CalibrationCampaign:
         """The schedule as arrays."""
         columns = list(zip(*self.rows, strict=True)) or [()] * 10
 
         def numbers(k: int) -> FloatArray:
             return np.array(columns[k], dtype=np.float64)
 
-        return Campaign(
+        return CalibrationCampaign(
             leave=numbers(0),
             arrive=numbers(1),
             time=numbers(2),

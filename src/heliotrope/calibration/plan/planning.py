@@ -31,7 +31,7 @@ SWEEPS = 50
 
 
 @dataclass(frozen=True)
-class Limits:
+class SightingLimits:
     """What a sighting must keep to.
 
     Attributes
@@ -56,7 +56,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class CandidateSightings:
     """M possible camera-target sightings.
 
     Attributes
@@ -97,7 +97,7 @@ class Candidates:
     def __len__(self) -> int:
         return len(self.time)
 
-    def take(self, rows: npt.ArrayLike) -> "Candidates":
+    def take(self, rows: npt.ArrayLike) -> "CandidateSightings":
         """Return those at ``rows`` (indices or a mask), in that order."""
         index = np.asarray(rows)
         if not index.size:
@@ -108,7 +108,7 @@ class Candidates:
             **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in whole},
         )
 
-    def of(self, heliostat: int) -> "Candidates":
+    def of(self, heliostat: int) -> "CandidateSightings":
         """Return those of one heliostat."""
         return self.take(np.flatnonzero(self.heliostat == heliostat))
 
@@ -138,7 +138,7 @@ def aim_at(
     mechanism: Mechanism,
     sun: FloatArray,
     target: Target,
-    limits: Limits,
+    limits: SightingLimits,
     current: FloatArray | None = None,
 ) -> Aimed:
     """Return the poses that send the sun to the centre of a target.
@@ -176,8 +176,8 @@ def candidates(
     names: tuple[str, ...],
     *,
     sigma: npt.ArrayLike = 5e-4,
-    limits: Limits | None = None,
-) -> Candidates:
+    limits: SightingLimits | None = None,
+) -> CandidateSightings:
     """Return the sightings that sun, targets and stops allow, heliostat by heliostat.
 
     Parameters
@@ -211,7 +211,7 @@ def candidates(
         raise InputError("planning: there is no target; a camera-target sighting needs one")
     if len(mechanism.shape) != 1:
         raise InputError(f"mechanisms of shape {mechanism.shape}; give one batch axis (N,)")
-    bounds = limits or Limits()
+    bounds = limits or SightingLimits()
     moments = np.atleast_1d(as_float(times))
     above = solar.position(moments, site)
     up = above.elevation >= bounds.min_elevation
@@ -237,7 +237,7 @@ def candidates(
     joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
     order = np.lexsort((joined[2], joined[1], joined[0]))
     labels = tuple(t.name for t in targets)
-    return Candidates(names, labels, *(array[order] for array in joined))
+    return CandidateSightings(names, labels, *(array[order] for array in joined))
 
 
 def _part(
@@ -250,7 +250,7 @@ def _part(
     suns: FloatArray,
     names: tuple[str, ...],
     sigma: FloatArray,
-    limits: Limits,
+    limits: SightingLimits,
 ) -> tuple[np.ndarray, ...]:
     """The arrays of :class:`Candidates` for some heliostats and one target."""
     some = mechanism[first:last]
@@ -323,7 +323,7 @@ def grid(start: float, stop: float, every: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Plan:
+class SightingPlan:
     """The K sightings to make of one heliostat, in order of time.
 
     Attributes
@@ -344,7 +344,7 @@ class Plan:
         Of the parameters after all, (P, P).
     """
 
-    chosen: Candidates
+    chosen: CandidateSightings
     rank: npt.NDArray[np.intp]
     gain: FloatArray
     before: float
@@ -362,7 +362,7 @@ class Plan:
 
 
 def plan(
-    found: Candidates,
+    found: CandidateSightings,
     count: int,
     information: npt.ArrayLike,
     form: npt.ArrayLike,
@@ -370,7 +370,7 @@ def plan(
     criterion: Criterion = "d",
     exchange: bool = True,
     gap: float = 0.0,
-) -> Plan:
+) -> SightingPlan:
     """Return the sightings of one heliostat that tell most together.
 
     Parameters
@@ -424,7 +424,7 @@ def plan(
     rows = sorted(rows, key=lambda r: (found.time[r], r))
     best = choice.greedy(len(rows), np.array(rows), apart=False)
     gain, error, covariance = choice.walk(rows)
-    return Plan(
+    return SightingPlan(
         chosen=found.take(rows),
         rank=np.array([best.index(r) + 1 for r in rows], dtype=np.intp),
         gain=gain,

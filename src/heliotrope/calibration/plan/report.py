@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from heliotrope.calibration.plan.campaign import Campaign
-from heliotrope.calibration.plan.planning import Candidates, Plan
+from heliotrope.calibration.plan.campaign import CalibrationCampaign
+from heliotrope.calibration.plan.planning import CandidateSightings, SightingPlan
 from heliotrope.errors import InputError
 from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, azimuth_elevation
@@ -24,7 +24,7 @@ _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#
 _PICTURES = (".png", ".svg", ".pdf")
 
 
-def plan_rows(heliostat: str, plan: Plan) -> list[dict[str, Any]]:
+def plan_rows(heliostat: str, plan: SightingPlan) -> list[dict[str, Any]]:
     """Return one record a sighting, in order of time, for tables and JSON."""
     c = plan.chosen
     azimuth, elevation = np.degrees(azimuth_elevation(c.sun))
@@ -50,7 +50,7 @@ def plan_rows(heliostat: str, plan: Plan) -> list[dict[str, Any]]:
 
 
 def campaign_rows(
-    found: Campaign, heliostats: Sequence[str], targets: Sequence[str]
+    found: CalibrationCampaign, heliostats: Sequence[str], targets: Sequence[str]
 ) -> list[dict[str, Any]]:
     """Return one record a measurement, in order of time, for tables and JSON."""
     return [
@@ -129,7 +129,7 @@ def check_picture(path: str | Path) -> str:
     return suffix
 
 
-def plan_picture(plans: Mapping[str, Plan], possible: Candidates) -> "Figure":
+def plan_picture(plans: Mapping[str, SightingPlan], possible: CandidateSightings) -> "Figure":
     """Return the sun's path with the chosen sightings, and the expected error after each.
 
     Parameters
@@ -177,7 +177,7 @@ def plan_picture(plans: Mapping[str, Plan], possible: Candidates) -> "Figure":
     return figure
 
 
-def _sun_paths(ax: "Axes", possible: Candidates, centre: float) -> None:
+def _sun_paths(ax: "Axes", possible: CandidateSightings, centre: float) -> None:
     order = np.argsort(possible.time, kind="stable")
     time, sun = possible.time[order], possible.sun[order]
     # Nights part the days.
@@ -190,7 +190,7 @@ def _sun_paths(ax: "Axes", possible: Candidates, centre: float) -> None:
         )
 
 
-def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Plan) -> None:
+def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: SightingPlan) -> None:
     """Ranks beside the points; those of points close together stand in one text."""
     left = list(range(len(plan)))
     while left:
@@ -211,7 +211,9 @@ def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Plan) -
         left = [k for k in left if k not in near]
 
 
-def campaign_picture(found: Campaign, position: FloatArray, targets: Sequence[str]) -> "Figure":
+def campaign_picture(
+    found: CalibrationCampaign, position: FloatArray, targets: Sequence[str]
+) -> "Figure":
     """Return the field coloured by what is to be expected after it, and the fall of the error.
 
     Parameters

@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliotrope.calibration.evaluation import Errors, Summary, errors, summary
-from heliotrope.calibration.fit.estimator import Outcome
+from heliotrope.calibration.evaluation import BeamErrors, ErrorSummary, beam_errors, summarise
+from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.assessment import Assessment
 from heliotrope.calibration.learn.learning import Learned, left_out_errors
 from heliotrope.calibration.report import pictures
 from heliotrope.calibration.report.results import (
-    Results,
+    FieldParameters,
     at_moment,
     calibrated_plant,
     write_json,
@@ -42,14 +42,14 @@ class Row:
 
     index: int
     name: str
-    before: Summary
-    after: Summary
-    held: Summary
-    outcome: Outcome
+    before: ErrorSummary
+    after: ErrorSummary
+    held: ErrorSummary
+    outcome: FitOutcome
 
 
 @dataclass(frozen=True)
-class Result:
+class CalibrationReport:
     """A calibration with what is needed to show it.
 
     Attributes
@@ -81,14 +81,14 @@ class Result:
     comparison: tuple[str, ...] = field(default=())
 
     @cached_property
-    def results(self) -> Results:
+    def results(self) -> FieldParameters:
         """The parameters at the moment of the last sighting."""
         return at_moment(self.names, self.learned)
 
     @cached_property
-    def before(self) -> Errors:
+    def before(self) -> BeamErrors:
         """Errors under the nominal mechanisms."""
-        return errors(self.learned.mechanism, self.learned.sightings)
+        return beam_errors(self.learned.mechanism, self.learned.sightings)
 
     @cached_property
     def after(self) -> FloatArray:
@@ -124,14 +124,14 @@ class Result:
     def _rows(self) -> tuple[Row, ...]:
         held = {h.name: h.beam for h in self.assessment.heliostats} if self.assessment else {}
         size = np.linalg.norm(self.after, axis=-1)
-        nothing = summary(np.empty(0))
+        nothing = summarise(np.empty(0))
         found = []
         for i, name in enumerate(self.names):
             mine = self.learned.sightings.heliostat == i
             if mine.any():
-                outcome = Outcome(int(self.learned.static.outcome[i]))
-                before = summary(self.before.beam[mine])
-                after = summary(size[mine])
+                outcome = FitOutcome(int(self.learned.static.outcome[i]))
+                before = summarise(self.before.beam[mine])
+                after = summarise(size[mine])
                 found.append(Row(i, name, before, after, held.get(name, nothing), outcome))
         return tuple(found)
 
@@ -140,7 +140,7 @@ class Result:
         return self._rows
 
 
-def write_parameters(result: Result, path: Path) -> None:
+def write_parameters(result: CalibrationReport, path: Path) -> None:
     """Write the parameters with their standard deviations as CSV, one heliostat a row.
 
     Columns carry the unit: ``tilt_north_rad``, ``tilt_north_sigma_rad``.
@@ -154,7 +154,7 @@ def write_parameters(result: Result, path: Path) -> None:
     lines = [",".join(header)]
     sigma = r.sigma
     for i, heliostat in enumerate(result.names):
-        cells = [heliostat, str(int(c.count[i])), Outcome(int(c.outcome[i])).name.lower()]
+        cells = [heliostat, str(int(c.count[i])), FitOutcome(int(c.outcome[i])).name.lower()]
         cells.append(f"{r.noise[i]:.17g}")
         for p in range(len(r.names)):
             cells += [f"{r.values[i, p]:.17g}", f"{sigma[i, p]:.17g}"]
@@ -163,7 +163,7 @@ def write_parameters(result: Result, path: Path) -> None:
 
 
 def write_report(
-    result: Result, folder: Path, progress: Callable[[int, int], None] | None = None
+    result: CalibrationReport, folder: Path, progress: Callable[[int, int], None] | None = None
 ) -> Path:
     """Write the page and the files beside it; returns the page's path.
 
@@ -214,7 +214,7 @@ def picture(figure: "Figure", alt: str, dpi: int = 80) -> str:
     return f'<img loading="lazy" src="data:image/png;base64,{code}" alt="{html.escape(alt)}">'
 
 
-def blind_spots(result: Result, i: int) -> tuple[BlindSpot, ...]:
+def blind_spots(result: CalibrationReport, i: int) -> tuple[BlindSpot, ...]:
     """Return what the sightings of heliostat ``i`` say nothing about."""
     r = result.results
     count = len(result.learned.model)
@@ -224,7 +224,7 @@ def blind_spots(result: Result, i: int) -> tuple[BlindSpot, ...]:
     )
 
 
-def _section(result: Result, row: Row) -> str:
+def _section(result: CalibrationReport, row: Row) -> str:
     name = html.escape(row.name)
     learned, i = result.learned, row.index
     notes = []
@@ -251,7 +251,7 @@ def _section(result: Result, row: Row) -> str:
     )
 
 
-def _parameter_table(result: Result, i: int) -> str:
+def _parameter_table(result: CalibrationReport, i: int) -> str:
     r = result.results
     lines = []
     for p, name in enumerate(r.names):
@@ -277,7 +277,7 @@ section { border-top: 1px solid #8886; margin-top: 2rem } :root { color-scheme: 
 """
 
 
-def _page(result: Result, sections: list[str]) -> str:
+def _page(result: CalibrationReport, sections: list[str]) -> str:
     body = []
     linked = "".join(sections)
     for row in result.rows():
@@ -310,7 +310,7 @@ def _page(result: Result, sections: list[str]) -> str:
     )
 
 
-def _summary(result: Result) -> str:
+def _summary(result: CalibrationReport) -> str:
     learned = result.learned
     unused = len(result.left_out)
     first = f"{len(result.rows())} heliostats with {len(learned.sightings)} sightings; "

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from heliotrope.calibration.report.page import Result
+    from heliotrope.calibration.report.page import CalibrationReport
 
 #: Grey, blue, orange and vermilion of Okabe and Ito, told apart by the colour-blind too.
 BEFORE, AFTER, TESTED, OUTLIER = "#999999", "#0072b2", "#e69f00", "#d55e00"
@@ -30,7 +30,7 @@ def figure_of(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figu
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def overview(result: "Result") -> "Figure":
+def overview(result: "CalibrationReport") -> "Figure":
     """Return the picture of all heliostats: median beam error before, after and held out."""
     rows = result.rows()
     figure, axes = figure_of(1, 1, (min(24.0, max(6.0, 0.32 * len(rows) + 2.0)), 4.2))
@@ -54,7 +54,7 @@ def overview(result: "Result") -> "Figure":
     return figure
 
 
-def field_map(result: "Result") -> "Figure":
+def field_map(result: "CalibrationReport") -> "Figure":
     """Return the map of the field coloured by the median beam error after calibration."""
     figure, axes = figure_of(1, 1, (7.0, 5.5))
     ax: Axes = axes[0, 0]
@@ -96,7 +96,7 @@ def field_map(result: "Result") -> "Figure":
     return figure
 
 
-def heliostat_figure(result: "Result", i: int) -> "Figure":
+def heliostat_figure(result: "CalibrationReport", i: int) -> "Figure":
     """Return the picture of one heliostat: target, residuals, parameters, the year."""
     figure, axes = figure_of(3, 3, (13.0, 11.0))
     mine = np.flatnonzero(result.learned.sightings.heliostat == i)
@@ -129,7 +129,7 @@ def heliostat_figure(result: "Result", i: int) -> "Figure":
 
 
 def _groups(
-    result: "Result", mine: npt.NDArray[np.intp]
+    result: "CalibrationReport", mine: npt.NDArray[np.intp]
 ) -> list[tuple[npt.NDArray[np.bool_], str, str]]:
     label, out = result.learned.regime[mine], result.learned.outlier[mine]
     found = []
@@ -182,7 +182,7 @@ def _residual(
 
 def _in_time(
     ax: "Axes",
-    result: "Result",
+    result: "CalibrationReport",
     i: int,
     mine: npt.NDArray[np.intp],
     groups: list[tuple[npt.NDArray[np.bool_], str, str]],
@@ -200,7 +200,7 @@ def _in_time(
     ax.set_title("in time (dotted: steps of the zeros)", fontsize=10)
 
 
-def _year(ax: "Axes", result: "Result", i: int) -> None:
+def _year(ax: "Axes", result: "CalibrationReport", i: int) -> None:
     r = result.results
     machine = result.learned.mechanism[i].with_parameters(
         {n: r.values[i, p] for p, n in enumerate(r.names)}
@@ -223,7 +223,7 @@ def _year(ax: "Axes", result: "Result", i: int) -> None:
     ax.set_ylabel("declination, °")
 
 
-def _parameters(ax: "Axes", result: "Result", i: int) -> None:
+def _parameters(ax: "Axes", result: "CalibrationReport", i: int) -> None:
     r = result.results
     learned = result.learned
     priors = np.array([learned.mechanism.parameter(n).prior for n in r.names])

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import __version__
-from heliotrope.calibration.fit.estimator import Outcome
+from heliotrope.calibration.fit.estimator import FitOutcome
 from heliotrope.calibration.learn.drift import DAY
 from heliotrope.calibration.learn.learning import Learned
 from heliotrope.errors import InputError
@@ -31,7 +31,7 @@ VERSION = 1
 
 
 @dataclass(frozen=True)
-class Results:
+class FieldParameters:
     """Parameters of N heliostats at one moment.
 
     Attributes
@@ -83,7 +83,9 @@ class Results:
         return heliostats.with_parameters(merged)
 
 
-def at_moment(names: tuple[str, ...], learned: Learned, time: float | None = None) -> Results:
+def at_moment(
+    names: tuple[str, ...], learned: Learned, time: float | None = None
+) -> FieldParameters:
     """Return the parameters at Unix ``time``, by default that of the last sighting used."""
     known = learned.sightings.time[learned.used & np.isfinite(learned.sightings.time)]
     when = float(known.max()) if time is None and len(known) else np.nan
@@ -91,7 +93,7 @@ def at_moment(names: tuple[str, ...], learned: Learned, time: float | None = Non
         when = time
     rows = np.arange(len(names))
     values, spread = learned.parameters_at(rows, np.full(len(names), when))
-    return Results(
+    return FieldParameters(
         learned.model,
         learned.names,
         names,
@@ -104,7 +106,11 @@ def at_moment(names: tuple[str, ...], learned: Learned, time: float | None = Non
 
 
 def write_json(
-    path: Path, names: tuple[str, ...], learned: Learned, results: Results, ids: tuple[str, ...]
+    path: Path,
+    names: tuple[str, ...],
+    learned: Learned,
+    results: FieldParameters,
+    ids: tuple[str, ...],
 ) -> None:
     """Write everything as JSON.
 
@@ -151,7 +157,9 @@ def write_json(
     write_text(path, json.dumps(document, ensure_ascii=False, indent=1) + "\n")
 
 
-def _heliostat(i: int, learned: Learned, results: Results, ids: tuple[str, ...]) -> dict[str, Any]:
+def _heliostat(
+    i: int, learned: Learned, results: FieldParameters, ids: tuple[str, ...]
+) -> dict[str, Any]:
     rows = learned.rows[i]
     member = learned.members[i]
     label = learned.regime[rows]
@@ -169,7 +177,7 @@ def _heliostat(i: int, learned: Learned, results: Results, ids: tuple[str, ...])
         "values": results.values[i].tolist(),
         "covariance": results.covariance[i].tolist(),
         "sightings": int(results.used[i]),
-        "outcome": Outcome(int(learned.static.outcome[i])).name.lower(),
+        "outcome": FitOutcome(int(learned.static.outcome[i])).name.lower(),
         "noise": float(results.noise[i]),
         "regimes": regimes,
         "steps": [_moment(float(day) * DAY) for day in member.data.steps],
@@ -183,7 +191,7 @@ def _moment(seconds: float) -> str | None:
     return datetime.fromtimestamp(seconds, UTC).isoformat()
 
 
-def read_json(path: str | Path) -> Results:
+def read_json(path: str | Path) -> FieldParameters:
     """Return the parameters of a file of :func:`write_json`.
 
     Raises
@@ -207,7 +215,7 @@ def read_json(path: str | Path) -> Results:
         if len(rows) != size:
             raise node["covariance"].fail(f"{len(rows)} rows for {size} parameters")
         spread[i] = [_numbers(row, size) for row in rows]
-    return Results(
+    return FieldParameters(
         tuple(node.text() for node in root["model"].elements()),
         names,
         tuple(name for name, _ in members),
@@ -235,7 +243,7 @@ def _seconds(node: _json.Node) -> float:
         raise node.fail(f"{node.value!r} is no ISO 8601 time") from None
 
 
-def write_parquet(path: Path, mechanism_units: dict[str, str], results: Results) -> None:
+def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldParameters) -> None:
     """Write one heliostat a row: parameters and standard deviations with their unit."""
     import pandas as pd
 
@@ -251,14 +259,14 @@ def write_parquet(path: Path, mechanism_units: dict[str, str], results: Results)
     write_file(path, lambda part: frame.to_parquet(part, index=False))
 
 
-def calibrated_plant(plant: Plant, group: str, results: Results) -> Plant:
+def calibrated_plant(plant: Plant, group: str, results: FieldParameters) -> Plant:
     """Return ``plant`` with the parameters in the heliostats of ``group``."""
     groups = dict(plant.groups)
     groups[group] = results.apply(groups[group])
     return replace(plant, groups=groups)
 
 
-def apply_to_plant(plant: Plant, results: Results) -> Plant:
+def apply_to_plant(plant: Plant, results: FieldParameters) -> Plant:
     """Return ``plant`` with the parameters in every group that has heliostats of these names.
 
     Raises

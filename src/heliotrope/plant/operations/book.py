@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.calibration.evaluation import errors
+from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.uncertainty import expected_error, precision
 from heliotrope.geometry import FloatArray
@@ -85,7 +85,7 @@ class CalibrationBook:
         """
         row = self._plant.field.place(name)
         before = self._history.get(name, ())
-        beams = errors(old, seen).beam[len(before) :]
+        beams = beam_errors(old, seen).beam[len(before) :]
         times = seen.time[len(before) :]
         self._history[name] = before + tuple(
             SightingView(float(at), target, float(beam))

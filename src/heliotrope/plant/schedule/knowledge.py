@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.learn.drift import DAY, zeros
 from heliotrope.calibration.plan import gain as _gain
-from heliotrope.calibration.plan.planning import Aimed, Limits, aim_at, sighting_jacobian
+from heliotrope.calibration.plan.planning import Aimed, SightingLimits, aim_at, sighting_jacobian
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
 from heliotrope.field.heliostats import Heliostats
@@ -148,7 +148,7 @@ class Knowledge:
         now: float,
         sun: FloatArray,
         target: Target,
-        limits: Limits,
+        limits: SightingLimits,
         *,
         shots: int,
         sigma: float,

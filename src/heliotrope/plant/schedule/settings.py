@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heliotrope.calibration.learn.drift import DAY, START_DAYS, START_RAD
-from heliotrope.calibration.plan.planning import Limits
+from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 
@@ -27,8 +27,8 @@ class Weather:
     wind: float = float("nan")
 
 
-def _default_limits() -> Limits:
-    return Limits(min_elevation=float(np.radians(15.0)))
+def _default_limits() -> SightingLimits:
+    return SightingLimits(min_elevation=float(np.radians(15.0)))
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Settings:
 
     model: str | tuple[str, ...] = "malan8"
     priors: Mapping[str, float] = field(default_factory=dict)
-    limits: Limits = field(default_factory=_default_limits)
+    limits: SightingLimits = field(default_factory=_default_limits)
     shots: int = 3
     interval: float = 20.0
     sigma: float = 5e-4

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from heliotrope.calibration.plan.planning import Limits
+from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, tangent_axes
@@ -51,7 +51,7 @@ class Sight:
         self._room = np.maximum(half[None, :] - radius[:, None], 0.1 * half)
         self._eyes = [c.position for c in cameras if c.position is not None]
 
-    def able(self, sun: FloatArray, limits: Limits) -> Mask:
+    def able(self, sun: FloatArray, limits: SightingLimits) -> Mask:
         """Return who may be within the limits, (N,); some that are not are let through."""
         half_way = 0.5 * angle_between(np.broadcast_to(sun, self.way.shape), self.way)
         return np.asarray(

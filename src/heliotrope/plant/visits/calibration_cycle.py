@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope import sun
-from heliotrope.calibration.evaluation import errors
-from heliotrope.calibration.fit.estimator import Calibration, Outcome, fit
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome, fit
 from heliotrope.calibration.sightings import Sightings, camera_target, join
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
@@ -276,11 +276,11 @@ class CalibrationCycle:
         text = f"calibrated: beam error {1e3 * before:.2f} to {1e3 * after:.2f} mrad RMS"
         return result(f"{text} over {len(every)} sightings", before, after, pushed)
 
-    def _problem(self, fitted: Calibration, before: float, after: float) -> str:
+    def _problem(self, fitted: FieldFit, before: float, after: float) -> str:
         """Return why a fit is not to be used, "" if it is."""
         settings = self._settings
-        outcome = Outcome(int(fitted.outcome[0]))
-        if outcome is not Outcome.CONVERGED:
+        outcome = FitOutcome(int(fitted.outcome[0]))
+        if outcome is not FitOutcome.CONVERGED:
             return outcome.text
         far = np.abs(fitted.values[0]) / fitted.prior[0]
         if far.max() > settings.most:
@@ -327,4 +327,4 @@ class CalibrationCycle:
 
 def _rms(mechanism: Mechanism, seen: Sightings) -> float:
     """Return the beam's error, rad RMS in two dimensions."""
-    return float(np.sqrt(np.mean(errors(mechanism, seen).beam ** 2)))
+    return float(np.sqrt(np.mean(beam_errors(mechanism, seen).beam ** 2)))
