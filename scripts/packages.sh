@@ -10,6 +10,8 @@ command -v npm >/dev/null || missing+=(npm)
 command -v systemd-analyze >/dev/null || missing+=(systemd)
 command -v initdb >/dev/null || compgen -G "/usr/lib/postgresql/*/bin/initdb" >/dev/null ||
   missing+=(postgresql)
+command -v gpsfake >/dev/null || missing+=(gpsd gpsd-clients gpsd-tools)
+command -v chronyd >/dev/null || [ -x /usr/sbin/chronyd ] || missing+=(chrony)
 [ ${#missing[@]} -eq 0 ] && exit 0
 
 as_root=""

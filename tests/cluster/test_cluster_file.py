@@ -4,7 +4,7 @@ import ctypes
 import json
 import math
 import shutil
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +15,12 @@ from heliotrope.cluster import timekeeping
 from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Node, rows
 from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
 from heliotrope.cluster.config_file import TABLES, read_cluster
-from heliotrope.cluster.gps import GpsTime
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.program import line_of, time_of
-from heliotrope.cluster.timekeeping import Time
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import SystemClock, VirtualClock
 from support.clusters import SITE, config_of
-from support.nmea_talk import rmc
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "cluster"
@@ -51,7 +48,8 @@ def test_the_example_is_read(folder: Path) -> None:
     assert [member.name for member in config.heliostats] == ["AA1", "AA2", "AA3"]
     assert config.heliostats[1].key == bytes(range(0x20, 0x40))
     assert (found.scheme, found.host, found.port) == ("tcp", "10.0.0.2", 4840)
-    assert (found.time.source, found.bus.baud_rate) == ("gps", 115200)
+    assert (found.error, found.gpsd) == (None, ("localhost", 2947))
+    assert found.bus.baud_rate == 115200
     assert found.state == folder / "C1.state.json"
     assert config.longest_autonomy == 0.0
     assert config.site.latitude_deg == -33.9281
@@ -75,13 +73,30 @@ def test_the_example_is_read(folder: Path) -> None:
         ("tcp://10.0.0.2:4840", "mqtt://10.0.0.2", "has no prefix"),
         ("tcp://10.0.0.2:4840", "http://10.0.0.2:80", "give tcp://host:port, mqtt://"),
         ("tcp://10.0.0.2:4840", "tcp://host:99999", "is no URL"),
-        ('url = "/dev/ttyACM0"\n', "", "time: source is gps, and no url is given"),
+        ("[time]", "[time]\nerror_s = 0.6", "time.error_s: 0.6: input should be less than"),
+        ("[time]", "[time]\nerror_s = 0", "time.error_s: 0: input should be greater than 0"),
+        ('"localhost"', '"localhost:0x"', "time.gpsd: 'localhost:0x': give host or host:port"),
+        ('"localhost"', '"tcp://localhost"', "time.gpsd: 'tcp://localhost': give host or"),
+        (
+            "[time]",
+            '[time]\nsource = "gps"',
+            "time.source: the computer's clock is kept by chronyd",
+        ),
+        ("[time]", '[time]\nurl = "/dev/ttyACM0"', 'write gpsd = "localhost"'),
+        (
+            "[time]",
+            "[time]\nbaud_rate = 9600",
+            "time.baud_rate: the computer's clock is kept by chronyd now: give the baud",
+        ),
+        ("[time]", "[time]\nlatency_s = 0.5", "offset of chronyd's refclock"),
+        (
+            "[time]",
+            "[time]\nsystem_tolerance_s = 0",
+            "2 s apart; remove the key",
+        ),
+        ("[time]", "[time]\nntp = true", "time.ntp: the kernel is asked unless error_s is stated"),
+        ("[time]", "[time]\ndrift_ppm = 50", "time.drift_ppm: the kernel's bound grows by 500 ppm"),
         ("latitude_deg = -33.9281", "latitude_deg = 133", "site.latitude_deg: 133"),
-        ("[time]", "[time]\nntp = true", "time.ntp: ntp belongs to source system"),
-        ("[time]", "[time]\nlatency_s = 2", "time.latency_s: 2: input should be less than"),
-        ("[time]", "[time]\nsystem_tolerance_s = -1", "time.system_tolerance_s: -1: input"),
-        ("[time]", "[time]\ndrift_ppm = 0", "time.drift_ppm: 0: input should be greater than 0"),
-        ("baud_rate = 9600", "baud_rate = 4000000", "time.baud_rate: 4000000: input should be"),
         ("[site] ", "[site", "no TOML"),
         ('"C1.keys.toml" ', '"none.toml" ', "none.toml: there is no such file"),
         ("version = 1\n", "version = 1\nkeys2 = 3\n", "'keys2' is not known; did you mean 'keys'"),
@@ -287,85 +302,38 @@ def test_links_and_times_are_made_as_the_file_says(folder: Path) -> None:
     clock = SystemClock()
     installation = read_cluster(folder / "C1.toml")
     assert _link(installation, clock).name == "plant at 10.0.0.2:4840"
-    assert isinstance(time_of(installation, clock), GpsTime)
     changed(folder, "tcp://10.0.0.2:4840", "mqtt://broker/heliotrope/example")
-    changed(folder, 'source = "gps"', 'source = "system"')
+    changed(folder, 'gpsd = "localhost"', "error_s = 0.25")
     installation = read_cluster(folder / "C1.toml")
     assert (installation.port, installation.prefix) == (1883, "heliotrope/example")
     assert "broker" in _link(installation, clock).name
     keeper = time_of(installation, clock)
-    assert keeper.time().error == 0.5
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.25)
     changed(folder, 'example"', 'example"\nauthority = "no.pem"')
     changed(folder, "mqtt://", "mqtts://")
     with pytest.raises(InputError, match=r"no\.pem"):
         _link(read_cluster(folder / "C1.toml"), clock)
 
 
-def spoken(keeper: GpsTime, clock: VirtualClock, seconds: int = 5) -> Time:
-    """What a receiver without latency makes a keeper believe."""
-    true = datetime(2026, 6, 21, 10, tzinfo=UTC)
-    for second in range(seconds):
-        keeper._disciplined.hear(rmc(true + timedelta(seconds=second)))
-        clock.advance(1.0)
-    return keeper.time()
-
-
-@pytest.mark.parametrize(
-    ("lines", "off", "quality", "error"),
-    [
-        ("", 0.0, "gps", 0.255),
-        ("latency_s = 0.1", 0.0, "gps", 0.055),
-        ("", 5.0, "none", math.inf),
-        ("system_tolerance_s = 6", 5.0, "gps", 0.255),
-        ("system_tolerance_s = 0", 5.0, "gps", 0.255),
-    ],
-)
-def test_a_receiver_is_believed_as_the_file_says(
-    folder: Path, lines: str, off: float, quality: str, error: float
+def test_unless_an_error_is_stated_the_kernel_is_asked(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changed(folder, "[time]", f"[time]\n{lines}")
+    told = [0.02]
+    monkeypatch.setattr(timekeeping, "kernel_bound", lambda: told[0])
     clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
-    clock.jump(off)
-    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
-    assert isinstance(keeper, GpsTime)
-    found = spoken(keeper, clock)
-    assert found.quality == quality
-    assert found.error == pytest.approx(error, abs=0.002)
-
-
-def test_an_oscillator_drifts_as_the_file_says(folder: Path) -> None:
-    changed(folder, "[time]", "[time]\ndrift_ppm = 200")
-    clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
-    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
-    assert isinstance(keeper, GpsTime)
-    before = spoken(keeper, clock).error
-    clock.advance(1000.0)
-    assert (keeper.time().quality, keeper.time().error) == (
-        "holdover",
-        pytest.approx(before + 0.2, abs=1e-6),
-    )
-
-
-def test_with_ntp_the_kernel_is_asked(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = [True]
-    monkeypatch.setattr(timekeeping, "kernel_synchronised", lambda: kept[0])
-    changed(
-        folder, 'source = "gps"', 'source = "system"\nntp = true\ndrift_ppm = 400\nerror_s = 0.1'
-    )
-    clock = VirtualClock(start=datetime(2026, 6, 21, 10, tzinfo=UTC))
-    keeper = time_of(read_cluster(folder / "C1.toml"), clock)
-    assert (keeper.time().quality, keeper.time().error) == ("system", 0.1)
-    kept[0] = False
-    clock.advance(1000.0)
-    assert (keeper.time().quality, keeper.time().error) == ("holdover", pytest.approx(0.5))
-    clock.advance(2000.0)
-    assert keeper.time().quality == "none"
+    changed(folder, '"localhost"', '"10.0.0.9:2948"')
+    installation = read_cluster(folder / "C1.toml")
+    assert installation.gpsd == ("10.0.0.9", 2948)
+    keeper = time_of(installation, clock)
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.02)
+    told[0] = math.inf
+    clock.advance(100.0)
+    assert (keeper.time().quality, keeper.time().error) == ("holdover", pytest.approx(0.07))
 
 
 def test_where_the_kernel_cannot_be_asked_that_is_said_at_the_start(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changed(folder, 'source = "gps"', 'source = "system"\nntp = true')
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
     with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
         time_of(read_cluster(folder / "C1.toml"), SystemClock())

@@ -107,7 +107,8 @@ class Installation:
             f'[[heliostats]]\nname = "{self.field.names[i]}"\naddress = {11 + i}\n' for i in own
         )
         (self.folder / f"{name}.toml").write_text(
-            f'format = "heliotrope-cluster"\nversion = 1\nname = "{name}"\nkeys = "{name}.keys"\n'
+            f'format = "heliotrope-cluster"\nversion = 1\nname = "{name}"\n'
+            f'keys = "{name}.keys"\ntime = {{error_s = 0.5}}\n'
             f"[site]\nlatitude_deg = {self.site.latitude_deg}\n"
             f"longitude_deg = {self.site.longitude_deg}\nheight_m = {self.site.height}\n"
             f'[bus]\nurl = "{port}"\nanswer_s = 0.2\nstored_answer_s = 1.0\n'

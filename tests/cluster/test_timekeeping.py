@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 
-from heliotrope.cluster.timekeeping import SystemTime, kernel_synchronised
+from heliotrope.cluster.timekeeping import SystemTime, kernel_bound
 from heliotrope.errors import InputError
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
 from heliotrope.links.link import running
@@ -59,6 +59,7 @@ def test_slewing_and_a_clock_that_runs_fast_are_no_jumps_but_many_small_steps_ar
 def test_a_clock_that_was_never_set_is_no_source(year: int) -> None:
     now = SystemTime(VirtualClock(start=datetime(year, 1, 1, 2, tzinfo=UTC))).time()
     assert (now.quality, now.error) == ("none", math.inf)
+    assert now.note == f"the computer's clock says {year}-01-01: it was never set"
 
 
 def test_a_jump_there_and_back_between_two_questions_is_seen_by_run() -> None:
@@ -77,40 +78,94 @@ def test_a_jump_there_and_back_between_two_questions_is_seen_by_run() -> None:
     assert run_virtual(main) == 2
 
 
+class Kernel:
+    """A kernel: its bound grows by 0.5 ms in each whole second, unless somebody renews it."""
+
+    def __init__(self, clock: VirtualClock, error: float) -> None:
+        self._clock = clock
+        self.renew(error)
+
+    def renew(self, error: float) -> None:
+        self._error, self._at = error, self._clock.monotonic()
+
+    def __call__(self) -> float:
+        return self._error + 500e-6 * math.floor(self._clock.monotonic() - self._at)
+
+
+def kept() -> tuple[VirtualClock, Kernel, SystemTime]:
+    clock = VirtualClock(start=START)
+    kernel = Kernel(clock, 0.01)
+    return clock, kernel, SystemTime(clock, bound=kernel)
+
+
+def test_the_bound_is_the_kernels() -> None:
+    clock, kernel, keeper = kept()
+    assert (keeper.time().quality, keeper.time().error, keeper.time().note) == ("system", 0.01, "")
+    for error in (0.02, 0.005, 0.3, 0.3):
+        clock.advance(60.0)
+        kernel.renew(error)
+        assert (keeper.time().quality, keeper.time().error) == ("system", error)
+
+
 def test_a_clock_that_nobody_keeps_any_more_holds_over_and_ends() -> None:
-    clock, kept = VirtualClock(start=START), True
-    keeper = SystemTime(clock, error=0.4, synchronised=lambda: kept, drift_ppm=100.0)
-    assert (keeper.time().quality, keeper.time().error) == ("system", 0.4)
-    kept = False
-    clock.advance(1000.0)
+    clock, kernel, keeper = kept()
+    for _ in range(300):
+        assert keeper.time().quality == "system"
+        clock.advance(1.0)
+    clock.advance(1.0)
     now = keeper.time()
     assert (now.quality, now.jumped) == ("holdover", False)
-    assert now.error == pytest.approx(0.5)
-    clock.advance(4990.0)
+    assert now.error == pytest.approx(0.01 + 500e-6 * 301)
+    assert "may be off by 0.16 s: chronyd has lost its sources" in now.note
+    clock.advance(1600.0)
     assert keeper.time().quality == "holdover"
+    clock.advance(100.0)
+    now = keeper.time()
+    assert (now.quality, now.error) == ("none", math.inf)
+    assert "may be off by 1 s, more than 1 s" in now.note
+    kernel.renew(0.01)
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.01)
+
+
+def test_a_restart_of_chronyd_ends_nothing_but_a_clock_set_meanwhile_does() -> None:
+    clock, kernel, keeper = kept()
+    assert keeper.time().quality == "system"
+    kernel.renew(math.inf)
     clock.advance(20.0)
+    now = keeper.time()
+    assert (now.quality, now.error) == ("holdover", pytest.approx(0.01 + 500e-6 * 20))
+    assert "nobody keeps the computer's clock" in now.note
+    clock.jump(5.0)
+    now = keeper.time()
+    assert (now.quality, now.error, now.jumped) == ("none", math.inf, True)
+    clock.advance(60.0)  # the jump has settled; nobody knows the time all the same
+    assert keeper.time().quality == "none"
+    kernel.renew(0.02)
+    assert (keeper.time().quality, keeper.time().error) == ("system", 0.02)
+
+
+def test_a_clock_that_nobody_keeps_for_long_ends_too() -> None:
+    clock, kernel, keeper = kept()
+    keeper.time()
+    kernel.renew(math.inf)
+    clock.advance(1900.0)
+    assert keeper.time().quality == "holdover"
+    clock.advance(200.0)
     assert (keeper.time().quality, keeper.time().error) == ("none", math.inf)
-    kept = True
-    assert (keeper.time().quality, keeper.time().error) == ("system", 0.4)
 
 
 def test_a_clock_that_nobody_ever_kept_is_no_source() -> None:
-    now = SystemTime(VirtualClock(start=START), synchronised=lambda: False).time()
+    now = SystemTime(VirtualClock(start=START), bound=lambda: math.inf).time()
     assert (now.quality, now.error) == ("none", math.inf)
+    assert now.note == "nobody keeps the computer's clock; is chronyd running?"
 
 
 @pytest.mark.parametrize(
     ("state", "bound_us", "wanted"),
-    [
-        (0, 300_000, True),
-        (1, 1_999_999, True),
-        (4, 10, True),
-        (5, 10, False),
-        (0, 2_000_000, False),
-    ],
+    [(0, 300_000, 0.3), (1, 10, 1e-5), (4, 16_000_000, 16.0), (5, 10, math.inf)],
 )
 def test_the_kernel_is_asked(
-    monkeypatch: pytest.MonkeyPatch, state: int, bound_us: int, wanted: bool
+    monkeypatch: pytest.MonkeyPatch, state: int, bound_us: int, wanted: float
 ) -> None:
     class Library:
         """A C library whose kernel is in a state."""
@@ -122,24 +177,18 @@ def test_the_kernel_is_asked(
             return state
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Library())
-    assert kernel_synchronised() is wanted
+    assert kernel_bound() == pytest.approx(wanted)
 
 
 def test_a_kernel_that_does_not_say_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
     with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
-        kernel_synchronised()
+        kernel_bound()
 
 
 def test_the_kernel_of_this_machine_answers_or_says_that_it_does_not() -> None:
     with contextlib.suppress(InputError):  # in a container it may be forbidden
-        assert kernel_synchronised() in (True, False)
-
-
-@pytest.mark.parametrize("values", [{"drift_ppm": 0.0}, {"largest_error": 0.4}])
-def test_a_holdover_that_is_none_is_refused(values: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=r"not below the error of 0\.5 s"):
-        SystemTime(VirtualClock(), **values)  # type: ignore[arg-type]
+        assert kernel_bound() >= 0.0
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, math.inf, math.nan])

@@ -123,7 +123,8 @@ def cluster_file(folder: Path, name: str, url: str) -> None:
     site, first = noon(), 2 * list(WAYS).index(name)
     members = "".join(f'[[heliostats]]\nname = "H{first + k}"\naddress = {k}\n' for k in (1, 2))
     (folder / f"{name}.toml").write_text(
-        f'format = "heliotrope-cluster"\nversion = 1\nname = "{name}"\nkeys = "{name}.keys"\n'
+        f'format = "heliotrope-cluster"\nversion = 1\nname = "{name}"\n'
+        f'keys = "{name}.keys"\ntime = {{error_s = 0.5}}\n'
         f"site = {{latitude_deg = {site.latitude_deg}, longitude_deg = {site.longitude_deg}}}\n"
         f'bus = {{url = "{folder}/{name}.bus", answer_s = 0.5}}\nplant = {{url = "{url}"}}\n'
         f"{members}"

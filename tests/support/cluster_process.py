@@ -72,6 +72,7 @@ keys = "keys.toml"
 site = {{latitude_deg = 20.0, longitude_deg = {noon:.3f}}}
 bus = {{url = "{folder}/bus", answer_s = 0.5}}
 plant = {{url = "tcp://127.0.0.1:{port}"}}
+time = {{error_s = 0.5}}
 heliostats = [{{name = "A1", address = 1}}, {{name = "A2", address = 2}}]
 """
     (folder / "C1.toml").write_text(text)

@@ -157,6 +157,10 @@ class Watch:
             readings["plant_silence", ""] = self._lease
         if self._line is not None:
             readings["emergency_line_live", ""] = Reading(float(self._line()), now)
+        if time.note:
+            self._reports.alarm("time_source", "", "WARNING", time.note)
+        else:
+            self._reports.clear("time_source", "")
         before = self.verdict.act
         self._state, actions = evaluate(readings, self._state, now)
         self._alarm(actions)

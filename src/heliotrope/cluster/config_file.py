@@ -14,6 +14,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member
+from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
@@ -24,6 +25,19 @@ _OTHERS = 0o077
 _MISSING = {
     "heliostats": "the cluster has no such heliostat",
     "clusters": "the plant has no such cluster",
+}
+_CHRONY = "the computer's clock is kept by chronyd now"
+#: Keys of ``[time]`` up to the first edition, and what to do instead.
+_OLD_TIME = {
+    "source": f"{_CHRONY}, from a receiver too: remove the key, or state error_s for a clock that "
+    "you vouch for",
+    "url": f'{_CHRONY}: give the receiver\'s port to gpsd, and write gpsd = "localhost"',
+    "baud_rate": f"{_CHRONY}: give the baud rate to gpsd, and remove the key",
+    "latency_s": f"{_CHRONY}: state the receiver's latency as offset of chronyd's refclock, and "
+    "remove the key",
+    "system_tolerance_s": "clock and receiver may always be 2 s apart; remove the key",
+    "ntp": "the kernel is asked unless error_s is stated; remove the key",
+    "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
 }
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
@@ -78,31 +92,17 @@ class PlantTable(Table):
 
 
 class TimeTable(Table):
-    """``[time]``: where the time comes from."""
+    """``[time]``: the computer's clock, and how far it is believed."""
 
-    source: Literal["system", "gps"] = Field("system", description="This computer, or a receiver.")
-    url: str = Field("", description="Of the receiver's port (NMEA 0183).")
-    baud_rate: int = Field(9600, ge=1200, le=921_600, description="Of the receiver's port.")
-    latency_s: float = Field(
-        0.5,
-        ge=0.01,
-        le=1.9,
-        description="From a second to the quickest of its sentences; half of it is the error.",
+    error_s: float | None = Field(
+        None,
+        gt=0.0,
+        le=0.5,
+        description="Bound of the clock's error that you vouch for; default: ask the kernel.",
     )
-    system_tolerance_s: float = Field(
-        2.0,
-        ge=0.0,
-        le=3600.0,
-        description="How far this computer's clock may be from the receiver; 0: it has no say.",
-    )
-    error_s: float = Field(
-        0.5, gt=0.0, le=0.5, description="What the operator vouches for with `system`."
-    )
-    ntp: bool = Field(
-        False, description="With `system`: ask the kernel whether NTP keeps its clock."
-    )
-    drift_ppm: float = Field(
-        100.0, gt=0.0, le=1000.0, description="Of this computer's oscillator, left alone, at most."
+    gpsd: str = Field(
+        "",
+        description="`host` or `host:port` of gpsd, to show the receiver and to check the clock.",
     )
 
 
@@ -182,8 +182,10 @@ class Installation:
         Of the plant's URL; ``prefix`` of MQTT topics.
     plant_key, password
         Of the link; of the MQTT broker.
-    time
-        ``[time]``.
+    error
+        Bound of the clock's error that the operator vouches for, s; None: the kernel's is asked.
+    gpsd
+        Host and port of gpsd; None: there is none.
     state
         File for epoch and editions.
     emergency_line
@@ -200,7 +202,8 @@ class Installation:
     prefix: str
     plant_key: bytes
     password: str
-    time: TimeTable
+    error: float | None
+    gpsd: tuple[str, int] | None
     state: Path
     emergency_line: Path | None
 
@@ -214,6 +217,7 @@ def read_cluster(path: str | Path) -> Installation:
         If something cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
+    _refuse_old(path)
     document = read_document(path, "cluster", ClusterDocument, TABLES)
     secrets = Keys(path.parent / document.keys if document.keys else None, "heliostats")
     try:
@@ -222,6 +226,14 @@ def read_cluster(path: str | Path) -> Installation:
         raise
     except InputError as error:
         raise FormatError(path, str(error)) from None
+
+
+def _refuse_old(path: Path) -> None:
+    """Refuse keys of a former format with what to write instead."""
+    time = read_toml(path, "a cluster file").get("time")
+    for key in time if isinstance(time, dict) else ():
+        if key in _OLD_TIME:
+            raise FormatError(path, _OLD_TIME[key], f"time.{key}")
 
 
 def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installation:
@@ -250,15 +262,6 @@ def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installa
         phase=polling.phase_s,
         longest_autonomy=document.safety.longest_autonomy_s,
     )
-    if document.time.source == "gps" and not document.time.url:
-        raise FormatError(path, "source is gps, and no url is given; add it", "time")
-    if document.time.source == "gps" and document.time.ntp:
-        raise FormatError(
-            path,
-            "ntp belongs to source system; with gps the computer's clock is asked through "
-            "system_tolerance_s",
-            "time.ntp",
-        )
     line = document.safety.emergency_line
     scheme, host, port, prefix = url_parts(path, document.plant.url, "plant.url")
     return Installation(
@@ -272,10 +275,25 @@ def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installa
         prefix=prefix,
         plant_key=secrets.plant,
         password=secrets.password,
-        time=document.time,
+        error=document.time.error_s,
+        gpsd=_gpsd_at(path, document.time.gpsd),
         state=path.parent / (document.state or f"{document.name}.state.json"),
         emergency_line=path.parent / line if line else None,
     )
+
+
+def _gpsd_at(path: Path, text: str) -> tuple[str, int] | None:
+    """Return host and port of gpsd, None if there is none."""
+    if not text:
+        return None
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port or PORT
+    except ValueError:
+        host = None
+    if not host or parts.path:
+        raise FormatError(path, f"{text!r}: give host or host:port of gpsd", "time.gpsd")
+    return host, port
 
 
 def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:

@@ -11,8 +11,7 @@ from typing import Any
 from heliotrope.cluster import timekeeping
 from heliotrope.cluster.config_file import Installation, read_cluster
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.discipline import DisciplineSettings
-from heliotrope.cluster.gps import GpsSettings, GpsTime
+from heliotrope.cluster.gpsd import Gpsd
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.serial_bus import SerialBus
 from heliotrope.cluster.timekeeping import SystemTime, TimeKeeper
@@ -23,26 +22,18 @@ from heliotrope.links.link import Link
 
 
 def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
-    """Return where a cluster has its time from.
+    """Return the time keeper of a cluster.
 
     Raises
     ------
     InputError
         If the kernel is to be asked and cannot be.
     """
-    time = installation.time
-    if time.source == "system":
-        if time.ntp:
-            # Where the kernel cannot be asked, that is said at the start.
-            timekeeping.kernel_synchronised()
-        asked = timekeeping.kernel_synchronised if time.ntp else None
-        return SystemTime(clock, time.error_s, synchronised=asked, drift_ppm=time.drift_ppm)
-    discipline = DisciplineSettings(
-        latency=time.latency_s,
-        drift_ppm=time.drift_ppm,
-        system_tolerance=time.system_tolerance_s or None,
-    )
-    return GpsTime(time.url, clock, GpsSettings(time.baud_rate, discipline=discipline))
+    gpsd = None if installation.gpsd is None else Gpsd(clock, *installation.gpsd)
+    if installation.error is not None:
+        return SystemTime(clock, installation.error, gpsd=gpsd)
+    timekeeping.kernel_bound()  # a system that cannot be asked is refused at the start
+    return SystemTime(clock, bound=timekeeping.kernel_bound, gpsd=gpsd)
 
 
 def line_of(file: Path | None) -> Callable[[], bool] | None:

@@ -1,12 +1,15 @@
-"""What time it is, how far that may be off, and who says so.
+"""The time of a cluster, with a bound of its error and its source.
 
-The sun moves 73 µrad in a second, and a mirror that follows the sun of a wrong time misses with its
-beam by as much. So a cluster never has a mere time, but a `Time`: with a bound of its error, and
-its source.
+The sun moves 73 µrad in a second: a mirror that follows the sun of a wrong time misses by as much.
+A cluster therefore never has a bare time but a `Time`, which is an interval (`Time.error`).
 
-A time is only told here. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so a
-jump, forward or back, extends nothing; it is detected against the monotonic clock (`Steadiness`)
-and reported.
+The computer's clock is kept by chrony (or another NTP program), from a satellite receiver with a
+pulse, from time servers, or from both. The kernel carries the bound of the clock's error: chrony
+renews it, and between renewals it grows by 0.5 ms a second. `SystemTime` uses that bound.
+
+A `Time` is only told. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so a jump,
+forward or back, extends nothing; `Steadiness` detects a jump by comparison with the monotonic
+clock.
 """
 
 import asyncio
@@ -17,20 +20,30 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Literal, Protocol
 
+from heliotrope.cluster.gpsd import Gpsd
 from heliotrope.errors import InputError, TimeError
 from heliotrope.links.clock import GPS_EPOCH, Clock, gps_seconds, sleep_until
 
 Quality = Literal["gps", "system", "holdover", "none"]
 
-#: No time before this is believed: a computer without a battery for its clock starts in the past.
+#: An earlier time is not believed: a computer without a battery for its clock starts in the past.
 NOT_BEFORE = datetime(2026, 1, 1, tzinfo=UTC)
-#: What adjtimex(2) returns for a clock that is not synchronised.
+#: adjtimex(2) returns this for a clock that is not synchronised.
 _TIME_ERROR = 5
-#: Where timex has the bound of the clock's error, in longs; in µs.
+#: Index of the bound of the clock's error in ``struct timex``, counted in longs; in µs.
 _MAXERROR = 3
-_LONG_AGO_US = 2_000_000
 #: Two oscillators are believed to run alike within this: twice what NTP slews at most.
 _SLEW = 1e-3
+#: The kernel lets the bound of a clock grow by this ratio (MAXFREQ, 500 ppm), once a second.
+_GROWTH = 500e-6
+#: A bound that exceeds its growth by more than this was renewed, s: two ticks of a second.
+_RENEWED = 1e-3
+#: A bound not renewed for this long is holdover, s.
+_FRESH = 300.0
+#: Above this error bound there is no time, s.
+LARGEST_ERROR = 1.0
+#: Clock and receiver contradict each other above this, s; reports come up to 1 s late.
+CONTRADICTION = 2.0
 
 
 @dataclass(frozen=True)
@@ -42,15 +55,17 @@ class Time:
     utc_s
         POSIX seconds.
     gps_s
-        Seconds of the GPS scale since 6 January 1980, which no leap second bends.
+        Seconds of the GPS scale since 6 January 1980, which has no leap seconds.
     error
-        Bound of both, in s; infinite if there is none.
+        Bound of the error of both, s; infinite: unknown.
     quality
-        "gps": a receiver with a fix; "holdover": it had one, and the oscillator has carried its
-        time on since; "system": this computer's clock; "none": nothing to rely on.
+        "gps": a clock that is kept, confirmed by a receiver with a fix; "system": a clock that is
+        kept; "holdover": nobody has kept it for a while, and its bound grows; "none": unusable.
     jumped
-        It was set, forward or back, within the last seconds: what was reckoned with the times
-        before does not fit the times after.
+        The clock was set, forward or back, within the last seconds: intervals between times
+        before and after are meaningless.
+    note
+        What is wrong, in one line for the operator; "" if nothing is.
     """
 
     utc_s: float
@@ -58,10 +73,11 @@ class Time:
     error: float
     quality: Quality
     jumped: bool
+    note: str = ""
 
 
 class TimeKeeper(Protocol):
-    """What a cluster has its time from.
+    """Where a cluster has its time from.
 
     ``run`` belongs into a TaskGroup of the owner (or use `link.running`); it ends when the keeper
     is closed. ``time`` may be called at any instant, before ``run`` and after ``close`` too.
@@ -81,16 +97,16 @@ class TimeKeeper(Protocol):
 
 
 class Steadiness:
-    """Tells whether a time was set, by comparing it with the monotonic clock.
+    """Detects that a clock was set, by comparing it with the monotonic clock.
 
     Parameters
     ----------
     clock
         Its monotonic time is the measure.
     tolerance
-        A step up to this, in s, is no jump. Slewing (up to 1 ms in a second) never is.
+        A step up to this is no jump, s. Slewing (up to 1 ms in a second) never is.
     settle
-        How long a jump is told, in s.
+        How long a jump is told, s.
 
     Raises
     ------
@@ -111,7 +127,7 @@ class Steadiness:
         self.jumps = 0
 
     def see(self, seconds: float) -> bool:
-        """Note a time in s that is now, and return whether it jumped within ``settle``."""
+        """Note the present time in s, and return whether it jumped within ``settle``."""
         now = self._clock.monotonic()
         offset = seconds - now
         if self._offset is None:
@@ -130,12 +146,12 @@ class Steadiness:
         return now - self._jumped_at < self._settle
 
 
-def kernel_synchronised() -> bool:
-    """Return whether the kernel knows of somebody who keeps its clock right.
+def kernel_bound() -> float:
+    """Return the kernel's bound of the error of its clock in s, infinite if nobody keeps it.
 
-    chronyd (with ``rtcsync``, as packaged), ntpd and systemd-timesyncd tell it, at least every
-    34 minutes, how far the clock may be off. The kernel adds 0.5 ms to that in each second; above
-    2 s, an hour after they have lost their servers, the answer is no.
+    chronyd (with ``rtcsync``, as packaged) and ntpd state the bound, the root distance to their
+    source, whenever they correct the clock. Between corrections the kernel adds 0.5 ms a second.
+    systemd-timesyncd states 0 in place of the root distance: use chronyd.
 
     Raises
     ------
@@ -143,39 +159,67 @@ def kernel_synchronised() -> bool:
         On a system that cannot be asked.
     """
     ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
-    timex = (ctypes.c_long * 128)()  # of zeros it asks and changes nothing; larger than any is
+    timex = (ctypes.c_long * 128)()  # zeros ask and change nothing; larger than any struct timex
     state = -1 if ask is None else int(ask(timex))
     if state < 0:
-        raise InputError("time: this system does not say whether its clock is synchronised")
-    return state != _TIME_ERROR and timex[_MAXERROR] < _LONG_AGO_US
+        raise InputError(
+            "time: this system does not say whether its clock is synchronised; state its error "
+            "with error_s"
+        )
+    return math.inf if state == _TIME_ERROR else 1e-6 * timex[_MAXERROR]
+
+
+class _Bound:
+    """The kernel's bound, carried on through a restart of the program that renews it.
+
+    chronyd declares the clock unsynchronised when it starts. The oscillator knows nothing of that:
+    unless the clock is set meanwhile, the bound of before goes on growing.
+    """
+
+    def __init__(self, ask: Callable[[], float]) -> None:
+        self._ask = ask
+        self._error, self._at = math.inf, 0.0
+        self.kept = False
+        self.renewed_at = -math.inf
+
+    def at(self, now: float, *, jumped: bool) -> float:
+        """Return the bound at a monotonic time, s."""
+        grown = self._error + _GROWTH * (now - self._at)
+        told = self._ask()
+        self.kept = told < math.inf
+        if not self.kept:
+            if jumped:
+                self._error = math.inf
+            return math.inf if jumped else grown
+        if told < self._error or told > grown + _RENEWED:
+            self.renewed_at = now
+        self._error, self._at = told, now
+        return told
 
 
 class SystemTime:
-    """The time of this computer, for clusters without a receiver and for simulation.
+    """The time of this computer.
 
     Parameters
     ----------
     clock
         Its ``utc`` is told, its ``monotonic`` is the measure of jumps.
     error
-        What the operator vouches for, in s: with NTP in the plant's own network 0.1 s is wide.
+        Bound of the clock's error that the operator vouches for, s; used without ``bound``.
     settle
-        How long a jump is told, in s.
+        How long a jump is told, s.
     tolerance
-        A step up to this, in s, is no jump.
-    synchronised
-        Says whether somebody keeps the clock right now: `kernel_synchronised`, where NTP runs.
-        While nobody does, the time is of quality "holdover" and its error grows. None: it is not
-        asked, and the operator vouches for the clock always.
-    drift_ppm
-        Of the clock that nobody keeps, at most, in 1e-6.
-    largest_error
-        Above this error bound, in s, a clock that nobody keeps tells no time.
+        A step up to this is no jump, s.
+    bound
+        Returns the bound of the clock's error in s, infinite if nobody keeps it: `kernel_bound`.
+        None: ``error`` holds always.
+    gpsd
+        A receiver that must not contradict the clock; run and closed with this.
 
     Raises
     ------
     InputError
-        A bound that is none.
+        An error, tolerance or duration that is not above 0.
     """
 
     def __init__(
@@ -185,23 +229,15 @@ class SystemTime:
         settle: float = 10.0,
         tolerance: float = 0.1,
         *,
-        synchronised: Callable[[], bool] | None = None,
-        drift_ppm: float = 100.0,
-        largest_error: float = 1.0,
+        bound: Callable[[], float] | None = None,
+        gpsd: Gpsd | None = None,
     ) -> None:
         if not 0.0 < error < math.inf:
             raise InputError(f"time: an error bound of {error} s; it must be above 0")
-        if not (0.0 < drift_ppm < math.inf and error <= largest_error < math.inf):
-            raise InputError(
-                f"time: a drift of {drift_ppm} ppm, a largest error of {largest_error} s; they "
-                f"must be above 0, and the largest error not below the error of {error} s"
-            )
         self._clock = clock
         self._error = error
-        self._synchronised = synchronised
-        self._drift = drift_ppm * 1e-6
-        self._largest = largest_error
-        self._kept_at = -math.inf
+        self._bound = None if bound is None else _Bound(bound)
+        self._gpsd = gpsd
         self._steadiness = Steadiness(clock, tolerance, settle)
         self._closing = asyncio.Event()
 
@@ -211,22 +247,48 @@ class SystemTime:
         return self._steadiness.jumps
 
     def time(self) -> Time:
-        """Return the time; of quality "none" before `NOT_BEFORE`, or if it was alone too long."""
+        """Return the time now."""
         utc = self._clock.utc()
         jumped = self._steadiness.see(utc.timestamp())
+        error, quality, note = self._judged(utc, jumped=jumped)
+        return Time(utc.timestamp(), _gps(utc), error, quality, jumped, note)
+
+    def _judged(self, utc: datetime, *, jumped: bool) -> tuple[float, Quality, str]:
+        """Return bound, quality and note."""
         now = self._clock.monotonic()
-        quality: Quality = "system"
-        if self._synchronised is None or self._synchronised():
-            self._kept_at = now
-        else:
-            quality = "holdover"
-        error = self._error + self._drift * (now - self._kept_at)
-        if utc < NOT_BEFORE or (quality == "holdover" and error > self._largest):
-            error, quality = math.inf, "none"
-        return Time(utc.timestamp(), _gps(utc), error, quality, jumped)
+        error = self._error if self._bound is None else self._bound.at(now, jumped=jumped)
+        if utc < NOT_BEFORE:
+            return math.inf, "none", f"the computer's clock says {utc:%Y-%m-%d}: it was never set"
+        if error == math.inf:
+            return math.inf, "none", "nobody keeps the computer's clock; is chronyd running?"
+        if error > LARGEST_ERROR:
+            return math.inf, "none", _old(error, f", more than {LARGEST_ERROR:g} s")
+        ahead = None if self._gpsd is None else self._gpsd.ahead
+        if ahead is not None and abs(ahead) > CONTRADICTION:
+            note = (
+                f"the computer's clock is {ahead:+.1f} s from the receiver, more than "
+                f"{CONTRADICTION:g} s: one of them is wrong; chronyc sources tells what chronyd "
+                "goes by"
+            )
+            return math.inf, "none", note
+        if self._bound is not None and now - self._bound.renewed_at > _FRESH:
+            return error, "holdover", _old(error, "")
+        if self._bound is not None and not self._bound.kept:
+            return error, "holdover", "nobody keeps the computer's clock; is chronyd running?"
+        problem = "" if self._gpsd is None else self._gpsd.problem
+        return error, "system" if ahead is None else "gps", problem
 
     async def run(self) -> None:
         """Look at the clock each second, so that no jump there and back is missed for long."""
+        if self._gpsd is None:
+            await self._look()
+            return
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._gpsd.run())
+            await self._look()
+            await self._gpsd.close()
+
+    async def _look(self) -> None:
         while not self._closing.is_set():
             self.time()
             due = self._clock.monotonic() + 1.0
@@ -239,6 +301,13 @@ class SystemTime:
     async def close(self) -> None:
         """End ``run``."""
         self._closing.set()
+
+
+def _old(error: float, limit: str) -> str:
+    return (
+        f"the computer's clock may be off by {error:.2g} s{limit}: chronyd has lost its sources; "
+        "chronyc sources tells why"
+    )
 
 
 def _gps(utc: datetime) -> float:

@@ -33,6 +33,7 @@ _PLAIN = frozenset(
         "plant_unintelligible",
         "lease_refused",
         "autonomy_limited",
+        "time_source",
         "state_unwritable",
     }
 )

@@ -1,0 +1,250 @@
+"""A satellite receiver as gpsd tells of it: position, fix, and a second opinion on the time.
+
+gpsd reads the receiver and feeds chrony, which keeps the computer's clock (docs/how-to/time.md).
+The cluster takes its time from that clock. It listens to gpsd only to show the receiver's state
+and to notice when clock and receiver contradict each other.
+
+`Reader` turns bytes of gpsd's JSON protocol into a `Receiver` without any input or output; `Gpsd`
+keeps a connection open and feeds one.
+"""
+
+import asyncio
+import json
+import math
+import random
+from collections import deque
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Any
+
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import Backoff, until_closed
+
+PORT = 2947
+_WATCH = b'?WATCH={"enable":true,"json":true};\n'
+#: A line of gpsd has a few kB at most; a longer one is not gpsd's.
+_LONGEST_LINE = 65536
+#: Mode of a TPV report from which on there is a fix, and with height.
+_FIX_2D, _FIX_3D = 2, 3
+#: A fix older than this counts as lost, s.
+_FRESH = 5.0
+#: The quickest of this many reports tells how far the clock is ahead: any may be read late.
+_REPORTS = 10
+#: A missing fix is a problem after this long, s: opening the receiver takes a moment.
+_PATIENCE = 10.0
+#: A connection silent for this long is opened anew, s: gpsd reports at least once a second.
+_SILENCE = 30.0
+_OPEN_LIMIT = 3.0
+_FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """State of a receiver.
+
+    Attributes
+    ----------
+    device
+        As gpsd names it.
+    mode
+        0 or 1: no fix; 2: without height; 3: with height.
+    utc_s
+        POSIX seconds of the last fix; nan: none yet.
+    latitude_deg, longitude_deg, height_m
+        Of the last fix, height above the ellipsoid; nan where not known.
+    used, seen
+        Satellites.
+    """
+
+    device: str = ""
+    mode: int = 0
+    utc_s: float = math.nan
+    latitude_deg: float = math.nan
+    longitude_deg: float = math.nan
+    height_m: float = math.nan
+    used: int = 0
+    seen: int = 0
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the last report had a fix."""
+        return self.mode >= _FIX_2D
+
+    @property
+    def text(self) -> str:
+        """State in a few words, for a log."""
+        kind = "3D fix" if self.mode >= _FIX_3D else "2D fix" if self.fixed else "no fix"
+        place = ""
+        if self.fixed and math.isfinite(self.latitude_deg + self.longitude_deg):
+            place = f" at {self.latitude_deg:.5f}° {self.longitude_deg:.5f}°"
+        return f"{kind}{place}, {self.used} of {self.seen} satellites"
+
+
+class Reader:
+    """Reads gpsd's JSON lines.
+
+    Attributes
+    ----------
+    receiver
+        As last reported.
+    error
+        What gpsd last complained of, "" if nothing.
+    refused
+        Count of lines that are not gpsd's.
+    """
+
+    def __init__(self) -> None:
+        self.receiver = Receiver()
+        self.error = ""
+        self.refused = 0
+        self._rest = b""
+
+    def feed(self, data: bytes) -> bool:
+        """Take bytes, and return whether a new fix was among them."""
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        if len(self._rest) > _LONGEST_LINE:
+            self._rest, self.refused = b"", self.refused + 1
+        fixes = [self._take(line) for line in lines if line.strip()]
+        return any(fixes)
+
+    def _take(self, line: bytes) -> bool:
+        try:
+            report = json.loads(line)
+            kind = report["class"]
+            if kind == "TPV":
+                return self._take_fix(report)
+            if kind == "SKY" and "uSat" in report:
+                self.receiver = replace(
+                    self.receiver, used=int(report["uSat"]), seen=int(report.get("nSat", 0))
+                )
+            elif kind == "ERROR":
+                self.error = str(report.get("message", ""))
+        except (ValueError, TypeError, KeyError, OverflowError):
+            self.refused += 1
+        return False
+
+    def _take_fix(self, report: dict[str, Any]) -> bool:
+        """Take a TPV report; whether it tells a time that was not told before."""
+        mode = int(report.get("mode", 0))
+        device = str(report.get("device", self.receiver.device))
+        if mode < _FIX_2D or "time" not in report:
+            self.receiver = replace(self.receiver, device=device, mode=min(mode, 1))
+            return False
+        before = self.receiver.utc_s
+        self.receiver = replace(
+            self.receiver,
+            device=device,
+            mode=mode,
+            utc_s=datetime.fromisoformat(report["time"]).timestamp(),
+            latitude_deg=float(report.get("lat", math.nan)),
+            longitude_deg=float(report.get("lon", math.nan)),
+            height_m=float(report.get("altHAE", math.nan)),
+        )
+        self.error = ""
+        return self.receiver.utc_s != before
+
+
+class Gpsd:
+    """A connection to gpsd.
+
+    Parameters
+    ----------
+    host, port
+        Where gpsd listens.
+    clock
+        Its monotonic time measures the age of a fix.
+    """
+
+    def __init__(self, clock: Clock, host: str = "localhost", port: int = PORT) -> None:
+        self._clock, self._host, self._port = clock, host, port
+        self._reader = Reader()
+        #: UTC of each of the last fixes minus the monotonic time at which it came, s.
+        self._offsets: deque[float] = deque(maxlen=_REPORTS)
+        self._fixed_at = -math.inf
+        self._begun = clock.monotonic()
+        self._trouble = "not connected yet"
+        self._closing = asyncio.Event()
+
+    @property
+    def receiver(self) -> Receiver:
+        """State of the receiver; one without a fresh fix says so."""
+        receiver = self._reader.receiver
+        return receiver if self._fresh else replace(receiver, mode=min(receiver.mode, 1))
+
+    @property
+    def _fresh(self) -> bool:
+        return self._clock.monotonic() - self._fixed_at <= _FRESH
+
+    @property
+    def ahead(self) -> float | None:
+        """How far the computer's clock is ahead of the receiver, s; None without a fresh fix.
+
+        Includes the delay of the quickest of the last reports: some tenths of a second.
+        """
+        if not self._fresh:
+            return None
+        receiver_utc = self._clock.monotonic() + max(self._offsets)
+        return self._clock.utc().timestamp() - receiver_utc
+
+    @property
+    def problem(self) -> str:
+        """Why there is no fix, "" if there is one (or there has hardly been time for one)."""
+        now = self._clock.monotonic()
+        if now - max(self._fixed_at, self._begun) <= _PATIENCE:
+            return ""
+        where = f"gpsd at {self._host}:{self._port}"
+        if self._trouble:
+            return f"{where}: {self._trouble}"
+        if self._reader.error:
+            return f"{where}: {self._reader.error}"
+        return f"{where}: the receiver has no fix; does its antenna see the sky?"
+
+    def hear(self, data: bytes) -> None:
+        """Take bytes of gpsd that have just come."""
+        reader = self._reader
+        if reader.feed(data):
+            now = self._clock.monotonic()
+            if now - self._fixed_at > _FRESH:
+                self._offsets.clear()
+            self._fixed_at = now
+            self._offsets.append(reader.receiver.utc_s - now)
+
+    async def run(self) -> None:
+        """Keep the connection open until closed."""
+        await until_closed(self._closing, self._keep())
+
+    async def close(self) -> None:
+        """End ``run``."""
+        self._closing.set()
+
+    async def _keep(self) -> None:
+        backoff = Backoff(_FIRST_PAUSE, _LONGEST_PAUSE, random.Random())
+        while True:
+            try:
+                async with asyncio.timeout(_OPEN_LIMIT):
+                    reader, writer = await asyncio.open_connection(self._host, self._port)
+            except (OSError, TimeoutError) as error:
+                self._trouble = f"no connection ({str(error) or 'it takes too long'})"
+            else:
+                await self._listen(reader, writer)
+                backoff.reset()
+            await sleep_until(self._clock, self._clock.monotonic() + backoff.next())
+
+    async def _listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            writer.write(_WATCH)
+            await writer.drain()
+            self._trouble = ""
+            while True:
+                async with asyncio.timeout(_SILENCE):
+                    data = await reader.read(_LONGEST_LINE)
+                if not data:
+                    self._trouble = "the connection was closed"
+                    return
+                self.hear(data)
+        except TimeoutError:
+            self._trouble = f"silent for {_SILENCE:g} s"
+        except OSError as error:
+            self._trouble = str(error)
+        finally:
+            writer.close()
