@@ -172,7 +172,7 @@ def test_what_stays_broken_is_given_up_after_a_while(tmp_path: Path) -> None:
             assert list(source) == []
             assert len(source.skipped) == 1
         else:
-            with pytest.raises(FormatError, match="truncated"):
+            with pytest.raises(FormatError, match="damaged"):
                 list(source)
             assert len(script.waited) == 7
 
