@@ -8,7 +8,7 @@ import pytest
 
 from heliotrope import sun
 from heliotrope.calibration.plan._allocation import Option, allocate, exchanged
-from heliotrope.calibration.plan.campaign import CalibrationCampaign, Fleet, Timing, campaign
+from heliotrope.calibration.plan.campaign import CalibrationCampaign, Fleet, Timing, plan_campaign
 from heliotrope.calibration.plan.planning import SightingLimits
 from heliotrope.calibration.sightings import camera_target
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
@@ -80,7 +80,7 @@ def _check(found: CalibrationCampaign, fleets: list[Fleet], timing: Timing, targ
 def mixed(request: Any) -> tuple[list[Fleet], CalibrationCampaign]:
     """Two kinds of heliostats with models of different sizes, two targets, two days."""
     fleets = [_fleet(FIELD, NAMES), _fleet(_jack_plant(), (*MODELS["guo6"], "pivot_offset"))]
-    return fleets, campaign(
+    return fleets, plan_campaign(
         fleets,
         PLANT.site,
         TARGETS,
@@ -134,11 +134,11 @@ def test_a_campaign_against_taking_turns() -> None:
         rms = np.sqrt(np.einsum("npq,nqp->n", fleet.form, covariance))
         return float(np.sqrt(np.mean(rms**2)))
 
-    full = campaign(
+    full = plan_campaign(
         [fleet], PLANT.site, PLANT.targets, START, START + DAY, timing=Timing(200.0, 60.0, 40.0)
     )
     assert full.error[-1] < 1.03 * turns(full.time)
-    some = campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY)
+    some = plan_campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY)
     assert len(some) < 0.12 * some.slots
     every = np.arange(some.time[0], some.time[-1], Timing().slot)
     assert some.error[-1] < turns(every[: len(some)]) / 4.0
@@ -149,7 +149,7 @@ def test_slow_drives_are_waited_for() -> None:
     table[..., SLOTS["speed"]] = 400.0
     slow = Mechanism(**{**vars(FIELD[:3]), "drives": type(FIELD.drives)(table[:3])})
     fleet = _fleet(slow, NAMES)
-    found = campaign([fleet], PLANT.site, TARGETS, START, START + DAY, worth=0.0)
+    found = plan_campaign([fleet], PLANT.site, TARGETS, START, START + DAY, worth=0.0)
     _check(found, [fleet], Timing(), TARGETS)
     assert (found.arrive - found.leave).min() > 60.0
     assert len(found) < found.slots / 4
@@ -160,8 +160,8 @@ def test_looking_ahead_ends_lower_with_as_many_measurements() -> None:
     fleet = _fleet(FIELD, NAMES)
     timing = Timing(60.0, 2.0, 30.0)
     run = (PLANT.site, PLANT.targets, START, START + DAY)
-    early = campaign([fleet], *run, timing=timing, ahead=False)
-    late = campaign([fleet], *run, timing=timing)
+    early = plan_campaign([fleet], *run, timing=timing, ahead=False)
+    late = plan_campaign([fleet], *run, timing=timing)
     assert len(late) < 0.8 * len(early)
     assert late.error[-1] < 0.8 * early.error[len(late) - 1]
 
@@ -169,7 +169,7 @@ def test_looking_ahead_ends_lower_with_as_many_measurements() -> None:
 def test_a_campaign_ends_at_its_count_and_tells_of_progress() -> None:
     told: list[tuple[int, int]] = []
     fleet = _fleet(FIELD, NAMES)
-    found = campaign(
+    found = plan_campaign(
         [fleet],
         PLANT.site,
         TARGETS,
@@ -186,7 +186,7 @@ def test_a_campaign_ends_at_its_count_and_tells_of_progress() -> None:
 def test_a_campaign_wants_more_for_less() -> None:
     fleet = _fleet(FIELD, NAMES)
     few, many = (
-        campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY, worth=w)
+        plan_campaign([fleet], PLANT.site, PLANT.targets, START, START + DAY, worth=w)
         for w in (0.4, 0.1)
     )
     assert len(few) < len(many)
@@ -197,19 +197,19 @@ def test_campaign_refusals() -> None:
     fleet = _fleet(FIELD[:2], NAMES)
     run = (PLANT.site, TARGETS)
     with pytest.raises(InputError, match="at least one target"):
-        campaign([fleet], PLANT.site, (), START, START + DAY)
+        plan_campaign([fleet], PLANT.site, (), START, START + DAY)
     with pytest.raises(InputError, match="at least one target"):
-        campaign([], *run, START, START + DAY)
+        plan_campaign([], *run, START, START + DAY)
     with pytest.raises(InputError, match="give 1 or more measurements"):
-        campaign([fleet], *run, START, START + DAY, count=0)
+        plan_campaign([fleet], *run, START, START + DAY, count=0)
     with pytest.raises(InputError, match="share from 0"):
-        campaign([fleet], *run, START, START + DAY, worth=1.0)
+        plan_campaign([fleet], *run, START, START + DAY, worth=1.0)
     with pytest.raises(InputError, match="finite numbers"):
-        campaign([fleet], *run, START, np.inf)
+        plan_campaign([fleet], *run, START, np.inf)
     with pytest.raises(InputError, match="0 slots of 12 s"):
-        campaign([fleet], *run, START, START + 5.0)
+        plan_campaign([fleet], *run, START, START + 5.0)
     with pytest.raises(InputError, match="never 10° high"):
-        campaign([fleet], *run, START + 0.9 * DAY, START + 0.95 * DAY)
+        plan_campaign([fleet], *run, START + 0.9 * DAY, START + 0.95 * DAY)
     with pytest.raises(InputError, match="settle -1"):
         Timing(settle=-1.0)
     with pytest.raises(InputError, match="too short"):
@@ -220,7 +220,7 @@ def test_campaign_refusals() -> None:
         Fleet(FIELD[0], NAMES, fleet.information, fleet.form, AIM)
     blind = Fleet(FIELD[:2], NAMES, fleet.information, 0.0 * fleet.form, AIM)
     with pytest.raises(InputError, match="none would gain"):
-        campaign([blind], *run, START, START + DAY)
+        plan_campaign([blind], *run, START, START + DAY)
 
 
 @pytest.mark.slow
@@ -235,7 +235,7 @@ def test_ten_thousand_heliostats_in_a_minute() -> None:
     targets = tuple(Target(t.name, t.corners + lift, t.center + lift) for t in TARGETS)
     begin = time.perf_counter()
     fleet = _fleet(mechanism, NAMES, AIM + lift)
-    found = campaign([fleet], PLANT.site, targets, START, START + DAY)
+    found = plan_campaign([fleet], PLANT.site, targets, START, START + DAY)
     assert time.perf_counter() - begin < 90.0
     assert len(found) > 0.99 * found.slots
     _check(found, [fleet], Timing(), targets)

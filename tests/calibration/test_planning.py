@@ -16,9 +16,9 @@ from heliotrope.calibration.plan.planning import (
     CandidateSightings,
     SightingLimits,
     SightingPlan,
-    candidates,
-    grid,
-    plan,
+    candidate_sightings,
+    plan_sightings,
+    time_grid,
 )
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.calibration.sightings import Sightings, camera_target
@@ -38,7 +38,9 @@ from support.planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
 @pytest.fixture(scope="module")
 def possible() -> CandidateSightings:
     """Three days of the whole field on two targets."""
-    return candidates(FIELD, PLANT.site, TARGETS, grid(START, START + 3 * DAY, 3600.0), NAMES)
+    return candidate_sightings(
+        FIELD, PLANT.site, TARGETS, time_grid(START, START + 3 * DAY, 3600.0), NAMES
+    )
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +78,7 @@ def test_candidates_keep_to_sun_stops_and_limits(possible: CandidateSightings) -
 
 def test_nothing_that_is_possible_is_left_out(possible: CandidateSightings) -> None:
     """Counted again, one heliostat and one time after the other."""
-    times = grid(START, START + 3 * DAY, 3600.0)
+    times = time_grid(START, START + 3 * DAY, 3600.0)
     count = 0
     for moment, vector in zip(times, sun.vector(times, PLANT.site), strict=True):
         if sun.position(moment, PLANT.site).elevation < SightingLimits().min_elevation:
@@ -91,9 +93,9 @@ def test_nothing_that_is_possible_is_left_out(possible: CandidateSightings) -> N
 
 
 def test_limits_narrow_the_choice(possible: CandidateSightings) -> None:
-    times = grid(START, START + 3 * DAY, 3600.0)
+    times = time_grid(START, START + 3 * DAY, 3600.0)
     narrow = SightingLimits(np.radians(30.0), np.radians(35.0), np.radians(40.0))
-    found = candidates(FIELD, PLANT.site, TARGETS, times, NAMES, limits=narrow)
+    found = candidate_sightings(FIELD, PLANT.site, TARGETS, times, NAMES, limits=narrow)
     assert 0 < len(found) < len(possible)
     assert found.incidence.max() <= narrow.max_incidence
     assert found.obliquity.max() <= narrow.max_obliquity
@@ -103,8 +105,8 @@ def test_limits_narrow_the_choice(possible: CandidateSightings) -> None:
 def test_jacobian_against_finite_differences(names: tuple[str, ...]) -> None:
     """Whitened normal minus bisector, the bisector moving with the vertex."""
     mechanism, sigma = FIELD[3:6], 4e-4
-    found = candidates(
-        mechanism, PLANT.site, TARGETS, grid(START, START + DAY, 7200.0), names, sigma=sigma
+    found = candidate_sightings(
+        mechanism, PLANT.site, TARGETS, time_grid(START, START + DAY, 7200.0), names, sigma=sigma
     )
     assert len(found) > 20
     whole = mechanism[found.heliostat]
@@ -176,7 +178,7 @@ def _square(
 def _planned(
     possible: CandidateSightings, year: FloatArray, i: int, count: int, **options: Any
 ) -> SightingPlan:
-    return plan(possible.of(i), count, precision(FIELD, NAMES)[i], year[i], **options)
+    return plan_sightings(possible.of(i), count, precision(FIELD, NAMES)[i], year[i], **options)
 
 
 @pytest.mark.parametrize("criterion", ["d", "v"])
@@ -232,7 +234,7 @@ def test_against_exhaustive_search(
         own = own.take(np.flatnonzero((own.target == 0) & (own.time < START + DAY)))
         assert 8 <= len(own) <= 12
         every = list(combinations(range(len(own)), 4))
-        found = plan(own, 4, information, year[i], criterion=criterion)
+        found = plan_sightings(own, 4, information, year[i], criterion=criterion)
         if criterion == "d":
             best = max(_log_det(own, rows, information) for rows in every)
             worst = min(worst, np.exp((found.log_det - best) / len(NAMES)))
@@ -282,7 +284,7 @@ def test_what_is_known_already_counts(possible: CandidateSightings, year: FloatA
         np.linalg.inv(information[9]), first.covariance, rtol=1e-6, atol=1e-14
     )
     np.testing.assert_array_equal(information[8], precision(FIELD, NAMES)[8])
-    second = plan(possible.of(9), 5, information[9], year[9])
+    second = plan_sightings(possible.of(9), 5, information[9], year[9])
     assert second.before == pytest.approx(first.error[-1], rel=1e-8)
     assert second.log_det < first.log_det
 
@@ -327,15 +329,15 @@ def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     information = precision(FIELD, NAMES)[0]
     own = possible.of(0)
     with pytest.raises(InputError, match="give 1 or more"):
-        plan(own, 0, information, year[0])
+        plan_sightings(own, 0, information, year[0])
     with pytest.raises(InputError, match="no candidate"):
-        plan(own.take([]), 3, information, year[0])
+        plan_sightings(own.take([]), 3, information, year[0])
     with pytest.raises(InputError, match="criterion 'a'"):
-        plan(own, 3, information, year[0], criterion="a")  # type: ignore[arg-type]
+        plan_sightings(own, 3, information, year[0], criterion="a")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="there is no target"):
-        candidates(FIELD, PLANT.site, (), [START], NAMES)
+        candidate_sightings(FIELD, PLANT.site, (), [START], NAMES)
     with pytest.raises(InputError, match="one batch axis"):
-        candidates(FIELD[0], PLANT.site, TARGETS, [START], NAMES)
+        candidate_sightings(FIELD[0], PLANT.site, TARGETS, [START], NAMES)
     with pytest.raises(InputError, match="one batch axis"):
         precision(FIELD[0], NAMES)
     with pytest.raises(InputError, match="must be above 0"):
@@ -346,9 +348,9 @@ def test_refusals(possible: CandidateSightings, year: FloatArray) -> None:
     with pytest.raises(InputError, match="row 30; there are 18"):
         precision(FIELD, NAMES, made)
     with pytest.raises(InputError, match="end must be after"):
-        grid(START, START, 60.0)
+        time_grid(START, START, 60.0)
     with pytest.raises(InputError, match="more than 200,000"):
-        grid(START, START + 30 * DAY, 1.0)
+        time_grid(START, START + 30 * DAY, 1.0)
     with pytest.raises(InputError, match="max_incidence"):
         SightingLimits(max_incidence=2.0)
     with pytest.raises(InputError, match="never reaches 80°"):
@@ -521,7 +523,10 @@ REFUSED: list[tuple[list[str], str]] = [
     (["--sightings", "no.csv"], "there is no such file"),
     (["--sigma-mrad", "nan"], "--sigma-mrad nan"),
     (["--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "no measurement is possible"),
-    (["--campaign", "--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"], "never 10° high"),
+    (
+        ["--campaign", "--from", "2026-09-02T20:00Z", "--to", "2026-09-02T22:00Z"],
+        "never reaches 10°",
+    ),
     (["--from", "9999-12-30T00:00Z"], "beyond the year 9999"),
 ]
 
@@ -552,5 +557,5 @@ def test_no_input_is_overwritten(run: Any, plant_file: Path, tmp_path: Path) -> 
     before = table.read_bytes()
     code, _, err = run(plant_file, "--heliostat", "P6A", *WEEK, "--csv", table)
     assert code == 2
-    assert "this file is read from" in err
+    assert "this file is an input" in err
     assert table.read_bytes() == before

@@ -14,7 +14,12 @@ from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.clusters import tour
 from heliotrope.airborne.plan.hover import Facing, Mirrors, Sampling, face
 from heliotrope.calibration.fit.residuals import linearise
-from heliotrope.calibration.plan.planning import CandidateSightings, Criterion, SightingPlan, plan
+from heliotrope.calibration.plan.planning import (
+    CandidateSightings,
+    Criterion,
+    SightingPlan,
+    plan_sightings,
+)
 from heliotrope.calibration.sightings import drone
 from heliotrope.calibration.uncertainty import error_form, precision
 from heliotrope.errors import InputError
@@ -178,7 +183,7 @@ def look_points(
         )
     information = precision(middle, names, priors=choosing.priors)[0]
     form = error_form(middle, aim, suns, names)[0]
-    chosen = plan(found, choosing.points, information, form, criterion=choosing.criterion)
+    chosen = plan_sightings(found, choosing.points, information, form, criterion=choosing.criterion)
     index = chosen.chosen.time.astype(np.intp)
     # A short way through the directions is a short way for mirrors and drone.
     south = np.array([0.0, -1.0, 0.0])

@@ -1,1 +1,40 @@
-"""Learning a field: regimes, drift, outliers, and the choice of a model."""
+"""Learns a field: parameters, their drift in time, noise, steps, regimes and outliers.
+
+Begin with `learn`; `predict` and `assess` compare the result with sightings. `compare_models` and
+`choose_model` find the model. Learning on several machines (`calibration.learn.on_dask`) needs the
+optional dask.distributed and stays in its module.
+"""
+
+from heliotrope.calibration.learn.assessment import Assessment, HeliostatFigures, assess
+from heliotrope.calibration.learn.drift import Hyperparameters, Posterior, Process
+from heliotrope.calibration.learn.learning import (
+    Learned,
+    Prediction,
+    learn,
+    left_out_errors,
+    predict,
+)
+from heliotrope.calibration.learn.models import (
+    ScoredModel,
+    candidate_models,
+    choose_model,
+    compare_models,
+)
+
+__all__ = [
+    "Assessment",
+    "HeliostatFigures",
+    "Hyperparameters",
+    "Learned",
+    "Posterior",
+    "Prediction",
+    "Process",
+    "ScoredModel",
+    "assess",
+    "candidate_models",
+    "choose_model",
+    "compare_models",
+    "learn",
+    "left_out_errors",
+    "predict",
+]

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.evaluation import ErrorSummary, summarise
-from heliotrope.calibration.learn.learning import Learned, Prediction
+from heliotrope.calibration.learn.learning import Learned, Prediction, predict
 from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
 from heliotrope.mechanism.guo import AxisAccuracy, axis_accuracy
@@ -136,7 +136,7 @@ def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
     """
     rows = np.flatnonzero(~learned.used)
     seen = learned.sightings.take(rows)
-    found = learned.predict(seen)
+    found = predict(learned, seen)
     counts = np.bincount(learned.sightings.heliostat, minlength=len(names))
     figures = [
         _one(names[i], int(i), int(counts[i]), learned, found, np.flatnonzero(seen.heliostat == i))

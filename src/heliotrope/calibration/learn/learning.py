@@ -156,21 +156,30 @@ class Learned:
         values, _ = self.parameters_at(heliostat, time)
         return _moved(self.mechanism, heliostat, self.names, values)
 
-    def predict(self, sightings: Sightings) -> Prediction:
-        """Return what was to be expected of sightings, and how far off it was."""
-        rows = sightings.heliostat
-        values, spread = self.parameters_at(rows, sightings.time)
-        moved = _moved(self.mechanism, rows, self.names, values)
-        alone = replace(sightings, heliostat=np.arange(len(rows)))
-        found = beam_errors(moved, alone)
-        line = linearise(moved, sightings, self.names)
-        noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in self.members])[rows]
-        white = line.jacobian @ spread @ np.swapaxes(line.jacobian, -1, -2)
-        white += noise[:, None, None] * np.eye(2)
-        covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
-        square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
-        inside = square <= CHI_SQUARE_90
-        return Prediction(found, found.offset, covariance, inside, line.beam)
+
+def predict(learned: Learned, sightings: Sightings) -> Prediction:
+    """Return the beams expected of sightings, and how far off they were.
+
+    Parameters
+    ----------
+    learned
+        Of N heliostats.
+    sightings
+        M of these heliostats, at any time.
+    """
+    rows = sightings.heliostat
+    values, spread = learned.parameters_at(rows, sightings.time)
+    moved = _moved(learned.mechanism, rows, learned.names, values)
+    alone = replace(sightings, heliostat=np.arange(len(rows)))
+    found = beam_errors(moved, alone)
+    line = linearise(moved, sightings, learned.names)
+    noise = np.array([m.hyper.noise**2 * m.hyper.heavy for m in learned.members])[rows]
+    white = line.jacobian @ spread @ np.swapaxes(line.jacobian, -1, -2)
+    white += noise[:, None, None] * np.eye(2)
+    covariance = line.beam @ white @ np.swapaxes(line.beam, -1, -2)
+    square = np.einsum("ma,mab,mb->m", found.offset, np.linalg.inv(covariance), found.offset)
+    inside = square <= CHI_SQUARE_90
+    return Prediction(found, found.offset, covariance, inside, line.beam)
 
 
 def _moved(
@@ -187,7 +196,7 @@ def left_out_errors(learned: Learned) -> FloatArray:
     To the right of and above the destination, predicted minus seen. Outliers and what was
     not used are seen from all that was.
     """
-    known = learned.predict(learned.sightings)
+    known = predict(learned, learned.sightings)
     found = known.plane.copy()
     for i, member in enumerate(learned.members):
         part = learned.rows[i][~learned.outlier[learned.rows[i]]]

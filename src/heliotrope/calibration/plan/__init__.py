@@ -1,1 +1,39 @@
-"""Planning of measurements: what to measure next, and campaigns of a whole field."""
+"""Plans measurements: the suns and targets that tell most about each heliostat.
+
+`plan_sightings` chooses among the `candidate_sightings` of one heliostat, `plan_each` does so for
+several that share targets, `plan_campaign` schedules a whole field; `fleets_of` prepares the
+heliostats of a plant. Tables and pictures are in `calibration.plan.report`, updates of a covariance
+by one more sighting in `calibration.plan.gain`.
+"""
+
+from heliotrope.calibration.plan.campaign import CalibrationCampaign, Timing, plan_campaign
+from heliotrope.calibration.plan.fleets import Fleet, fleets_of, plan_each
+from heliotrope.calibration.plan.planning import (
+    Aimed,
+    CandidateSightings,
+    SightingLimits,
+    SightingPlan,
+    aim_at,
+    candidate_sightings,
+    plan_sightings,
+    sighting_jacobian,
+    time_grid,
+)
+
+__all__ = [
+    "Aimed",
+    "CalibrationCampaign",
+    "CandidateSightings",
+    "Fleet",
+    "SightingLimits",
+    "SightingPlan",
+    "Timing",
+    "aim_at",
+    "candidate_sightings",
+    "fleets_of",
+    "plan_campaign",
+    "plan_each",
+    "plan_sightings",
+    "sighting_jacobian",
+    "time_grid",
+]

@@ -1,10 +1,10 @@
-"""Which heliostat is seen when and where, if a whole day is looked at together.
+"""Allocates the beams of a whole day to intervals and targets.
 
-Options are (interval, target) pairs with room for some beams. The greatest gain of all
-is taken again and again (greedy choice under capacities, Fisher, Nemhauser & Wolsey
-1978); gains only fall as heliostats become known, so a gain that has grown old is found
-anew only when it comes up (Minoux 1978). Then beams are moved and exchanged between
-options as long as the sum falls: the first choice does not know what comes after it.
+An option is a pair of interval and target with room for some beams. The beam with the greatest
+gain is allocated again and again (greedy choice under capacities, Fisher, Nemhauser & Wolsey
+1978). Gains only fall as heliostats become better known, so an outdated gain is computed anew
+only when it comes to the top (Minoux 1978). Then beams are moved and exchanged between options
+as long as the sum of squared errors falls, because the greedy choice does not look ahead.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.geometry import FloatArray, as_float
 
-#: Beams that are looked at for moves and exchanges, at most; some seconds' worth.
+#: Most beams tried for moves and exchanges; takes some seconds.
 TRIES = 4_000
 #: Sweeps over all beams, options tried for each, and partners tried in each.
 SWEEPS, DEPTH, PARTNERS = 8, 4, 64
@@ -31,13 +31,13 @@ class Option:
     Attributes
     ----------
     rows
-        Heliostats that can be there, (n,).
+        Heliostats whose beams can reach it, (n,).
     slope
-        Their derivatives in scaled parameters, (n, 2, P).
+        Whitened derivatives by the scaled parameters, (n, 2, P).
     room
-        Beams that it can take.
+        Number of beams that fit in.
     most
-        How often each heliostat can be there, (n,).
+        Most visits of each heliostat, (n,).
     """
 
     rows: npt.NDArray[np.intp]
@@ -47,7 +47,7 @@ class Option:
 
 
 def gains(covariance: FloatArray, form: FloatArray, option: Option) -> FloatArray:
-    """Fall of the expected squared error by one sighting of each, rad², (n,)."""
+    """Fall of the expected squared error by one sighting of each heliostat, rad², (n,)."""
     found = np.empty(len(option.rows))
     for a in range(0, len(found), CHUNK):
         part = option.rows[a : a + CHUNK]
@@ -63,18 +63,18 @@ def allocate(
     worth: float,
     count: int | None,
 ) -> list[list[int]]:
-    """Return for each option the heliostats that it shows, the most telling first.
+    """Return the heliostats of each option, the greatest gain first.
 
     Parameters
     ----------
     covariance, form
-        (N, P, P); they stay as they are.
+        (N, P, P); not changed.
     options
         In any order.
     worth
         A sighting must lower the heliostat's expected squared error by this share.
     count
-        At most so many sightings, if given.
+        Most sightings in total; default: no limit.
     """
     known = covariance.copy()
     square = np.einsum("npq,nqp->n", form, known)
@@ -108,7 +108,7 @@ def allocate(
 
 
 class _Exchange:
-    """The chosen beams, and what each heliostat's are worth together."""
+    """The allocated beams and the information that each heliostat gains by them."""
 
     def __init__(
         self,
@@ -131,17 +131,17 @@ class _Exchange:
         return np.asarray(self.options[o].slope[self.place[o, rows]])
 
     def square(self, o: int, i: int) -> FloatArray:
-        """Information of one sighting."""
+        """Information of one sighting, (P, P)."""
         slope = self.slope(o, i)
         return np.asarray(slope.T @ slope)
 
     def able(self, o: int, i: int) -> bool:
-        """Whether heliostat ``i`` may come to option ``o`` once more."""
+        """Whether option ``o`` can take heliostat ``i`` once more."""
         k = self.place[o, i]
         return bool(k >= 0 and self.chosen[o].count(i) < self.options[o].most[k])
 
     def better(self, o: int, i: int) -> bool:
-        """Move one beam of ``i`` from option ``o``, alone or against another's, if it pays."""
+        """Move a beam of ``i`` away from option ``o``, or exchange it, if that lowers the error."""
         rest = as_float(np.linalg.inv(self.information[i] - self.square(o, i)))
         others = np.array([p for p in range(len(self.options)) if p != o and self.able(p, i)])
         if not others.size:
@@ -164,7 +164,7 @@ class _Exchange:
         return self._replace(o, i, rest)
 
     def _replace(self, o: int, i: int, rest: FloatArray) -> bool:
-        """Give a beam's place to another heliostat that gains more by it."""
+        """Give the place of a beam of ``i`` to a heliostat that gains more by it."""
         rows = self.options[o].rows
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         new = [int(b) for b in rows if b != i and self.able(o, int(b))]
@@ -181,7 +181,7 @@ class _Exchange:
         return True
 
     def _partner(self, o: int, p: int, i: int, gain: float) -> int | None:
-        """Who of option ``p`` loses least by going to ``o``, if it loses less than ``gain``."""
+        """Heliostat of option ``p`` that loses least in ``o``, if it loses less than ``gain``."""
         rows = [b for b in dict.fromkeys(self.chosen[p]) if b != i and self.able(o, b)]
         rows = rows[:: max(1, -(-len(rows) // PARTNERS))]
         if not rows:
@@ -191,7 +191,7 @@ class _Exchange:
         form = self.form[rows]
         change = _gain.variance_gain(rest, there, form) - _gain.variance_gain(rest, here, form)
         best = int(np.argmax(change))
-        # Rounding must not keep two beams changing places.
+        # The margin keeps rounding from exchanging two beams for ever.
         return rows[best] if change[best] > -gain * (1.0 - 1e-6) else None
 
     def _move(self, o: int, p: int, i: int) -> None:
@@ -206,7 +206,7 @@ def exchanged(
     options: Sequence[Option],
     chosen: Sequence[Sequence[int]],
 ) -> list[list[int]]:
-    """Return the choice of :func:`allocate` after moves and exchanges that pay."""
+    """Return the result of `allocate` after moves and exchanges that lower the error."""
     work = _Exchange(covariance, form, options, chosen)
     tries = 0
     for _ in range(SWEEPS):

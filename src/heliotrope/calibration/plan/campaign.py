@@ -1,10 +1,10 @@
-"""A campaign: which heliostat goes to which target when, for a whole field.
+"""Plans a campaign: which heliostat is measured on which target at what time.
 
-A target shows one beam at a time. Its time is cut into slots of equal length (settle,
-expose, clear). Either a day is looked at as a whole, and every heliostat gets the hours
-that tell most about it as far as there is room; or each slot is given to the heliostat
-whose sighting then makes the field's expected squared beam error fall most. Mirrors
-travel while others are seen; each comes from its aim and goes back to it.
+A target shows one beam at a time. Its time is cut into slots of equal length (settle, expose,
+clear). Either each day is planned as a whole, and every heliostat gets its most telling hours as
+far as there is room; or each slot goes to the heliostat whose sighting then lowers the field's
+expected squared beam error most. Mirrors travel while others are measured; each comes from its
+aim point and returns to it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,33 +19,33 @@ import numpy.typing as npt
 from heliotrope import sun as solar
 from heliotrope.calibration.plan import _allocation
 from heliotrope.calibration.plan import gain as _gain
+from heliotrope.calibration.plan.fleets import Fleet
 from heliotrope.calibration.plan.planning import SightingLimits, aim_at, sighting_jacobian
 from heliotrope.calibration.uncertainty import CHUNK
 from heliotrope.errors import InputError
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray, as_float, as_vectors
+from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site
 
-#: For the derivatives of a day that is looked at as a whole, bytes.
+#: Most memory for the derivatives of a day that is planned as a whole, bytes.
 MEMORY = 1e9
 
 
 @dataclass(frozen=True)
 class Timing:
-    """What a beam does on a target, s.
+    """Times of a beam on a target, s.
 
     Attributes
     ----------
     settle
         From its arrival until it stands still.
     exposure
-        Of the camera.
+        Exposure of the camera.
     clear
-        Until it has left the target, and the next may arrive.
+        From the exposure until it has left the target and the next may arrive.
     """
 
     settle: float = 5.0
@@ -62,80 +62,35 @@ class Timing:
 
     @property
     def slot(self) -> float:
-        """Time of a beam on the target, s."""
+        """Time that one beam occupies the target, s."""
         return self.settle + self.exposure + self.clear
 
 
 @dataclass(frozen=True)
-class Fleet:
-    """N heliostats of one kind that take part.
-
-    Attributes
-    ----------
-    mechanism
-        Best estimates, batch shape (N,).
-    names
-        P parameters of the model.
-    information
-        What is known before, (N, P, P), see
-        :func:`~heliotrope.calibration.uncertainty.precision`.
-    form
-        What the beam's error is made of, (N, P, P), see
-        :func:`~heliotrope.calibration.uncertainty.error_form`; 0 for a heliostat that
-        does not count, which is then never measured.
-    aim
-        Where each stands between its measurements, ENU metres, (N, 3).
-    sigma
-        Standard deviation of the beam's direction as the camera finds it, rad.
-    """
-
-    mechanism: Mechanism
-    names: tuple[str, ...]
-    information: FloatArray
-    form: FloatArray
-    aim: FloatArray
-    sigma: float = 5e-4
-
-    def __post_init__(self) -> None:
-        if len(self.mechanism.shape) != 1:
-            raise InputError(f"mechanisms of shape {self.mechanism.shape}; give one axis (N,)")
-        count, p = len(self.mechanism), len(self.names)
-        for name in ("information", "form"):
-            shape = getattr(self, name).shape
-            if shape != (count, p, p):
-                raise InputError(f"fleet: {name} of shape {shape}; it must be {(count, p, p)}")
-        aim = np.broadcast_to(as_vectors(self.aim, "aim"), (count, 3))
-        object.__setattr__(self, "aim", aim)
-
-    def __len__(self) -> int:
-        return len(self.mechanism)
-
-
-@dataclass(frozen=True)
 class CalibrationCampaign:
-    """M sightings in order of time, and what they are expected to bring.
+    """M planned sightings in order of time, with the beam errors to expect.
 
     Heliostats are numbered through all fleets. Times are unix seconds (UTC).
 
     Attributes
     ----------
     leave, arrive, time, done, back
-        When the heliostat leaves its aim, is on the target, is exposed (the middle), is
-        off the target, and is at its aim again, (M,).
+        When the beam leaves its aim, arrives on the target, is exposed (middle of the
+        exposure), has left the target, and is back at its aim, (M,).
     heliostat, target
         Rows, (M,).
     counts
-        Of the drives at ``time``, (M, D).
-    heliostat_error
-        Expected RMS of this heliostat's beam error after it, rad, (M,).
-    error
-        Expected RMS of the field's after it, rad, (M,).
+        Drive counts at ``time``, (M, D).
+    heliostat_error, error
+        Expected RMS beam error of this heliostat and of the field after the sighting,
+        rad, (M,).
     before
-        Expected RMS of the field's before all, rad.
+        Expected RMS beam error of the field before the campaign, rad.
     expected
-        Of each heliostat after all, rad, (N,); 0 where it does not count.
+        Expected RMS beam error of each heliostat after the campaign, rad, (N,); 0 where it
+        does not count.
     slots
-        Slots there were on all targets together.
+        Number of slots on all targets together.
     """
 
     leave: FloatArray
@@ -155,8 +110,13 @@ class CalibrationCampaign:
     def __len__(self) -> int:
         return len(self.time)
 
+    @property
+    def after(self) -> float:
+        """Expected RMS beam error of the field after the campaign, rad."""
+        return float(self.error[-1]) if len(self) else self.before
 
-def campaign(
+
+def plan_campaign(
     fleets: Sequence[Fleet],
     site: Site,
     targets: Sequence[Target],
@@ -171,7 +131,7 @@ def campaign(
     count: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> CalibrationCampaign:
-    """Return the measurements of a field from ``start`` to ``stop``.
+    """Return the measurements to make in a field from ``start`` to ``stop``.
 
     Parameters
     ----------
@@ -180,35 +140,35 @@ def campaign(
     site
         Place and air.
     targets
-        With a camera on each.
+        Targets with cameras.
     start, stop
         Unix seconds (UTC).
     timing, limits
-        By default :class:`Timing` and :class:`~heliotrope.calibration.plan.planning.Limits`.
+        Default: `Timing()` and `SightingLimits()`.
     every
-        Gains are found anew for the whole field at this interval, s; what is chosen is
-        computed for its own time.
+        Interval at which the gains of the whole field are computed, s; the sightings chosen
+        are computed for their own times.
     ahead
-        Look at each day as a whole, so that the error is smallest at its end; otherwise
-        each slot by itself, so that the error falls fastest.
+        Plan each day as a whole, so that the error is smallest at its end; otherwise slot by
+        slot, so that the error falls fastest.
     worth
-        A measurement must lower the heliostat's own expected squared error by this share;
-        a slot in which none does stays empty.
+        A measurement must lower the heliostat's own expected squared error by this share; a
+        slot in which none does stays empty.
     count
-        At most so many measurements.
+        Most measurements; default: no limit.
     progress
         Called with (slots done, all slots) after each interval.
 
     Returns
     -------
-    No two beams are on one target at a time, no heliostat is in two places, each leaves
-    its aim in time, and each is within its stops and the limits. It is taken to need as
-    long for the way back as for the way out.
+    A schedule in which no two beams share a target, no heliostat is in two places, each
+    leaves its aim in time, and stops and limits are kept. The way back is taken to last as
+    long as the way out.
 
     Raises
     ------
     InputError
-        If there is nothing to plan with, or the sun is not up in the span.
+        If there are no heliostats or targets, or the sun is not up in the span.
     """
     if not fleets or not sum(len(f) for f in fleets) or not targets:
         raise InputError("campaign: give heliostats and at least one target")
@@ -221,7 +181,7 @@ def campaign(
     drives = {len(f.mechanism.driven) for f in fleets}
     if len(drives) != 1:
         raise InputError("campaign: mechanisms with different numbers of drives; plan each alone")
-    work = _Work(
+    schedule = _Schedule(
         tuple(fleets),
         site,
         tuple(targets),
@@ -231,37 +191,37 @@ def campaign(
         worth,
         count,
     )
-    cells, slots = _cells(work, start, stop, every)
+    cells, slots = _cells(schedule, start, stop, every)
     done = 0
     for begin, day in groupby(cells, key=lambda cell: cell[0]):
-        for arrivals in work.day(begin, [cell[1] for cell in day]):
+        for arrivals in schedule.day(begin, [cell[1] for cell in day]):
             done += len(arrivals)
             if progress:
                 progress(done, slots)
-        if work.full:
+        if schedule.full:
             break
     if progress:
         progress(slots, slots)
-    return work.result(slots * len(targets), drives.pop())
+    return schedule.result(slots * len(targets), drives.pop())
 
 
 def _cells(
-    work: "_Work", start: float, stop: float, every: float
+    schedule: "_Schedule", start: float, stop: float, every: float
 ) -> tuple[list[tuple[float, FloatArray]], int]:
-    """(When the window opened, arrivals of some slots) while the sun is up; number of slots."""
-    slot = work.timing.slot
+    """Pairs (begin of daylight, arrivals of some slots), and the number of slots."""
+    slot = schedule.timing.slot
     number = int(np.floor((stop - start) / slot + 1e-9))
     if not 1 <= number <= 2_000_000:
         raise InputError(
             f"campaign: {stop - start:.0f} s hold {number} slots of {slot:g} s; give 1 to 2,000,000"
         )
     edges = start + slot * np.arange(number + 1)
-    high = solar.position(edges, work.site).elevation >= work.limits.min_elevation
+    high = solar.position(edges, schedule.site).elevation >= schedule.limits.min_elevation
     up = high[:-1] & high[1:]
     if not up.any():
         raise InputError(
-            f"campaign: the sun is never {np.degrees(work.limits.min_elevation):g}° high in the "
-            "span; choose other times or lower the least elevation"
+            f"campaign: the sun never reaches {np.degrees(schedule.limits.min_elevation):g}° in "
+            "the span; choose other times or lower the least elevation"
         )
     size = max(1, round(every / slot))
     opens = np.flatnonzero(up & ~np.concatenate([[False], up[:-1]]))
@@ -275,8 +235,8 @@ def _cells(
 
 
 @dataclass(frozen=True)
-class _View:
-    """One target at one instant, for some heliostats: J (n, 2, P) is scaled and padded."""
+class _TargetView:
+    """Some heliostats aimed at one target at one instant; ``slope`` is scaled and padded."""
 
     able: npt.NDArray[np.bool_]
     slope: FloatArray
@@ -284,8 +244,8 @@ class _View:
     counts: FloatArray
 
 
-class _Work:
-    """The state of a campaign: covariances in scaled parameters, padded to the largest P."""
+class _Schedule:
+    """State of a campaign: covariances by scaled parameters, padded to the largest P."""
 
     def __init__(
         self,
@@ -317,15 +277,15 @@ class _Work:
         self.square = np.einsum("npq,nqp->n", self.form, self.covariance)
         self.counted = int(self.form.any(axis=(1, 2)).sum())
         if not self.counted:
-            raise InputError("campaign: no heliostat can serve its aim, so none would gain")
+            raise InputError("campaign: no heliostat can serve its aim; check aims and stops")
         self.before = float(np.sqrt(self.square.sum() / self.counted))
         self.armatures = [f.mechanism.armature.table for f in fleets]
         self.version = np.zeros(total, dtype=np.int64)
         self.free = np.full(total, -np.inf)
         self.rows: list[tuple[Any, ...]] = []
 
-    def view(self, k: int, rows: slice, sun: FloatArray, target: Target) -> _View:
-        """What ``rows`` of fleet ``k`` would show on a target under the sun."""
+    def view(self, k: int, rows: slice, sun: FloatArray, target: Target) -> _TargetView:
+        """Heliostats ``rows`` of fleet ``k`` aimed at a target."""
         fleet = self.fleets[k]
         some, armature = fleet.mechanism[rows], Armature(self.armatures[k][rows])
         home = track(armature, sun, fleet.aim[rows], drives=some.drives)
@@ -346,26 +306,29 @@ class _Work:
             fleet.sigma,
         )
         part = slice(self.offsets[k] + rows.start, self.offsets[k] + rows.stop)
-        return _View(able, slope * self.scale[part, None], seconds, aimed.counts)
+        return _TargetView(able, slope * self.scale[part, None], seconds, aimed.counts)
 
-    def field_view(self, sun: FloatArray, target: Target) -> _View:
-        """All heliostats, fleet after fleet."""
+    def field_view(self, sun: FloatArray, target: Target) -> _TargetView:
+        """All heliostats aimed at a target, fleet after fleet."""
         parts = [
             self.view(k, slice(a, min(a + CHUNK, len(fleet))), sun, target)
             for k, fleet in enumerate(self.fleets)
             for a in range(0, len(fleet), CHUNK)
         ]
-        return _View(
-            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_View))
+        return _TargetView(
+            *(
+                np.concatenate([getattr(part, f.name) for part in parts])
+                for f in fields(_TargetView)
+            )
         )
 
     @property
     def full(self) -> bool:
-        """Whether all measurements that were asked for are there."""
+        """Whether the largest number of measurements is reached."""
         return self.limit is not None and len(self.rows) >= self.limit
 
     def day(self, begin: float, cells: list[FloatArray]) -> Iterator[FloatArray]:
-        """Fill the intervals of a window that opened at ``begin``; yields each when it is done."""
+        """Plan the intervals of a day that begins at ``begin``; yields each when it is done."""
         size = self.covariance[:, :2].nbytes * len(self.targets)
         look = max(1, int(MEMORY // size)) if self.ahead else 1
         for first in range(0, len(cells), look):
@@ -391,12 +354,12 @@ class _Work:
 
     @property
     def _shift(self) -> float:
-        """From a beam's arrival to the middle of the exposure, s."""
+        """From the arrival of a beam to the middle of the exposure, s."""
         return self.timing.settle + 0.5 * self.timing.exposure
 
-    def _option(self, view: _View, room: int) -> _allocation.Option:
+    def _option(self, view: _TargetView, room: int) -> _allocation.Option:
         rows = np.flatnonzero(view.able)
-        # A heliostat is back at its aim before it comes again.
+        # A heliostat returns to its aim before it comes again.
         again = self.timing.slot + 2.0 * view.seconds[rows]
         most = np.floor((room * self.timing.slot + 2.0 * view.seconds[rows]) / again)
         return _allocation.Option(rows, view.slope[rows], room, most.astype(np.intp))
@@ -411,7 +374,7 @@ class _Work:
                 self._fill(j, queue, begin, float(arrive), sun)
 
     def _fill(self, j: int, queue: "_Queue", begin: float, arrive: float, sun: FloatArray) -> None:
-        """Give one slot of target ``j`` to the first of its queue that can be there."""
+        """Give one slot of target ``j`` to the first heliostat in its queue that can be there."""
         waiting: list[tuple[float, int, int]] = []
         while queue.heap:
             entry = heappop(queue.heap)
@@ -426,7 +389,7 @@ class _Work:
             k = int(np.searchsorted(self.offsets, i, side="right")) - 1
             row = i - int(self.offsets[k])
             own = self.view(k, slice(row, row + 1), sun, self.targets[j])
-            # What the middle of the interval allowed, the slot itself may not.
+            # The queue is of the middle of the interval; the slot itself may be out of reach.
             if not own.able[0]:
                 continue
             if arrive - own.seconds[0] < ready:
@@ -438,7 +401,7 @@ class _Work:
         for entry in waiting:
             heappush(queue.heap, entry)
 
-    def _take(self, i: int, j: int, arrive: float, own: _View) -> None:
+    def _take(self, i: int, j: int, arrive: float, own: _TargetView) -> None:
         way, done = float(own.seconds[0]), arrive + self.timing.slot
         self.covariance[i] = _gain.updated(self.covariance[i], own.slope[0])
         self.square[i] = max(0.0, float(np.sum(self.form[i] * self.covariance[i])))
@@ -461,7 +424,7 @@ class _Work:
         )
 
     def result(self, slots: int, drives: int) -> CalibrationCampaign:
-        """The schedule as arrays."""
+        """Return the schedule as arrays."""
         columns = list(zip(*self.rows, strict=True)) or [()] * 10
 
         def numbers(k: int) -> FloatArray:
@@ -487,32 +450,38 @@ class _Work:
 class _Queue:
     """Heliostats for one target during an interval, the greatest gain first.
 
-    Either ``wanted`` are settled, in that order; or all that can be there are in it with
-    the gain of the middle of the interval, and an entry whose heliostat has been measured
-    since is found stale by its version when it comes up, and only then renewed.
+    Either the order ``wanted`` is settled; or all heliostats within reach are in it with their
+    gain at the middle of the interval. An entry of a heliostat that has been measured since is
+    outdated, which its version shows; its gain is renewed when it comes to the top.
     """
 
     def __init__(
-        self, work: _Work, view: _View, option: _allocation.Option, wanted: list[int] | None
+        self,
+        schedule: _Schedule,
+        view: _TargetView,
+        option: _allocation.Option,
+        wanted: list[int] | None,
     ) -> None:
-        self.work, self.view, self.settled = work, view, wanted is not None
+        self.schedule, self.view, self.settled = schedule, view, wanted is not None
         self.heap: list[tuple[float, int, int]]
         if wanted is not None:
             self.heap = [(float(n), 0, i) for n, i in enumerate(wanted)]
             return
-        found = _allocation.gains(work.covariance, work.form, option)
+        found = _allocation.gains(schedule.covariance, schedule.form, option)
         self.heap = [
-            (-float(g), int(work.version[i]), int(i))
+            (-float(g), int(schedule.version[i]), int(i))
             for g, i in zip(found, option.rows, strict=True)
-            if g > work.worth * work.square[i]
+            if g > schedule.worth * schedule.square[i]
         ]
         heapify(self.heap)
 
     def push(self, i: int) -> None:
-        """Enter heliostat ``i`` with the gain that it has now."""
-        work = self.work
+        """Enter heliostat ``i`` with its present gain."""
+        schedule = self.schedule
         if self.settled:
             return
-        gain = float(_gain.variance_gain(work.covariance[i], self.view.slope[i], work.form[i]))
-        if gain > work.worth * work.square[i]:
-            heappush(self.heap, (-gain, int(work.version[i]), i))
+        gain = float(
+            _gain.variance_gain(schedule.covariance[i], self.view.slope[i], schedule.form[i])
+        )
+        if gain > schedule.worth * schedule.square[i]:
+            heappush(self.heap, (-gain, int(schedule.version[i]), i))

@@ -1,4 +1,4 @@
-"""What one more sighting gains: rank-two updates of covariances, batch axes first.
+"""Gain of one more sighting: rank-two updates of covariances, batch axes first.
 
 With C the covariance of the parameters and J the whitened derivative (2, P) of a
 sighting, the information grows by JᵀJ, and with S = 1 + J C Jᵀ (matrix determinant
@@ -20,7 +20,7 @@ def _terms(covariance: FloatArray, jacobian: FloatArray) -> tuple[FloatArray, Fl
 
 
 def _inverse(s: FloatArray) -> FloatArray:
-    """Of symmetric matrices (..., 2, 2) that exceed the unit matrix."""
+    """Inverse of symmetric matrices (..., 2, 2) that exceed the unit matrix."""
     turned = np.empty_like(s)
     turned[..., 0, 0], turned[..., 1, 1] = s[..., 1, 1], s[..., 0, 0]
     turned[..., 0, 1] = turned[..., 1, 0] = -s[..., 0, 1]

@@ -1,10 +1,9 @@
-r"""Planning of sightings: which sun and target tell most about a heliostat.
+"""Plans the sightings of one heliostat: the suns and targets that tell most about it.
 
-A camera-target sighting adds JᵀJ to the information on the parameters, J being the
-whitened derivative of normal minus bisector. *D-optimal* choice makes the determinant
-of the information largest; *V-optimal* choice makes the expected squared error of the
-beam over the year smallest (Atkinson, Donev & Tobias 2007, chapters 10 and 12: greedy
-choice and Fedorov's exchange).
+A camera-target sighting adds JᵀJ to the information on the parameters, with J the whitened
+derivative of normal minus bisector. The *D-optimal* choice maximises the determinant of the
+information, the *V-optimal* choice minimises the expected squared error of the beam over the
+year (Atkinson, Donev & Tobias 2007, chapters 10 and 12: greedy choice and Fedorov's exchange).
 """
 
 from dataclasses import dataclass, fields, replace
@@ -26,13 +25,13 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.sun import Site
 
 Criterion = Literal["d", "v"]
-#: Rounds of exchange at most; two or three are usual.
+#: Most rounds of exchange; two or three are usual.
 SWEEPS = 50
 
 
 @dataclass(frozen=True)
 class SightingLimits:
-    """What a sighting must keep to.
+    """Limits that a sighting must keep.
 
     Attributes
     ----------
@@ -66,18 +65,17 @@ class CandidateSightings:
     targets
         Names of the targets.
     heliostat, target
-        Rows of heliostat and target, (M,).
+        Rows, (M,).
     time
         Unix seconds (UTC), (M,).
     sun
         Unit vectors to the apparent sun, ENU, (M, 3).
     counts
-        Of the drives, (M, D).
+        Drive counts, (M, D).
     normal
-        Of the mirror, ENU, (M, 3).
+        Mirror normals, ENU, (M, 3).
     incidence, obliquity
-        Angles of the sun from the mirror's normal and of the beam from the target's,
-        rad, (M,).
+        Angle between sun and mirror normal, and between beam and target normal, rad, (M,).
     jacobian
         Whitened derivative of normal minus bisector by the parameters, (M, 2, P).
     """
@@ -98,7 +96,7 @@ class CandidateSightings:
         return len(self.time)
 
     def take(self, rows: npt.ArrayLike) -> "CandidateSightings":
-        """Return those at ``rows`` (indices or a mask), in that order."""
+        """Return the sightings at ``rows`` (indices or a mask), in that order."""
         index = np.asarray(rows)
         if not index.size:
             index = index.astype(np.intp)
@@ -109,22 +107,22 @@ class CandidateSightings:
         )
 
     def of(self, heliostat: int) -> "CandidateSightings":
-        """Return those of one heliostat."""
+        """Return the sightings of one heliostat."""
         return self.take(np.flatnonzero(self.heliostat == heliostat))
 
 
 @dataclass(frozen=True)
 class Aimed:
-    """Mirrors sent to a target; batch shape (...).
+    """Mirrors aimed at a target; batch shape (...).
 
     Attributes
     ----------
     counts, normal
-        Of the drives and of the mirror, (..., D) and (..., 3).
+        Drive counts (..., D) and mirror normals (..., 3).
     incidence, obliquity
         rad, (...).
     able
-        Within the stops and the limits, (...).
+        Whether stops and limits allow it, (...).
     """
 
     counts: FloatArray
@@ -146,12 +144,12 @@ def aim_at(
     Parameters
     ----------
     mechanism, sun
-        Their batch shapes broadcast, (..., 3) unit vectors ENU. The sun's elevation is
-        not looked at.
+        Batch shapes broadcast; unit vectors ENU, (..., 3). The sun's elevation is not
+        checked.
     target, limits
-        Where to, and what is allowed.
+        The target, and the limits that decide `Aimed.able`.
     current
-        Counts where the drives stand, (..., D), to choose the nearer branch.
+        Present drive counts, (..., D), to choose the nearer branch.
     """
     solved = track(mechanism, sun, target.center, current=current)
     normal, vertex = solved.chosen(solved.normal), solved.chosen(solved.vertex)
@@ -168,7 +166,7 @@ def aim_at(
     return Aimed(solved.chosen(solved.counts), normal, incidence, obliquity, able)
 
 
-def candidates(
+def candidate_sightings(
     mechanism: Mechanism,
     site: Site,
     targets: tuple[Target, ...],
@@ -178,7 +176,7 @@ def candidates(
     sigma: npt.ArrayLike = 5e-4,
     limits: SightingLimits | None = None,
 ) -> CandidateSightings:
-    """Return the sightings that sun, targets and stops allow, heliostat by heliostat.
+    """Return all sightings that sun, targets and stops allow.
 
     Parameters
     ----------
@@ -187,25 +185,24 @@ def candidates(
     site
         Place and air.
     targets
-        With a camera on each; beams are sent to their centres.
+        Targets with cameras; beams are sent to their centres.
     times
-        Unix seconds (UTC), (T,); see :func:`grid`.
+        Unix seconds (UTC), (T,); see `time_grid`.
     names
         P parameters of the table.
     sigma
-        Standard deviation of the beam's direction as the camera finds it, rad, () or (N,).
+        Standard deviation of the beam's direction as the camera measures it, rad, () or (N,).
     limits
-        By default :class:`Limits`.
+        Default: `SightingLimits()`.
 
     Returns
     -------
-    In order of heliostat, then target, then time; there may be none.
+    Sorted by heliostat, then target, then time; possibly none.
 
     Raises
     ------
     InputError
-        If there is no target, the mechanisms have not one batch axis, or a time or
-        sigma cannot be used.
+        If there is no target, or the mechanisms do not have one batch axis.
     """
     if not targets:
         raise InputError("planning: there is no target; a camera-target sighting needs one")
@@ -252,7 +249,7 @@ def _part(
     sigma: FloatArray,
     limits: SightingLimits,
 ) -> tuple[np.ndarray, ...]:
-    """The arrays of :class:`Candidates` for some heliostats and one target."""
+    """The arrays of `CandidateSightings` for some heliostats and one target."""
     some = mechanism[first:last]
     aimed = aim_at(some, suns[:, None], target, limits)
     row, which = np.nonzero(aimed.able.T)
@@ -284,15 +281,15 @@ def sighting_jacobian(
     Parameters
     ----------
     mechanism
-        One a sighting, batch shape (M,).
+        One for each sighting, batch shape (M,).
     counts, sun
-        (M, D) and unit vectors (M, 3).
+        Drive counts (M, D) and unit vectors (M, 3).
     target
-        The beam is seen at its centre.
+        With the beam at its centre.
     names
         P parameters.
     sigma
-        rad of beam, () or (M,).
+        Standard deviation of the beam's direction, rad, () or (M,).
     """
     rows = len(counts)
     if not rows:
@@ -301,7 +298,7 @@ def sighting_jacobian(
     return linearise(mechanism, seen, names).jacobian
 
 
-def grid(start: float, stop: float, every: float) -> FloatArray:
+def time_grid(start: float, stop: float, every: float) -> FloatArray:
     """Return the multiples of ``every`` s from ``start`` to ``stop``, unix seconds, (T,).
 
     Raises
@@ -316,7 +313,7 @@ def grid(start: float, stop: float, every: float) -> FloatArray:
         )
     if (stop - start) / every > 200_000:
         raise InputError(
-            f"{(stop - start) / every:.0f} times in the span are more than 200,000; take a "
+            f"{(stop - start) / every:.0f} times in the span are more than 200,000; give a "
             "longer step or a shorter span"
         )
     return np.arange(np.ceil(start / every), np.floor(stop / every) + 1.0) * every
@@ -324,24 +321,24 @@ def grid(start: float, stop: float, every: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class SightingPlan:
-    """The K sightings to make of one heliostat, in order of time.
+    """K planned sightings of one heliostat, in order of time.
 
     Attributes
     ----------
     chosen
         The sightings.
     rank
-        Place of each if only the most telling could be made, 1 … K, (K,).
+        Order of usefulness, 1 to K, (K,).
     gain
-        Growth of the log determinant of the information by each, nats, (K,).
+        Growth of the log determinant of the information, nats, (K,).
     before
-        Expected RMS of the beam's error over the year before the first, rad.
+        Expected RMS beam error over the year before the first sighting, rad.
     error
-        And after each, rad, (K,).
+        Expected RMS beam error after each sighting, rad, (K,).
     best_first
-        The same in order of rank, rad, (K,).
+        The same if made in order of rank, rad, (K,).
     covariance
-        Of the parameters after all, (P, P).
+        Of the parameters after all sightings, (P, P).
     """
 
     chosen: CandidateSightings
@@ -357,11 +354,11 @@ class SightingPlan:
 
     @property
     def log_det(self) -> float:
-        """Growth of the log determinant by all, nats."""
+        """Growth of the log determinant by all sightings, nats."""
         return float(self.gain.sum())
 
 
-def plan(
+def plan_sightings(
     found: CandidateSightings,
     count: int,
     information: npt.ArrayLike,
@@ -371,37 +368,35 @@ def plan(
     exchange: bool = True,
     gap: float = 0.0,
 ) -> SightingPlan:
-    """Return the sightings of one heliostat that tell most together.
+    """Return the sightings of one heliostat that together tell most about it.
 
     Parameters
     ----------
     found
-        Its candidates, (M,).
+        Candidates of the heliostat, (M,).
     count
-        How many to choose; fewer are chosen where there are no more.
+        Number of sightings; fewer if there are not enough candidates.
     information
-        What is known before, (P, P), see :func:`~heliotrope.calibration.uncertainty.precision`.
+        Information on the parameters so far, (P, P); see `precision`.
     form
-        What the beam's error is made of, (P, P), see
-        :func:`~heliotrope.calibration.uncertainty.error_form`.
+        Form of the squared beam error, (P, P); see `error_form`.
     criterion
         "d": largest determinant of the information; "v": smallest expected squared
-        error of the beam.
+        beam error.
     exchange
-        Whether the greedy choice is improved by exchanging one sighting at a time.
+        Improve the greedy choice by exchanging one sighting at a time.
     gap
-        Two sightings are further apart than this, s; at 0 they are at different times.
+        Least time between two sightings, s; at 0 their times only differ.
 
     Raises
     ------
     InputError
-        If there is no candidate, count is below 1 or the criterion is none.
+        If there is no candidate, the count is below 1 or the criterion is unknown.
 
     Notes
     -----
-    Greedy choice reaches 63 % of the largest growth of log det at least (Nemhauser et
-    al. 1978: it is submodular); with exchange 98 % or more of exhaustive search in the
-    tests.
+    The growth of log det is submodular, so the greedy choice reaches at least 63 % of the
+    largest one (Nemhauser et al. 1978); with exchange the tests find 98 % or more.
     """
     if criterion not in ("d", "v"):
         raise InputError(f"criterion {criterion!r}: give d (determinant) or v (beam variance)")
@@ -409,12 +404,13 @@ def plan(
         raise InputError(f"count {count}: give 1 or more sightings")
     if not len(found):
         raise InputError(
-            "planning: no candidate; the sun, the stops or the limits allow no sighting then"
+            "planning: no candidate; the sun, the stops or the limits allow no sighting at these "
+            "times; widen the span"
         )
     matrix = as_float(information)
     scale = 1.0 / np.sqrt(np.diagonal(matrix))
     slope = found.jacobian * scale
-    # Scaled, metres and radians weigh alike, and the prior is near the unit matrix.
+    # Scaled, metres and radians weigh alike, and the prior is close to the unit matrix.
     known = matrix * scale[:, None] * scale
     weights = as_float(form) * scale[:, None] * scale
     choice = _Choice(slope, found.time, known, weights, criterion, gap)
@@ -437,7 +433,7 @@ def plan(
 
 @dataclass(frozen=True)
 class _Choice:
-    """The search, in scaled parameters."""
+    """Greedy choice and exchange, in scaled parameters."""
 
     slope: FloatArray
     time: FloatArray
@@ -452,7 +448,7 @@ class _Choice:
         return _gain.variance_gain(covariance, self.slope[rows], self.weights)
 
     def greedy(self, count: int, rows: npt.NDArray[np.intp], apart: bool = True) -> list[int]:
-        """Best first."""
+        """Rows of the best sightings, best first."""
         covariance, chosen = as_float(np.linalg.inv(self.known)), list[int]()
         free = np.ones(len(rows), dtype=np.bool_)
         while len(chosen) < count and free.any():
@@ -467,7 +463,7 @@ class _Choice:
         return chosen
 
     def exchange(self, chosen: list[int]) -> list[int]:
-        """Replace one at a time by a better one until none is better."""
+        """Replace one sighting at a time by a better one until there is none."""
         rows, everything = list(chosen), np.arange(len(self.time))
         total = self.known + sum(self.slope[r].T @ self.slope[r] for r in rows)
         for _ in range(SWEEPS):
@@ -486,7 +482,7 @@ class _Choice:
         return rows
 
     def walk(self, rows: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gain and expected error after each of ``rows``, and the last covariance."""
+        """Gain and expected error after each of ``rows``, and the final covariance."""
         covariance = as_float(np.linalg.inv(self.known))
         gain, error = np.empty(len(rows)), np.empty(len(rows))
         for k, row in enumerate(rows):

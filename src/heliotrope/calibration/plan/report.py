@@ -1,4 +1,4 @@
-"""Plans for people and other programs: tables as CSV, and pictures."""
+"""Plans as tables, JSON documents and pictures."""
 
 import csv
 import io
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from heliotrope.calibration.plan.campaign import CalibrationCampaign
+from heliotrope.calibration.plan.fleets import Fleet
 from heliotrope.calibration.plan.planning import CandidateSightings, SightingPlan
 from heliotrope.errors import InputError
 from heliotrope.files.text import write_file, write_text
@@ -25,7 +26,7 @@ _PICTURES = (".png", ".svg", ".pdf")
 
 
 def plan_rows(heliostat: str, plan: SightingPlan) -> list[dict[str, Any]]:
-    """Return one record a sighting, in order of time, for tables and JSON."""
+    """Return one record for each sighting, in order of time."""
     c = plan.chosen
     azimuth, elevation = np.degrees(azimuth_elevation(c.sun))
     normal_azimuth, normal_elevation = np.degrees(azimuth_elevation(c.normal))
@@ -52,7 +53,7 @@ def plan_rows(heliostat: str, plan: SightingPlan) -> list[dict[str, Any]]:
 def campaign_rows(
     found: CalibrationCampaign, heliostats: Sequence[str], targets: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return one record a measurement, in order of time, for tables and JSON."""
+    """Return one record for each measurement, in order of time."""
     return [
         {
             "time": iso(found.time[k]),
@@ -70,24 +71,63 @@ def campaign_rows(
     ]
 
 
+def plans_document(
+    plans: Mapping[str, SightingPlan], fleets: Sequence[Fleet], targets: Sequence[str]
+) -> dict[str, Any]:
+    """Return the plans of some heliostats for JSON."""
+    return {
+        **_head(fleets, targets),
+        "heliostats": {
+            name: {
+                "before_expected_beam_rms_mrad": 1e3 * plan.before,
+                "log_det_gain": plan.log_det,
+                "measurements": plan_rows(name, plan),
+            }
+            for name, plan in plans.items()
+        },
+    }
+
+
+def campaign_document(
+    found: CalibrationCampaign, fleets: Sequence[Fleet], targets: Sequence[str]
+) -> dict[str, Any]:
+    """Return a campaign for JSON."""
+    labels = [name for fleet in fleets for name in fleet.labels]
+    return {
+        **_head(fleets, targets),
+        "slots": found.slots,
+        "before_expected_beam_rms_mrad": 1e3 * found.before,
+        "after_expected_beam_rms_mrad": 1e3 * found.after,
+        "measurements": campaign_rows(found, labels, targets),
+    }
+
+
+def _head(fleets: Sequence[Fleet], targets: Sequence[str]) -> dict[str, Any]:
+    return {
+        "targets": list(targets),
+        "parameters": list(dict.fromkeys(p for fleet in fleets for p in fleet.names)),
+        "sigma_mrad": 1e3 * fleets[0].sigma,
+    }
+
+
 def _counts(counts: FloatArray) -> dict[str, float]:
     return {f"count_{d + 1}": float(value) for d, value in enumerate(counts)}
 
 
 def iso(seconds: float) -> str:
-    """Return unix seconds as ISO 8601 in UTC, to the second or, if need be, the millisecond."""
+    """Return unix seconds as ISO 8601 in UTC, with milliseconds only if they are not 0."""
     time = datetime.fromtimestamp(round(float(seconds), 3), UTC)
     unit = "milliseconds" if time.microsecond else "seconds"
     return time.isoformat(timespec=unit).replace("+00:00", "Z")
 
 
 def write_table(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write records as CSV, whole or not at all; their keys are the header.
+    """Write records as CSV, whole or not at all, with their keys as the header.
 
     Raises
     ------
     InputError
-        If the folder cannot be written to.
+        If the folder does not exist or cannot be written to.
     """
     text = io.StringIO(newline="")
     if rows:
@@ -103,7 +143,7 @@ def write_picture(path: str | Path, figure: "Figure") -> None:
     Raises
     ------
     InputError
-        If the suffix is another one, or the folder cannot be written to.
+        If the suffix is not one of these, or the folder cannot be written to.
     """
     suffix = check_picture(path)
 
@@ -119,7 +159,7 @@ def check_picture(path: str | Path) -> str:
     Raises
     ------
     InputError
-        If it is none of .png, .svg and .pdf.
+        If it is not .png, .svg or .pdf.
     """
     suffix = Path(path).suffix.lower()
     if suffix not in _PICTURES:
@@ -130,14 +170,14 @@ def check_picture(path: str | Path) -> str:
 
 
 def plan_picture(plans: Mapping[str, SightingPlan], possible: CandidateSightings) -> "Figure":
-    """Return the sun's path with the chosen sightings, and the expected error after each.
+    """Return a picture of the sun's path with the chosen sightings, and of the expected error.
 
     Parameters
     ----------
     plans
         By name of the heliostat.
     possible
-        What could have been chosen; its suns are drawn as small dots.
+        Candidates; their suns are drawn as small dots.
     """
     from matplotlib.figure import Figure
 
@@ -180,7 +220,7 @@ def plan_picture(plans: Mapping[str, SightingPlan], possible: CandidateSightings
 def _sun_paths(ax: "Axes", possible: CandidateSightings, centre: float) -> None:
     order = np.argsort(possible.time, kind="stable")
     time, sun = possible.time[order], possible.sun[order]
-    # Nights part the days.
+    # A gap longer than 30,000 s is a night.
     for n, run in enumerate(
         np.split(np.arange(len(time)), np.flatnonzero(np.diff(time) > 3e4) + 1)
     ):
@@ -191,7 +231,7 @@ def _sun_paths(ax: "Axes", possible: CandidateSightings, centre: float) -> None:
 
 
 def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: SightingPlan) -> None:
-    """Ranks beside the points; those of points close together stand in one text."""
+    """Write ranks beside the points, one text for points close together."""
     left = list(range(len(plan)))
     while left:
         first = left[0]
@@ -214,14 +254,14 @@ def _ranks(ax: "Axes", azimuth: FloatArray, elevation: FloatArray, plan: Sightin
 def campaign_picture(
     found: CalibrationCampaign, position: FloatArray, targets: Sequence[str]
 ) -> "Figure":
-    """Return the field coloured by what is to be expected after it, and the fall of the error.
+    """Return a map of the field by expected error after the campaign, and the error over time.
 
     Parameters
     ----------
     found
         The campaign.
     position
-        Of its heliostats, ENU metres, (N, 3).
+        Of the heliostats, ENU metres, (N, 3).
     targets
         Names.
     """
@@ -261,11 +301,11 @@ def _finish(axes: "Sequence[Axes]", legend: bool) -> None:
 
 
 def _centre(suns: FloatArray) -> float:
-    """Azimuth of the mean sun, degrees."""
+    """Azimuth of the mean sun, °."""
     return float(np.degrees(azimuth_elevation(suns.sum(axis=0))[0]))
 
 
 def _place(suns: FloatArray, centre: float) -> tuple[FloatArray, FloatArray]:
-    """Azimuth within half a turn of ``centre``, so that a path across north is one line."""
+    """Azimuth within half a turn of ``centre``, so that no path breaks at north; elevation."""
     azimuth, elevation = np.degrees(azimuth_elevation(suns))
     return np.asarray((azimuth - centre + 180.0) % 360.0 - 180.0 + centre), elevation
