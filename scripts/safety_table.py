@@ -3,80 +3,90 @@
 import math
 from pathlib import Path
 
-from heliotrope.safety import evaluation as safety
-from heliotrope.safety.evaluation import Act, Condition, Watcher
+from heliotrope import safety
+from heliotrope.safety import Act, Condition, Watcher
 
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "safety.md"
 
 _INTRO = """\
 # Safety
 
-What trips, what is then done, and when it ends is one table (`heliotrope.safety.evaluation`). The
-plant, the clusters and the local controllers evaluate the rows that name them; the evaluation is
-a pure function of readings, state and monotonic time. This page is made from the table by
-`scripts/safety_table.py`.
+One table (`heliotrope.safety`) says what trips, what is then done, and when it ends. The plant,
+the clusters and the local controllers each evaluate the rows assigned to them. The evaluation is
+a pure function of readings, state and monotonic time. `scripts/safety_table.py` writes this page
+from the table. The handbook says what each alarm means and what
+the operator should do.
 
-The numbers are defaults. Those of the wind must be replaced by the heliostat maker's, those of
-the receiver by its maker's, before a plant is run with them.
+The numbers are defaults. Before a plant runs with them, replace the wind limits by those of the
+heliostat's maker and the receiver limits by those of the receiver's maker.
 
 ## Rules for every row
 
-- A reading that is missing, not a number or from the future does not count. The last good one
-  does until it is older than *missing for*; from then on the worst case counts. A silence or age
-  grows by itself.
-- A row trips when its value has been at its limit or beyond for its delay. It releases when fresh
-  readings have been on the safe side of the second limit for the time named; between the limits
-  it stays as it is. A stream of readings that stands still releases nothing.
-- A row that *latches* stays until its cause has gone and a person of that role or above
-  acknowledges it. An acknowledgement before that is refused.
+- A reading that is missing, not a number, or from the future does not count. The last good
+  reading counts until it is older than *stale after*; from then on the worst case counts. An age
+  or a silence grows by itself.
+- A row trips when its value has been at the limit or beyond it for the *delay*. It releases when
+  fresh readings have been on the safe side of the release limit for the time given. Between the
+  two limits it stays as it is. A stream of readings that stands still releases nothing.
+- A row that *latches* stays until its cause has gone and a person with the given role, or a
+  higher one, acknowledges it. An acknowledgement before that is refused.
 - The strongest action wins, in the order of the list below. DEFOCUS and STOW pre-empt every
-  motion. A row that is released moves no mirror: going back to the receiver needs a fresh command
-  of the command authority.
-- *Budget* is from the fault to the finished action, the detection included.
+  motion. The release of a row moves no heliostat: returning to the receiver needs a fresh command
+  under the command authority.
+- The *budget* runs from the fault to the finished action and includes the detection.
 """
 
 _AFTER = f"""
 ## The proof of an emergency
 
-From an order to DEFOCUS or STOW on, every node is on a list (`Proof`): it has acknowledged within
-{safety.ORDER_BUDGET:g} s and is done within {safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or
-{safety.STOW_BUDGET:g} s (STOW), or it is named. Reports of strangers and from before the order
-prove nothing. The flux on the receiver must be below 10 % of the nominal by a fresh reading; else
-`flux_after_emergency` trips.
+An order to DEFOCUS or STOW the field lists every heliostat (`Proof`). Each of them must acknowledge
+within {safety.ORDER_BUDGET:g} s and be done within {safety.DEFOCUS_BUDGET:g} s (DEFOCUS) or
+{safety.STOW_BUDGET:g} s (STOW); a heliostat that is not is named. Reports from other heliostats
+and from before the order prove nothing. A fresh reading must show the flux on the receiver below
+10 % of nominal; otherwise `flux_after_emergency` trips.
 
 ## Joining the receiver
 
-A token bucket (`JoinLimiter`) bounds how many mirrors join: in any span of T seconds at most
+A token bucket (`JoinLimiter`) bounds how many heliostats join: in any span of T seconds at most
 burst + rate · T.
 
 ## What the table does not do
 
-It is software on ordinary computers and has no safety integrity level. Receiver protection and the
-emergency line must not depend on it. The thresholds have not been tried on a plant.
+It is software on ordinary computers and has no safety integrity level. The protection of the
+receiver and the emergency line must not depend on it. The limits have not been tried on a plant.
 """
 
 
-def _limit(row: Condition) -> str:
-    sign, unit = ("≥" if row.above else "≤"), ("" if row.unit == "1" else f" {row.unit}")
-    return f"{row.what} {sign} {row.trips:g}{unit}"
+def _trip(row: Condition) -> str:
+    if row.unit == "yes/no":
+        return row.what if row.above else f"no {row.what}"
+    return f"{row.what} {'≥' if row.above else '≤'} {_value(row, row.trips)}"
+
+
+def _value(row: Condition, value: float) -> str:
+    return f"{value:g} rad" if row.unit == "rad" else row.shown(value)
 
 
 def _action(row: Condition) -> str:
-    then = "" if math.isinf(row.then_stow) else f", after {row.then_stow:g} s STOW"
+    then = "" if math.isinf(row.then_stow) else f", STOW after {row.then_stow:g} s"
     return f"{row.act.name} {row.scope.name.lower()}{then}"
 
 
+def _release(row: Condition) -> str:
+    limit = f"{'≤' if row.above else '≥'} {_value(row, row.releases)} "
+    return f"{row.release} ({'' if row.unit == 'yes/no' else limit}for {row.clear_for:g} s)"
+
+
 def _line(row: Condition) -> str:
-    sign, unit = ("≤" if row.above else "≥"), ("" if row.unit == "1" else f" {row.unit}")
     cells = [
         f"`{row.name}`",
-        _limit(row),
+        _trip(row),
         f"{row.delay:g} s",
         "grows" if row.ages else f"{row.stale_after:g} s",
         _action(row),
-        row.severity.name.lower(),
-        "no" if row.role is None else f"{row.role.name.lower()}",
-        f"{row.release} ({sign} {row.releases:g}{unit} for {row.clear_for:g} s)",
+        row.severity,
+        "no" if row.role is None else row.role.title,
+        _release(row),
         f"{row.budget:g} s",
     ]
     return f"| {' | '.join(cells)} |"
@@ -90,11 +100,11 @@ def page() -> str:
         "condition",
         "trips at",
         "delay",
-        "missing for",
+        "stale after",
         "action",
         "severity",
         "latches for",
-        "release",
+        "releases when",
         "budget",
     )
     for tier in Watcher:

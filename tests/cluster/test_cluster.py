@@ -13,7 +13,6 @@ from heliotrope.links.link import LinkError, running
 from heliotrope.links.messages import (
     NEVER,
     Acknowledge,
-    Alarm,
     Answer,
     Ask,
     Lease,
@@ -21,6 +20,7 @@ from heliotrope.links.messages import (
     Status,
     encode,
 )
+from heliotrope.safety import Alarm, Severity
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
 from support.clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
 
@@ -194,7 +194,7 @@ def test_an_open_emergency_line_defocuses() -> None:
         await asyncio.sleep(3.0)
         closed[0] = False
         await field.until(lambda: field.states() == ["DEFOCUSED", "DEFOCUSED"], 2.5)
-        assert field.plant.alarms("emergency_line")[0].severity == "EMERGENCY"
+        assert field.plant.alarms("emergency_line")[0].severity is Severity.EMERGENCY
 
     run(main, "TRACKING", line=lambda: closed[0])
 
@@ -210,7 +210,7 @@ def test_an_emergency_reaches_all_at_once_and_names_who_does_not_answer() -> Non
         assert field.clock.monotonic() - begin < 1.0
         await field.until(lambda: bool(field.plant.alarms("order_unacknowledged")), 3.0)
         (alarm,) = field.plant.alarms("order_unacknowledged")
-        assert (alarm.subject, alarm.severity) == ("A2", "EMERGENCY")
+        assert (alarm.subject, alarm.severity) == ("A2", Severity.EMERGENCY)
         assert "A2 has not acknowledged DEFOCUS" in alarm.text
         # It comes back with its motors where they were, and is told at once.
         await asyncio.sleep(10.0)
@@ -228,7 +228,7 @@ def test_an_emergency_is_given_up_for_the_plant_but_asked_further() -> None:
         field.boards[1].on = False
         await field.emergency("stop", "STOW")
         await field.until(lambda: Stage.FAILED in field.plant.stages("stop", "A2"), 35.0)
-        assert "STOW not acknowledged within 30 s; it is asked further" in field.plant.text("stop")
+        assert "STOW not acknowledged within 30 s; it is repeated" in field.plant.text("stop")
         field.boards[1].boot(field.clock.monotonic())
         await field.until(lambda: not field.plant.alarms("order_unacknowledged")[-1].active, 10.0)
 
@@ -260,8 +260,9 @@ def test_a_heliostat_that_falls_silent_is_reported_with_its_beam() -> None:
         field.boards[0].on = False
         await field.until(lambda: bool(field.plant.alarms("node_silent")), 13.0)
         (alarm,) = field.plant.alarms("node_silent")
-        assert alarm.text == (
-            "A1: no answer for 10 s; it was TRACKING; where its beam is, is not known"
+        assert alarm.severity is Severity.ALARM
+        assert alarm.text.startswith(
+            "A1: no answer for 10 s; its last state was TRACKING; where its beam is, is not known. "
         )
         rows = field.plant.status().nodes()
         assert rows["heard_ms"][0] > 9000
@@ -327,9 +328,9 @@ def test_who_has_only_acknowledged_is_not_told_to_be_in_any_state() -> None:
         await field.until(lambda: bool(field.plant.all(Answer)))
         assert field.plant.all(Answer)[0].data == {}
         await field.until(lambda: len(field.plant.alarms("node_silent")) == 2, 15.0)
-        assert field.plant.alarms("node_silent")[0].text == (
-            "A1: no answer for 10 s, its state was never heard"
-        )
+        alarm = field.plant.alarms("node_silent")[0]
+        assert alarm.severity is Severity.WARNING
+        assert alarm.text.startswith("A1: no answer for 10 s; its state was never heard. ")
 
     run(main, bus=dumb)
 
@@ -473,7 +474,7 @@ def test_what_no_plant_says_is_an_alarm() -> None:
         await asyncio.sleep(2.0)
         first, second = field.plant.alarms("plant_unintelligible")
         assert "message of 8 bytes does not begin with JSON" in first.text
-        assert second.text == "a status came from the plant; only clusters send it"
+        assert "a status came from the plant; only clusters send it" in second.text
         assert field.states() == ["STOWED", "STOWED"]
 
     run(main)

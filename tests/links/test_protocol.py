@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from heliotrope.links import messages as protocol
 from heliotrope.links.messages import (
     NODE,
-    Alarm,
     Answer,
     Ask,
     Command,
@@ -25,6 +24,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
+from heliotrope.safety import Alarm, Severity
 
 ROWS = np.zeros(3, NODE)
 ROWS["primary"] = (-5, 7, 2**31 - 1)
@@ -36,7 +36,7 @@ MESSAGES = [
     Ask("q1", "stored", "A1"),
     Status("K1", 4, 1.4e9, "gps", 1e-3, 2.5, 0.2, ("DEFOCUS",), ("A1", "A2"), ROWS.tobytes()),
     Progress("c1", Stage.ACKNOWLEDGED, ("A1",), "because"),
-    Alarm("wind_gust", "", "serious", "the wind is 25 m/s"),
+    Alarm("wind_gust", "", Severity.ALARM, "the wind is 25 m/s"),
     Answer("q1", {"A1": [1, {"x": None}]}, b"\n\n"),
 ]
 
@@ -44,6 +44,24 @@ MESSAGES = [
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.kind)
 def test_round_trip(message: protocol.Message) -> None:
     assert decode(encode(message)) == message
+
+
+@pytest.mark.parametrize(
+    ("word", "severity"),
+    [
+        ("warning", Severity.WARNING),
+        ("EMERGENCY", Severity.EMERGENCY),
+        ("Info", Severity.INFO),
+        ("serious", Severity.ALARM),
+    ],
+)
+def test_an_alarm_of_an_older_cluster_is_not_lost(word: str, severity: Severity) -> None:
+    """Clusters said severities in upper case once; an unknown one counts as an alarm."""
+    line = encode(Alarm("node_silent", "A1", Severity.INFO, "no answer"))
+    assert b'"severity":"info"' in line
+    found = decode(line.replace(b'"info"', f'"{word}"'.encode()))
+    assert isinstance(found, Alarm)
+    assert found.severity is severity
 
 
 def test_rows_and_items_come_back() -> None:

@@ -18,13 +18,14 @@ from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import normalize
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import Outcome, Statistics
-from heliotrope.links.messages import Alarm, Ask, Lease, Status, encode
+from heliotrope.links.messages import Ask, Lease, Status, encode
 from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.log import Logbook
 from heliotrope.plant.operations.operations import WorkSettings
 from heliotrope.plant.visits.calibration_cycle import Shot
 from heliotrope.plant.visits.centring import Centring, seen, spiral
+from heliotrope.safety import Alarm, Severity
 from heliotrope.store.records import StoreError
 from heliotrope.twin.live.live import LiveOptions, LivePlant
 
@@ -170,17 +171,17 @@ class _Silent:
 def test_a_book_counts_alarms_until_they_are_over_and_acknowledged() -> None:
     clock = VirtualClock()
     book = Logbook(clock)
-    book.take_alarm(Alarm("wind", "", "alarm", "too strong"))
+    book.take_alarm(Alarm("wind", "", Severity.ALARM, "too strong"))
     clock.advance(5.0)
-    book.take_alarm(Alarm("wind", "", "alarm", "stronger still"))
+    book.take_alarm(Alarm("wind", "", Severity.ALARM, "stronger still"))
     (row,) = book.alarms()
     assert (row.count, row.text, book.open_alarms) == (1, "stronger still", 1)
     book.acknowledge("Olga", "wind", "")
     assert book.open_alarms == 1, "it holds still"
-    book.take_alarm(Alarm("wind", "", "alarm", "over", active=False))
+    book.take_alarm(Alarm("wind", "", Severity.ALARM, "over", active=False))
     assert book.open_alarms == 0
     clock.advance(5.0)
-    book.take_alarm(Alarm("wind", "", "alarm", "again"))
+    book.take_alarm(Alarm("wind", "", Severity.ALARM, "again"))
     (row,) = book.alarms()
     assert (row.count, row.acknowledged_by, book.open_alarms) == (2, "", 1)
     assert [event.text for event in book.events(9)] == [
@@ -223,7 +224,7 @@ class _Full:
 def test_a_store_that_keeps_nothing_is_an_alarm_and_stops_nothing() -> None:
     book = Logbook(VirtualClock(), _Full())  # type: ignore[arg-type]
     book.event("plant", "", "something")
-    book.take_alarm(Alarm("wind", "", "alarm", "too strong"))
+    book.take_alarm(Alarm("wind", "", Severity.ALARM, "too strong"))
     found = {row.condition: row.text for row in book.alarms()}
     assert "the disk is full" in found["records"]
     assert found["wind"] == "too strong"

@@ -17,7 +17,6 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.in_process import Faults
 from heliotrope.links.messages import (
     NODE,
-    Alarm,
     Answer,
     Ask,
     Command,
@@ -33,6 +32,7 @@ from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import AuditError, read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.settings import PlantSettings
+from heliotrope.safety import Alarm, Severity
 from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
@@ -459,7 +459,7 @@ def test_what_cannot_be_recorded_is_not_accepted_but_defocus_is(
             for _ in range(8):
                 await bench.wait(1.0)
                 plant.authority.keep(OPERATOR, token)
-            with pytest.raises(RefusedError, match="time without a confirmed write"):
+            with pytest.raises(RefusedError, match="not confirmed a write"):
                 plant.command(OPERATOR, token, "APPROACH")
         assert not any(r.what == "STOW" for r in read(bench.audit.path)[0])
         await bench.wait(3.0)
@@ -479,7 +479,7 @@ def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
         Status("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, names=("P1A", "P1A", "P6C"), block=rows),
         Progress("nothing-known", Stage.DONE, ("P1A",)), Lease(7), Command("c", "TRACK"),
         Answer("statistics-1", {"error": "no"}), Answer("stored-9", {"names": 1}),
-        Answer("stored-1", {"names": ["a"], "sizes": [3]}), Alarm("x", "", "alarm", "text"),
+        Answer("stored-1", {"names": ["a"], "sizes": [3]}), Alarm("x", "", Severity.ALARM, "text"),
     ]  # fmt: skip
 
     async def scene(bench: Bench) -> None:

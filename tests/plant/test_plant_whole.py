@@ -9,7 +9,7 @@ from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import checksums, items_of
 from heliotrope.plant.audit import read
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings
-from heliotrope.safety.evaluation import Act
+from heliotrope.safety import Act
 from support.whole_plant import ENGINEER, MACHINE, WholePlant
 
 

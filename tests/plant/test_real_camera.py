@@ -22,8 +22,8 @@ from heliotrope.imaging.snapshot import SnapshotSource, is_snapshot
 from heliotrope.imaging.sources import SimulatedSource, Source, open_source
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import SystemClock
-from heliotrope.links.messages import Alarm
 from heliotrope.plant.cameras import RealCameras, source_of
+from heliotrope.safety import Alarm
 from heliotrope.twin.cameras import Mirror, Optics, RenderedCamera, Sight
 from heliotrope.twin.live.live import prototype_plant
 

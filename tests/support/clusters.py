@@ -21,7 +21,6 @@ from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import Bus, messages, running
 from heliotrope.links.messages import (
-    Alarm,
     Command,
     Emergency,
     Lease,
@@ -32,6 +31,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
+from heliotrope.safety import Alarm
 from heliotrope.sun import Site
 from heliotrope.twin.boards.bus import TwinBus
 from support.lcu_machines import STOW, Flash, heliostat, items_of_heliostat, sha256

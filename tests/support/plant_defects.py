@@ -11,15 +11,13 @@ from heliotrope.plant import authority, field_state
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import proof as _emergency
+from heliotrope.safety import JoinLimiter
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
 
 def join_limiter_off(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(
-        _emergency.JoinLimiter, "admit", lambda self, wanted, now: (replace(self, at=now), wanted)
-    )
+    patch.setattr(JoinLimiter, "admit", lambda self, wanted, now: (replace(self, at=now), wanted))
 
 
 def record_doubled(patch: pytest.MonkeyPatch) -> None:

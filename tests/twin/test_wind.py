@@ -5,7 +5,7 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import normalize
-from heliotrope.safety.evaluation import CONDITIONS
+from heliotrope.safety import CONDITIONS
 from heliotrope.twin.wind import DENSITY, GUST_S, MEAN_S, Wind
 
 HERE = (0.0, 0.0, 2.0)

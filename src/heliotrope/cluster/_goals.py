@@ -22,7 +22,7 @@ from heliotrope.lcu.states import (
     TRACKING,
 )
 from heliotrope.links.messages import Stage
-from heliotrope.safety.evaluation import DEFOCUS_BUDGET, STOW_BUDGET
+from heliotrope.safety import DEFOCUS_BUDGET, STOW_BUDGET
 
 _ALL = frozenset(range(len(states.STATES)))
 #: States in which a beam may be on the receiver, on its standby point, or under way to them.

@@ -1,8 +1,10 @@
 """What is to be told to the plant: stages of commands, alarms, answers; bounded, and in order."""
 
 from collections import deque
+from dataclasses import replace
 
-from heliotrope.links.messages import Alarm, Answer, Message, Progress, Stage, Status
+from heliotrope.links.messages import Answer, Message, Progress, Stage, Status
+from heliotrope.safety import Alarm
 
 #: Messages that wait; the oldest are dropped first. A status waits alone: only the newest counts.
 _CAPACITY = 256
@@ -34,27 +36,23 @@ class Reports:
         """Note the status, in place of the one before."""
         self._status = status
 
-    def alarm(self, condition: str, subject: str, severity: str, text: str) -> None:
-        """Note that something is wrong; told of if it is new or worse."""
-        key = condition, subject
+    def alarm(self, alarm: Alarm) -> None:
+        """Report an alarm if it is new or its severity has changed."""
+        key = alarm.condition, alarm.subject
         known = self._alarms.get(key)
-        if known is None or known.severity != severity:
-            self._alarms[key] = alarm = Alarm(condition, subject, severity, text)
+        if known is None or known.severity != alarm.severity:
+            self._alarms[key] = alarm
             self._out.append(alarm)
 
-    def event(self, condition: str, subject: str, severity: str, text: str) -> None:
-        """Note something that happens and is over, each time."""
-        self._out.append(Alarm(condition, subject, severity, text))
+    def event(self, alarm: Alarm) -> None:
+        """Report something that happens and is over, each time."""
+        self._out.append(alarm)
 
-    def clear(self, condition: str, subject: str, text: str = "") -> None:
-        """Note that it is over."""
-        known = self._alarms.pop((condition, subject), None)
+    def clear(self, ended: Alarm) -> None:
+        """Report that an alarm is over, with the severity that it was raised with."""
+        known = self._alarms.pop((ended.condition, ended.subject), None)
         if known is not None:
-            self._out.append(
-                Alarm(
-                    condition, subject, known.severity, text or f"{condition}: over", active=False
-                )
-            )
+            self._out.append(replace(ended, severity=known.severity))
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:

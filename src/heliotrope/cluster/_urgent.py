@@ -12,7 +12,7 @@ from heliotrope.cluster._goals import Goals
 from heliotrope.cluster._nodes import Node
 from heliotrope.cluster._reports import Reports
 from heliotrope.links.messages import Stage
-from heliotrope.safety.evaluation import ORDER_BUDGET
+from heliotrope.safety import ORDER_BUDGET, alarms
 
 NAMES = ("DEFOCUS", "STOW")
 _CALLS = 3
@@ -177,7 +177,7 @@ class Urgent:
             node.counts.retries += 1
             order.waiting.append(node)
             return
-        self._reports.clear("order_unacknowledged", node.name, f"{node.name} has acknowledged")
+        self._reports.clear(alarms.ORDER_UNACKNOWLEDGED.ended(node.name))
         self._acknowledged(order, node)
         for other in same:
             other.waiting.remove(node)
@@ -194,13 +194,12 @@ class Urgent:
         if age <= ORDER_BUDGET:
             return
         for node in order.waiting:
-            text = f"{node.name} has not acknowledged {order.name}; where its beam is, is not known"
-            self._reports.alarm("order_unacknowledged", node.name, "EMERGENCY", text)
+            self._reports.alarm(alarms.ORDER_UNACKNOWLEDGED.raised(node.name, order=order.name))
             if age > _PATIENCE and not order.given_up:
                 self._reports.add(
                     order.identity,
                     Stage.FAILED,
                     node.name,
-                    f"{order.name} not acknowledged within {_PATIENCE:g} s; it is asked further",
+                    f"{order.name} not acknowledged within {_PATIENCE:g} s; it is repeated",
                 )
         order.given_up = order.given_up or age > _PATIENCE

@@ -7,16 +7,17 @@ from dataclasses import dataclass, replace
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.messages import Lease
-from heliotrope.safety.evaluation import (
+from heliotrope.safety import (
     Act,
     Action,
+    Alarm,
     Condition,
     Reading,
     Role,
     SafetyState,
-    Severity,
     Watcher,
     acknowledge,
+    alarms,
     conditions,
     decision,
     evaluate,
@@ -115,14 +116,12 @@ class Watch:
         autonomy = min(lease.autonomy, self._longest)
         if autonomy < lease.autonomy:
             self._reports.alarm(
-                "autonomy_limited",
-                "",
-                "WARNING",
-                f"the plant grants {lease.autonomy:g} s of autonomy; cluster {self._cluster} is "
-                f"configured for {self._longest:g} s, which it keeps to",
+                alarms.AUTONOMY_LIMITED.raised(
+                    granted=lease.autonomy, cluster=self._cluster, longest=self._longest
+                )
             )
         else:
-            self._reports.clear("autonomy_limited", "")
+            self._reports.clear(alarms.AUTONOMY_LIMITED.ended())
         if autonomy != self._autonomy:
             self._autonomy = autonomy
             self._state = replace(self._state, table=self._table())
@@ -158,9 +157,9 @@ class Watch:
         if self._line is not None:
             readings["emergency_line_live", ""] = Reading(float(self._line()), now)
         if time.note:
-            self._reports.alarm("time_source", "", "WARNING", time.note)
+            self._reports.alarm(alarms.TIME_SOURCE.raised(problem=time.note))
         else:
-            self._reports.clear("time_source", "")
+            self._reports.clear(alarms.TIME_SOURCE.ended())
         before = self.verdict.act
         self._state, actions = evaluate(readings, self._state, now)
         self._alarm(actions)
@@ -191,10 +190,11 @@ class Watch:
         tripped = {action.condition for action in actions}
         for alarm in self._reports.alarms:
             if alarm.condition not in tripped and alarm.subject == self._cluster:
-                self._reports.clear(alarm.condition, self._cluster)
+                text = f"{alarm.condition}: over"
+                self._reports.clear(replace(alarm, text=text, active=False))
         for action in actions:
             self._reports.alarm(
-                action.condition, self._cluster, Severity(action.severity).name, action.text
+                Alarm(action.condition, self._cluster, action.severity, action.line)
             )
 
     def acknowledge(self, condition: str, who: str, role: Role) -> str:

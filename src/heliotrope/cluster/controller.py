@@ -40,7 +40,6 @@ from heliotrope.links.link import Bus, Link, LinkClosedError, LinkError, Outcome
 from heliotrope.links.link import messages as received
 from heliotrope.links.messages import (
     Acknowledge,
-    Alarm,
     Answer,
     Ask,
     Command,
@@ -55,7 +54,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.safety.evaluation import Act, Role
+from heliotrope.safety import Act, Alarm, Role, alarms
 from heliotrope.sun import broadcast_values
 
 #: Of TIME on the wire.
@@ -299,9 +298,9 @@ class Cluster:
         sender = self._exchange.sender
         try:
             sender.epoch, sender.count = self._kept.start(at_least), 0
-            self._reports.clear("state_unwritable", "")
+            self._reports.clear(alarms.STATE_UNWRITABLE.ended())
         except OSError as error:
-            self._reports.alarm("state_unwritable", "", "ALARM", f"epoch cannot be kept: {error}")
+            self._reports.alarm(alarms.STATE_UNWRITABLE.raised(problem=error))
         self._epoch_of_time = self._epoch_of_time or at_least > 0
         self._orders.out_of_step = 0
 
@@ -349,13 +348,12 @@ class Cluster:
     def _believes(self, node: Node, status: tuple[Any, ...]) -> bool:
         """Take a STATUS; False if its firmware has states that this side doesn't know."""
         if status[0] >= len(states.STATES):
-            text = f"{node.name}: state {status[0]} is not known; its firmware is another"
-            self._reports.alarm("node_unintelligible", node.name, "ALARM", text)
+            self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
             self._strange.add(node.index)
             return False
         if node.index in self._strange:
             self._strange.remove(node.index)
-            self._reports.clear("node_unintelligible", node.name)
+            self._reports.clear(alarms.NODE_UNINTELLIGIBLE.ended(node.name))
         before, node.status, node.status_at = node.status, status, node.heard_at
         if before[2] != status[2]:
             self._fault(node)
@@ -376,9 +374,9 @@ class Cluster:
         if node.fault:
             known = node.fault < len(names.FAULTS)
             text = names.FAULTS[node.fault] if known else f"fault {node.fault}"
-            self._reports.alarm("node_fault", node.name, "ALARM", f"{node.name}: {text}")
+            self._reports.alarm(alarms.NODE_FAULT.raised(node.name, fault=text))
         else:
-            self._reports.clear("node_fault", node.name, f"{node.name}: fault cleared")
+            self._reports.clear(alarms.NODE_FAULT.ended(node.name))
 
     def _look_for_silence(self, now: float) -> None:
         limit = self.config.silence
@@ -389,18 +387,18 @@ class Cluster:
                 self._tell_silence(node, limit)
             elif not silent and node.index in self._silent:
                 self._silent.remove(node.index)
-                self._reports.clear("node_silent", node.name, f"{node.name}: it answers again")
+                self._reports.clear(alarms.NODE_SILENT.ended(node.name))
 
     def _tell_silence(self, node: Node, limit: float) -> None:
-        text = f"{node.name}: no answer for {limit:g} s"
+        out = node.known and node.state in BEAM_OUT
         if not node.known:
-            heard = "never heard" if node.heard_at < self._started else "its state was never heard"
-            self._reports.alarm("node_silent", node.name, "WARNING", f"{text}, {heard}")
-            return
-        state = states.STATES[node.state]
-        out = node.state in BEAM_OUT
-        text += f"; it was {state}" + ("; where its beam is, is not known" if out else "")
-        self._reports.alarm("node_silent", node.name, "ALARM" if out else "WARNING", text)
+            last = "never heard" if node.heard_at < self._started else "its state was never heard"
+        else:
+            last = f"its last state was {states.STATES[node.state]}"
+            last += "; where its beam is, is not known" if out else ""
+        self._reports.alarm(
+            alarms.NODE_SILENT.raised(node.name, worse=out, silence=limit, last=last)
+        )
 
     # -- the plant -------------------------------------------------------------------------
 
@@ -409,7 +407,7 @@ class Cluster:
             try:
                 message = decode(data)
             except ProtocolError as error:
-                self._reports.event("plant_unintelligible", "", "WARNING", str(error))
+                self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=error))
             else:
                 self._take(message)
             if self._reports.waiting:
@@ -420,9 +418,9 @@ class Cluster:
         if isinstance(message, Lease):
             refusal = self._watch.take(message, self._clock.monotonic())
             if refusal:
-                self._reports.alarm("lease_refused", "", "ALARM", refusal)
+                self._reports.alarm(alarms.LEASE_REFUSED.raised(problem=refusal))
             else:
-                self._reports.clear("lease_refused", "")
+                self._reports.clear(alarms.LEASE_REFUSED.ended())
                 self._orders.token = self._authority()
         elif isinstance(message, Emergency):
             self._take_emergency(message.identity, message.name, message.heliostats)
@@ -441,7 +439,7 @@ class Cluster:
             self._take_acknowledgement(message)
         elif isinstance(message, Status | Progress | Alarm | Answer):
             text = f"a {message.kind} came from the plant; only clusters send it"
-            self._reports.event("plant_unintelligible", "", "WARNING", text)
+            self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=text))
         self._wake.set()
 
     def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:

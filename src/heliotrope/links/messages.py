@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import HeliotropeError
+from heliotrope.safety import Alarm, Severity
 
 VERSION = 1
 
@@ -234,18 +235,6 @@ class Progress:
 
 
 @dataclass(frozen=True)
-class Alarm:
-    """One line for the operator, with the safety row or event that it comes from."""
-
-    kind: ClassVar[str] = "alarm"
-    condition: str
-    subject: str
-    severity: str
-    text: str
-    active: bool = True
-
-
-@dataclass(frozen=True)
 class Answer:
     """What was asked; ``data`` is plain JSON, ``block`` stored bytes."""
 
@@ -358,6 +347,7 @@ def _is_text(value: object) -> bool:
 #: By type of a field: returns its value from that of JSON, None if it is not of that type.
 _READERS: dict[Any, Callable[[Any], Any]] = {
     Stage: lambda value: next((stage for stage in Stage if stage.value == value), None),
+    Severity: lambda value: Severity.read(value) if isinstance(value, str) else None,
     str: lambda value: value if isinstance(value, str) else None,
     bool: lambda value: value if isinstance(value, bool) else None,
     int: lambda value: value if _is_whole(value) else None,

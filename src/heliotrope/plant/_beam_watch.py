@@ -13,7 +13,7 @@ from heliotrope.mechanism.tracking import Status
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.field_state import FieldState
-from heliotrope.safety.evaluation import Reading
+from heliotrope.safety import Reading
 
 Rows = npt.NDArray[np.intp]
 

@@ -12,7 +12,7 @@ from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.proof import JoinLimiter
+from heliotrope.safety import JoinLimiter
 
 
 @dataclass

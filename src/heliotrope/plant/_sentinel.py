@@ -7,7 +7,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.links.clock import Clock
-from heliotrope.links.messages import Alarm, Progress
+from heliotrope.links.messages import Progress
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant._beam_watch import Lookout
 from heliotrope.plant._cluster_end import ClusterEnd
@@ -18,8 +18,7 @@ from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.evaluation import Act
-from heliotrope.safety.proof import Reading, proof_readings
+from heliotrope.safety import Act, Alarm, Reading, proof_readings
 from heliotrope.sun import Site, fast_vector
 
 #: Who was sent off the receiver shows it after this time at the latest, s.

@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from heliotrope.errors import InputError
-from heliotrope.links.messages import Alarm
-from heliotrope.safety.evaluation import (
+from heliotrope.safety import (
     Act,
     Action,
+    Alarm,
     Condition,
     Reading,
     Role,
@@ -112,7 +112,7 @@ class PlantWatch:
         news = []
         for action in self.actions:
             key = (action.condition, action.subject)
-            alarm = Alarm(*key, action.severity.name.lower(), action.text)
+            alarm = Alarm(*key, action.severity, action.line)
             if key not in self._told or action.new:
                 news.append(alarm)
             found[key] = alarm

@@ -18,7 +18,6 @@ from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
-from heliotrope.links.messages import Alarm
 from heliotrope.mechanism.board_items import Machine, items_of
 from heliotrope.mechanism.parameters import MODELS
 from heliotrope.plant.assigned import Assigned, rest_on
@@ -36,6 +35,7 @@ from heliotrope.plant.schedule.schedule import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CycleSettings
 from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.safety import alarms
 from heliotrope.store.records import Records
 
 #: Of calibrations: what a quick installation leaves, and what a photograph is worth.
@@ -191,9 +191,9 @@ class RealPlant:
             for name, value in news.values.items():
                 self.plant.put(name, value)
             for name, text in news.problems.items():
-                active = bool(text)
-                said = text or "it is read again"
-                self.logbook.take_alarm(Alarm("sensor", name, "alarm", said, active))
+                self.logbook.take_alarm(
+                    alarms.SENSOR.raised(name, problem=text) if text else alarms.SENSOR.ended(name)
+                )
             await asyncio.sleep(_SENSED)
 
     async def _look(self) -> None:

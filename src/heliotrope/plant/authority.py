@@ -18,9 +18,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
+from heliotrope import safety
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.links.clock import Clock
-from heliotrope.safety import evaluation as safety
 
 
 class RefusedError(HeliotropeError):

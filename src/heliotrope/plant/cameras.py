@@ -28,10 +28,10 @@ from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
 from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
 from heliotrope.imaging.targets.teaching import read_pictures
 from heliotrope.links.clock import Clock
-from heliotrope.links.messages import Alarm
 from heliotrope.plant.camera_views import Views, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.safety import Alarm, alarms
 
 #: A photograph is awaited for so long, and its frame looked for so often, s.
 PATIENCE, _LOOK = 15.0, 0.05
@@ -221,7 +221,7 @@ class RealCameras:
             frame, limit = eye.feed.newest, timedelta(seconds=self._patience)
             known = None if frame is None else frame.time
             if known is not None and self._clock.utc() - known < limit:
-                self._tell(target, "frames come again", active=False)
+                self._tell(target)
         return target not in self.silent
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -262,17 +262,19 @@ class RealCameras:
             frame = eye.feed.newest
             if frame is not None and _dated(frame, eye.camera) >= asked:
                 if target in self.silent:
-                    self._tell(target, "frames come again", active=False)
+                    self._tell(target)
                 return frame
             await asyncio.sleep(_LOOK)
         why = eye.feed.problem or "look at the camera, its network and its clock"
         text = f"camera {eye.camera.name}: no frame for {self._patience:g} s; {why}"
-        self._tell(target, text, active=True)
+        self._tell(target, text)
         raise FetchError(text)
 
-    def _tell(self, target: str, text: str, *, active: bool) -> None:
-        (self.silent.add if active else self.silent.discard)(target)
-        self.on_alarm(Alarm("camera", target, "warning", text, active))
+    def _tell(self, target: str, problem: str = "") -> None:
+        """Raise the alarm about a target's camera, or end it."""
+        (self.silent.add if problem else self.silent.discard)(target)
+        kind = alarms.CAMERA
+        self.on_alarm(kind.raised(target, problem=problem) if problem else kind.ended(target))
 
     def _read(self, eye: _Eye, frame: Frame) -> tuple[Photograph, bytes]:
         settings = replace(self._settings, empty=self._memory.models)

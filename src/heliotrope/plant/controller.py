@@ -30,7 +30,6 @@ from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import Link, messages
 from heliotrope.links.messages import (
     Acknowledge,
-    Alarm,
     Answer,
     Ask,
     Lease,
@@ -56,7 +55,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.evaluation import Act, Condition, conditions
+from heliotrope.safety import Act, Alarm, Condition, alarms, conditions
 from heliotrope.sun import fast_vector
 
 #: Commands that bring beams to the receiver or move them across it.
@@ -295,8 +294,8 @@ class PlantController:
         elif answer.identity.startswith("statistics-") and "error" not in answer.data:
             self.field.learn_order(end.name, tuple(answer.data))
         elif (found := self._pusher.take(answer)) is not None and found[1]:
-            text = f"{found[0]}: {', '.join(found[1])} differ from what is wanted"
-            self._tell(Alarm("parameters_differ", found[0], "warning", text))
+            differs = alarms.PARAMETERS_DIFFER
+            self._tell(differs.raised(found[0], items=", ".join(found[1])))
 
     # Time.
 

@@ -15,8 +15,7 @@ from heliotrope.lcu import states
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.evaluation import Act
-from heliotrope.safety.proof import Proof, ProofReport
+from heliotrope.safety import Act, Proof, ProofReport
 
 #: A mirror this close (rad) to the goal of its defocus is off the receiver.
 NEAR = 5e-3

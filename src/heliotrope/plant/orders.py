@@ -11,7 +11,7 @@ from heliotrope.links.messages import Command, Emergency, Parameters, Progress, 
 from heliotrope.plant._cluster_end import ClusterEnd
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.evaluation import Act
+from heliotrope.safety import Act
 
 #: Commands that are taken from anybody.
 SAFE = ("DEFOCUS", "STOW")

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from heliotrope.plant._watch import OWN_READINGS
-from heliotrope.safety.evaluation import CONDITIONS, Watcher, watched_by
+from heliotrope.safety import CONDITIONS, Watcher, watched_by
 
 #: Readings that have to come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS

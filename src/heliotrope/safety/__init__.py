@@ -1,1 +1,71 @@
-"""Safety: a table of conditions, its evaluation, and the proof of an emergency."""
+"""Safety: the table of conditions, its pure evaluation, alarms, and the proof of an emergency.
+
+Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which turns readings and time into
+the actions that are demanded. `Proof` records that every heliostat obeyed an emergency order.
+`JoinLimiter` bounds how many heliostats join the receiver. `Alarm` is what people are told, and
+`heliotrope.safety.alarms` lists every kind of alarm beside the rows.
+
+Nothing here reads a clock, a sensor or a link.
+"""
+
+from heliotrope.safety.alarms import Alarm, AlarmKind
+from heliotrope.safety.condition import (
+    Act,
+    Condition,
+    Reading,
+    Role,
+    Scope,
+    Severity,
+    Watcher,
+)
+from heliotrope.safety.conditions import CONDITIONS, conditions
+from heliotrope.safety.evaluation import (
+    Action,
+    SafetyState,
+    acknowledge,
+    adjusted,
+    decision,
+    evaluate,
+    narrowed,
+    start,
+    watched_by,
+)
+from heliotrope.safety.joining import JoinLimiter
+from heliotrope.safety.proof import (
+    DEFOCUS_BUDGET,
+    ORDER_BUDGET,
+    STOW_BUDGET,
+    Proof,
+    ProofReport,
+    proof_readings,
+)
+
+__all__ = [
+    "CONDITIONS",
+    "DEFOCUS_BUDGET",
+    "ORDER_BUDGET",
+    "STOW_BUDGET",
+    "Act",
+    "Action",
+    "Alarm",
+    "AlarmKind",
+    "Condition",
+    "JoinLimiter",
+    "Proof",
+    "ProofReport",
+    "Reading",
+    "Role",
+    "SafetyState",
+    "Scope",
+    "Severity",
+    "Watcher",
+    "acknowledge",
+    "adjusted",
+    "conditions",
+    "decision",
+    "evaluate",
+    "narrowed",
+    "proof_readings",
+    "start",
+    "watched_by",
+]

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import Enum, IntEnum, StrEnum
 
 from heliotrope.errors import InputError
 
@@ -23,44 +23,74 @@ class Act(IntEnum):
 
 
 _ACT_TEXTS = {
-    Act.ALARM: "tell the operator; nothing moves or stops for it",
-    Act.REFUSE_NEW: "no new motion is accepted but DEFOCUS, STOW and LOCK; what runs goes on",
-    Act.HOLD: "motions stop where they are; as REFUSE_NEW besides",
-    Act.DEFOCUS: "beams off the receiver now; pre-empts every motion but stowing",
-    Act.STOW: "to the stow position; pre-empts everything",
+    Act.ALARM: "the operator is told; no motion starts or stops",
+    Act.REFUSE_NEW: "new motions are refused, except DEFOCUS, STOW and LOCK; running motions go on",
+    Act.HOLD: "heliostats stop where they are, and new motions are refused as by REFUSE_NEW",
+    Act.DEFOCUS: "beams leave the receiver now; pre-empts every motion except stowing",
+    Act.STOW: "heliostats go to the stow position; pre-empts everything",
 }
 
 
 class Scope(IntEnum):
-    """What an action is done to."""
+    """What an action applies to."""
 
     HELIOSTAT = 0
     CLUSTER = 1
     FIELD = 2
 
 
-class Severity(IntEnum):
-    """How bad it is."""
+class Severity(StrEnum):
+    """How serious an alarm or event is; the same word on the wire, in the store and on the page."""
 
-    INFO = 0
-    WARNING = 1
-    ALARM = 2
-    EMERGENCY = 3
+    INFO = "info"
+    WARNING = "warning"
+    ALARM = "alarm"
+    EMERGENCY = "emergency"
+
+    @property
+    def rank(self) -> int:
+        """From 0, the least serious."""
+        return tuple(Severity).index(self)
+
+    @classmethod
+    def read(cls, word: str) -> "Severity":
+        """Return the severity that another program names.
+
+        Upper case is accepted. An unknown word counts as `ALARM`: no alarm is lost because of its
+        severity.
+        """
+        return next((each for each in cls if each == word.lower()), cls.ALARM)
 
 
 class Role(IntEnum):
-    """Who may acknowledge; a higher role may for a lower one."""
+    """Who may acknowledge; a higher role may acknowledge for a lower one.
+
+    The console's engineer acts as supervisor, and people are shown that title.
+    """
 
     OPERATOR = 0
     SUPERVISOR = 1
 
+    @property
+    def title(self) -> str:
+        """The role as the control room knows it."""
+        return "operator" if self is Role.OPERATOR else "engineer"
+
 
 class Watcher(Enum):
-    """The tier that evaluates a row."""
+    """The tier that evaluates a row, or raises an alarm."""
 
     PLANT = "plant"
     CLUSTER = "cluster"
     NODE = "local controller"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A value in the unit of its row, and when it was taken, monotonic s."""
+
+    value: float
+    at: float
 
 
 @dataclass(frozen=True)
@@ -72,30 +102,35 @@ class Condition:
     name
         Unique.
     watcher
-        Who evaluates it.
-    reading, unit, what
-        Key of the reading, its unit (SI; "1" for a ratio, a share or yes/no), what it is.
+        The tier that evaluates it.
+    reading, unit
+        Key of the reading, and its unit: "s", "m/s", "rad", "share" (1 is 100 %), "count" or
+        "yes/no" (1 is yes).
+    what, wrong
+        The reading as a noun; what is wrong when the row trips, with ``{value}`` for the reading.
     trips, releases
-        The row trips at ``trips`` or beyond and may release at ``releases`` or on the safe
-        side of it. ``trips`` above ``releases`` means that large values are bad.
+        The row trips at ``trips`` or beyond, and may release at ``releases`` or on its safe side.
+        ``trips`` above ``releases`` means that large values are bad.
     act, scope, severity
-        What is done, to what, how bad.
+        What is done, to what, and how serious it is.
     budget
         From the fault to the finished action, s.
     then_stow
-        From the trip to STOW instead of ``act``, s; infinite if never.
+        From the trip to STOW in place of ``act``, s; infinite for never.
     delay
         How long the value must be beyond ``trips``, s.
     clear_for
         How long fresh readings must be safe before release, s.
     stale_after
-        Age from which a reading counts as its worst case, s; not used for ``ages``.
+        Age from which a reading counts as its worst case, s; not used with ``ages``.
     ages
-        The reading is an age or silence: it grows with time until the next reading.
+        The reading is an age or a silence, which grows until the next reading.
     role
-        Who must acknowledge; ``None`` if the row does not latch.
+        Who must acknowledge; None if the row does not latch.
     release
-        What brings it to an end, in words.
+        How it ends, in words.
+    remedy
+        What the operator should do: a sentence.
     """
 
     name: str
@@ -103,6 +138,7 @@ class Condition:
     reading: str
     unit: str
     what: str
+    wrong: str
     trips: float
     releases: float
     act: Act
@@ -116,6 +152,7 @@ class Condition:
     ages: bool = False
     role: Role | None = None
     release: str = ""
+    remedy: str = ""
 
     def __post_init__(self) -> None:
         at = f"condition {self.name}"
@@ -156,12 +193,12 @@ class Condition:
 
     @property
     def detection(self) -> float:
-        """Longest time from the fault to the trip, s, the reading itself failing included."""
+        """Longest time from the fault to the trip, s, including the loss of the reading itself."""
         return self.delay + (self.trips if self.ages else self.stale_after)
 
     @property
     def worst(self) -> float:
-        """The value that stands for a reading that is missing."""
+        """The value that stands for a missing reading."""
         return math.inf if self.above else -math.inf
 
     def beyond(self, value: float) -> bool:
@@ -171,3 +208,40 @@ class Condition:
     def safe(self, value: float) -> bool:
         """Whether a value may release."""
         return value <= self.releases if self.above else value >= self.releases
+
+    def shown(self, value: float) -> str:
+        """Return a value of the reading as people read it."""
+        match self.unit:
+            case "share":
+                return f"{100.0 * value:.3g} %"
+            case "rad":
+                return f"{math.degrees(value):.3g}°"
+            case "yes/no":
+                return "yes" if value >= 0.5 else "no"
+            case "count":
+                return f"{value:.0f}"
+            case _:
+                return f"{value:.3g} {self.unit}"
+
+    @property
+    def limit(self) -> str:
+        """The trip in words, as " (limit 3 s)"; "" where yes or no, or one, is enough."""
+        return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
+
+    @property
+    def consequence(self) -> str:
+        """What happens by itself: a sentence."""
+        target = {Scope.HELIOSTAT: "the heliostat", Scope.CLUSTER: "the cluster"}
+        whole = target.get(self.scope, "the field")
+        text = {
+            Act.ALARM: f"Nothing moves or stops in {whole}",
+            Act.REFUSE_NEW: f"New motions of {whole} are refused; running motions go on",
+            Act.HOLD: f"HOLD: {whole} stops where it is",
+            Act.DEFOCUS: f"DEFOCUS of {whole}",
+            Act.STOW: f"STOW of {whole}",
+        }[self.act]
+        if math.isfinite(self.then_stow):
+            text += f"; STOW after {self.then_stow:g} s"
+        if self.role is not None:
+            text += f"; holds until acknowledged ({self.role.title})"
+        return f"{text}."

@@ -1,7 +1,7 @@
 """The rows of the safety table.
 
-Numbers are defaults; a plant adjusts them to its receiver, mirrors and weather. Those of the
-wind are common for heliostats of tens of square metres and must be replaced by the maker's.
+The numbers are defaults, to be adjusted to the receiver, the mirrors and the weather of a plant.
+The wind limits are common for heliostats of tens of square metres; replace them by the maker's.
 """
 
 import math
@@ -15,9 +15,9 @@ _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
 _OPERATOR, _SUPERVISOR = Role
 
-#: Lease of the plant to a cluster, and of a cluster's sun to its local controllers, s.
+#: Lease of the plant to a cluster, and of a cluster's sun vector to its local controllers, s.
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
-#: From a defocus that nobody lifts to stowing, s.
+#: From a defocus that nobody lifts to STOW, s.
 _PATIENCE = 30.0
 
 
@@ -27,7 +27,7 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
     Parameters
     ----------
     autonomy
-        How long clusters may go on without the plant, s. Above 0 only where a hard-wired
+        How long clusters may go on without the plant, s. Set it above 0 only where a hard-wired
         emergency line reaches every cluster.
 
     Raises
@@ -51,30 +51,45 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
 def _orders() -> tuple[Condition, ...]:
     return (
         Condition(
-            "operator_emergency", _PLANT, "emergency_order", "1", "emergency order",
+            "operator_emergency", _PLANT, "emergency_order", "yes/no", "emergency order",
+            "a person has ordered an emergency",
             0.5, 0.4, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE,
-            role=_OPERATOR, release="order withdrawn",
+            role=_OPERATOR, release="the order is withdrawn",
+            remedy="Keep people away from the receiver and the beams; find the cause, then withdraw"
+            " the order and acknowledge.",
         ),
         Condition(
-            "emergency_line", _CLUSTER, "emergency_line_live", "1", "current in the emergency line",
+            "emergency_line", _CLUSTER, "emergency_line_live", "yes/no",
+            "current in the emergency line", "the emergency line carries no current",
             0.5, 0.6, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, stale_after=1.0,
-            role=_SUPERVISOR, release="line closed again",
+            role=_SUPERVISOR, release="the line is closed again",
+            remedy="Find out who pressed the button; if nobody did, check the line.",
         ),
         Condition(
-            "nodes_unacknowledged", _PLANT, "nodes_unacknowledged", "1",
-            "number of nodes that have not acknowledged the emergency", 1.0, 0.0, _DEFOCUS,
+            "nodes_unacknowledged", _PLANT, "nodes_unacknowledged", "count",
+            "number of heliostats that have not acknowledged the emergency order",
+            "{value} heliostats have not acknowledged the emergency order", 1.0, 0.0, _DEFOCUS,
             _FIELD, _EMERGENCY, 30.0, then_stow=_PATIENCE, role=_OPERATOR,
-            release="every node has acknowledged, or the emergency is over",
+            release="every heliostat has acknowledged, or the emergency is over",
+            remedy="The EMERGENCY banner names them. Assume that their beams have not moved; keep"
+            " people away, and inspect each of them.",
         ),
         Condition(
-            "flux_after_emergency", _PLANT, "flux_after_emergency", "1",
-            "share of the nominal flux after an emergency", 0.10, 0.08, _STOW, _FIELD,
-            _EMERGENCY, 300.0, role=_SUPERVISOR, release="flux gone, or the emergency over",
+            "flux_after_emergency", _PLANT, "flux_after_emergency", "share",
+            "flux on the receiver after an emergency order, of its nominal value",
+            "flux on the receiver is {value} of nominal after an emergency order, or not known",
+            0.10, 0.08, _STOW, _FIELD, _EMERGENCY, 300.0, role=_SUPERVISOR,
+            release="the flux is gone, or the emergency is over",
+            remedy="Look at the receiver from a safe place; find the heliostats whose beams are"
+            " still on it.",
         ),
         Condition(
-            "authority_lost", _PLANT, "authority_silence", "s", "silence of the command authority",
+            "authority_lost", _PLANT, "authority_silence", "s",
+            "time since the command authority was renewed",
+            "nobody has renewed the command authority for {value}",
             10.0, 5.0, _REFUSE, _FIELD, _WARNING, 15.0, ages=True,
-            release="an authority is there again",
+            release="somebody holds the command authority again",
+            remedy="Take the command authority, or switch automatic control on.",
         ),
     )  # fmt: skip
 
@@ -82,25 +97,34 @@ def _orders() -> tuple[Condition, ...]:
 def _receiver() -> tuple[Condition, ...]:
     return (
         Condition(
-            "receiver_flux_high", _PLANT, "receiver_flux", "1", "receiver flux over its limit",
+            "receiver_flux_high", _PLANT, "receiver_flux", "share",
+            "flux on the receiver, of its limit", "flux on the receiver is {value} of its limit",
             1.0, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=5.0,
-            clear_for=10.0, role=_OPERATOR, release="flux well below its limit",
+            clear_for=10.0, role=_OPERATOR, release="the flux is well below its limit",
+            remedy="Let the receiver cool; return with fewer heliostats or other aim points.",
         ),
         Condition(
-            "receiver_temperature_high", _PLANT, "receiver_temperature", "1",
-            "receiver temperature over its limit", 1.0, 0.95, _DEFOCUS, _FIELD, _EMERGENCY, 30.0,
-            delay=1.0, stale_after=5.0, clear_for=60.0, role=_OPERATOR,
-            release="temperature well below its limit",
+            "receiver_temperature_high", _PLANT, "receiver_temperature", "share",
+            "temperature of the receiver, of its limit",
+            "temperature of the receiver is {value} of its limit", 1.0, 0.95, _DEFOCUS, _FIELD,
+            _EMERGENCY, 30.0, delay=1.0, stale_after=5.0, clear_for=60.0, role=_OPERATOR,
+            release="the temperature is well below its limit",
+            remedy="Check the flow first, then the aim points.",
         ),
         Condition(
-            "receiver_flow_low", _PLANT, "receiver_flow", "1", "receiver flow over its demand",
+            "receiver_flow_low", _PLANT, "receiver_flow", "share",
+            "flow through the receiver, of its demand",
+            "flow through the receiver is {value} of demand",
             0.8, 0.9, _DEFOCUS, _FIELD, _EMERGENCY, 30.0, delay=1.0, stale_after=3.0,
-            clear_for=30.0, role=_OPERATOR, release="flow back",
+            clear_for=30.0, role=_OPERATOR, release="the flow is back",
+            remedy="Check pumps and valves before the field returns.",
         ),
         Condition(
             "receiver_camera_lost", _PLANT, "receiver_camera_silence", "s",
-            "silence of the receiver's camera", 10.0, 5.0, _REFUSE, _FIELD, _SERIOUS, 15.0,
-            ages=True, clear_for=10.0, release="pictures come again",
+            "time since the last picture of the receiver camera",
+            "no picture from the receiver camera for {value}",
+            10.0, 5.0, _REFUSE, _FIELD, _SERIOUS, 15.0, ages=True, clear_for=10.0,
+            release="pictures arrive again", remedy="Check the camera and its network.",
         ),
     )  # fmt: skip
 
@@ -108,29 +132,32 @@ def _receiver() -> tuple[Condition, ...]:
 def _weather() -> tuple[Condition, ...]:
     return (
         Condition(
-            "wind_gust_stow", _PLANT, "wind_gust", "m/s", "gust of wind (3 s)",
-            20.0, 15.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
-            release="gusts are weak",
+            "wind_gust_stow", _PLANT, "wind_gust", "m/s", "wind gust (3 s)",
+            "wind gust of {value}", 20.0, 15.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
+            release="gusts have dropped",
+            remedy="Wait; walk the field before heliostats leave stow.",
         ),
         Condition(
-            "wind_gust_defocus", _PLANT, "wind_gust", "m/s", "gust of wind (3 s)",
-            15.0, 12.0, _DEFOCUS, _FIELD, _WARNING, 30.0, delay=3.0, clear_for=600.0,
-            release="gusts are weak",
+            "wind_gust_defocus", _PLANT, "wind_gust", "m/s", "wind gust (3 s)",
+            "wind gust of {value}", 15.0, 12.0, _DEFOCUS, _FIELD, _WARNING, 30.0, delay=3.0,
+            clear_for=600.0, release="gusts have dropped", remedy="Wait for the wind to drop.",
         ),
         Condition(
             "wind_mean_stow", _PLANT, "wind_mean", "m/s", "mean wind (600 s)",
-            14.0, 11.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
-            release="wind is weak",
+            "mean wind of {value}", 14.0, 11.0, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=600.0,
+            release="the wind has dropped",
+            remedy="Wait; walk the field before heliostats leave stow.",
         ),
         Condition(
             "wind_mean_defocus", _PLANT, "wind_mean", "m/s", "mean wind (600 s)",
-            11.0, 9.0, _DEFOCUS, _FIELD, _WARNING, 30.0, clear_for=600.0,
-            release="wind is weak",
+            "mean wind of {value}", 11.0, 9.0, _DEFOCUS, _FIELD, _WARNING, 30.0,
+            clear_for=600.0, release="the wind has dropped", remedy="Wait for the wind to drop.",
         ),
         Condition(
             "sun_below_horizon", _PLANT, "sun_elevation", "rad", "elevation of the sun",
-            0.0, 0.035, _STOW, _FIELD, _INFO, 300.0, clear_for=60.0, stale_after=10.0,
-            release="sun is up",
+            "the sun is down: its elevation is {value}", 0.0, 0.035, _STOW, _FIELD, _INFO, 300.0,
+            clear_for=60.0, stale_after=10.0, release="the sun is up",
+            remedy="Nothing to do.",
         ),
     )  # fmt: skip
 
@@ -138,34 +165,48 @@ def _weather() -> tuple[Condition, ...]:
 def _links(autonomy: float) -> tuple[Condition, ...]:
     return (
         Condition(
-            "plant_link_lost", _CLUSTER, "plant_silence", "s", "silence of the plant",
+            "plant_link_lost", _CLUSTER, "plant_silence", "s",
+            "time since the plant renewed its lease", "no lease from the plant for {value}",
             PLANT_LEASE + autonomy, 2.0, _DEFOCUS, _BUS, _SERIOUS, 30.0 + autonomy,
-            then_stow=_PATIENCE, ages=True, release="heartbeats of the plant",
+            then_stow=_PATIENCE, ages=True, release="leases of the plant arrive again",
+            remedy="Check the plant, the network and the broker.",
         ),
         Condition(
-            "cluster_silent", _PLANT, "cluster_silence", "s", "silence of the cluster",
-            PLANT_LEASE, 2.0, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, ages=True,
-            release="heartbeats of the cluster",
+            "cluster_silent", _PLANT, "cluster_silence", "s",
+            "time since the last status of the cluster",
+            "no status from the cluster for {value}", PLANT_LEASE, 2.0, _DEFOCUS, _BUS, _SERIOUS,
+            30.0, then_stow=_PATIENCE, ages=True, release="the cluster reports again",
+            remedy="Check the cluster's computer and its link; the tab Clusters shows why.",
         ),
         Condition(
-            "broker_lost", _PLANT, "broker_silence", "s", "silence of the broker",
+            "broker_lost", _PLANT, "broker_silence", "s",
+            "time since a heartbeat came back from the broker",
+            "no heartbeat back from the broker for {value}",
             PLANT_LEASE, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
-            release="our heartbeats come back through it",
+            release="heartbeats come back from the broker",
+            remedy="Check Mosquitto and the machine it runs on.",
         ),
         Condition(
-            "bus_errors", _CLUSTER, "bus_errors", "1", "share of bad frames on the bus (10 s)",
+            "bus_errors", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "{value} of the frames on the bus are bad",
             0.2, 0.05, _REFUSE, _BUS, _WARNING, 20.0, delay=5.0, clear_for=30.0,
-            release="bus is sound",
+            release="the bus is sound again",
+            remedy="Check cable and termination; look for one controller that talks out of turn.",
         ),
         Condition(
-            "bus_failed", _CLUSTER, "bus_errors", "1", "share of bad frames on the bus (10 s)",
+            "bus_failed", _CLUSTER, "bus_errors", "share", "bad frames on the bus within 10 s",
+            "{value} of the frames on the bus are bad",
             0.9, 0.2, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=2.0,
-            clear_for=30.0, release="bus works",
+            clear_for=30.0, release="the bus works again",
+            remedy="Check the bus adapter and the cable; without the bus each heliostat defocuses"
+            " by itself within 6 s.",
         ),
         Condition(
             "sun_stale", _NODE, "sun_age", "s", "age of the sun vector",
-            SUN_LEASE, 3.0, _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0, then_stow=_PATIENCE, ages=True,
-            release="fresh sun vectors; a fresh command to track",
+            "no sun vector for {value}", SUN_LEASE, 3.0, _DEFOCUS, _HELIOSTAT, _SERIOUS, 30.0,
+            then_stow=_PATIENCE, ages=True,
+            release="fresh sun vectors arrive; tracking needs a fresh command",
+            remedy="Check its cluster; then command it to track again.",
         ),
     )  # fmt: skip
 
@@ -173,19 +214,26 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
 def _time() -> tuple[Condition, ...]:
     return (
         Condition(
-            "clock_jump", _CLUSTER, "clock_step", "s", "step of the time against the counter",
+            "clock_jump", _CLUSTER, "clock_step", "s",
+            "step of the cluster's time against its monotonic clock",
+            "the cluster's time stepped by {value}",
             0.5, 0.1, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, clear_for=10.0,
-            role=_OPERATOR, release="time agrees again",
+            role=_OPERATOR, release="the time agrees again",
+            remedy="Check the time receiver and the clock; acknowledge when the time is right.",
         ),
         Condition(
-            "time_source_lost", _CLUSTER, "time_source_silence", "s", "silence of the time source",
+            "time_source_lost", _CLUSTER, "time_source_silence", "s",
+            "time since the time source was heard", "no time source for {value}",
             60.0, 10.0, _ALARM, _BUS, _WARNING, 65.0, ages=True, clear_for=10.0,
-            release="time source back; until then holdover",
+            release="the time source is back; until then the cluster runs on its own clock",
+            remedy="Check the antenna and the receiver before the holdover ends.",
         ),
         Condition(
-            "holdover_exhausted", _CLUSTER, "time_uncertainty", "s", "uncertainty of the time",
+            "holdover_exhausted", _CLUSTER, "time_uncertainty", "s",
+            "uncertainty of the cluster's time",
+            "the cluster's time is uncertain by {value}",
             1.0, 0.5, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, clear_for=10.0,
-            release="time is known again",
+            release="the time is known again", remedy="Check the antenna and the receiver.",
         ),
     )  # fmt: skip
 
@@ -193,19 +241,24 @@ def _time() -> tuple[Condition, ...]:
 def _power_and_records() -> tuple[Condition, ...]:
     return (
         Condition(
-            "ups_on_battery", _PLANT, "ups_on_battery", "1", "UPS on battery",
+            "ups_on_battery", _PLANT, "ups_on_battery", "yes/no", "UPS on battery",
+            "the UPS runs on battery: mains power is lost",
             0.5, 0.4, _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=5.0,
-            clear_for=60.0, release="mains back",
+            clear_for=60.0, release="mains power is back", remedy="Check the mains supply.",
         ),
         Condition(
-            "ups_charge_low", _PLANT, "ups_charge", "1", "charge of the UPS",
+            "ups_charge_low", _PLANT, "ups_charge", "share", "charge of the UPS",
+            "charge of the UPS is {value}",
             0.5, 0.8, _STOW, _FIELD, _SERIOUS, 300.0, clear_for=60.0, stale_after=30.0,
-            release="charged",
+            release="the UPS is charged", remedy="Restore the mains supply at once.",
         ),
         Condition(
-            "database_unwritable", _PLANT, "audit_silence", "s", "time without a confirmed write",
+            "database_unwritable", _PLANT, "audit_silence", "s",
+            "time since the audit last confirmed a write",
+            "the audit has not confirmed a write for {value}",
             5.0, 2.0, _REFUSE, _FIELD, _SERIOUS, 10.0, ages=True, clear_for=5.0,
             release="writes are confirmed",
+            remedy="Check the disk or the database; the alarm records gives the reason.",
         ),
     )  # fmt: skip
 
@@ -213,19 +266,25 @@ def _power_and_records() -> tuple[Condition, ...]:
 def _mirrors() -> tuple[Condition, ...]:
     return (
         Condition(
-            "keep_out_predicted", _PLANT, "keep_out_predicted", "1",
-            "predicted entry into a keep-out volume", 0.5, 0.4, _HOLD, _HELIOSTAT, _SERIOUS, 10.0,
-            release="the checked way is clear",
+            "keep_out_predicted", _PLANT, "keep_out_predicted", "yes/no",
+            "beam in or heading for a keep-out volume",
+            "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _HOLD, _HELIOSTAT,
+            _SERIOUS, 10.0, release="the beam and its way are clear",
+            remedy="Give it another aim point, or stow it.",
         ),
         Condition(
-            "node_faults", _PLANT, "node_fault_share", "1", "share of nodes that failed in 600 s",
-            0.02, 0.01, _REFUSE, _FIELD, _WARNING, 20.0, delay=5.0, clear_for=60.0,
-            role=_OPERATOR, release="few faults",
+            "node_faults", _PLANT, "node_fault_share", "share",
+            "heliostats that failed within 600 s",
+            "{value} of the heliostats failed within 600 s", 0.02, 0.01, _REFUSE, _FIELD,
+            _WARNING, 20.0, delay=5.0, clear_for=60.0, role=_OPERATOR, release="few faults",
+            remedy="Find what they share: a cluster, a supply, a firmware version.",
         ),
         Condition(
-            "node_faults_many", _PLANT, "node_fault_share", "1",
-            "share of nodes that failed in 600 s", 0.10, 0.05, _DEFOCUS, _FIELD, _SERIOUS, 30.0,
-            delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
+            "node_faults_many", _PLANT, "node_fault_share", "share",
+            "heliostats that failed within 600 s",
+            "{value} of the heliostats failed within 600 s", 0.10, 0.05, _DEFOCUS, _FIELD,
+            _SERIOUS, 30.0, delay=5.0, clear_for=60.0, role=_SUPERVISOR, release="few faults",
+            remedy="Find at once what they share: a cluster, a supply, a firmware version.",
         ),
     )  # fmt: skip
 

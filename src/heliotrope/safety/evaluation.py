@@ -1,19 +1,19 @@
-"""Failsafe: one table of conditions and actions, and its evaluation.
+"""The evaluation of the safety table: a pure function of readings, state and time.
 
-Plant, clusters and local controllers each watch the rows that name them. A row says which
-reading trips it, from which value on and after which delay, what is then done to what, how
-bad it is, whether it latches, who must acknowledge it, and when it releases. Nothing here
+The plant, the clusters and the local controllers each watch the rows that name them. A row says
+which reading trips it, at which value and after which delay; what is then done to what; how
+serious it is; whether it latches and who must acknowledge it; and when it releases. Nothing here
 reads a clock or a sensor: readings and time (monotonic seconds) are arguments.
 
-Rules that hold for every row:
+Rules for every row:
 
-- A reading that is missing, not finite or from the future does not count; the last good one
-  does, until it is older than the row's age. Then its worst case counts. A reading that is
-  itself an age (silence) grows by itself.
-- Only fresh readings release: a stream that stands still never improves anything.
+- A reading that is missing, not finite or from the future does not count. The last good one counts
+  until it is older than the row's age; from then on the worst case counts. A reading that is itself
+  an age (a silence) grows by itself.
+- Only fresh readings release a row: a stream that stands still never improves anything.
 - A latched row stays until its cause has gone *and* a person of the row's role or above
   acknowledges it. An acknowledgement before the cause has gone is refused.
-- The strongest action wins. A released row moves no mirror: that needs a fresh command.
+- The strongest action wins. A released row moves no heliostat: that needs a fresh command.
 """
 
 import math
@@ -21,33 +21,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from heliotrope.errors import InputError, UnknownNameError
-from heliotrope.safety.condition import Act, Condition, Role, Scope, Severity, Watcher
-from heliotrope.safety.conditions import CONDITIONS, conditions
-from heliotrope.safety.proof import (
-    DEFOCUS_BUDGET,
-    ORDER_BUDGET,
-    STOW_BUDGET,
-    JoinLimiter,
-    Proof,
-    ProofReport,
-    Reading,
-    proof_readings,
-)
+from heliotrope.safety import alarms
+from heliotrope.safety.condition import Act, Condition, Reading, Role, Scope, Severity, Watcher
+from heliotrope.safety.proof import DEFOCUS_BUDGET
 
-__all__ = [
-    "CONDITIONS", "DEFOCUS_BUDGET", "ORDER_BUDGET", "STOW_BUDGET", "Act", "Action", "Condition",
-    "JoinLimiter", "Proof", "ProofReport", "Reading", "Role", "SafetyState", "Scope", "Severity",
-    "Watcher", "acknowledge", "adjusted", "conditions", "decision", "evaluate", "proof_readings",
-    "start", "watched_by",
-]  # fmt: skip
-
-#: What a state is kept for: name of the condition and of the cluster or heliostat ("" = all).
+#: Key of a track: name of the condition, and of the cluster or heliostat ("" for all).
 Key = tuple[str, str]
 
 
 @dataclass(frozen=True)
 class Track:
-    """What is remembered of one row for one subject.
+    """The memory of one row for one subject.
 
     Attributes
     ----------
@@ -55,15 +39,15 @@ class Track:
         Last good reading (``None`` before the first) and its time, s; before the first, the
         time of the start.
     beyond_since
-        Since when the value has been beyond the trip, s, if it is.
+        When the value went beyond the trip, s; None while it is not.
     safe_since
-        Time of the first of the unbroken safe readings, s, if the last is safe.
+        Time of the first of an unbroken run of safe readings, s; None if the last is not safe.
     tripped_at
-        When the row tripped, s, if it is tripped.
+        When the row tripped, s; None while it is not tripped.
     cleared
-        Whether the cause has gone and only the acknowledgement is missing.
+        The cause has gone and only the acknowledgement is missing.
     acknowledged_by
-        Who acknowledged the last trip.
+        The person who acknowledged the last trip.
     """
 
     seen: float
@@ -77,14 +61,14 @@ class Track:
 
 @dataclass(frozen=True)
 class SafetyState:
-    """All that the evaluation remembers: rows, their tracks, and the time of the last one, s."""
+    """The memory of the evaluation: rows, their tracks, and the time of the last evaluation, s."""
 
     table: tuple[Condition, ...]
     now: float
     tracks: Mapping[Key, Track] = field(default_factory=dict)
 
     def tripped(self) -> tuple[Key, ...]:
-        """Which rows are tripped, for which subjects."""
+        """Return the rows that are tripped, each with its subject."""
         return tuple(key for key, track in self.tracks.items() if track.tripped_at is not None)
 
 
@@ -95,17 +79,17 @@ class Action:
     Attributes
     ----------
     act, scope, subject
-        What is to be done, to what; name of the cluster or heliostat, "" for the field.
+        What to do, and to what: the name of the cluster or heliostat, "" for the field.
     condition, severity, budget
         Of the row; s.
     since
         When it tripped, monotonic s.
     new
-        Whether it tripped, or became a STOW, in this evaluation.
+        It tripped, or became a STOW, in this evaluation.
     waits
-        Whether only an acknowledgement is missing.
-    text
-        One line for the operator.
+        Only an acknowledgement is missing.
+    text, remedy
+        What is wrong and what is done, and what the operator should do.
     """
 
     act: Act
@@ -118,6 +102,12 @@ class Action:
     new: bool
     waits: bool
     text: str
+    remedy: str = ""
+
+    @property
+    def line(self) -> str:
+        """Text and remedy, for an alarm."""
+        return f"{self.text}. {self.remedy}" if self.remedy else self.text
 
 
 def start(
@@ -132,8 +122,8 @@ def start(
     now
         Monotonic seconds; the ages of readings that never come count from here.
     subjects
-        By the name of a row of scope CLUSTER or HELIOSTAT: the clusters or heliostats that
-        it is evaluated for. Without, it is evaluated once, for the subject "".
+        For a row of scope CLUSTER or HELIOSTAT, by its name: the clusters or heliostats that
+        it is evaluated for. Without them it is evaluated once, for the subject "".
 
     Raises
     ------
@@ -158,9 +148,9 @@ def start(
 
 
 def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetyState:
-    """Return the state with a row evaluated for some subjects, besides those that it trips for.
+    """Return the state with a row evaluated for some subjects and those that it trips for.
 
-    For a row about heliostats, of which few are ever worth a look.
+    Made for rows about heliostats, few of which ever need evaluating.
 
     Parameters
     ----------
@@ -169,7 +159,7 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
     name
         Of the row.
     subjects
-        Whose readings are there.
+        Those with a reading.
     """
     tracks = {
         key: track
@@ -185,7 +175,7 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
 def evaluate(
     readings: Mapping[Key, Reading], state: SafetyState, now: float
 ) -> tuple[SafetyState, list[Action]]:
-    """Return the next state and all actions that are demanded now, the strongest first.
+    """Return the next state and every action demanded now, the strongest first.
 
     Parameters
     ----------
@@ -202,19 +192,21 @@ def evaluate(
     time = now
     if not (now >= state.now and math.isfinite(now)):
         time = state.now
-        text = f"the monotonic time went from {state.now:g} s to {now:g} s; restart this controller"
+        kind = alarms.TIME_WENT_BACK
+        text = kind.text.format(before=state.now, now=now)
         actions.append(
             Action(
                 Act.DEFOCUS,
                 Scope.FIELD,
                 "",
-                "time_went_back",
-                Severity.EMERGENCY,
+                kind.name,
+                kind.severity,
                 DEFOCUS_BUDGET,
                 time,
                 new=True,
                 waits=False,
                 text=text,
+                remedy=kind.remedy,
             )
         )
     rows = {row.name: row for row in state.table}
@@ -226,7 +218,9 @@ def evaluate(
         if after.tripped_at is not None:
             actions.append(_action(row, subject, track, after, state.now, time))
     actions += _strangers(readings, state, time)
-    actions.sort(key=lambda a: (-a.act, -a.scope, -a.severity, a.since, a.condition, a.subject))
+    actions.sort(
+        key=lambda a: (-a.act, -a.scope, -a.severity.rank, a.since, a.condition, a.subject)
+    )
     return SafetyState(state.table, time, tracks), actions
 
 
@@ -234,7 +228,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
     """Return the track after a reading, or after none, at ``now``."""
     value, seen, fresh = track.value, track.seen, False
     if reading is not None and math.isfinite(reading.value) and seen <= reading.at <= now:
-        # Of two readings of one time the worse counts.
+        # Of two readings with the same time the worse counts.
         worse = value is None or (reading.value > value if row.above else reading.value < value)
         if reading.at > seen or worse:
             value, seen, fresh = reading.value, reading.at, True
@@ -260,7 +254,7 @@ def _advance(row: Condition, track: Track, reading: Reading | None, now: float) 
 
 
 def _counting(row: Condition, value: float | None, seen: float, now: float) -> float:
-    """Return the value that counts now."""
+    """Return the value that the row is judged by now."""
     age = now - seen
     if row.ages:
         return (0.0 if value is None else value) + age
@@ -278,12 +272,23 @@ def _action(
     new = before.tripped_at is None or _act(row, last - since) != act
     waits = after.cleared
     text = f"{row.name}{f' {subject}' if subject else ''}: {_said(row, after, now)}"
+    if now - since >= 1.0 and not (row.ages or waits):
+        text += f", for {now - since:.0f} s"
     if waits and row.role is not None:
-        text += f"; the cause has gone, {row.role.name.lower()} to acknowledge"
-    scope = row.scope.name.lower()
-    text += f"; {act.name} {scope}{f' {subject}' if subject else ''}"
+        text += f"; the cause has gone, {row.role.title} to acknowledge"
+    text += f"; {act.name} {row.scope.name.lower()}{f' {subject}' if subject else ''}"
     return Action(
-        act, row.scope, subject, row.name, row.severity, row.budget, since, new, waits, text
+        act,
+        row.scope,
+        subject,
+        row.name,
+        row.severity,
+        row.budget,
+        since,
+        new,
+        waits,
+        text,
+        row.remedy,
     )
 
 
@@ -292,50 +297,51 @@ def _act(row: Condition, tripped_for: float) -> Act:
 
 
 def _said(row: Condition, track: Track, now: float) -> str:
-    """Return what the reading is, in words."""
+    """Return in words what the row is judged by."""
     counts = _counting(row, track.value, track.seen, now)
     if math.isinf(counts):
-        return f"no {row.what} for {now - track.seen:.1f} s (limit {row.stale_after:g} s)"
-    unit = "" if row.unit == "1" else f" {row.unit}"
-    side = "at or above" if row.above else "at or below"
-    if not row.beyond(counts):
-        side = "released at" if row.safe(counts) else "not yet back at"
-        return f"{row.what} is {counts:.3g}{unit}, {side} {row.releases:g}{unit}"
-    return f"{row.what} is {counts:.3g}{unit}, {side} {row.trips:g}{unit}"
+        return f"no reading of {row.what} for {now - track.seen:.1f} s, so the worst case counts"
+    if row.beyond(counts):
+        return row.wrong.format(value=row.shown(counts)) + row.limit
+    back = row.shown(row.releases)
+    if row.safe(counts):
+        return f"{row.release}: {row.what} is {row.shown(counts)}, released at {back}"
+    return f"{row.what} is {row.shown(counts)}, not yet back at {back}"
 
 
 def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) -> Iterable[Action]:
-    """Yield an alarm for each reading that no row waits for: a wrong name watches nothing."""
+    """Yield an alarm for each reading that no row uses: a wrong name watches nothing."""
     known = {row.reading for row in state.table}
+    kind = alarms.UNKNOWN_READING
     for name in sorted({name for name, _ in readings} - known):
-        text = f"reading {name!r} is in no row of the table; correct its name"
         yield Action(
             Act.ALARM,
             Scope.FIELD,
             "",
-            "unknown_reading",
-            Severity.WARNING,
+            kind.name,
+            kind.severity,
             0.0,
             now,
             new=False,
             waits=False,
-            text=text,
+            text=kind.text.format(reading=name),
+            remedy=kind.remedy,
         )
 
 
 def acknowledge(
     state: SafetyState, condition: str, who: str, role: Role, subject: str = ""
 ) -> tuple[SafetyState, str]:
-    """Return the state after a person's acknowledgement, and why it was refused ("" if not).
+    """Return the state after a person's acknowledgement, and why it was refused ("" if it was not).
 
     Parameters
     ----------
     state
         After the last evaluation.
     condition, subject
-        The row, and the cluster or heliostat it is about.
+        The row, and the cluster or heliostat that it is about.
     who, role
-        The person's name, for the audit record, and role.
+        The person's name, for the record, and role.
     """
     rows = {row.name: row for row in state.table}
     row, track = rows.get(condition), state.tracks.get((condition, subject))
@@ -345,11 +351,11 @@ def acknowledge(
     if track.tripped_at is None:
         return state, f"{label}: it is not tripped; there is nothing to acknowledge"
     if row.role is None:
-        return state, f"{label}: it releases by itself; it needs no acknowledgement"
+        return state, f"{label}: it releases by itself and needs no acknowledgement"
     if not who.strip():
         return state, f"{label}: an acknowledgement needs a person's name"
     if role < row.role:
-        return state, f"{label}: {row.role.name.lower()} must acknowledge, not {role.name.lower()}"
+        return state, f"{label}: {row.role.title} must acknowledge, not {role.title}"
     if not track.cleared:
         return state, f"{label}: the cause has not gone: {_said(row, track, state.now)}"
     released = replace(
@@ -359,9 +365,9 @@ def acknowledge(
 
 
 def decision(actions: Iterable[Action], cluster: str = "", heliostat: str = "") -> Act | None:
-    """Return the strongest action that concerns a heliostat of a cluster; ``None`` if none does.
+    """Return the strongest act that applies to a heliostat of a cluster; None if there is none.
 
-    An action without a subject concerns all that the evaluating tier commands.
+    An action without a subject applies to everything that the evaluating tier commands.
     """
     ours = {Scope.HELIOSTAT: heliostat, Scope.CLUSTER: cluster, Scope.FIELD: ""}
     acts = (a.act for a in actions if a.subject in {"", ours[a.scope]})
@@ -374,14 +380,14 @@ def watched_by(table: Iterable[Condition], watcher: Watcher) -> tuple[Condition,
 
 
 def adjusted(table: Iterable[Condition], name: str, **changes: float) -> tuple[Condition, ...]:
-    """Return the table with numbers of one row changed, such as ``trips`` and ``releases``.
+    """Return the table with some numbers of one row changed, such as ``trips`` and ``releases``.
 
     Raises
     ------
     UnknownNameError
         If there is no such row, or a row has no such number.
     InputError
-        If the row does not hold together any more.
+        If the changed row contradicts itself.
     """
     rows = tuple(table)
     numbers = ("trips", "releases", "budget", "then_stow", "delay", "clear_for", "stale_after")

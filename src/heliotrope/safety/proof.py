@@ -1,44 +1,35 @@
-"""What surrounds an emergency: readings, the proof that it was carried out, joining in steps."""
+"""The proof that an emergency order was carried out."""
 
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 from heliotrope.errors import InputError
+from heliotrope.safety.condition import Reading
 
-#: From the order: to the last local controller; beams off; mirrors stowed, s.
+#: From the order to the last acknowledgement, to beams off the receiver, and to stow, s.
 ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
-#: Largest share of the nominal flux on the receiver after a defocus.
+#: Limit of the flux on the receiver after a defocus, as a share of the nominal.
 FLUX_LIMIT = 0.10
-#: A reading of the flux older than this (s) proves nothing.
+#: A flux reading older than this (s) proves nothing.
 FLUX_AGE = 5.0
 
 
 @dataclass(frozen=True)
-class Reading:
-    """A value in the unit of its row, and when it was taken, monotonic s."""
-
-    value: float
-    at: float
-
-
-@dataclass(frozen=True)
 class ProofReport:
-    """How far an emergency has come.
+    """How far an emergency order has been carried out.
 
     Attributes
     ----------
-    unacknowledged
-        Nodes that have not acknowledged the order, sorted.
-    not_done
-        Nodes that have not reported that they are defocused or stowed, sorted.
+    unacknowledged, not_done
+        Heliostats that have not acknowledged the order, and that have not carried it out; sorted.
     late
-        Nodes beyond the deadline of their acknowledgement or of the action, sorted.
+        Heliostats that missed the deadline for either, sorted.
     flux_proven
-        Whether the flux is below its limit, by a fresh reading taken after the order;
-        ``None`` while the time for it is not over and it is not.
+        Whether a fresh reading, taken after the order, shows the flux below its limit; None while
+        there is still time for that.
     complete
-        Every node acknowledged and done, and the flux proven.
+        Every heliostat has acknowledged and is done, and the flux is proven.
     """
 
     unacknowledged: tuple[str, ...]
@@ -51,7 +42,7 @@ class ProofReport:
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            return "every node acknowledged and done; the flux is below its limit"
+            return "every heliostat has acknowledged and is done; the flux is below its limit"
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:
@@ -66,7 +57,7 @@ class ProofReport:
 
 @dataclass(frozen=True)
 class Proof:
-    """Bookkeeping of one DEFOCUS or STOW order: every node acknowledged, or named.
+    """The record of one DEFOCUS or STOW order: every heliostat has acknowledged it or is named.
 
     Attributes
     ----------
@@ -75,13 +66,13 @@ class Proof:
     ordered_at
         Monotonic s.
     nodes
-        Who must obey.
+        Heliostats that must obey.
     acknowledged, done
-        When each node acknowledged the order and reported the action done, s.
+        When each of them acknowledged the order and carried it out, s.
     flux
-        Last reading of the flux as a share of the nominal, taken after the order.
+        Last reading of the flux after the order, as a share of the nominal.
     refused
-        Reports that prove nothing: of strangers, or from before the order.
+        Count of reports that prove nothing: from other heliostats, or from before the order.
     """
 
     order: str
@@ -109,11 +100,11 @@ class Proof:
         return DEFOCUS_BUDGET if self.order == "DEFOCUS" else STOW_BUDGET
 
     def with_acknowledged(self, node: str, at: float) -> "Proof":
-        """Return the proof with a node's acknowledgement; only the first one counts."""
+        """Return the proof with an acknowledgement; only the first one of a heliostat counts."""
         return self.with_news(acknowledged={node: at})
 
     def with_done(self, node: str, at: float) -> "Proof":
-        """Return the proof with a node's report that it is done, which acknowledges too."""
+        """Return the proof with a report that a heliostat is done, which acknowledges as well."""
         return self.with_news(done={node: at})
 
     def with_news(
@@ -122,7 +113,7 @@ class Proof:
         acknowledged: Mapping[str, float] | None = None,
         done: Mapping[str, float] | None = None,
     ) -> "Proof":
-        """Return the proof with the reports of many nodes, each with its time: one copy for all."""
+        """Return the proof with reports of many heliostats, each with its time, in one copy."""
         told, ready = dict(acknowledged or {}), dict(done or {})
         good_told = {node: at for node, at in told.items() if self._counts(node, at)}
         good_ready = {node: at for node, at in ready.items() if self._counts(node, at)}
@@ -135,7 +126,7 @@ class Proof:
         )
 
     def with_flux(self, share: float, at: float) -> "Proof":
-        """Return the proof with a reading of the flux, as a share of the nominal."""
+        """Return the proof with a flux reading, as a share of the nominal."""
         newer = self.flux is None or at > self.flux.at
         if not (math.isfinite(share) and at >= self.ordered_at and newer):
             return replace(self, refused=self.refused + 1)
@@ -145,12 +136,12 @@ class Proof:
         return node in self.nodes and math.isfinite(at) and at >= self.ordered_at
 
     def report(self, now: float) -> ProofReport:
-        """Return what is proven at ``now``, and who is late."""
+        """Return what is proven at ``now``, and which heliostats are late."""
         silent = self.nodes - set(self.acknowledged)
         open_ = self.nodes - set(self.done)
         late = {n for n, at in self.acknowledged.items() if at - self.ordered_at > ORDER_BUDGET}
         late |= {n for n, at in self.done.items() if at - self.ordered_at > self.budget}
-        # A time that cannot be compared is as late as can be.
+        # A time that is not a number counts as too late.
         if not now - self.ordered_at <= ORDER_BUDGET:
             late |= silent
         if not now - self.ordered_at <= self.budget:
@@ -172,11 +163,11 @@ class Proof:
 
 
 def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Reading]:
-    """Return the readings that rows of the table take from a proof; ``None``: no emergency.
+    """Return the readings that the safety table takes from a proof; None: no emergency.
 
-    ``nodes_unacknowledged`` is the number of nodes without acknowledgement once the time for
-    it is over; ``flux_after_emergency`` is 0 until the time to defocus is over, then the
-    share of the nominal flux, and 1 if that is not known.
+    ``nodes_unacknowledged`` is 0 until the deadline of the acknowledgements, then the number of
+    heliostats that have not acknowledged. ``flux_after_emergency`` is 0 until the deadline of the
+    defocus, then the flux as a share of the nominal, or 1 if it is not known.
     """
     silent, flux = 0.0, 0.0
     if proof is not None:
@@ -190,47 +181,3 @@ def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Rea
         ("nodes_unacknowledged", ""): Reading(silent, now),
         ("flux_after_emergency", ""): Reading(flux, now),
     }
-
-
-@dataclass(frozen=True)
-class JoinLimiter:
-    """Bounds how many mirrors join the receiver: a token bucket without a clock.
-
-    In any span of T seconds at most ``burst + rate · T`` mirrors join.
-
-    Attributes
-    ----------
-    rate
-        Mirrors a second, 0 or more.
-    burst
-        Mirrors at once after a rest, a whole number from 1.
-    tokens, at
-        What may join at the monotonic time ``at``, s. A new limiter is empty.
-    """
-
-    rate: float
-    burst: int
-    tokens: float = 0.0
-    at: float | None = None
-
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.rate) and self.rate >= 0.0):
-            raise InputError(f"joining rate {self.rate} mirrors/s must be 0 or more and finite")
-        if self.burst < 1:
-            raise InputError(f"joining burst {self.burst} must be a whole number from 1")
-
-    def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:
-        """Return the limiter afterwards and how many of ``wanted`` mirrors may join now.
-
-        A clock that stands, goes back or is not a number grants no new tokens; one that
-        jumps ahead fills the bucket at most to its burst.
-        """
-        at = self.at
-        tokens = self.tokens
-        if math.isfinite(now):
-            if at is not None and now > at:
-                tokens = min(float(self.burst), tokens + self.rate * (now - at))
-            at = now if at is None else max(at, now)
-        # Rounding must not withhold a token that is earned.
-        granted = max(0, min(wanted, math.floor(tokens + 1e-9)))
-        return replace(self, tokens=max(0.0, tokens - granted), at=at), granted

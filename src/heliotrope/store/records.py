@@ -24,9 +24,10 @@ from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.safety import Severity
 
 Identities = npt.NDArray[np.int64]
-SEVERITIES = ("info", "warning", "alarm", "emergency")
+SEVERITIES = tuple(Severity)
 
 
 class StoreError(HeliotropeError):

@@ -10,35 +10,20 @@ import numpy as np
 from heliotrope.errors import HeliotropeError
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link, Outcome, Statistics
-from heliotrope.links.messages import Alarm, ProtocolError, Status, decode
+from heliotrope.links.messages import ProtocolError, Status, decode
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
+from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import Event, Records
 
 #: Come each second: only the last of each cluster is kept.
 _STEADY = ("lease", "status")
 #: Longest text of a packet, letters.
 _LONGEST = 240
-#: Alarms of no row of the safety table, of the plant and of clusters: noted when acknowledged.
-_PLAIN = frozenset(
-    {
-        "records",
-        "work",
-        "camera",
-        "sensor",
-        "order_unacknowledged",
-        "node_silent",
-        "node_fault",
-        "node_unintelligible",
-        "plant_unintelligible",
-        "lease_refused",
-        "autonomy_limited",
-        "time_source",
-        "state_unwritable",
-    }
-)
+#: Raised and ended by the evaluation of the table itself: there is nothing to acknowledge.
+_UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
 #: Is told once and mended by the plant itself.
-_PASSING = ("parameters_differ",)
+_PASSING = (alarms.PARAMETERS_DIFFER.name,)
 
 
 class Logbook:
@@ -141,8 +126,14 @@ class Logbook:
         try:
             keep(*values, **named)
         except HeliotropeError as error:
+            raised = alarms.RECORDS.raised(problem=error)
             self._alarms["records", ""] = AlarmRow(
-                self._now(), "records", "", "alarm", f"not kept: {error}", active=True
+                self._now(),
+                raised.condition,
+                raised.subject,
+                raised.severity,
+                raised.text,
+                active=True,
             )
 
     def acknowledge(self, who: str, condition: str, subject: str) -> None:
@@ -158,7 +149,7 @@ class Logbook:
     @staticmethod
     def is_plain(condition: str) -> bool:
         """Whether an alarm belongs to no row of the safety table."""
-        return condition in _PLAIN
+        return condition in alarms.KINDS and condition not in _UNACKNOWLEDGED
 
     @property
     def open_alarms(self) -> int:

@@ -45,7 +45,7 @@ from heliotrope.plant.operations.views import (
 from heliotrope.plant.operations.work import Automat, Photographer, Scheduling, WorkSettings
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.centring import CentringCycle
-from heliotrope.safety.evaluation import Act
+from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
 __all__ = ["Logbook", "Operations", "WorkSettings"]

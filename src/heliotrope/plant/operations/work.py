@@ -20,7 +20,6 @@ from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.links.clock import sleep_until
-from heliotrope.links.messages import Alarm
 from heliotrope.plant._beam_watch import BeamError
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
@@ -38,6 +37,7 @@ from heliotrope.plant.operations.views import (
 from heliotrope.plant.tickets import Ticket
 from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.safety import alarms
 from heliotrope.store.records import Records
 
 #: Who it is.
@@ -282,13 +282,13 @@ class Automat:
             try:
                 await part()
                 if failed:
-                    self._log.take_alarm(Alarm("work", name, "alarm", "it works again", False))
+                    self._log.take_alarm(alarms.WORK.ended(name))
                 failed = False
             except RefusedError as error:
                 self._log.event("calibration", AUTOMAT.name, str(error))
             except Exception as error:  # noqa: BLE001 - the work survives whatever fails in a part
                 failed, text = True, f"{type(error).__name__}: {error}"
-                self._log.take_alarm(Alarm("work", name, "alarm", text))
+                self._log.take_alarm(alarms.WORK.raised(name, error=text))
                 await self._sleep(5.0)
             await self._sleep(pause)
 
@@ -433,7 +433,7 @@ class Automat:
             row = self._plant.field.place(name)
             self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
             self._blocked.add(name)
-            self._log.take_alarm(Alarm("beam_blocked", name, "warning", f"{name}: {text}"))
+            self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
         """Name who was refused when its turn to join came; who is elsewhere now is not any more."""
@@ -444,8 +444,7 @@ class Automat:
             row = self._plant.field.place(name)
             if self._plant.field.rows["state"][row] != self._told_in[row]:
                 self._blocked.remove(name)
-                text = f"{name}: it is no longer where it had no way"
-                self._log.take_alarm(Alarm("beam_blocked", name, "warning", text, False))
+                self._log.take_alarm(alarms.BEAM_BLOCKED.ended(name))
 
     def _note_told(self, rows: npt.NDArray[np.intp], state: int) -> None:
         """Note who was commanded in which state: not again before something has come of it."""
@@ -464,8 +463,8 @@ class Automat:
         self._keeper.forget(self._utc(), self._settings.events)
         problem = self._keeper.problem
         if problem or self._troubled:
-            text = problem or "records are kept again"
-            self._log.take_alarm(Alarm("records", "", "alarm", text, bool(problem)))
+            kind = alarms.RECORDS
+            self._log.take_alarm(kind.raised(problem=problem) if problem else kind.ended())
         self._troubled = bool(problem)
         await self._sleep(10.0)
 

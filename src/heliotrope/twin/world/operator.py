@@ -20,7 +20,7 @@ from heliotrope.links.messages import Command, encode
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety.evaluation import Act
+from heliotrope.safety import Act
 from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.world.pod import PlantEar, Pod

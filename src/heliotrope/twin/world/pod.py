@@ -14,7 +14,6 @@ from heliotrope.links.clock import VirtualClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import MemoryLine
 from heliotrope.links.messages import (
-    Alarm,
     Command,
     Emergency,
     Lease,
@@ -24,6 +23,7 @@ from heliotrope.links.messages import (
     Status,
     decode,
 )
+from heliotrope.safety import Alarm
 from heliotrope.sun import Site
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus

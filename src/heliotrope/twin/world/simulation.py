@@ -28,7 +28,7 @@ from heliotrope.links.clock import VirtualClock, VirtualLoop
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety.evaluation import conditions
+from heliotrope.safety import conditions
 from heliotrope.sun import Site, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter

@@ -1,0 +1,263 @@
+"""Every alarm that is no row of the safety table, as data: severity, text, consequence, remedy.
+
+The places that raise an alarm fill in its text: ``NODE_SILENT.raised("H12", ...)``. So each text
+stands once, and `docs/reference/alarms.md` and the operator's handbook are checked against this
+table and the rows of `safety.conditions`.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from heliotrope.safety.condition import Severity, Watcher
+
+_PLANT, _CLUSTER = Watcher.PLANT, Watcher.CLUSTER
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """One alarm, raised or over: a message of the links too.
+
+    Attributes
+    ----------
+    condition, subject
+        Name of the row or of the `AlarmKind`; the cluster, heliostat, target or sensor it is about,
+        "" for the plant.
+    severity, text
+        For the operator.
+    active
+        False when it is over.
+    """
+
+    kind: ClassVar[str] = "alarm"
+    condition: str
+    subject: str
+    severity: Severity
+    text: str
+    active: bool = True
+
+
+@dataclass(frozen=True)
+class AlarmKind:
+    """An alarm that the code can raise.
+
+    Attributes
+    ----------
+    name
+        Its name on the wire and on the page.
+    watcher
+        The tier that raises it.
+    severity
+        The usual one.
+    meaning
+        When it is raised.
+    text
+        What is wrong and where, with ``{subject}`` and other fields to be filled in.
+    consequence, remedy
+        What happens by itself, and what the operator should do: a sentence each.
+    over
+        The text when it is over; "" if it never ends by itself.
+    worse
+        The severity in the worse case that ``meaning`` names, if there is one.
+    """
+
+    name: str
+    watcher: Watcher
+    severity: Severity
+    meaning: str
+    text: str
+    consequence: str
+    remedy: str
+    over: str = ""
+    worse: Severity | None = None
+
+    def line(self, **fields: object) -> str:
+        """Return the whole text: what is wrong, what happens by itself, what to do."""
+        return f"{self.text.format(**fields)}. {self.consequence} {self.remedy}"
+
+    def raised(self, subject: str = "", *, worse: bool = False, **fields: object) -> Alarm:
+        """Return the alarm about a subject; ``fields`` complete its text."""
+        severity = self.worse if worse and self.worse is not None else self.severity
+        return Alarm(self.name, subject, severity, self.line(subject=subject, **fields))
+
+    def ended(self, subject: str = "", **fields: object) -> Alarm:
+        """Return that the alarm about a subject is over."""
+        text = (self.over or "{subject} {name}: over").format(
+            subject=subject, name=self.name, **fields
+        )
+        return Alarm(self.name, subject, self.severity, text.strip(), active=False)
+
+
+TIME_WENT_BACK = AlarmKind(
+    "time_went_back",
+    _PLANT,
+    Severity.EMERGENCY,
+    "The monotonic clock of the plant's or a cluster's machine went back or gave no number.",
+    "the monotonic time went from {before:g} s to {now:g} s; restart this controller",
+    "DEFOCUS of the field; nothing ages or releases meanwhile.",
+    "Restart the controller and replace its machine.",
+    over="the monotonic time runs forwards again",
+)
+UNKNOWN_READING = AlarmKind(
+    "unknown_reading",
+    _PLANT,
+    Severity.WARNING,
+    "A reading arrives that no row of the safety table uses.",
+    "reading {reading!r} is in no row of the safety table, so nothing watches it",
+    "The reading is ignored.",
+    "Correct its name.",
+    over="every reading belongs to a row again",
+)
+PARAMETERS_DIFFER = AlarmKind(
+    "parameters_differ",
+    _PLANT,
+    Severity.WARNING,
+    "A local controller stores other parameters than the plant wants.",
+    "{subject}: stored parameters differ from what is wanted: {items}",
+    "They are pushed as soon as there is a command authority and the heliostat's state allows it.",
+    "Nothing to do; if it returns, replace the controller's flash memory.",
+)
+RECORDS = AlarmKind(
+    "records",
+    _PLANT,
+    Severity.ALARM,
+    "Telemetry, events or results cannot be stored.",
+    "records are not stored: {problem}",
+    "The plant goes on without them.",
+    "Check the disk or the database.",
+    over="records are stored again",
+)
+WORK = AlarmKind(
+    "work",
+    _PLANT,
+    Severity.ALARM,
+    "A part of automatic control failed.",
+    "automatic control, part {subject}, failed: {error}",
+    "It is tried again after 5 s.",
+    "Report the text; without this part, command the field by hand.",
+    over="automatic control, part {subject}, works again",
+)
+BEAM_BLOCKED = AlarmKind(
+    "beam_blocked",
+    _PLANT,
+    Severity.WARNING,
+    "The beam of a heliostat would enter a keep-out volume at its aim or on the way there.",
+    "{subject}: {reason}",
+    "Automatic control leaves it where it is and tries again every five minutes.",
+    "Give it another aim point, or correct the volume in the plant file.",
+    over="{subject}: it has left the place from which no way was clear",
+)
+CAMERA = AlarmKind(
+    "camera",
+    _PLANT,
+    Severity.WARNING,
+    "A target's camera delivers no frame.",
+    "target {subject}: {problem}",
+    "Nothing is calibrated on this target meanwhile.",
+    "Check the camera, its network and its clock.",
+    over="target {subject}: frames arrive again",
+)
+SENSOR = AlarmKind(
+    "sensor",
+    _PLANT,
+    Severity.ALARM,
+    "The file of a sensor cannot be read.",
+    "sensor {subject}: {problem}",
+    "Once its last reading is stale, the safety table counts the worst case.",
+    "Check the program that writes the file.",
+    over="sensor {subject}: its file is read again",
+)
+ORDER_UNACKNOWLEDGED = AlarmKind(
+    "order_unacknowledged",
+    _CLUSTER,
+    Severity.EMERGENCY,
+    "A heliostat has not acknowledged DEFOCUS or STOW within a second.",
+    "{subject} has not acknowledged {order}; where its beam is, is not known",
+    "The cluster repeats the order until it is acknowledged.",
+    "Keep people away from its beam and inspect the heliostat.",
+    over="{subject} has acknowledged",
+)
+NODE_SILENT = AlarmKind(
+    "node_silent",
+    _CLUSTER,
+    Severity.WARNING,
+    "A local controller does not answer; an alarm if its beam was out when it was last heard.",
+    "{subject}: no answer for {silence:g} s; {last}",
+    "The cluster goes on asking it.",
+    "Assume that its beam has not moved; check its supply and its cable.",
+    over="{subject}: it answers again",
+    worse=Severity.ALARM,
+)
+NODE_FAULT = AlarmKind(
+    "node_fault",
+    _CLUSTER,
+    Severity.ALARM,
+    "A local controller has latched a fault.",
+    "{subject}: fault: {fault}",
+    "The heliostat has turned away or stopped.",
+    "See Faults of a heliostat in the handbook; an engineer clears the fault.",
+    over="{subject}: fault cleared",
+)
+NODE_UNINTELLIGIBLE = AlarmKind(
+    "node_unintelligible",
+    _CLUSTER,
+    Severity.ALARM,
+    "A local controller reports a state that the cluster does not know.",
+    "{subject}: state {state} is not known",
+    "Its reports are ignored, so it counts as silent.",
+    "Install the same firmware version on heliostat and cluster.",
+    over="{subject}: its state is known again",
+)
+PLANT_UNINTELLIGIBLE = AlarmKind(
+    "plant_unintelligible",
+    _CLUSTER,
+    Severity.WARNING,
+    "The plant sends a message that the cluster does not know.",
+    "message from the plant ignored: {problem}",
+    "The message is ignored.",
+    "Install matching versions of plant and cluster.",
+)
+LEASE_REFUSED = AlarmKind(
+    "lease_refused",
+    _CLUSTER,
+    Severity.ALARM,
+    "The plant's lease is out of range.",
+    "{problem}",
+    "The lease is not taken; when the last one ends, the cluster defocuses.",
+    "Correct the plant's settings lease and autonomy.",
+    over="the plant's lease is accepted again",
+)
+TIME_SOURCE = AlarmKind(
+    "time_source",
+    _CLUSTER,
+    Severity.WARNING,
+    "Nothing keeps the cluster's clock, or its receiver and its clock contradict each other.",
+    "{problem}",
+    "The cluster goes on; it defocuses when the error of its time passes 1 s.",
+    "Run chronyc sources on that computer, and check antenna and receiver.",
+    over="the cluster's clock is kept again",
+)
+AUTONOMY_LIMITED = AlarmKind(
+    "autonomy_limited",
+    _CLUSTER,
+    Severity.WARNING,
+    "The plant grants more autonomy than the cluster is configured for.",
+    "the plant grants {granted:g} s of autonomy; cluster {cluster} is configured for {longest:g} s",
+    "The cluster keeps to its own limit.",
+    "Set longest_autonomy_s of the cluster, or lower the plant's setting autonomy.",
+    over="the autonomy granted is within the cluster's limit",
+)
+STATE_UNWRITABLE = AlarmKind(
+    "state_unwritable",
+    _CLUSTER,
+    Severity.ALARM,
+    "The cluster cannot store its epoch.",
+    "the cluster's epoch cannot be stored: {problem}",
+    "The cluster goes on; local controllers may reject signed messages after its next start.",
+    "Check the cluster's disk.",
+    over="the cluster's epoch is stored again",
+)
+
+#: All of them, by name.
+KINDS: dict[str, AlarmKind] = {
+    kind.name: kind for kind in tuple(globals().values()) if isinstance(kind, AlarmKind)
+}

@@ -1,0 +1,50 @@
+"""A bound on how many heliostats join the receiver: a token bucket without a clock."""
+
+import math
+from dataclasses import dataclass, replace
+
+from heliotrope.errors import InputError
+
+
+@dataclass(frozen=True)
+class JoinLimiter:
+    """Bounds how many heliostats join the receiver.
+
+    In any span of T seconds at most ``burst + rate · T`` heliostats join.
+
+    Attributes
+    ----------
+    rate
+        Heliostats a second, 0 or more.
+    burst
+        Heliostats at once after a rest, a whole number from 1.
+    tokens, at
+        Heliostats that may join at the monotonic time ``at``, s. A new limiter is empty.
+    """
+
+    rate: float
+    burst: int
+    tokens: float = 0.0
+    at: float | None = None
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate >= 0.0):
+            raise InputError(f"joining rate {self.rate} mirrors/s must be 0 or more and finite")
+        if self.burst < 1:
+            raise InputError(f"joining burst {self.burst} must be a whole number from 1")
+
+    def admit(self, wanted: int, now: float) -> tuple["JoinLimiter", int]:
+        """Return the limiter afterwards and how many of ``wanted`` heliostats may join now.
+
+        A clock that stands still, goes back or is not a number grants no tokens; one that jumps
+        ahead fills the bucket to its burst at most.
+        """
+        at = self.at
+        tokens = self.tokens
+        if math.isfinite(now):
+            if at is not None and now > at:
+                tokens = min(float(self.burst), tokens + self.rate * (now - at))
+            at = now if at is None else max(at, now)
+        # Rounding must not withhold an earned token.
+        granted = max(0, min(wanted, math.floor(tokens + 1e-9)))
+        return replace(self, tokens=max(0.0, tokens - granted), at=at), granted
