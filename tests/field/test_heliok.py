@@ -1,4 +1,4 @@
-"""HelioK XML: word for word, both ways, against published angles and reference cases."""
+"""HelioK XML against published angles and reference cases."""
 
 import re
 from pathlib import Path
@@ -6,102 +6,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from heliotrope.field.formats import heliok
-from heliotrope.field.formats.frames import euler_angles, euler_matrix, mirror_frame
-from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.formats.frames import euler_matrix, mirror_frame
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import angle_between, normalize, reflect, rotation
-from heliotrope.mechanism import kinds
-from heliotrope.mechanism.drives import direct
+from heliotrope.geometry import angle_between, normalize, rotation
 from heliotrope.mechanism.tracking import track
 from reference import cases
-from support.heliok_files import SCENE, SITE, edited, mixed_plant, scene
+from support.heliok_files import SCENE, SITE, edited, scene
+
+
+def xyz_angles(matrix: Any) -> Any:
+    return Rotation.from_matrix(matrix).as_euler("xyz")
 
 
 def plant() -> Plant:
     return heliok.to_plant(scene(), SITE)
 
 
-# -- word for word ---------------------------------------------------------------------
-
-
-def test_reading_writing_and_reading_again_keeps_everything(tmp_path: Path) -> None:
-    first = scene()
-    heliok.write(first, tmp_path / "copy.xml")
-    again = heliok.read(tmp_path / "copy.xml")
-    assert again == first
-    heliok.write(again, tmp_path / "second.xml")
-    assert (tmp_path / "second.xml").read_bytes() == (tmp_path / "copy.xml").read_bytes()
-
-
-@pytest.mark.parametrize(
-    "kept",
-    [
-        'origin="written for the tests"',
-        'maker="kept although nobody reads it"',
-        '<Canting method="an element we do not know">free text</Canting>',
-        "<!-- the azimuth turns clockwise -->",
-        "<!-- Two azimuth-elevation heliostats",
-        '<?end of="scene"?>',
-        'roughness="1.000 mrad"',
-        "<SunShapeBuieRational/>",
-    ],
-)
-def test_what_nobody_reads_is_kept(tmp_path: Path, kept: str) -> None:
-    heliok.write(scene(), tmp_path / "copy.xml")
-    assert kept in (tmp_path / "copy.xml").read_text(encoding="utf-8")
-
-
-def test_text_between_elements_is_kept(tmp_path: Path) -> None:
-    inner = heliok.Element(
-        "Note", children=("one", heliok.Element("b"), "two", heliok.Remark("c"), "3")
-    )
-    units = (("unitLength", "m"), ("unitAngle", "rad"))
-    document = heliok.Document(heliok.Element("HelioK", units, (inner,)))
-    heliok.write(document, tmp_path / "note.xml")
-    assert heliok.read(tmp_path / "note.xml") == document
-
-
-def test_lines_take_no_part_in_comparisons() -> None:
+def test_comments_and_unknown_elements_change_nothing(tmp_path: Path) -> None:
+    path = edited(tmp_path, "<Scene>", "<!-- note --><Scene><?tool x?><Note a='1'>text</Note>")
+    again = heliok.to_plant(heliok.read(path), SITE)
+    np.testing.assert_array_equal(again.position, plant().position)
     assert heliok.Element("a", line=1) == heliok.Element("a", line=2)
-
-
-xml_text = st.text(
-    st.characters(
-        codec="utf-8", exclude_categories=("C",), exclude_characters="\u0085\u2028\u2029"
-    ),
-    max_size=12,
-)
-xml_name = st.from_regex(r"\A[A-Za-z_][A-Za-z0-9_]{0,8}\Z")
-
-
-@st.composite
-def elements(draw: st.DrawFn, depth: int = 3) -> heliok.Element:
-    attributes = draw(st.dictionaries(xml_name, xml_text, max_size=3))
-    children: list[Any] = []
-    if depth:
-        kinds_of_child = st.one_of(
-            elements(depth=depth - 1),
-            st.builds(heliok.Remark, xml_text.filter(lambda t: "-" not in t)),
-        )
-        children = draw(st.lists(kinds_of_child, max_size=3))
-    return heliok.Element(draw(xml_name), tuple(attributes.items()), tuple(children))
-
-
-@settings(max_examples=40, deadline=None)
-@given(elements())
-def test_any_tree_survives(tmp_path_factory: pytest.TempPathFactory, tree: heliok.Element) -> None:
-    units = (("unitLength", "mm"), ("unitAngle", "mrad"))
-    document = heliok.Document(heliok.Element("HelioK", units, (tree,)))
-    path = tmp_path_factory.mktemp("xml") / "tree.xml"
-    heliok.write(document, path)
-    assert heliok.read(path) == document
-
-
-# -- meaning ---------------------------------------------------------------------------
 
 
 def test_published_angles_are_met() -> None:
@@ -264,13 +192,13 @@ def test_reference_cases_pass_through_a_file(tmp_path: Path, case: dict[str, Any
           rotationAngles="-3.15, 3.15"/>
         <Secondary translation="{text(inputs["t2"])}" rotationAxis="{text(inputs["axis2_unit"])}"
           rotationAngles="-3.15, 3.15"/>
-        <Facet rotation="{text(euler_angles(mirror_frame(inputs["n0"])))}"><ShapeKit>
+        <Facet rotation="{text(xyz_angles(mirror_frame(inputs["n0"])))}"><ShapeKit>
           <ApertureRectangular xWidth="1" yWidth="1"/></ShapeKit></Facet>
         <Angles primary="0" secondary="0"/>
         <Tracking point="{text(inputs["r0"])}" normal="{text(inputs["n0"])}"/>
         <Aiming point="{text(inputs["aim_ENZ"])}"/></HeliostatKit></Factory>
         <Scene><Node name="H" translation="{text(inputs["position"])}"
-          rotation="{text(euler_angles(turn))}"><HeliostatKit ref="m"/></Node></Scene></HelioK>""",
+          rotation="{text(xyz_angles(turn))}"><HeliostatKit ref="m"/></Node></Scene></HelioK>""",
         encoding="utf-8",
     )
     heliostats = heliok.to_plant(heliok.read(path), SITE).groups["heliostats"]
@@ -289,108 +217,7 @@ def test_reference_cases_pass_through_a_file(tmp_path: Path, case: dict[str, Any
 # -- from a plant ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("unit", "tolerance"), [("rad", 1e-13), ("deg", 1e-13), ("mrad", 1e-13)])
-def test_a_plant_survives(tmp_path: Path, unit: str, tolerance: float) -> None:
-    before = mixed_plant()
-    heliok.write(heliok.from_plant(before, unit_angle=unit), tmp_path / "plant.xml")
-    after = heliok.to_plant(heliok.read(tmp_path / "plant.xml"), SITE)
-    assert sorted(after.names) == sorted(before.names)
-    angles = np.random.default_rng(3).uniform(-1, 1, (20, 2))
-    for name in before.names:
-        (old, i), (new, k) = before.find(name), after.find(name)
-        poses = [g.calibrated.armature.table[row] for g, row in ((old, i), (new, k))]
-        normal_old, vertex_old = type(old.calibrated.armature)(poses[0]).pose(angles)
-        normal_new, vertex_new = type(old.calibrated.armature)(poses[1]).pose(angles)
-        np.testing.assert_allclose(normal_new, normal_old, atol=tolerance)
-        np.testing.assert_allclose(vertex_new, vertex_old, atol=1e-11)
-        assert (new.width[k], new.height[k]) == pytest.approx(
-            (old.width[i], old.height[i]), rel=1e-3
-        )
-        if old.facets is not None:
-            assert new.facets is not None
-            for part in ("center", "half_width", "half_height"):
-                np.testing.assert_allclose(
-                    getattr(new.facets, part)[k], getattr(old.facets, part)[i], atol=1e-13
-                )
-    np.testing.assert_allclose(
-        after.target("white").corners, before.target("white").corners, atol=1e-2
-    )
-    np.testing.assert_allclose(
-        after.target("white").normal, before.target("white").normal, atol=1e-12
-    )
-    np.testing.assert_allclose(
-        after.receiver("oven").normal, before.receiver("oven").normal, atol=1e-12
-    )
-
-
-def test_a_plant_from_a_file_goes_back_without_a_changed_bit(tmp_path: Path) -> None:
-    document = heliok.from_plant(plant())
-    heliok.write(document, tmp_path / "once.xml")
-    again = heliok.to_plant(heliok.read(tmp_path / "once.xml"), SITE)
-    old, new = plant().groups["heliostats"], again.groups["heliostats"]
-    np.testing.assert_array_equal(new.mechanism.axes, old.mechanism.axes)
-    np.testing.assert_array_equal(new.mechanism.origins, old.mechanism.origins)
-    np.testing.assert_array_equal(new.mechanism.drives.table, old.mechanism.drives.table)
-    np.testing.assert_array_equal(new.position, old.position)
-    np.testing.assert_array_equal(new.aim, old.aim)
-    assert len(heliok.models(document)) == 1
-
-
-def test_stops_come_from_angles_and_counts(tmp_path: Path) -> None:
-    heliok.write(heliok.from_plant(mixed_plant()), tmp_path / "plant.xml")
-    placed = {h.name: h.model for h in heliok.heliostats(heliok.read(tmp_path / "plant.xml"))}
-    np.testing.assert_allclose(placed["a1"].primary.stops, [-np.pi, np.pi])
-    np.testing.assert_array_equal(placed["a1"].secondary.stops, [-0.1, 1.6])
-    jack = mixed_plant().groups["j"].mechanism.drives
-    ends = jack.angles([[0.0, 0.0]])[0], jack.angles([[68000.0, 68000.0]])[0]
-    np.testing.assert_allclose(
-        placed["j1"].primary.stops, sorted([ends[0][0], ends[1][0]]), rtol=1e-14
-    )
-
-
-def test_a_stop_at_one_end_leaves_a_turn() -> None:
-    one = kinds.azimuth_elevation(
-        [[0.0, 50, 0]], drives=(direct(min_angle=-1.0), direct(max_angle=1.5))
-    )
-    group = Heliostats(("h",), one, np.ones(1), np.ones(1), aim=np.array([[0.0, 0, 20]]))
-    model = next(iter(heliok.models(heliok.from_plant(Plant("p", SITE, {"g": group}))).values()))
-    np.testing.assert_allclose(model.primary.stops, [-1.0, -1.0 + 2 * np.pi])
-    np.testing.assert_allclose(model.secondary.stops, [1.5 - 2 * np.pi, 1.5])
-
-
-def test_missing_aims_go_to_the_receiver_first() -> None:
-    placed = {h.name: h.model for h in heliok.heliostats(heliok.from_plant(mixed_plant()))}
-    for name, aim in (("p2", (0, 1, 50)), ("p1", (0, 0, 30)), ("a1", (0, 1, 50))):
-        np.testing.assert_array_equal(placed[name].aim, aim)
-
-
-def test_tracking_is_the_same_before_and_after(tmp_path: Path) -> None:
-    before = mixed_plant()
-    heliok.write(heliok.from_plant(before), tmp_path / "plant.xml")
-    after = heliok.to_plant(heliok.read(tmp_path / "plant.xml"), SITE)
-    group, row = after.find("a2")
-    sun, aim = normalize([0.3, -0.5, 0.7]), np.array([0.0, 1.0, 50.0])
-    result = track(group.mechanism[row], sun, aim)
-    best = int(result.best)
-    assert result.reachable[best]
-    beam = reflect(sun, result.normal[best])
-    assert angle_between(beam, normalize(aim - result.vertex[best])) < 1e-10
-
-
 # -- frames ----------------------------------------------------------------------------
-
-
-@given(st.tuples(*[st.floats(-np.pi, np.pi)] * 3))
-@settings(max_examples=200, deadline=None)
-def test_euler_angles_come_back(angles: tuple[float, float, float]) -> None:
-    turned = euler_matrix(angles)
-    np.testing.assert_allclose(euler_matrix(euler_angles(turned)), turned, atol=1e-12)
-
-
-@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
-def test_euler_angles_come_back_at_the_gimbal(pitch: float) -> None:
-    turned = euler_matrix((0.3, pitch, 1.1))
-    np.testing.assert_allclose(euler_matrix(euler_angles(turned)), turned, atol=1e-12)
 
 
 def test_euler_matrices_are_products_of_turns() -> None:

@@ -1,22 +1,17 @@
 """OpenCSP's tables: columns by name, the pivot's place, facets, both ways."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as nps
 
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError
 from heliotrope.field.formats import opencsp
 from heliotrope.field.formats.frames import mirror_frame
 from heliotrope.field.formats.opencsp import Centroids, Field
-from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import rotation
-from heliotrope.mechanism import kinds
 from heliotrope.sun import Site
 
 FILES = Path(__file__).parents[1] / "files"
@@ -143,99 +138,6 @@ size = st.floats(1e-3, 100)
 cell = st.text(st.characters(codec="utf-8", exclude_categories=("C", "Z")), max_size=8)
 
 
-@st.composite
-def fields(draw: st.DrawFn) -> Field:
-    names = draw(st.lists(cell.filter(bool), min_size=1, max_size=5, unique=True))
-    count = len(names)
-    rows, columns = (draw(nps.arrays(np.int64, count, elements=st.integers(1, 9))) for _ in "rc")
-
-    def column(elements: st.SearchStrategy[float]) -> np.ndarray:
-        return draw(nps.arrays(np.float64, count, elements=elements))
-
-    return Field(
-        tuple(names),
-        draw(nps.arrays(np.float64, (count, 3), elements=number)),
-        rows * columns,
-        rows,
-        columns,
-        column(number),
-        column(number),
-        column(size),
-        column(size),
-        {"Note": tuple(draw(st.lists(cell, min_size=count, max_size=count)))},
-    )
-
-
-@settings(max_examples=60, deadline=None)
-@given(fields())
-def test_any_field_survives(tmp_path_factory: pytest.TempPathFactory, table: Field) -> None:
-    path = tmp_path_factory.mktemp("field") / "field.csv"
-    opencsp.write_field(table, path)
-    again = opencsp.read_field(path)
-    assert again.names == table.names
-    assert again.extra == table.extra
-    for name in (
-        "location",
-        "facets",
-        "rows",
-        "columns",
-        "pivot_height",
-        "pivot_offset",
-        "facet_width",
-        "facet_height",
-    ):
-        np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
-
-
-def test_a_plant_survives(tmp_path: Path) -> None:
-    table, centroids = opencsp.from_plant(plant())
-    opencsp.write_field(table, tmp_path / "field.csv")
-    opencsp.write_centroids(centroids, tmp_path / "centroids.csv")
-    again = opencsp.read_field(tmp_path / "field.csv")
-    first = opencsp.read_field(FIELD)
-    assert again.names == first.names
-    for name in ("location", "pivot_height", "pivot_offset", "facet_width", "facet_height"):
-        np.testing.assert_allclose(getattr(again, name), getattr(first, name), atol=1e-12)
-    np.testing.assert_array_equal(again.rows, first.rows)
-    np.testing.assert_array_equal(again.columns, first.columns)
-    places = opencsp.read_centroids(tmp_path / "centroids.csv")
-    np.testing.assert_array_equal(places.center, opencsp.read_centroids(CENTROIDS).center)
-
-
-def test_a_mirror_without_facets_is_one() -> None:
-    group = Heliostats(
-        ("h",),
-        kinds.azimuth_elevation([[1.0, 2, 0.5]], pivot_height=2.0),
-        np.full(1, 3.0),
-        np.full(1, 2.0),
-    )
-    table, centroids = opencsp.from_plant(Plant("p", SITE, {"g": group}))
-    assert (table.facets[0], table.rows[0], table.columns[0]) == (1, 1, 1)
-    assert (table.facet_width[0], table.facet_height[0]) == (3.0, 2.0)
-    np.testing.assert_array_equal(table.location, [[1, 2, 2.5]])
-    np.testing.assert_array_equal(centroids.center, [[0, 0, 0]])
-
-
-def test_facets_in_no_grid_count_as_a_row() -> None:
-    scattered = Centroids(("a", "b", "c"), np.array([[0.0, 1, 0], [-1, -1, 0], [1.2, -1, 0]]))
-    one = np.ones(1, dtype=np.int64)
-    table = replace(
-        opencsp.read_field(FIELD),
-        names=("h",),
-        location=np.zeros((1, 3)),
-        facets=3 * one,
-        rows=one,
-        columns=3 * one,
-        pivot_height=np.ones(1),
-        pivot_offset=np.zeros(1),
-        facet_width=np.ones(1),
-        facet_height=np.ones(1),
-        extra={},
-    )
-    again, _ = opencsp.from_plant(opencsp.to_plant(table, SITE, scattered))
-    assert (again.rows[0], again.columns[0]) == (1, 3)
-
-
 # -- refusals --------------------------------------------------------------------------
 
 
@@ -287,21 +189,3 @@ def test_wrong_centroids_get_one_line(tmp_path: Path, content: bytes, problem: s
     with pytest.raises(FormatError) as error:
         opencsp.read_centroids(path)
     assert problem in str(error.value)
-
-
-def test_plants_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="heliostat A1: 6 facets, but there are 2 centroids"):
-        opencsp.to_plant(opencsp.read_field(FIELD), SITE, Centroids(("1", "2"), np.zeros((2, 3))))
-    with pytest.raises(InputError, match="plant 'bare': it has no heliostats"):
-        opencsp.from_plant(Plant("bare", SITE, {}))
-    polar = Heliostats(("p",), kinds.polar([[0.0, 1, 0]], 0.6), np.ones(1), np.ones(1))
-    with pytest.raises(InputError, match="group g: OpenCSP's tables hold azimuth_elevation"):
-        opencsp.from_plant(Plant("p", SITE, {"g": polar}))
-    path = edited(tmp_path, FIELD, "3.97,6,2,3", "3.97,4,2,2")
-    mixed = opencsp.to_plant(opencsp.read_field(path), SITE)
-    with pytest.raises(
-        InputError, match="heliostat A1: its facets stand elsewhere than those of B1"
-    ):
-        opencsp.from_plant(mixed)
-    with pytest.raises(InputError, match="cannot be written"):
-        opencsp.write_field(opencsp.read_field(FIELD), tmp_path / "nowhere" / "field.csv")

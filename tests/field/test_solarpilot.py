@@ -5,14 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as nps
 
-from heliotrope.errors import FormatError, InputError
+from heliotrope.errors import FormatError
 from heliotrope.field.formats import solarpilot
-from heliotrope.field.formats.solarpilot import SEPARATORS, Layout, Template
-from heliotrope.field.plant import Plant
+from heliotrope.field.formats.solarpilot import Layout, Template
 from heliotrope.geometry import azimuth_elevation
 from heliotrope.sun import Site
 
@@ -102,67 +99,6 @@ def test_blank_lines_a_mark_and_small_letters_are_fine(tmp_path: Path) -> None:
 finite = st.floats(-1e6, 1e6, allow_subnormal=False)
 
 
-@st.composite
-def layouts(draw: st.DrawFn) -> Layout:
-    count = draw(st.integers(1, 6))
-
-    def maybe(width: int) -> np.ndarray:
-        values = draw(nps.arrays(np.float64, (count, width), elements=finite))
-        values[draw(nps.arrays(np.bool_, count))] = np.nan
-        return values
-
-    return Layout(
-        draw(nps.arrays(np.int64, count, elements=st.integers(0, 40))),
-        draw(nps.arrays(np.bool_, count)),
-        draw(nps.arrays(np.bool_, count)),
-        draw(nps.arrays(np.float64, (count, 3), elements=finite)),
-        maybe(2),
-        maybe(3),
-        maybe(3),
-    )
-
-
-@settings(max_examples=60, deadline=None)
-@given(layouts(), st.sampled_from(sorted(SEPARATORS)), st.booleans())
-def test_any_layout_survives(
-    tmp_path_factory: pytest.TempPathFactory, layout: Layout, separator: str, header: bool
-) -> None:
-    path = tmp_path_factory.mktemp("layout") / "layout.csv"
-    header = header and separator != "space"
-    solarpilot.write_layout(layout, path, separator=separator, header=header)
-    assert_same(solarpilot.read_layout(path), layout)
-
-
-def test_twelve_columns_survive(tmp_path: Path) -> None:
-    layout = layout_of(tmp_path, PUBLISHED)
-    solarpilot.write_layout(layout, tmp_path / "old.csv", columns=12, header=True)
-    assert len((tmp_path / "old.csv").read_text().splitlines()[-1].split(",")) == 12
-    assert_same(solarpilot.read_layout(tmp_path / "old.csv"), layout)
-
-
-def test_the_header_names_the_flags_in_their_order(tmp_path: Path) -> None:
-    solarpilot.write_layout(solarpilot.read_layout(EXPORT), tmp_path / "new.csv", header=True)
-    lines = (tmp_path / "new.csv").read_text().splitlines()
-    assert lines[0].startswith("Template,Enabled,In layout,Loc. X,")
-    assert lines[2:4] == [
-        "0,1,1,10.25,120.5,0.0,NULL,NULL,NULL,NULL,NULL,0.5,5.9,95.0",
-        "0,0,1,-31.75,118.0,1.2,125.0,126.5,-0.01,0.02,0.99975,-1.5,5.6,95.0",
-    ]
-
-
-def test_writing_is_refused_in_one_line(tmp_path: Path) -> None:
-    layout, path = solarpilot.read_layout(EXPORT), tmp_path / "x.csv"
-    with pytest.raises(InputError, match="separator 'pipe': give one of comma, semicolon, tab"):
-        solarpilot.write_layout(layout, path, separator="pipe")
-    with pytest.raises(InputError, match="columns 13: a layout is written with 14 or 12"):
-        solarpilot.write_layout(layout, path, columns=13)
-    with pytest.raises(InputError, match="row 2: it is not enabled or not in the layout"):
-        solarpilot.write_layout(layout, path, columns=12)
-    with pytest.raises(InputError, match="header: its names hold spaces"):
-        solarpilot.write_layout(layout, path, separator="space", header=True)
-    assert not path.exists()
-
-
 # -- plants ----------------------------------------------------------------------------
 
 
@@ -185,29 +121,6 @@ def test_x_is_east_and_y_is_north() -> None:
     azimuth, _ = azimuth_elevation(plant.position * [1, 1, 0])
     # H1 stands north of the tower, H4 in the south-east.
     np.testing.assert_allclose(np.degrees(azimuth), [4.86, 129.9], atol=0.1)
-
-
-def test_a_plant_becomes_a_layout(tmp_path: Path) -> None:
-    plant = solarpilot.to_plant(solarpilot.read_layout(EXPORT), SITE, TEMPLATES)
-    solarpilot.write_layout(solarpilot.from_plant(plant), tmp_path / "again.csv")
-    again = solarpilot.read_layout(tmp_path / "again.csv")
-    first = solarpilot.read_layout(EXPORT)
-    np.testing.assert_array_equal(again.template, [0, 1])
-    np.testing.assert_allclose(again.location, first.location[[0, 3]], atol=1e-12)
-    np.testing.assert_array_equal(again.aim, first.aim[[0, 3]])
-    assert again.enabled.all()
-
-
-def test_plants_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    layout = solarpilot.read_layout(EXPORT)
-    with pytest.raises(InputError, match=r"row 4: template 1 is not among those given \(0\)"):
-        solarpilot.to_plant(layout, SITE, {0: TEMPLATES[0]})
-    with pytest.raises(InputError, match="none of its heliostats is enabled and in the layout"):
-        solarpilot.to_plant(layout_of(tmp_path, "0,0,1,1,2,3"), SITE, TEMPLATES)
-    with pytest.raises(InputError, match="plant 'bare': it has no heliostats to lay out"):
-        solarpilot.from_plant(Plant("bare", SITE, {}))
-    with pytest.raises(InputError, match="heliostat H1: width 0"):
-        solarpilot.to_plant(layout, SITE, {0: Template(0.0, 1.0), 1: TEMPLATES[1]})
 
 
 # -- refusals --------------------------------------------------------------------------

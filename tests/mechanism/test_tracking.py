@@ -16,7 +16,7 @@ from heliotrope.geometry import (
     wrap_signed,
 )
 from heliotrope.mechanism import guo, kinds
-from heliotrope.mechanism.armature import armature
+from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import direct
 from heliotrope.mechanism.tracking import Status, track
 from support.machines import every_kind, imperfect
@@ -40,7 +40,7 @@ def test_the_beam_reaches_its_aim(a, b, n, s, p, arm, distance) -> None:  # type
         return
     if np.dot(s, p) < -0.99:
         return  # nearly opposite: the bisector itself is lost in rounding
-    machine = armature(a, (0, 0, 1), b, arm * b + (0, 0, 1), arm * n + arm * b + (0, 0, 1), n)
+    machine = Armature.of(a, (0, 0, 1), b, arm * b + (0, 0, 1), arm * n + arm * b + (0, 0, 1), n)
     aim = distance * p
     found = track(machine, s, aim)
     for branch in (0, 1):

@@ -25,7 +25,7 @@ from heliotrope.files.cells import (
     read_rows,
     rows_of,
 )
-from heliotrope.files.text import LIMIT, write_file
+from heliotrope.files.text import SIZE_LIMIT, write_file
 from heliotrope.geometry import FloatArray, direction
 
 #: Kinds of sightings; whether their source and their destination are at infinity.
@@ -373,10 +373,10 @@ def _write_csv(path: Path, columns: dict[str, list[Any]], stream: BinaryIO) -> N
     writer.writerows(zip(*cells, strict=True))
     text.flush()
     text.detach()
-    if stream.tell() > LIMIT:
+    if stream.tell() > SIZE_LIMIT:
         raise InputError(
             f"{path}: {stream.tell() / 2**20:.0f} MiB of CSV are more than the "
-            f"{LIMIT / 2**20:.0f} MiB that are read again; write .parquet"
+            f"{SIZE_LIMIT / 2**20:.0f} MiB that are read again; write .parquet"
         )
 
 

@@ -54,22 +54,9 @@ def parse_point(text: str, what: str) -> tuple[float, float, float]:
 
 def open_plant(path: Path) -> "Plant":
     """Return the plant of a TOML file, a HelioK XML file or a folder in PAINT's form."""
-    from heliotrope.errors import FormatError
+    from heliotrope.field import formats
 
-    if path.is_dir():
-        from heliotrope.field.formats import paint
-
-        return paint.read_plant(path)
-    if not path.exists():
-        raise FormatError(path, "there is no such file; give a plant file or a folder")
-    if path.suffix.lower() == ".xml":
-        from heliotrope.field.formats import heliok
-        from heliotrope.sun import Site
-
-        return heliok.to_plant(heliok.read(path), Site(0.0, 0.0, 0.0))
-    from heliotrope.field.formats import plant_file
-
-    return plant_file.read_plant(path)
+    return formats.open_plant(path)
 
 
 def print_json(value: Any) -> None:

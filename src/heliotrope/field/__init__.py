@@ -1,1 +1,54 @@
-"""Many heliostats, the tower with its targets and receiver, and the files they come in."""
+"""Many heliostats, the tower with its targets and receiver, and the cameras that look at them.
+
+`Plant` holds everything: the site, `Heliostats` in groups of one kind of mechanism, `Target`s,
+`Receiver`s, `Camera`s and keep-out volumes. `formats` reads and writes plants; `layouts` makes new
+ones; `prototype` is an example of 18 heliostats.
+"""
+
+from heliotrope.field.camera import (
+    Camera,
+)
+from heliotrope.field.example import (
+    prototype,
+    roughly_installed,
+)
+from heliotrope.field.heliostats import (
+    Facets,
+    Heliostats,
+)
+from heliotrope.field.marks import (
+    Mark,
+)
+from heliotrope.field.plant import (
+    Plant,
+)
+from heliotrope.field.target import (
+    Receiver,
+    Target,
+)
+from heliotrope.field.volumes import (
+    Box,
+    Cylinder,
+    Prism,
+    Sphere,
+    Volume,
+    outline,
+)
+
+__all__ = [
+    "Box",
+    "Camera",
+    "Cylinder",
+    "Facets",
+    "Heliostats",
+    "Mark",
+    "Plant",
+    "Prism",
+    "Receiver",
+    "Sphere",
+    "Target",
+    "Volume",
+    "outline",
+    "prototype",
+    "roughly_installed",
+]

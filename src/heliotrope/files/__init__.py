@@ -1,1 +1,54 @@
-"""Files read and written safely: whole or refused in one line, never half-written."""
+"""Reading and writing files safely, with errors that name the file and the place in it.
+
+- `text`: whole text files and binary files; written whole or not at all.
+- `json`, `xml`: documents whose values know where they stand.
+- `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
+  there, because pydantic is slow to load.
+- `cells`: tables (CSV, Parquet) cell by cell, and times in ISO 8601.
+
+Begin with `read_text` and `write_text`.
+"""
+
+from heliotrope.files.cells import (
+    Cells,
+    Rows,
+    find_heliostats,
+    format_time,
+    parse_time,
+    read_parquet,
+    read_rows,
+    rows_of,
+)
+from heliotrope.files.json import (
+    Node,
+    read_json,
+)
+from heliotrope.files.text import (
+    SIZE_LIMIT,
+    check_file,
+    read_text,
+    write_file,
+    write_text,
+)
+from heliotrope.files.xml import Document, Element, read_xml
+
+__all__ = [
+    "SIZE_LIMIT",
+    "Cells",
+    "Document",
+    "Element",
+    "Node",
+    "Rows",
+    "check_file",
+    "find_heliostats",
+    "format_time",
+    "parse_time",
+    "read_json",
+    "read_parquet",
+    "read_rows",
+    "read_text",
+    "read_xml",
+    "rows_of",
+    "write_file",
+    "write_text",
+]

@@ -8,7 +8,7 @@ from typing import BinaryIO
 from heliotrope.errors import FormatError, InputError
 
 #: A layout of 400,000 heliostats is 60 MB; more is not a file of this kind.
-LIMIT = 64 * 2**20
+SIZE_LIMIT = 64 * 2**20
 
 
 def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
@@ -42,10 +42,10 @@ def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
         raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
     if not start:
         raise FormatError(file, f"the file is empty; it should be {what}")
-    if size > LIMIT:
+    if size > SIZE_LIMIT:
         raise FormatError(
             file,
-            f"{size / 2**20:.0f} MiB are more than the limit of {LIMIT / 2**20:.0f} MiB; "
+            f"{size / 2**20:.0f} MiB are more than the limit of {SIZE_LIMIT / 2**20:.0f} MiB; "
             f"this is not {what}",
         )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):

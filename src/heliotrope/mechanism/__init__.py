@@ -1,1 +1,81 @@
-"""One heliostat, or an array of them: joints, drives, parameters, armature, tracking."""
+"""One heliostat, or an array of them: joints, drives, parameters, armature, tracking.
+
+A mechanism is data: a chain of joints from the ground to the mirror, two of them driven. Build one
+with `azimuth_elevation`, `two_jacks`, … (`kinds`), give it drives (`rotary`, `linear_paint`, …),
+set its imperfections with `Mechanism.with_parameters`, and point it with `track`.
+
+The names of these modules are used through the module:
+
+- `guo`: Guo's closed form for azimuth-elevation heliostats, a cross-check of `track`.
+- `parameters`: the parameter table and the models.
+- `board_items`: the bytes that a local controller stores of a mechanism.
+- `kernels`: the compiled code.
+"""
+
+from heliotrope.mechanism.armature import (
+    Armature,
+    check_axes,
+)
+from heliotrope.mechanism.chain import (
+    Jacobian,
+    Mechanism,
+    Pose,
+)
+from heliotrope.mechanism.drives import (
+    SLOTS,
+    Drive,
+    direct,
+    linear_grigoriev,
+    linear_guo,
+    linear_paint,
+    rotary,
+)
+from heliotrope.mechanism.kinds import (
+    azimuth_elevation,
+    pitch_roll,
+    polar,
+    single_axis,
+    target_aligned,
+    tilt_roll,
+    two_axis,
+    two_jacks,
+)
+from heliotrope.mechanism.parameters import (
+    MODELS,
+    Parameter,
+)
+from heliotrope.mechanism.tracking import (
+    Branch,
+    Status,
+    Tracking,
+    track,
+)
+
+__all__ = [
+    "MODELS",
+    "SLOTS",
+    "Armature",
+    "Branch",
+    "Drive",
+    "Jacobian",
+    "Mechanism",
+    "Parameter",
+    "Pose",
+    "Status",
+    "Tracking",
+    "azimuth_elevation",
+    "check_axes",
+    "direct",
+    "linear_grigoriev",
+    "linear_guo",
+    "linear_paint",
+    "pitch_roll",
+    "polar",
+    "rotary",
+    "single_axis",
+    "target_aligned",
+    "tilt_roll",
+    "track",
+    "two_axis",
+    "two_jacks",
+]

@@ -1,8 +1,8 @@
 """The armature: all that tracking needs of a mechanism, in 18 numbers.
 
-Whatever errors a chain has, at fixed imperfections it turns a vertex and a normal about
-two lines in space. Grigoriev et al. 2021 call this the armature. A local controller
-stores it and knows no error model.
+With fixed imperfections, any chain turns a vertex and a normal about two lines in space.
+Grigoriev et al. 2021 call this the armature. A local controller stores it and knows no
+error model.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,40 @@ class Armature:
     ----------
     table
         Shape (..., 18): primary axis, point on it, secondary axis, point on it,
-        vertex, normal; ENU, metres. A secondary axis of zero length means that
-        there is none (single-axis tracker).
+        vertex, normal; ENU, metres. A secondary axis of zero length means a
+        single-axis tracker.
     """
 
     table: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        axis_1: npt.ArrayLike,
+        origin_1: npt.ArrayLike,
+        axis_2: npt.ArrayLike,
+        origin_2: npt.ArrayLike,
+        vertex: npt.ArrayLike,
+        normal: npt.ArrayLike,
+    ) -> "Armature":
+        """Return an armature from its six vectors (..., 3), ENU metres; directions of any length.
+
+        Raises
+        ------
+        InputError
+            If an axis or the normal is zero, or the axes are parallel.
+        """
+        a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
+        check_axes(a1, a2)
+        parts = np.broadcast_arrays(
+            a1,
+            as_vectors(origin_1, "origin_1"),
+            a2,
+            as_vectors(origin_2, "origin_2"),
+            as_vectors(vertex, "vertex"),
+            normalize(normal, "normal"),
+        )
+        return cls(np.concatenate(parts, axis=-1))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -78,35 +107,7 @@ class Armature:
         return normal, self.origin_1 + turned(first, arm)
 
 
-def armature(
-    axis_1: npt.ArrayLike,
-    origin_1: npt.ArrayLike,
-    axis_2: npt.ArrayLike,
-    origin_2: npt.ArrayLike,
-    vertex: npt.ArrayLike,
-    normal: npt.ArrayLike,
-) -> Armature:
-    """Return an armature from its six vectors (..., 3), ENU metres; directions of any length.
-
-    Raises
-    ------
-    InputError
-        If an axis or the normal is zero, or the axes are parallel.
-    """
-    a1, a2 = normalize(axis_1, "axis_1"), normalize(axis_2, "axis_2")
-    check_axes(a1, a2)
-    parts = np.broadcast_arrays(
-        a1,
-        as_vectors(origin_1, "origin_1"),
-        a2,
-        as_vectors(origin_2, "origin_2"),
-        as_vectors(vertex, "vertex"),
-        normalize(normal, "normal"),
-    )
-    return Armature(np.concatenate(parts, axis=-1))
-
-
-#: Axes closer than this (rad) leave a mechanism without its second freedom.
+#: Smallest angle between the axes, rad; parallel axes give only one degree of freedom.
 PARALLEL_LIMIT = 1e-3
 
 

@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from heliotrope.errors import FormatError
-from heliotrope.files.xml import Document, Element
+from heliotrope.files import Document, Element
 from heliotrope.geometry import FloatArray
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}

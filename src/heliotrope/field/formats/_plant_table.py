@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError
-from heliotrope.files.text import check_file, write_file
+from heliotrope.files import check_file, write_file
 from heliotrope.geometry import FloatArray
 
 TEXTS = ("name", "group", "cluster")

@@ -41,21 +41,3 @@ def euler_matrix(angles: npt.ArrayLike) -> FloatArray:
         (-sy, sx * cy, cx * cy),
     )
     return as_float(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
-
-
-def euler_angles(matrix: npt.ArrayLike) -> FloatArray:
-    """Return angles about x, y and z, rad, (..., 3), with R = Rz·Ry·Rx.
-
-    Where y is ±π/2 only the difference (or sum) of the others is defined: z is then 0.
-    """
-    r = as_float(matrix)
-    across = np.hypot(r[..., 0, 0], r[..., 1, 0])
-    locked = across < 1e-9
-    x = np.where(
-        locked,
-        np.arctan2(-r[..., 1, 2], r[..., 1, 1]),
-        np.arctan2(r[..., 2, 1], r[..., 2, 2]),
-    )
-    y = np.arctan2(-r[..., 2, 0], across)
-    z = np.where(locked, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
-    return np.stack([x, y, z], axis=-1)

@@ -1,8 +1,7 @@
 """HelioK XML: heliostats with arbitrary axes, nested nodes and facets (Grigoriev et al. 2021).
 
-A file is kept word for word as a :class:`Document`, so that reading, writing and reading
-again gives the same numbers and the same structure, with every attribute and comment,
-known or not. The functions below read its meaning::
+`read` gives the file as a tree of elements, with the attributes as they stand in it. The
+functions below read its meaning::
 
     HelioK   version, unitLength, unitAngle
       World    Location (name, longitude, latitude); Sun (azimuth, elevation, irradiance)
@@ -17,8 +16,7 @@ lies in x and y of its own frame, its normal along z.
 
 A number may carry its own unit behind a space ("1.000 mrad"). HelioK itself reads
 ``Angles`` without one as radians, less their last digit, and ignores ``unitLength``; here
-the units of the root hold for all numbers, and what :func:`from_plant` writes names the
-unit of ``Angles``.
+the units of the root hold for all numbers.
 """
 
 from collections.abc import Iterator
@@ -29,18 +27,11 @@ import numpy as np
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.formats._heliok_values import Values
-from heliotrope.field.formats._heliok_write import from_plant
 from heliotrope.field.formats.frames import euler_matrix, mirror_frame
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.files.xml import (
-    Document,
-    Element,
-    Remark,
-    read_document,
-    write_document,
-)
+from heliotrope.files import Document, Element, read_xml
 from heliotrope.geometry import FloatArray, angle_between, as_float, direction, normalize
 from heliotrope.mechanism.armature import check_axes
 from heliotrope.mechanism.drives import Drive, direct
@@ -48,9 +39,21 @@ from heliotrope.mechanism.kinds import two_axis
 from heliotrope.sun import Site
 
 __all__ = [
-    "Axis", "Document", "Element", "Model", "PlacedModel", "PlacedSurface", "Remark", "Surface",
-    "from_plant", "heliostats", "models", "read", "site", "sun", "surfaces", "to_plant", "write",
-]  # fmt: skip
+    "Axis",
+    "Document",
+    "Element",
+    "Model",
+    "PlacedModel",
+    "PlacedSurface",
+    "Surface",
+    "heliostats",
+    "models",
+    "read",
+    "site",
+    "sun",
+    "surfaces",
+    "to_plant",
+]
 
 _LEANS = ("east", "north", "up")
 #: A normal closer than this (rad) to the secondary axis is not turned by it.
@@ -167,7 +170,7 @@ class PlacedSurface:
 
 
 def read(path: str | Path) -> Document:
-    """Read a HelioK file, word for word.
+    """Read a HelioK file.
 
     Raises
     ------
@@ -175,20 +178,9 @@ def read(path: str | Path) -> Document:
         If the file cannot be read, is not well-formed, defines entities, is no HelioK
         file or names no units.
     """
-    document = read_document(path, "a HelioK file")
+    document = read_xml(path, "a HelioK file")
     Values(document)
     return document
-
-
-def write(document: Document, path: str | Path) -> None:
-    """Write a document: whole or not at all.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written or a value holds a character that XML cannot.
-    """
-    write_document(document, path)
 
 
 def models(document: Document) -> dict[str, Model]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError
 from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
-from heliotrope.files.text import check_file
+from heliotrope.files import check_file
 from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
 
 if TYPE_CHECKING:

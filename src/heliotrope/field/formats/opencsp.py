@@ -31,7 +31,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files.text import read_text, write_text
+from heliotrope.files import read_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -43,10 +43,6 @@ COLUMNS = (
 FACET_COLUMNS = ("Facet id", "X", "Y", "Z")
 
 _COUNTS = ("Num. Facets", "Num. Rows", "Num. Cols")
-_ARRAYS = (
-    "location", "facets", "rows", "columns", "pivot_height", "pivot_offset", "facet_width",
-    "facet_height",
-)  # fmt: skip
 #: Centroids that agree to this (m) stand in the same row, column or place.
 SAME_PLACE = 1e-3
 
@@ -259,49 +255,6 @@ class _Table:
         return values.astype(np.int64)
 
 
-def write_field(table: Field, path: str | Path) -> None:
-    """Write the table of heliostats, further columns last: whole or not at all.
-
-    Numbers have as many digits, up to 17, as give the same double again.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    numbers = [table.pivot_height, table.pivot_offset, table.facet_width, table.facet_height]
-    lines: list[list[str]] = [[*COLUMNS, *table.extra]]
-    for i, name in enumerate(table.names):
-        lines.append(
-            [
-                name,
-                *map(repr, table.location[i].tolist()),
-                *(str(column[i]) for column in (table.facets, table.rows, table.columns)),
-                *(repr(float(column[i])) for column in numbers),
-                *(column[i] for column in table.extra.values()),
-            ]
-        )
-    write_text(path, _csv(lines))
-
-
-def write_centroids(table: Centroids, path: str | Path) -> None:
-    """Write the table of facet centroids: whole or not at all.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
-    """
-    rows = zip(table.ids, table.center.tolist(), strict=True)
-    write_text(path, _csv([[*FACET_COLUMNS], *([name, *map(repr, c)] for name, c in rows)]))
-
-
-def _csv(lines: list[list[str]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(lines)
-    return text.getvalue()
-
-
 def to_plant(table: Field, site: Site, centroids: Centroids | None = None) -> Plant:
     """Return the plant of a field: azimuth-elevation heliostats.
 
@@ -368,82 +321,3 @@ def _edge_to_edge(rows: int, columns: int, size: FloatArray) -> FloatArray:
     center[..., 0] = (right - 0.5 * (columns - 1)) * size[:, :1]
     center[..., 1] = (0.5 * (rows - 1) - down) * size[:, 1:]
     return center
-
-
-def from_plant(plant: Plant) -> tuple[Field, Centroids]:
-    """Return the tables of a plant.
-
-    Nominal pivots and offsets, and the facets' places and sizes, are kept. Sites, aim
-    points, drives, calibrated deviations and the canting of facets have no place in the
-    tables and are left out. A mirror without facets is written as one.
-
-    Parameters
-    ----------
-    plant
-        Azimuth-elevation heliostats whose facets all stand alike.
-
-    Raises
-    ------
-    InputError
-        If there are no heliostats, a mechanism is of another kind, or facets stand in
-        different places from one heliostat to the next.
-    """
-    if not len(plant):
-        raise InputError(f"plant {plant.name!r}: it has no heliostats")
-    tables: list[Field] = []
-    centers: list[FloatArray] = []
-    for name, heliostats in plant.groups.items():
-        if heliostats.mechanism.kind != "azimuth_elevation":
-            raise InputError(
-                f"group {name}: OpenCSP's tables hold azimuth_elevation heliostats, not "
-                f"{heliostats.mechanism.kind}"
-            )
-        table, own = _tables(heliostats)
-        tables.append(table)
-        centers.extend(own)
-    for name, center in zip(plant.names, centers, strict=True):
-        if center.shape != centers[0].shape or np.abs(center - centers[0]).max() > SAME_PLACE:
-            raise InputError(
-                f"heliostat {name}: its facets stand elsewhere than those of {plant.names[0]}; "
-                "OpenCSP has one table for all, so write it by itself"
-            )
-
-    def joined(column: str) -> Any:
-        return np.concatenate([getattr(table, column) for table in tables])
-
-    ids = tuple(str(k) for k in range(1, len(centers[0]) + 1))
-    return Field(plant.names, *map(joined, _ARRAYS)), Centroids(ids, centers[0])
-
-
-def _tables(heliostats: Heliostats) -> tuple[Field, FloatArray]:
-    """Return the table of a group and the centroids of each of its heliostats, (N, F, 3)."""
-    mechanism, facets = heliostats.mechanism, heliostats.facets
-    pivot = mechanism.armature.origin_1
-    count = len(heliostats)
-    if facets is None:
-        center = np.zeros((count, 1, 3))
-        width, height = heliostats.width, heliostats.height
-    else:
-        center = facets.center
-        width = 2.0 * np.linalg.norm(facets.half_width[:, 0], axis=-1)
-        height = 2.0 * np.linalg.norm(facets.half_height[:, 0], axis=-1)
-    rows, columns = _grid(center[0])
-    full = np.ones(count, dtype=np.int64)
-    table = Field(
-        heliostats.names,
-        pivot,
-        full * center.shape[1],
-        full * rows,
-        full * columns,
-        pivot[:, 2] - mechanism.position[:, 2],
-        np.sum(mechanism.vertex * mechanism.normal, axis=-1),
-        width,
-        height,
-    )
-    return table, center
-
-
-def _grid(center: FloatArray) -> tuple[int, int]:
-    """Return rows and columns of facets; those that stand in no grid count as one row."""
-    columns, rows = (len(np.unique(np.round(center[:, k] / SAME_PLACE))) for k in (0, 1))
-    return (rows, columns) if rows * columns == len(center) else (1, len(center))

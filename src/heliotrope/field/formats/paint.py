@@ -16,8 +16,7 @@ from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.files.json import Node, read_json
-from heliotrope.files.text import write_text
+from heliotrope.files import Node, read_json, write_text
 from heliotrope.geometry import FloatArray, enu_to_geodetic, geodetic_to_enu
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import Drive, linear_paint

@@ -26,8 +26,8 @@ from heliotrope.field.formats._plant_table import HeliostatTable, read_table, wr
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
+from heliotrope.files import write_text
 from heliotrope.files.documents import read_document
-from heliotrope.files.text import write_text
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.sun import Site
 

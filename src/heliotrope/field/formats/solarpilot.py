@@ -32,7 +32,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files.text import read_text, write_text
+from heliotrope.files import read_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -269,66 +269,6 @@ class _Row:
         return value
 
 
-def write_layout(
-    layout: Layout,
-    path: str | Path,
-    *,
-    separator: str = "comma",
-    columns: int = 14,
-    header: bool = False,
-) -> None:
-    """Write a layout file: whole or not at all.
-
-    Numbers have as many digits, up to 17, as give the same double again.
-
-    Parameters
-    ----------
-    layout
-        The rows.
-    path
-        The file.
-    separator
-        "comma", "semicolon", "tab" or "space". SolarPILOT itself fails on semicolons: it
-        takes them for ends of rows.
-    columns
-        14, or 12 for older versions.
-    header
-        Whether to write two lines with names and units first, the flags in the order in
-        which they stand.
-
-    Raises
-    ------
-    InputError
-        If ``columns`` is 12 and a heliostat is not enabled or not in the layout, the
-        separator or number of columns is not known, or the file cannot be written.
-    """
-    if separator not in SEPARATORS:
-        raise InputError(f"separator {separator!r}: give one of {', '.join(SEPARATORS)}")
-    if columns not in {12, 14}:
-        raise InputError(f"columns {columns}: a layout is written with 14 or 12")
-    if header and separator == "space":
-        raise InputError("header: its names hold spaces; give another separator or no header")
-    off = np.flatnonzero(~(layout.enabled & layout.in_layout))
-    if columns == 12 and len(off):
-        raise InputError(
-            f"row {off[0] + 1}: it is not enabled or not in the layout, which 12 columns cannot "
-            "say; write 14"
-        )
-    kept = [k for k in range(14) if columns == 14 or k not in {1, 2}]
-    lines = [[COLUMNS[k][part] for k in kept] for part in (0, 1)] if header else []
-    numbers = np.concatenate([layout.location, layout.focus, layout.cant, layout.aim], axis=1)
-    for i in range(len(layout)):
-        cells = [
-            str(layout.template[i]),
-            str(int(layout.enabled[i])),
-            str(int(layout.in_layout[i])),
-        ]
-        cells += ["NULL" if math.isnan(value) else repr(value) for value in numbers[i].tolist()]
-        lines.append([cells[k] for k in kept])
-    between = SEPARATORS[separator]
-    write_text(path, "".join(between.join(line) + "\n" for line in lines))
-
-
 def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> Plant:
     """Return the plant of a layout: azimuth-elevation heliostats, one group a template.
 
@@ -379,35 +319,3 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
     left_out = [f"H{i + 1}" for i in np.flatnonzero(~used)]
     notes = {"left out": ", ".join(left_out)} if left_out else {}
     return Plant(site.name, site, groups, notes=notes)
-
-
-def from_plant(plant: Plant) -> Layout:
-    """Return the layout of a plant: nominal pivots and aim points; a group is a template.
-
-    Parameters
-    ----------
-    plant
-        Its groups become templates 0, 1, … in order. Names, mechanisms, calibrated
-        deviations, facets and sizes have no place in a layout and are left out.
-    """
-    parts = []
-    for number, heliostats in enumerate(plant.groups.values()):
-        count = len(heliostats)
-        missing = np.full((count, 3), np.nan)
-        on = np.ones(count, dtype=np.bool_)
-        parts.append(
-            Layout(
-                np.full(count, number, dtype=np.int64),
-                on,
-                on,
-                heliostats.mechanism.armature.origin_1.copy(),
-                missing[:, :2],
-                missing,
-                missing if heliostats.aim is None else heliostats.aim,
-            )
-        )
-    if not parts:
-        raise InputError(f"plant {plant.name!r}: it has no heliostats to lay out")
-    return Layout(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in Layout.__match_args__)
-    )
