@@ -24,7 +24,7 @@ def test_every_public_name_is_there() -> None:
     for name in ht.__all__:
         assert getattr(ht, name) is getattr(ht, name)
     assert ht.track is import_module("heliotrope.mechanism.tracking").track
-    assert ht.evaluate is import_module("heliotrope.calibration.evaluation").errors
+    assert ht.evaluate is import_module("heliotrope.calibration.evaluation").beam_errors
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:

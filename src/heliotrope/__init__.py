@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from heliotrope import geometry as geometry
     from heliotrope import optics as optics
     from heliotrope import sun as sun
-    from heliotrope.calibration.evaluation import errors as evaluate
-    from heliotrope.calibration.evaluation import split, summary
+    from heliotrope.calibration.evaluation import beam_errors as evaluate
+    from heliotrope.calibration.evaluation import split, summarise
     from heliotrope.calibration.fit.estimator import fit
     from heliotrope.calibration.learn.learning import Learned, learn
     from heliotrope.calibration.sighting_table import read_sightings, write_sightings
@@ -49,7 +49,7 @@ _HOMES = {
     "Target": "heliotrope.field",
     "Tracking": "heliotrope.mechanism",
     "camera_target": "heliotrope.calibration.sightings",
-    "evaluate": "heliotrope.calibration.evaluation:errors",
+    "evaluate": "heliotrope.calibration.evaluation:beam_errors",
     "fit": "heliotrope.calibration.fit.estimator",
     "image_offsets": "heliotrope.optics",
     "learn": "heliotrope.calibration.learn.learning",
@@ -62,7 +62,7 @@ _HOMES = {
     "roughly_installed": "heliotrope.field",
     "sightings": "heliotrope.calibration.sightings",
     "split": "heliotrope.calibration.evaluation",
-    "summary": "heliotrope.calibration.evaluation",
+    "summarise": "heliotrope.calibration.evaluation",
     "track": "heliotrope.mechanism",
     "write_plant": "heliotrope.field.formats.plant_file",
     "write_sightings": "heliotrope.calibration.sighting_table",
@@ -103,7 +103,7 @@ __all__ = [
     "roughly_installed",
     "sightings",
     "split",
-    "summary",
+    "summarise",
     "sun",
     "track",
     "write_plant",
