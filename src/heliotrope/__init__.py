@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from heliotrope.calibration.evaluation import beam_errors as evaluate
     from heliotrope.calibration.evaluation import split, summarise
     from heliotrope.calibration.fit.estimator import fit
-    from heliotrope.calibration.learn.learning import Learned, learn
+    from heliotrope.calibration.learn.learning import Learned, learn, predict
     from heliotrope.calibration.sighting_table import read_sightings, write_sightings
     from heliotrope.calibration.sightings import Sightings, camera_target, sightings
     from heliotrope.field import Heliostats, Plant, Receiver, Target, prototype, roughly_installed
@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from heliotrope.mechanism import kinds as kinds
     from heliotrope.optics import image_offsets, predict_flux
     from heliotrope.sun import Site
-
-    predict = Learned.predict
 
 __version__ = "0.1.0"
 
@@ -54,7 +52,7 @@ _HOMES = {
     "image_offsets": "heliotrope.optics",
     "learn": "heliotrope.calibration.learn.learning",
     "open_plant": "heliotrope.field.formats",
-    "predict": "heliotrope.calibration.learn.learning:Learned.predict",
+    "predict": "heliotrope.calibration.learn.learning",
     "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
     "read_plant": "heliotrope.field.formats.plant_file",
@@ -118,10 +116,8 @@ if not TYPE_CHECKING:
         if name in _MODULES:
             found = import_module(_MODULES[name])
         elif name in _HOMES:
-            module, _, path = _HOMES[name].partition(":")
-            found = import_module(module)
-            for part in (path or name).split("."):
-                found = getattr(found, part)
+            module, _, own = _HOMES[name].partition(":")
+            found = getattr(import_module(module), own or name)
         else:
             raise AttributeError(f"module 'heliotrope' has no attribute {name!r}")
         globals()[name] = found
