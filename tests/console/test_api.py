@@ -264,7 +264,7 @@ def test_the_own_password(console: LiveConsole, ask: Ask) -> None:
             one.headers["X-CSRF-Token"] = answer.json()["csrf"]
         refused = client.put("session/password", json=change)
         assert refused.status_code == 403
-        assert "present password" in refused.json()["detail"]
+        assert "current password" in refused.json()["detail"]
         change["old"] = "a long password"
         assert client.put("session/password", json={**change, "new": "short"}).status_code == 422
         assert client.put("session/password", json=change).status_code == 204

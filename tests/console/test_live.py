@@ -18,22 +18,22 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from heliotrope.cli._ctl import app
+from heliotrope.console import Client, LiveMessage, RemoteError, read_message
 from heliotrope.console._secrets import verify_password
-from heliotrope.console.client import Client, Message, RemoteError, read_message
-from heliotrope.console.live import MARK, ROW, changed, message
 from heliotrope.console.models import plain
+from heliotrope.console.stream import MARK, ROW, changed, message
 from support.live_console import PASSWORD, LiveConsole
 
 Ask = Callable[..., httpx.Response]
 
 
 def _watch(
-    console: LiveConsole, token: str, enough: Callable[[np.ndarray[Any, Any], Message], bool]
-) -> list[Message]:
+    console: LiveConsole, token: str, enough: Callable[[np.ndarray[Any, Any], LiveMessage], bool]
+) -> list[LiveMessage]:
     """Follow the stream until the field that it tells is as wanted."""
 
-    async def follow() -> list[Message]:
-        seen: list[Message] = []
+    async def follow() -> list[LiveMessage]:
+        seen: list[LiveMessage] = []
         field = np.zeros(len(console.live.names), ROW)
         client = Client(token, console.address)
         try:
@@ -53,7 +53,7 @@ def _watch(
 def test_the_whole_first_then_what_changed(console: LiveConsole, tokens: dict[str, str]) -> None:
     frames: list[Any] = []
 
-    def same(field: np.ndarray[Any, Any], one: Message) -> bool:
+    def same(field: np.ndarray[Any, Any], one: LiveMessage) -> bool:
         frames.append((field.copy(), one))
         return len(frames) >= 4
 

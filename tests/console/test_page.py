@@ -77,7 +77,7 @@ def _said(page: Any, text: str) -> None:
 def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     assert page.inner_text(".hx-plant >> nth=0")
-    assert "You look only" in page.inner_text(".hx-bar")
+    assert "View only" in page.inner_text(".hx-bar")
     assert page.locator(".hx-bar button").count() == 0
     for title in ("Heliostat", "Targets", "Calibration", "Clusters", "Alarms", "Logs", "Schedule"):
         page.click(f".hx-tabs >> text={title}")
@@ -212,7 +212,7 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
     dialog.locator("text=Add…").click()
     page.fill("dialog:last-of-type [name=name]", "desk-1")
     page.fill("dialog:last-of-type [name=password]", "long enough for it")
-    page.click("dialog:last-of-type >> text='Let in'")
+    page.click("dialog:last-of-type >> text='Make account'")
     row = dialog.locator("tr:has-text('desk-1')")
     row.wait_for()
     row.locator("select").select_option("operator")
@@ -222,8 +222,8 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
     page.click("dialog:last-of-type >> text='Make'")
     word = dialog.locator(".hx-secret").inner_text()
     assert verify_password(people.account("desk-1").password_hash, word)
-    row.locator("text=Keep out").click()
-    row.locator("text=kept out").wait_for()
+    row.locator("text=Disable").click()
+    row.locator("text=disabled").wait_for()
     assert people.account("desk-1").disabled
     # Told once: it is gone with whatever is done next.
     assert word not in page.content()
@@ -243,7 +243,7 @@ def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], 
     assert people.token(secret, time.time()).label == "nightly"
     dialog.locator("tr:has-text('nightly') >> text=Revoke").click()
     page.click("dialog:last-of-type >> text='Revoke'")
-    dialog.locator("text=There is none").wait_for()
+    dialog.locator("text=No token").wait_for()
     assert people.token(secret, time.time()) is None
 
 
@@ -335,7 +335,7 @@ def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[s
     field.call(lambda: setattr(buses[3], "plugged", False))
     try:
         page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
-        page.wait_for_selector(".hx-clusters tbody tr:has-text('missing')")
+        page.wait_for_selector(".hx-clusters tbody tr:has-text('degraded')")
         page.wait_for_function(
             "document.querySelector('.hx-legend').textContent.includes('stale 32')"
         )

@@ -1,20 +1,20 @@
-"""How many log-ins have failed lately: by address, and by name."""
+"""Recent failed sign-ins, by address and by name."""
 
 from collections import deque
 from collections.abc import Callable
 
 
 class Attempts:
-    """Counts failures by key within a span of time.
+    """Counts failures by key within a time span.
 
     Parameters
     ----------
     most, span
-        Failures that are let through within ``span`` s.
+        Failures allowed within ``span`` s.
     monotonic
-        Tells the time, s.
+        Returns the time, s.
     largest
-        Keys that are kept; the oldest go first.
+        Number of keys that are kept; the oldest go first.
     """
 
     def __init__(
@@ -24,7 +24,7 @@ class Attempts:
         self._failures: dict[str, deque[float]] = {}
 
     def wait(self, *keys: str) -> float:
-        """Return how long to wait before the next attempt, s; 0 if it may be made."""
+        """Return the time to wait before the next attempt, s; 0 if it may be made now."""
         now, longest = self._now(), 0.0
         for key in keys:
             times = self._failures.get(key)
@@ -39,7 +39,7 @@ class Attempts:
     def begin(self, *keys: str) -> None:
         """Count an attempt as failed until `good` says otherwise.
 
-        What is counted only after the slow check of a password lets many through at once.
+        Counting only after the slow password check would let many attempts through at once.
         """
         for key in keys:
             self._failures.setdefault(key, deque(maxlen=self._most)).append(self._now())
@@ -47,6 +47,6 @@ class Attempts:
                 del self._failures[next(iter(self._failures))]
 
     def good(self, *keys: str) -> None:
-        """Forget the failures of keys that have logged in."""
+        """Forget the failures of keys that have signed in."""
         for key in keys:
             self._failures.pop(key, None)

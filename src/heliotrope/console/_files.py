@@ -1,7 +1,7 @@
-"""Answers for the files of the page from memory: one turn of the plant's loop each, no thread.
+"""The page's files served from memory: one turn of the plant's loop each, and no thread.
 
-A page is some thirty files. Each that is read from the disk goes through a thread and several turns
-of the loop, which the plant needs too; and is compressed again for everybody.
+The page has some thirty files. Reading one from the disk takes a thread and several turns of the
+loop, which the plant needs too, and compressing it again for every viewer takes more.
 """
 
 import gzip
@@ -14,12 +14,12 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 STATIC = Path(__file__).with_name("static")
-#: Files that are kept, and the largest of them, bytes.
+#: Number of files that are kept, and the largest of them, bytes.
 _MOST, _LARGEST = 200, 4 << 20
 #: Smaller answers are not compressed, bytes.
 SMALL = 1024
 _PACKED = ("text/", "application/javascript", "application/json", "image/svg")
-#: What a name with a version in it holds never changes.
+#: A file with a version in its name never changes.
 _FOREVER = "public, max-age=31536000, immutable"
 
 
@@ -30,9 +30,9 @@ def _tag() -> str:
     return digest.hexdigest()[:12]
 
 
-#: Of what is in static/: it stands in the addresses of the page's own files.
+#: Version of static/, part of the addresses of the page's own files.
 TAG = _tag()
-#: Where they are: for the page, whose browsers keep them, and for plain pages.
+#: Their addresses: for the page, which browsers cache, and for plain pages.
 KEPT, PLAIN = f"/console/{TAG}", "/console/static"
 
 
@@ -42,7 +42,7 @@ class Files:
     Parameters
     ----------
     app
-        What reads them.
+        Application that reads them.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -74,7 +74,7 @@ class Files:
     async def _read(
         self, scope: Scope, receive: Receive
     ) -> tuple[bytes, bytes | None, dict[str, str]] | None:
-        """Return a whole file with its headers; None if it is none to be kept."""
+        """Return a whole file with its headers; None if it should not be kept."""
         if len(self._kept) >= _MOST:
             return None
         body, start = bytearray(), dict[str, Any]()
@@ -85,7 +85,7 @@ class Files:
             else:
                 body.extend(message.get("body", b""))
 
-        # What the browser would rather have, or has already, is not the file.
+        # A range, or a file that the browser already has, is not the whole file.
         wanted = [(b"host", Headers(scope=scope).get("host", "").encode("latin-1"))]
         await self._app({**scope, "headers": wanted}, receive, take)
         if start.get("status") != 200 or len(body) > _LARGEST:
@@ -103,12 +103,12 @@ class Files:
 
 
 def takes_gzip(headers: Headers) -> bool:
-    """Whether who asks takes compressed answers."""
+    """Whether the browser accepts compressed answers."""
     return "gzip" in headers.get("accept-encoding", "")
 
 
 def path_is_plain(path: str) -> bool:
-    """Whether a path has no version in it: what is there may change with the program."""
+    """Whether a path has no version in it, so that its file may change with the program."""
     return path.startswith(f"{PLAIN}/")
 
 

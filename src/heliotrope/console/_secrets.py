@@ -1,4 +1,4 @@
-"""Passwords, which are kept as argon2id hashes, and the word that protects a session."""
+"""Passwords, kept as argon2id hashes, and the CSRF word that protects a session."""
 
 import hashlib
 import hmac
@@ -8,15 +8,15 @@ import argon2
 
 from heliotrope.errors import InputError
 
-#: Shortest password; longest, so that nobody makes the server hash a book.
+#: Shortest password, and longest, so that nobody makes the server hash a book.
 SHORTEST, LONGEST = 10, 200
 _HASHER = argon2.PasswordHasher()
-#: Verified where there is no account, so that both take the same time.
+#: Verified where there is no account, so that both cases take the same time.
 _NOBODY = _HASHER.hash(secrets.token_hex(16))
 
 
 def check_password(password: str) -> str:
-    """Return a password that may be used.
+    """Return a password if it is acceptable.
 
     Raises
     ------
@@ -34,7 +34,7 @@ def hash_password(password: str) -> str:
 
 
 def verify_password(kept: str | None, password: str) -> bool:
-    """Return whether a password is that of a hash; the same time if there is none."""
+    """Return whether a password matches a hash; takes the same time without one."""
     try:
         good = _HASHER.verify(kept if kept is not None else _NOBODY, password)
     except (argon2.exceptions.VerificationError, argon2.exceptions.InvalidHashError):
@@ -50,10 +50,10 @@ def new_password() -> str:
 
 
 def csrf_of(session: str) -> str:
-    """Return the word that a page must send with what it does in a session."""
+    """Return the word that a page must send with every change in a session."""
     return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
 
 
 def same(one: str, other: str) -> bool:
-    """Return whether two words are the same, in constant time."""
+    """Return whether two words are equal, in constant time."""
     return hmac.compare_digest(one.encode(), other.encode())

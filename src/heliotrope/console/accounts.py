@@ -37,7 +37,7 @@ def _who(who: Caller) -> models.Who:
 
 @router.get("/session", response_model=models.Who, tags=["people"])
 async def session(who: Anyone) -> models.Who:
-    """Return who asks."""
+    """Return the signed-in person."""
     return _who(who)
 
 
@@ -52,7 +52,7 @@ async def sign_in(
 ) -> models.Who:
     """Sign in: the answer sets the session's cookie."""
     if not same_origin(console, request):
-        raise HTTPException(403, "this page is from elsewhere; sign in at the console itself")
+        raise HTTPException(403, "this page comes from another site; sign in at the console itself")
     secret, expires = await log_in(console, given.name, given.password, _address(request))
     response.set_cookie(
         COOKIE,
@@ -88,14 +88,14 @@ async def sign_out(console: Here, who: Anyone, response: Response) -> None:
 async def own_password(
     console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
 ) -> None:
-    """Change one's own password; all one's sessions end, this one too."""
+    """Change your own password; all your sessions end, including this one."""
     if who.by != "session":
-        raise HTTPException(403, "a token cannot change a password; sign in for it")
+        raise HTTPException(403, "a token cannot change a password; sign in to do so")
     try:
         await checked(console, who.person.name, given.old, _address(request))
     except HTTPException as error:
         if error.status_code == 401:
-            raise HTTPException(403, "the present password is wrong") from None
+            raise HTTPException(403, "the current password is wrong") from None
         raise
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
@@ -104,9 +104,9 @@ async def own_password(
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
 async def reset_password(console: Here, who: Engineer, name: Named) -> models.GivenPassword:
-    """Give a person a new password, which is told once; all their sessions end."""
+    """Give a person a new password, shown once; all their sessions end."""
     if name == who.person.name:
-        raise HTTPException(409, f"{name}: the own password is changed with PUT session/password")
+        raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if await console.read(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     password = _secrets.new_password()
@@ -117,7 +117,7 @@ async def reset_password(console: Here, who: Engineer, name: Named) -> models.Gi
 
 @router.get("/accounts", response_model=list[models.AccountState], tags=["people"])
 async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
-    """Return who may come in."""
+    """Return the accounts."""
     del who
     return [_account(one) for one in await console.read(console.people.accounts)]
 
@@ -126,7 +126,7 @@ async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
 async def new_account(
     console: Here, who: Engineer, given: models.NewAccount
 ) -> models.AccountState:
-    """Let a person in."""
+    """Make an account."""
     kept = await _hashed(console, given.password)
     made = await asyncio.to_thread(console.people.add, given.name, kept, given.role, console.now())
     console.operations.logbook.event(
@@ -139,9 +139,9 @@ async def new_account(
 async def change_account(
     console: Here, who: Engineer, name: Named, given: models.AccountChange
 ) -> models.AccountState:
-    """Change role or password of a person, or keep them out."""
+    """Change the role or password of an account, or disable it."""
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
-        raise HTTPException(409, f"{name}: nobody takes away their own role; another must do it")
+        raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
     if await console.read(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     kept = await _hashed(console, given.password) if given.password is not None else None
@@ -160,18 +160,18 @@ async def change_account(
 
 @router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
 async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
-    """Return the tokens: one's own, or all to an engineer."""
+    """Return the tokens: your own, or all of them for an engineer."""
     found = await console.read(lambda: console.people.tokens(_whose(who)))
     return [models.TokenState(**asdict(one)) for one in found]
 
 
 @router.post("/tokens", response_model=models.TokenState, status_code=201, tags=["people"])
 async def new_token(console: Here, who: Anyone, given: models.NewToken) -> models.TokenState:
-    """Make a token for a program; its secret is in this answer and nowhere else."""
+    """Make a token for a program; its secret is shown in this answer only."""
     if who.by != "session":
-        raise HTTPException(403, "a token cannot make tokens; sign in for it")
+        raise HTTPException(403, "a token cannot make tokens; sign in to do so")
     if ROLES[given.role] > who.person.role:
-        raise HTTPException(403, f"token: its role {given.role} is higher than one's own")
+        raise HTTPException(403, f"token: role {given.role} is higher than your own")
     made, secret = await asyncio.to_thread(
         console.people.add_token,
         who.person.name,
@@ -188,7 +188,7 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
 
 @router.delete("/tokens/{key}", status_code=204, tags=["people"])
 async def revoke(console: Here, who: Anyone, key: Named) -> None:
-    """Revoke a token: one's own, or any as an engineer."""
+    """Revoke a token: your own, or any as an engineer."""
     found = await console.read(lambda: console.people.tokens(_whose(who)))
     if key not in {one.key for one in found}:
         raise HTTPException(404, f"there is no token {key}")
@@ -212,7 +212,7 @@ def _address(request: Request) -> str:
 
 
 def _whose(who: Caller) -> str:
-    """Return whose tokens one may see: "" for everybody's."""
+    """Return the name whose tokens a person may see, "" for everybody's."""
     return "" if who.person.role >= Role.ENGINEER else who.person.name
 
 

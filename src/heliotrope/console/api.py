@@ -28,7 +28,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.plant.operations.operations import Operations
 
-#: Answers that any route behind the door may give.
+#: Answers that any route behind the sign-in may give.
 REFUSALS: dict[int | str, dict[str, Any]] = {
     401: {"model": models.Problem, "description": "Not signed in"},
     403: {"model": models.Problem, "description": "The role is too low"},
@@ -37,7 +37,7 @@ REFUSALS: dict[int | str, dict[str, Any]] = {
     422: {"model": models.Problem, "description": "What was sent cannot be used"},
     503: {"model": models.Problem, "description": "It cannot be recorded now; nothing was sent"},
 }
-#: Age of a view that is shown to all, s.
+#: Age of a view that all viewers share, s.
 FRESH = 0.5
 MOST_SHARED = 100
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
@@ -54,9 +54,9 @@ def answer(value: Any) -> JSONResponse:
 def shared(
     console: Console, request: Request, key: str, make: Callable[[], Any], fresh: float = FRESH
 ) -> Response:
-    """Return a view that everybody sees the same, encoded once for all who ask together.
+    """Return a view that is the same for everybody, encoded once for all who ask together.
 
-    Nothing in it is of the person who asks: what is compressed tells no secret by its length.
+    It holds nothing of the person who asks, so its compressed length reveals no secret.
     """
     now, kept = time.monotonic(), console.shared.get(key)
     if kept is None or now - kept[0] >= fresh:
@@ -74,14 +74,14 @@ def shared(
 
 @router.get("/health", tags=["plant"], responses={})
 async def health(console: Here) -> dict[str, Any]:
-    """Whether the console answers; open to all, tells nothing of the plant."""
+    """Return whether the console answers; open to all, reveals nothing of the plant."""
     del console
     return {"ok": True, "version": __version__}
 
 
 @router.get("/field", response_model=models.FieldState, tags=["field"])
 async def field(console: Here, request: Request, who: Anyone) -> Response:
-    """Return what does not change of the field."""
+    """Return everything about the field that does not change."""
     del who
     return shared(console, request, FIXED, lambda: _field(console.operations), math.inf)
 
@@ -116,14 +116,14 @@ def _field(here: Operations) -> dict[str, Any]:
 
 @router.get("/summary", response_model=models.Summary, tags=["plant"])
 async def summary(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the plant in one look."""
+    """Return a summary of the plant."""
     del who
     return shared(console, request, "summary", console.operations.summary)
 
 
 @router.get("/sun", response_model=models.SunView, tags=["plant"])
 async def where_the_sun_is(console: Here, request: Request, who: Anyone) -> Response:
-    """Return where the sun is."""
+    """Return the position of the sun."""
     del who
     return shared(console, request, "sun", console.operations.sun)
 
@@ -144,7 +144,7 @@ async def clusters(console: Here, request: Request, who: Anyone) -> Response:
 
 @router.get("/receivers/{name}/flux", response_model=models.FluxView, tags=["plant"])
 async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Response:
-    """Return the predicted light on a receiver."""
+    """Return the predicted flux on a receiver."""
     del who
     return shared(console, request, f"flux {name}", lambda: console.operations.receiver_flux(name))
 
@@ -156,7 +156,7 @@ async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Res
     responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "None was taken yet"}},
 )
 async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
-    """Return the last photograph of a target, with what the software saw in it."""
+    """Return the last photograph of a target, annotated with the findings of the software."""
     del who
     view = console.operations.camera(name)
     if not view.jpeg:
@@ -170,7 +170,7 @@ async def photograph(console: Here, request: Request, who: Anyone, name: Named) 
 
 @router.get("/targets/{name}", response_model=models.CameraReading, tags=["calibration"])
 async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
-    """Return what the software saw in the last photograph of a target."""
+    """Return the findings of the software in the last photograph of a target."""
     del who
     view = console.operations.camera(name)
     return answer(
@@ -186,7 +186,7 @@ async def target(console: Here, who: Anyone, name: Named) -> JSONResponse:
 
 @router.get("/alarms", response_model=models.many(models.AlarmRow), tags=["alarms"])
 async def alarms(console: Here, request: Request, who: Anyone) -> Response:
-    """Return the alarms, those that want attention first."""
+    """Return the alarms, those that need attention first."""
     del who
     return shared(console, request, "alarms", console.operations.alarms)
 
@@ -218,21 +218,21 @@ async def packets(
 
 @router.get("/calibration", response_model=models.CalibrationView, tags=["calibration"])
 async def calibration(console: Here, request: Request, who: Anyone) -> Response:
-    """Return how far calibration has come."""
+    """Return the progress of calibration."""
     del who
     return shared(console, request, "calibration", console.operations.calibration)
 
 
 @router.get("/schedule", response_model=models.many(models.Planned), tags=["calibration"])
 async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 20) -> Response:
-    """Return the plan of the next measurements."""
+    """Return the planned next measurements."""
     del who
     return shared(console, request, f"schedule {limit}", lambda: console.operations.schedule(limit))
 
 
 @router.get("/holds", response_model=models.many(models.Hold), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
-    """Return the heliostats that are kept out of calibration."""
+    """Return the heliostats that are excluded from calibration."""
     del who
     return answer(console.operations.holds())
 
@@ -255,7 +255,7 @@ async def live(socket: WebSocket) -> None:
         return
     await socket.accept()
     if console.stream.viewers >= console.settings.viewers:
-        await socket.close(4429, f"{console.settings.viewers} viewers look already")
+        await socket.close(4429, f"{console.settings.viewers} viewers are connected already")
         return
     checked = console.now()
 
@@ -270,5 +270,5 @@ async def live(socket: WebSocket) -> None:
         await console.stream.follow(socket.send_bytes, allowed)
         await socket.close(4401, "the session has ended")
     except (WebSocketDisconnect, RuntimeError, OSError):
-        # The viewer has gone: a socket that is closed cannot be written to.
+        # The viewer has left: a closed socket cannot be written to.
         return

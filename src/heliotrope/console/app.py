@@ -46,8 +46,8 @@ def create(
     people
         Accounts, sessions and tokens.
     settings
-        Of the console. A process can have one page (NiceGUI is global), and any number of
-        applications without.
+        Settings of the console. A process can have one page (NiceGUI is global), and any number of
+        applications without one.
     """
     chosen = settings or ConsoleSettings()
     stream = Stream(operations, chosen.period)
@@ -85,7 +85,7 @@ def create(
     ):
         app.add_exception_handler(kind, _problem(status))
     app.add_middleware(Files)
-    # The one that is added last stands first.
+    # The middleware added last comes first.
     app.add_middleware(Guard, console=lambda: console)
     _pages(app)
     if chosen.page:
@@ -104,7 +104,7 @@ def _problem(status: int) -> Callable[[Request, Exception], Response]:
 
 
 def _pages(app: FastAPI) -> None:
-    """Add the files of the page, and signing in: plain, without the frame."""
+    """Add the page's files and the sign-in page, which does without the frame."""
     for place in (KEPT, PLAIN):
         app.mount(place, StaticFiles(directory=STATIC), name=place)
 

@@ -1,8 +1,8 @@
-"""Who asks: sessions by cookie, tokens by header, roles, and protection against what others send.
+"""Authentication: sessions by cookie, tokens by header, roles, and protection against forgery.
 
-A browser has a session: its cookie is out of the reach of scripts (HttpOnly), is not sent from
-other sites (SameSite=Strict), and what changes anything needs the session's own word in a header
-besides, which a page from elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
+A browser has a session: scripts cannot read its cookie (HttpOnly), other sites cannot send it
+(SameSite=Strict), and every change also needs the session's own word in a header, which a page from
+elsewhere cannot read. Programs have a token (``Authorization: Bearer``).
 """
 
 import asyncio
@@ -30,13 +30,13 @@ from heliotrope.store.records import StoreError
 
 T = TypeVar("T")
 COOKIE = "heliotrope_session"
-#: A session that was found valid is trusted for so long without the store, s.
+#: A session that was found valid is trusted for this long without asking the store, s.
 TRUSTED = 5.0
-#: And so long for EMERGENCY alone, s.
+#: The same for EMERGENCY alone, s.
 LONG_TRUSTED = 3600.0
 MOST_KNOWN = 2000
 DAY = 86_400.0
-#: Who has kept the authority up counts as there for so long, s.
+#: A holder of the authority counts as present for this long after renewing it, s.
 PRESENT = 8.0
 #: The shared answer that never changes.
 FIXED = "field"
@@ -45,7 +45,7 @@ SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 
 @dataclass
 class Console:
-    """What the routes work on."""
+    """State that the routes share."""
 
     operations: Operations
     people: People
@@ -53,20 +53,20 @@ class Console:
     stream: Stream
     attempts: Attempts
     tickets: Tickets = field(default_factory=Tickets)
-    #: Checks of passwords at once: each takes 50 ms of a core and 64 MiB.
+    #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
-    #: Who was found valid lately, and when, by the kind and secret of what they showed.
+    #: Recently authenticated callers, with the time, by kind and secret.
     known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
-    #: When each holder of the authority was there last, machine's monotonic s.
+    #: When each holder of the authority was last present, monotonic time of the machine, s.
     present: dict[str, float] = field(default_factory=dict)
 
-    #: Answers that all viewers ask for, and when they were made: made at most twice a second.
+    #: Answers that all viewers ask for, with the time: made at most twice a second.
     shared: dict[str, tuple[float, bytes, bytes | None]] = field(default_factory=dict)
 
     async def keep_authority(self) -> None:
-        """Keep the authority up for a holder whose page (or program) has said so lately.
+        """Renew the authority for a holder whose page or program has been present recently.
 
         The authority lasts by the plant's time, which may run faster than people do.
         """
@@ -79,50 +79,50 @@ class Console:
                 self.operations.keep_authority(grant.holder, grant.token)
 
     async def forget_expired(self) -> None:
-        """Let the store go of sessions and tokens that have expired, at the start and once a day.
+        """Remove expired sessions and tokens from the store, at the start and once a day.
 
-        The loop's time may be faster than the machine's, by which sessions end.
+        Sessions end by the machine's time; the loop's time may be faster.
         """
         last = -math.inf
         while True:
             if self.now() - last >= DAY:
                 last = self.now()
-                with contextlib.suppress(StoreError):  # a store that is full is told by others
+                with contextlib.suppress(StoreError):  # others report a full store
                     self.people.forget_expired(last)
             await asyncio.sleep(60.0)
 
     def forget(self) -> None:
-        """Let go of the answers that a change may have made old."""
+        """Drop the shared answers that a change may have made stale."""
         fixed = self.shared.get(FIXED)
         self.shared.clear()
         if fixed is not None:
             self.shared[FIXED] = fixed
 
     async def read(self, look: Callable[[], T]) -> T:
-        """Return what the store says.
+        """Return an answer of the store.
 
-        A file is asked at once, which takes below a millisecond: a thread beside a loop that is
-        busy would take a hundred. A server, which may be slow or gone, must not hold the loop.
+        A file is read at once, in less than a millisecond; a thread beside a busy loop would take a
+        hundred. A database server, which may be slow or gone, must not hold the loop.
         """
         return look() if self.people.near else await asyncio.to_thread(look)
 
     def now(self) -> float:
-        """Return the machine's time, POSIX s: sessions end by it, whatever time the plant has."""
+        """Return the machine's time, POSIX s: sessions end by it, whatever the plant's time."""
         return time.time()
 
 
 @dataclass(frozen=True)
 class Caller:
-    """Who asks.
+    """An authenticated caller.
 
     Attributes
     ----------
     person
-        With the role that counts now.
+        With the role that applies now.
     by
         "session" or "token".
     secret
-        Of the session or token.
+        Secret of the session or token.
     expires
         POSIX s; None for never.
     """
@@ -134,12 +134,12 @@ class Caller:
 
     @property
     def csrf(self) -> str:
-        """What must be sent with all that changes anything; "" for a token."""
+        """The word that must be sent with every change; "" for a token."""
         return _secrets.csrf_of(self.secret) if self.by == "session" else ""
 
 
 async def here(connection: HTTPConnection) -> Console:
-    """Return the console of an application; in the loop: a thread for it would cost more."""
+    """Return the console of an application, in the loop: a thread would cost more."""
     return console_of(connection)
 
 
@@ -152,10 +152,10 @@ Here = Annotated[Console, Depends(here)]
 
 
 async def find_caller(console: Console, connection: HTTPConnection) -> Caller | None:
-    """Return who asks, None if they are not known (any more).
+    """Return the caller, None if unknown or no longer valid.
 
-    For EMERGENCY it is enough that they were known lately: it must not wait for a store that is
-    slow or gone.
+    EMERGENCY accepts a caller who was known recently: it must not wait for a store that is slow or
+    gone.
     """
     bearer = connection.headers.get("authorization", "")
     kind, _, word = bearer.partition(" ")
@@ -176,7 +176,7 @@ async def find_caller(console: Console, connection: HTTPConnection) -> Caller | 
 
 
 async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Caller] | None:
-    """Ask the store who has a secret."""
+    """Ask the store for the owner of a secret."""
     now = console.now()
     found: ApiToken | Session | None
     if by == "token":
@@ -208,25 +208,25 @@ def same_origin(console: Console, connection: HTTPConnection) -> bool:
 
 
 def host_known(console: Console, netloc: str) -> bool:
-    """Whether a request names this machine as it is known here."""
+    """Whether a request names this machine by a known name."""
     host = netloc.rpartition(":")[0] if netloc.rpartition(":")[2].isdigit() else netloc
     return host.lower() in console.settings.hosts
 
 
 async def caller(connection: HTTPConnection, console: Here) -> Caller:
-    """Return who asks.
+    """Return the caller.
 
     Raises
     ------
     HTTPException
-        401 if they are not known; 403 if a page from elsewhere may have sent it.
+        401 if unknown; 403 if a page from elsewhere may have sent the request.
     """
     found = await find_caller(console, connection)
     if found is None:
         raise HTTPException(401, "sign in, or send a valid token", {"WWW-Authenticate": "Bearer"})
     changes = connection.scope.get("method", "GET") not in SAFE_METHODS
     if changes:
-        # Who changes something sees it changed.
+        # A caller that makes a change must see it.
         console.forget()
     if found.by == "session" and changes:
         word = connection.headers.get("x-csrf-token", "")
@@ -239,12 +239,12 @@ Anyone = Annotated[Caller, Depends(caller)]
 
 
 def at_least(role: Role) -> Any:
-    """Return a dependency that lets only some in."""
+    """Return a dependency that admits only a role or higher."""
 
     async def allowed(who: Anyone) -> Caller:
         if who.person.role < role:
             name, mine = who.person.name, who.person.role.name.lower()
-            raise HTTPException(403, f"{name} is {mine}; it needs {role.name.lower()}")
+            raise HTTPException(403, f"{name} is {mine}; this needs {role.name.lower()}")
         return who
 
     return Depends(allowed)
@@ -255,23 +255,23 @@ Engineer = Annotated[Caller, at_least(Role.ENGINEER)]
 
 
 def token_of(console: Console, person: Person) -> int:
-    """Return the token of the command authority that a person has.
+    """Return a person's token of the command authority.
 
     Raises
     ------
     RefusedError
-        If they have none.
+        If the person does not hold it.
     """
     grant = console.operations.plant.authority.grant
     if grant is None:
-        raise RefusedError(f"authority: nobody has it; {person.name} must take it first")
+        raise RefusedError(f"command authority: nobody has it; {person.name} must take it first")
     if grant.holder != person:
-        raise RefusedError(f"authority: {grant.holder.name} has it; take it first")
+        raise RefusedError(f"command authority: {grant.holder.name} has it; take it first")
     return grant.token
 
 
 async def log_in(console: Console, name: str, password: str, address: str) -> tuple[str, float]:
-    """Check a password; return the secret of a new session and when it ends, POSIX s.
+    """Check a password; return the secret of a new session and its end, POSIX s.
 
     Raises
     ------
@@ -287,7 +287,7 @@ async def log_in(console: Console, name: str, password: str, address: str) -> tu
 
 
 async def checked(console: Console, name: str, password: str, address: str) -> Account:
-    """Return the account of somebody who knows its password.
+    """Return the account for a name and password.
 
     Raises
     ------
@@ -299,7 +299,7 @@ async def checked(console: Console, name: str, password: str, address: str) -> A
         seconds = math.ceil(wait)
         raise HTTPException(
             429,
-            f"too many failed log-ins; try again in {seconds} s",
+            f"too many failed sign-ins; try again in {seconds} s",
             {"Retry-After": str(seconds)},
         )
     console.attempts.begin(*keys)

@@ -1,68 +1,28 @@
 """A thin client of the HTTP API: for scripts, and for `heliotrope ctl`."""
 
-import json
-import struct
-from collections.abc import AsyncIterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import AsyncIterator, Sequence
 from types import TracebackType
 from typing import Any
 
 import httpx
-import numpy as np
-import numpy.typing as npt
 
-from heliotrope.console.live import MARK, ROW
-from heliotrope.errors import HeliotropeError
+from heliotrope.console.stream import LiveMessage, RemoteError, read_message
 
-#: Where the console of this machine is.
+#: Address of the console on this machine.
 HERE = "http://127.0.0.1:8080/"
 
 
-class RemoteError(HeliotropeError):
-    """What the console has refused, or why it cannot be reached; ``status`` 0 if it cannot."""
-
-    def __init__(self, text: str, status: int = 0) -> None:
-        super().__init__(text)
-        self.status = status
-
-
-@dataclass(frozen=True)
-class Message:
-    """One message of the live stream: its header, and the rows that it tells of."""
-
-    header: Mapping[str, Any]
-    rows: npt.NDArray[Any]
-
-
-def read_message(data: bytes) -> Message:
-    """Return a message of the live stream.
-
-    Raises
-    ------
-    RemoteError
-        If it is none.
-    """
-    if len(data) < 8 or data[:4] != MARK:
-        raise RemoteError(f"live stream: {len(data)} bytes that do not begin with {MARK.decode()}")
-    (length,) = struct.unpack_from("<I", data, 4)
-    rest = len(data) - 8 - length
-    if rest < 0 or rest % ROW.itemsize:
-        raise RemoteError(f"live stream: {rest} bytes behind a header of {length} are no rows")
-    header = json.loads(data[8 : 8 + length])
-    return Message(header, np.frombuffer(data, ROW, offset=8 + length))
-
-
 class Client:
-    """A connection to a console, as whoever a token belongs to.
+    """A connection to a console.
 
     Parameters
     ----------
     token
-        Of the API; "" for what needs none.
+        Token of the API; "" for routes that need none.
     url
         Address of the console.
     timeout
-        Of each request, s.
+        Time limit of each request, s.
     """
 
     def __init__(self, token: str = "", url: str = HERE, timeout: float = 30.0) -> None:
@@ -85,16 +45,16 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """End it."""
+        """Close the connection."""
         self._http.close()
 
     def ask(self, method: str, path: str, body: Any = None) -> Any:
-        """Send a request to a path below ``/api/v1/``; return what it answers.
+        """Send a request to a path below ``/api/v1/``; return the answer.
 
         Raises
         ------
         RemoteError
-            What the console says against it, or that it cannot be reached.
+            If the console refuses it, or cannot be reached.
         """
         try:
             answer = self._http.request(method, path.lstrip("/"), json=body)
@@ -107,7 +67,7 @@ class Client:
         raise RemoteError(_detail(answer), answer.status_code)
 
     def get(self, path: str) -> Any:
-        """Return what a path tells."""
+        """Return the answer of a path."""
         return self.ask("GET", path)
 
     def command(
@@ -118,7 +78,7 @@ class Client:
         return self.ask("POST", "commands", order)
 
     def sign_in(self, name: str, password: str) -> None:
-        """Begin a session: what follows is done as this person.
+        """Sign in; later requests are made as this person.
 
         Raises
         ------
@@ -128,8 +88,8 @@ class Client:
         who = self.ask("POST", "session", {"name": name, "password": password})
         self._http.headers["X-CSRF-Token"] = who["csrf"]
 
-    async def live(self) -> AsyncIterator[Message]:
-        """Give the messages of the live stream: the whole field, then what has changed.
+    async def live(self) -> AsyncIterator[LiveMessage]:
+        """Yield the messages of the live stream: the whole field, then the changes.
 
         Raises
         ------

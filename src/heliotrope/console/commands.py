@@ -1,8 +1,8 @@
-"""The HTTP API, version 1: what moves the plant.
+"""The HTTP API, version 1: commands.
 
-Every command is given as the person who asks, with the role that the store says they have now, and
-goes through the one command authority; what is accepted has its record in the audit before it is
-sent. EMERGENCY is open to everybody who is signed in; all else needs an operator.
+Every command is given as the caller, with the role that the store has for them now, through the one
+command authority; an accepted command has its record in the audit before it is sent. EMERGENCY is
+open to everybody who is signed in; everything else needs an operator.
 """
 
 import asyncio
@@ -22,7 +22,7 @@ router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 
 def authority_of(console: Console, who: Caller) -> models.AuthorityState:
-    """Return who has the command authority."""
+    """Return the holder of the command authority."""
     authority = console.operations.plant.authority
     grant = authority.grant
     if grant is None:
@@ -38,7 +38,7 @@ def authority_of(console: Console, who: Caller) -> models.AuthorityState:
 async def _told(console: Console) -> None:
     """Wait until a new token is known: clusters hear it with a lease, their nodes a second later.
 
-    Before that, commands would be refused in the field.
+    Until then the field would refuse commands.
     """
     await asyncio.sleep(1.5 * console.operations.plant.settings.period + 1.0)
 
@@ -47,7 +47,7 @@ async def _told(console: Console) -> None:
 async def call_emergency(
     console: Here, who: Anyone, order: models.EmergencyCall | None = None
 ) -> JSONResponse:
-    """Order DEFOCUS (or STOW) of the whole field, with proof; everybody who is signed in may."""
+    """Order DEFOCUS (or STOW) of the whole field, with proof; open to everybody signed in."""
     call = order or models.EmergencyCall()
     console.operations.emergency(who.person, call.act, call.reason)
     return answer(console.operations.emergency_view())
@@ -55,7 +55,7 @@ async def call_emergency(
 
 @router.delete("/emergency", response_model=models.EmergencyView, tags=["safety"])
 async def withdraw_emergency(console: Here, who: Operator) -> JSONResponse:
-    """Take the emergency order back; nothing moves by that."""
+    """Withdraw the emergency order; nothing moves because of it."""
     console.operations.withdraw(who.person)
     return answer(console.operations.emergency_view())
 
@@ -68,13 +68,13 @@ async def acknowledge(console: Here, who: Operator, which: models.Acknowledged) 
 
 @router.get("/authority", response_model=models.AuthorityState, tags=["authority"])
 async def authority(console: Here, who: Anyone) -> models.AuthorityState:
-    """Return who has the command authority."""
+    """Return the holder of the command authority."""
     return authority_of(console, who)
 
 
 @router.post("/authority", response_model=models.AuthorityState, tags=["authority"])
 async def take(console: Here, who: Operator) -> models.AuthorityState:
-    """Take the command authority, or keep it up; the automatic work gives way."""
+    """Take the command authority, or renew it; automatic control gives way."""
     here = console.operations
     grant = here.plant.authority.grant
     if grant is not None and grant.holder == who.person:
@@ -88,7 +88,7 @@ async def take(console: Here, who: Operator) -> models.AuthorityState:
 
 @router.post("/authority/seize", response_model=models.AuthorityState, tags=["authority"])
 async def seize(console: Here, who: Operator, why: models.Reason) -> models.AuthorityState:
-    """Break another's command authority and take it."""
+    """Break another person's command authority and take it."""
     console.operations.seize_authority(who.person, why.reason)
     await _told(console)
     console.present[who.person.name] = time.monotonic()
@@ -97,7 +97,7 @@ async def seize(console: Here, who: Operator, why: models.Reason) -> models.Auth
 
 @router.put("/authority", response_model=models.AuthorityState, tags=["authority"])
 async def keep(console: Here, who: Operator) -> models.AuthorityState:
-    """Keep the command authority up: every few seconds, while somebody is there."""
+    """Renew the command authority: every few seconds, while somebody is present."""
     console.operations.keep_authority(who.person, token_of(console, who.person))
     console.present[who.person.name] = time.monotonic()
     return authority_of(console, who)
@@ -105,7 +105,7 @@ async def keep(console: Here, who: Operator) -> models.AuthorityState:
 
 @router.delete("/authority", response_model=models.AuthorityState, tags=["authority"])
 async def release(console: Here, who: Operator) -> models.AuthorityState:
-    """Give the command authority back; the automatic work goes on."""
+    """Release the command authority; automatic control continues."""
     console.present.pop(who.person.name, None)
     console.operations.release_authority(who.person, token_of(console, who.person))
     return authority_of(console, who)
@@ -131,7 +131,7 @@ async def command(console: Here, who: Operator, order: models.CommandOrder) -> m
         act = here.stow if name == "STOW" else here.defocus
         return console.tickets.put(act(who.person, order.heliostats))
     if name not in OPERATOR_COMMANDS and who.person.role < Role.ENGINEER:
-        raise HTTPException(403, f"{name}: {who.person.name} is operator; it needs engineer")
+        raise HTTPException(403, f"{name}: {who.person.name} is operator; this needs engineer")
     token = token_of(console, who.person)
     if name == "ZERO":
         ticket = zero(here.plant, who.person, token, order.heliostats, order.values)
@@ -143,14 +143,14 @@ async def command(console: Here, who: Operator, order: models.CommandOrder) -> m
 
 @router.get("/commands", response_model=list[models.TicketState], tags=["commands"])
 async def commands(console: Here, who: Anyone) -> list[models.TicketState]:
-    """Return the last commands that came this way, newest first."""
+    """Return the last commands given through the console, newest first."""
     del who
     return console.tickets.last()
 
 
 @router.get("/commands/{identity}", response_model=models.TicketState, tags=["commands"])
 async def one_command(console: Here, who: Anyone, identity: Named) -> models.TicketState:
-    """Return how far a command has come."""
+    """Return the progress of a command."""
     del who
     return console.tickets.get(identity)
 
@@ -178,27 +178,27 @@ async def standby(console: Here, who: Operator, order: models.StandbyOrder) -> m
 
 @router.post("/automatic", status_code=204, tags=["commands"])
 async def automatic(console: Here, who: Operator, whom: models.Whom) -> None:
-    """Give heliostats to the automatic work: it raises and calibrates them."""
+    """Give heliostats to automatic control, which raises and calibrates them."""
     console.operations.give_back(who.person, whom.heliostats)
 
 
 @router.put("/calibration", response_model=models.CalibrationView, tags=["calibration"])
 async def switch(console: Here, who: Operator, to: models.Switch) -> JSONResponse:
-    """Switch the automatic calibration on or off."""
+    """Switch automatic calibration on or off."""
     console.operations.switch_calibration(who.person, to.on)
     return answer(console.operations.calibration())
 
 
 @router.post("/holds", response_model=models.many(models.Hold), tags=["calibration"])
 async def hold(console: Here, who: Operator, order: models.HoldOrder) -> JSONResponse:
-    """Keep heliostats out of calibration."""
+    """Exclude heliostats from calibration."""
     console.operations.hold(who.person, order.heliostats, order.reason)
     return answer(console.operations.holds())
 
 
 @router.post("/holds/release", response_model=models.many(models.Hold), tags=["calibration"])
 async def unhold(console: Here, who: Operator, whom: models.Whom) -> JSONResponse:
-    """Give heliostats back to calibration."""
+    """Return heliostats to calibration."""
     names = whom.heliostats or [one.heliostat for one in console.operations.holds()]
     console.operations.unhold(who.person, names)
     return answer(console.operations.holds())

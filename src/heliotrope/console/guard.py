@@ -1,4 +1,4 @@
-"""What stands before every request: known names only, safe headers, sign-in for the page."""
+"""Checks before every request: known host names only, safe headers, sign-in for the page."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,19 +10,19 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from heliotrope.console.auth import Console, find_caller, host_known
 
-#: Nothing from elsewhere, nothing inline.
+#: Nothing from other origins, nothing inline.
 STRICT = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; font-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'"
 )
-#: The frame of the page is NiceGUI's, whose page holds scripts of its own and compiles templates.
+#: The page's frame is NiceGUI's, which has inline scripts and compiles templates.
 FRAME = (
     "default-src 'none'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; connect-src 'self'; "
     "font-src 'self' data:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 )
-#: Largest body that is taken, bytes: points for every heliostat of a large field.
+#: Largest accepted body, bytes: points for every heliostat of a large field.
 LARGEST = 16 << 20
 
 
@@ -32,16 +32,16 @@ class Guard:
     Parameters
     ----------
     app
-        What it stands before.
+        Application behind it.
     console
-        Gives the console.
+        Returns the console.
     """
 
     def __init__(self, app: ASGIApp, console: Callable[[], Console]) -> None:
         self._app, self._console = app, console
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, if it may pass."""
+        """Pass a request on, if it is allowed."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -67,14 +67,14 @@ class Guard:
     async def _refusal(
         self, console: Console, scope: Scope, headers: Headers
     ) -> tuple[int, str] | None:
-        """Return status and reason for what may not pass."""
+        """Return status and reason for a request that is not allowed."""
         if not host_known(console, headers.get("host", "")):
             return 421, "this machine is not known here by that name; see --name"
         if "transfer-encoding" in headers:
             return 411, "a body is to be sent with its length"
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > LARGEST:
-            return 413, f"at most {LARGEST} bytes are taken"
+            return 413, f"the body is longer than {LARGEST} bytes"
         if scope["path"].startswith("/_nicegui_ws") and (
             await find_caller(console, HTTPConnection(scope)) is None
         ):

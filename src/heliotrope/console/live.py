@@ -1,15 +1,11 @@
-"""The live stream: one message a second, made once for all who look.
+"""The live stream: one message a second, made once for all viewers.
 
-Who comes gets the whole field, then only rows that changed. A message is binary: the mark
-``HLS1``, the length of a header (uint32), the header (JSON, padded with spaces to a multiple of
-4 bytes), then rows of `ROW`; all little-endian. The reference stands in docs/reference/api-http.md.
+A new viewer gets the whole field, then only rows that changed; `stream` holds the messages' form.
 
-A viewer that is slow misses messages, and then gets the whole field again: nothing is queued.
+A slow viewer misses messages, and then gets the whole field again: nothing is queued.
 """
 
 import asyncio
-import json
-import struct
 import time
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -18,26 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.console.models import plain
+from heliotrope.console.stream import ROW, changed, message
 from heliotrope.errors import HeliotropeError
 from heliotrope.lcu import names as meanings
 from heliotrope.plant.operations.operations import Operations
 
-MARK = b"HLS1"
-ROW = np.dtype(
-    [
-        ("row", "<u4"),
-        ("error", "<f4"),
-        ("measured", "<f4"),
-        ("calibrated", "<u4"),
-        ("sightings", "<u2"),
-        ("flags", "<u2"),
-        ("state", "u1"),
-        ("fault", "u1"),
-        ("on", "u1"),
-        ("held", "u1"),
-    ]
-)
-#: Flags that come and go with every step or sun vector: they would make every row change.
+#: Flags that come and go with every step or sun vector, which would change every row.
 _RESTLESS = sum(1 << meanings.FLAGS.index(name) for name in ("MOVING", "SUN_FRESH"))
 #: Health of a cluster as the page colours it.
 WELL, TROUBLED, SILENT = 0, 1, 2
@@ -57,31 +39,15 @@ def rows_of(operations: Operations) -> npt.NDArray[Any]:
     return rows
 
 
-def changed(before: npt.NDArray[Any], after: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the rows of ``after`` that differ; NaN is the same as NaN."""
-    width = ROW.itemsize
-    one = before.view(np.uint8).reshape(-1, width)
-    other = after.view(np.uint8).reshape(-1, width)
-    found: npt.NDArray[Any] = after[(one != other).any(axis=1)]
-    return found
-
-
-def message(header: dict[str, Any], rows: npt.NDArray[Any]) -> bytes:
-    """Return a message of the stream."""
-    text = json.dumps(header, separators=(",", ":"), allow_nan=False).encode()
-    text += b" " * (-len(text) % 4)
-    return MARK + struct.pack("<I", len(text)) + text + rows.tobytes()
-
-
 class Stream:
-    """Makes the messages, and tells who waits that there is a new one.
+    """Makes the messages, and tells the waiting viewers about each.
 
     Parameters
     ----------
     operations
-        What is shown.
+        The plant at work.
     period
-        Between messages, s.
+        Time between messages, s.
     """
 
     def __init__(self, operations: Operations, period: float = 1.0) -> None:
@@ -96,9 +62,9 @@ class Stream:
         self._problem: str = ""
 
     async def run(self) -> None:
-        """Make a message each period, for as long as anybody looks.
+        """Make a message each period while anybody is watching.
 
-        The period is of the people who look: a loop of a simulation may run faster.
+        The period is in the viewers' time: the loop of a simulation may run faster.
         """
         due = time.monotonic()
         while True:
@@ -115,11 +81,11 @@ class Stream:
             rows = rows_of(self._operations)
             header = header_of(self._operations)
         except HeliotropeError as error:
-            # What cannot be read is not shown: the page tells by the age of the last message.
+            # An unreadable plant is not shown: the page judges by the age of the last message.
             self._problem = str(error)
             return
         self.tick += 1
-        # Who joins now may get this one as the whole; it is encoded only if somebody does.
+        # A viewer that joins now may get this one as the whole; it is encoded only if one does.
         header["tick"], header["problem"] = self.tick, self._problem
         news = rows if self._rows is None else changed(self._rows, rows)
         self.news = message({**header, "whole": self._rows is None}, news)
@@ -138,7 +104,7 @@ class Stream:
     async def follow(
         self, send: Callable[[bytes], Any], allowed: Callable[[], Awaitable[bool]]
     ) -> None:
-        """Send to one viewer for as long as they are allowed to look."""
+        """Send to one viewer for as long as they are allowed to watch."""
         self.viewers += 1
         try:
             if self.viewers == 1:
@@ -157,7 +123,7 @@ class Stream:
 
 
 def header_of(operations: Operations) -> dict[str, Any]:
-    """Return what a message tells besides the rows."""
+    """Return the header of a message."""
     summary, light = operations.summary(), operations.sun()
     calibration = operations.calibration()
     quality = calibration.quality[-1] if calibration.quality else None
@@ -190,7 +156,7 @@ def header_of(operations: Operations) -> dict[str, Any]:
 
 
 def _newest(operations: Operations) -> float:
-    """Return when the last event was, POSIX s; 0 before the first."""
+    """Return the time of the last event, POSIX s; 0 before the first."""
     events = operations.events(1)
     return events[0].at if events else 0.0
 
@@ -198,5 +164,5 @@ def _newest(operations: Operations) -> float:
 def _health(row: Any) -> int:
     if not row.alive:
         return SILENT
-    # NaN, not known yet, is no trouble.
+    # NaN, not yet known, is not a problem.
     return TROUBLED if row.live < row.heliostats or row.answered < 0.95 or row.acts else WELL

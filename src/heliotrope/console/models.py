@@ -1,8 +1,7 @@
-"""What goes over HTTP: models of the plant's views, made from them, and of what people send.
+"""Models of the HTTP API: made from the plant's views, and of requests.
 
-The views of `control.operations` are frozen dataclasses of plain values and arrays. Their models
-have the same names and fields, so that there is one description of each. Numbers that are not
-known (NaN, infinite) are null.
+The views of `plant.operations` are frozen dataclasses of plain values and arrays. Their models have
+the same names and fields, so each has one description. Unknown numbers (NaN, infinite) are null.
 """
 
 import dataclasses
@@ -37,7 +36,7 @@ def model_of(view: type) -> type[BaseModel]:
 
 
 def _type(hint: Any) -> Any:
-    """Return the type that JSON holds for that of a field."""
+    """Return the JSON type of a field's type."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if dataclasses.is_dataclass(hint):
         return model_of(typing.cast("type", hint))
@@ -60,7 +59,7 @@ def _type(hint: Any) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold of views: lists, dictionaries, numbers, text; NaN as None."""
+    """Return the JSON values of views: lists, dictionaries, numbers, text; NaN as None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or (isinstance(value, str | bool | int) and not isinstance(value, Enum)):
@@ -79,7 +78,7 @@ def plain(value: Any) -> Any:
 
 
 class Strict(BaseModel):
-    """What people send: nothing else may be in it."""
+    """A request, without any further fields."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -101,7 +100,7 @@ class LogIn(Strict):
 
 
 class Who(BaseModel):
-    """Who asks: the name and role that this plant knows, and how they came in."""
+    """The caller: name and role in this plant, and the way of signing in."""
 
     name: str
     role: str
@@ -137,27 +136,27 @@ class StandbyOrder(Strict):
 
 
 class Reason(Strict):
-    """Why."""
+    """The reason."""
 
     reason: Words
 
 
 class EmergencyCall(Strict):
-    """What the whole field is to do, and why."""
+    """Order for the whole field, and the reason."""
 
     act: Annotated[str, Field(pattern="^(DEFOCUS|STOW)$")] = "DEFOCUS"
     reason: Words = ""
 
 
 class Acknowledged(Strict):
-    """Which alarm."""
+    """The alarm."""
 
     condition: Name
     subject: Words = ""
 
 
 class HoldOrder(Whom):
-    """Heliostats to keep out of calibration, and why."""
+    """Heliostats to exclude from calibration, and the reason."""
 
     heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
     reason: Words
@@ -170,7 +169,7 @@ class Switch(Strict):
 
 
 class NewAccount(Strict):
-    """A person to let in."""
+    """A new account."""
 
     name: Name
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")]
@@ -178,7 +177,7 @@ class NewAccount(Strict):
 
 
 class AccountChange(Strict):
-    """What is to change of an account; null: as it was."""
+    """Changes to an account; null: unchanged."""
 
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")] | None = None
     password: Annotated[str, Field(min_length=10, max_length=200)] | None = None
@@ -186,14 +185,14 @@ class AccountChange(Strict):
 
 
 class OwnPassword(Strict):
-    """One's password, and the new one."""
+    """Your password, and the new one."""
 
     old: Annotated[str, Field(min_length=1, max_length=200)]
     new: Annotated[str, Field(min_length=10, max_length=200)]
 
 
 class GivenPassword(BaseModel):
-    """A password that was made for a person; it is in this answer and nowhere else."""
+    """A password made for a person; it is shown in this answer only."""
 
     name: str
     password: str
@@ -208,7 +207,7 @@ class NewToken(Strict):
 
 
 class TicketState(BaseModel):
-    """How far an accepted command has come."""
+    """Progress of an accepted command."""
 
     identity: str
     command: str
@@ -221,7 +220,7 @@ class TicketState(BaseModel):
 
 
 class AuthorityState(BaseModel):
-    """Who has the command authority."""
+    """Holder of the command authority."""
 
     holder: str
     role: str
@@ -230,14 +229,14 @@ class AuthorityState(BaseModel):
 
 
 class KeepOut(BaseModel):
-    """A volume where no beam may be, as seen on a map."""
+    """A keep-out volume, as seen on a map."""
 
     name: str
     outline: list[tuple[float, float]] = Field(description="East and north of its corners, m")
 
 
 class FieldState(BaseModel):
-    """What does not change of the field, in the order of all its rows."""
+    """Everything about the field that does not change, in the order of all its rows."""
 
     plant: str
     names: list[str]
@@ -255,13 +254,13 @@ class FieldState(BaseModel):
 
 
 class Problem(BaseModel):
-    """Why something was not done."""
+    """Reason of a refusal."""
 
     detail: str | list[Any]
 
 
 class CameraReading(BaseModel):
-    """What the software saw in the last photograph of a target."""
+    """Findings of the software in the last photograph of a target."""
 
     target: str
     version: int = Field(description="Rises with each photograph; 0 before the first")
@@ -271,7 +270,7 @@ class CameraReading(BaseModel):
 
 
 class AccountState(BaseModel):
-    """A person who may come in."""
+    """An account."""
 
     name: str
     role: str

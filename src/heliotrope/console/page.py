@@ -1,8 +1,8 @@
 """The operator page: NiceGUI's frame (head, tabs, command bar), filled by the parts in static/.
 
-The page has no powers of its own: all that it shows comes from the live stream and the API, and all
-that it does goes to the API with the session of the person. EMERGENCY is a plain button with a
-script of its own, outside the frame: it works when the frame does not.
+The page has no powers of its own: everything it shows comes from the live stream and the API, and
+everything it does goes to the API with the person's session. EMERGENCY is a plain button with its
+own script, outside the frame: it works when the frame does not.
 """
 
 from html import escape
@@ -22,12 +22,12 @@ TABS = (
     ("calibration", "Calibration"), ("clusters", "Clusters"), ("alarms", "Alarms"),
     ("logs", "Logs"), ("schedule", "Schedule"),
 )  # fmt: skip
-#: Modules of the page, in the order in which they need each other.
+#: Modules of the page, in order of their dependencies.
 _SCRIPTS = ("live", "dom", "palette", "orders", "map", "panels", "people", "console")
 _EMERGENCY = f"""
 <div id="emergency-box">
   <span id="emergency-said" role="status"></span>
-  <button id="emergency" type="button" title="Takes all beams off the receiver, at once">
+  <button id="emergency" type="button" title="Take all beams off the receiver now">
     EMERGENCY</button>
 </div>
 <script defer src="{KEPT}/emergency.js"></script>
@@ -35,12 +35,12 @@ _EMERGENCY = f"""
 
 
 class View(ui.element, component="static/view.js"):
-    """A part of the page; what is in it is drawn by static/console.js.
+    """A part of the page, drawn by static/console.js.
 
     Parameters
     ----------
     kind
-        Which one.
+        Name of the part.
     """
 
     def __init__(self, kind: str) -> None:
@@ -58,14 +58,14 @@ def attach(app: FastAPI) -> None:
         dark=True,
         tailwind=False,
         show_welcome_message=False,
-        # Nothing of the page runs here: bindings need not be looked at.
+        # No code of the page runs here, so bindings need no polling.
         binding_refresh_interval=None,
         reconnect_timeout=10.0,
     )
 
 
 async def _page(request: Request) -> Response | None:
-    """Return the page, or the way to the log-in."""
+    """Return the page, or redirect to the sign-in."""
     who = await find_caller(request.scope["heliotrope"], request)
     if who is None or who.by != "session":
         return RedirectResponse("/login", 303)
@@ -95,7 +95,7 @@ async def _page(request: Request) -> Response | None:
 
 
 def _menu(who: Caller) -> list[tuple[str, str]]:
-    """Return what a person may do with accounts: title, and name of the part."""
+    """Return a person's tab for accounts: title, and name of the part."""
     own = [("Change password", "password"), ("API tokens", "tokens")]
     return own + [("People", "people")] * (who.person.role >= Role.ENGINEER)
 
@@ -125,7 +125,7 @@ def _head(who: Caller) -> str:
     metas = "".join(
         f'<meta name="{name}" content="{escape(text)}">' for name, text in facts.items()
     )
-    # The page's own scripts come while those of the frame do, and ask for the field at once.
+    # The page's own scripts load while those of the frame do, and ask for the field at once.
     links = "".join(f'<link rel="modulepreload" href="{KEPT}/{name}.js">' for name in _SCRIPTS)
     style = f'<link rel="stylesheet" href="{KEPT}/console.css">'
     return f'{metas}{style}{links}<script type="module" src="{KEPT}/live.js"></script>'

@@ -1,4 +1,4 @@
-"""Who may come in: persons of the store's accounts, and the first of them."""
+"""The people of the console: the store's accounts, and the first of them."""
 
 from heliotrope.console import _secrets
 from heliotrope.plant.authority import Person, Role
@@ -15,7 +15,7 @@ def first_start(people: People, now: float) -> str | None:
     Parameters
     ----------
     people
-        Of the store.
+        Accounts of the store.
     now
         POSIX s.
 
@@ -31,5 +31,5 @@ def first_start(people: People, now: float) -> str | None:
 
 
 def person_of(name: str, role: str) -> Person:
-    """Return who commands."""
+    """Return the account as a person who commands."""
     return Person(name, ROLES[role])

@@ -1,4 +1,4 @@
-"""Runs the console in the plant's own event loop."""
+"""Run the console in the plant's own event loop."""
 
 import asyncio
 import contextlib
@@ -15,7 +15,7 @@ from heliotrope.store.people import People
 
 
 class _Server(uvicorn.Server):
-    """Leaves signals to whoever owns the process: the field is to be stowed before the end."""
+    """Leaves signals to the owner of the process, which stows the field before it ends."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -61,26 +61,26 @@ class ConsoleServer:
         Raises
         ------
         InputError
-            If the address cannot be had.
+            If the address is not available.
         """
         try:
-            # What is there now stays. A look of the collector through the objects of 10,000
-            # heliostats holds the loop for up to a second, and comes every ten seconds.
+            # Freeze the existing objects: every ten seconds the collector would walk through those
+            # of 10,000 heliostats and hold the loop for up to a second.
             gc.freeze()
             await self._server.serve()
         except SystemExit:
-            # uvicorn's way to say that it could not begin.
+            # uvicorn's way of saying that it could not start.
             raise InputError(
-                f"console: {self.settings.host} port {self.settings.port} cannot be had; another "
-                "program may use it, choose another with --port"
+                f"console: {self.settings.host} port {self.settings.port} is not "
+                "available; another program may use it, choose another with --port"
             ) from None
 
     async def close(self) -> None:
-        """End it; who looks is disconnected."""
+        """Stop serving; viewers are disconnected."""
         self._server.should_exit = True
 
     async def address(self, within: float = 30.0) -> str:
-        """Wait until it listens; return its address.
+        """Wait until the console listens; return its address.
 
         Raises
         ------

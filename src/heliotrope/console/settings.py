@@ -9,35 +9,35 @@ from heliotrope.errors import InputError
 
 @dataclass(frozen=True)
 class ConsoleSettings:
-    """Where the console listens and how strict it is.
+    """Where the console listens, and how strict it is.
 
     Attributes
     ----------
     host, port
-        Address it binds to; port 0 takes a free one.
+        Address to bind; port 0 takes a free one.
     names
-        Further names that people may write into the browser for this machine. A request for any
-        other name is refused, since a page from elsewhere may resolve its own name to this one.
+        Further names for this machine in a browser's address bar. A request for any other name is
+        refused, since a page from elsewhere may resolve its own name to this machine.
     certificate, key
-        Files of a TLS certificate and its key, PEM; None: plain HTTP.
+        TLS certificate and its key, PEM files; None: plain HTTP.
     session_s
-        How long a person stays signed in, s.
+        Length of a session, s.
     failures, failures_s
-        Failed log-ins from one address or of one name that are let through within a span, s.
+        Failed sign-ins allowed from one address or for one name within a span, s.
     period
-        Between two messages of the live stream, s.
+        Time between messages of the live stream, s.
     viewers
-        Live streams at once.
+        Largest number of concurrent live streams.
     page
-        Whether the operator page is served; if not, only the API is.
+        Whether to serve the operator page beside the API.
     plain
-        Whether it may be reached from other machines without TLS: behind a proxy that has it.
+        Whether other machines may connect without TLS, behind a proxy that has it.
 
     Raises
     ------
     InputError
-        A port that none is, a key without certificate, a time that is not above 0; an address
-        other than this machine's own without TLS.
+        An invalid port, a key without a certificate, a time that is not above 0; an address other
+        than this machine's own without TLS.
     """
 
     host: str = "127.0.0.1"
@@ -70,12 +70,12 @@ class ConsoleSettings:
 
     @property
     def tls(self) -> bool:
-        """Whether it speaks TLS itself."""
+        """Whether the console itself speaks TLS."""
         return self.certificate is not None
 
     @property
     def local(self) -> bool:
-        """Whether only this machine reaches it."""
+        """Whether only this machine can connect."""
         if self.host == "localhost":
             return True
         try:
@@ -85,10 +85,10 @@ class ConsoleSettings:
 
     @property
     def hosts(self) -> frozenset[str]:
-        """Names that a request may be for."""
+        """Host names that a request may carry."""
         return frozenset({"127.0.0.1", "localhost", "[::1]", "::1", self.host, *self.names})
 
     def address(self, port: int) -> str:
-        """Return the address to write into a browser."""
+        """Return the address for a browser."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return f"{'https' if self.tls else 'http'}://{host}:{port}/"

@@ -1,4 +1,4 @@
-"""The last commands that came through the console, to be asked after."""
+"""The last commands given through the console."""
 
 from collections import OrderedDict
 
@@ -6,7 +6,7 @@ from heliotrope.console.models import TicketState
 from heliotrope.errors import UnknownNameError
 from heliotrope.plant.tickets import Ticket
 
-#: Tickets that are kept; those of whole fields are large.
+#: Number of tickets kept; those of whole fields are large.
 KEPT = 200
 
 
@@ -17,14 +17,14 @@ class Tickets:
         self._kept: OrderedDict[str, Ticket] = OrderedDict()
 
     def put(self, ticket: Ticket) -> TicketState:
-        """Keep a ticket; return how far it has come."""
+        """Keep a ticket; return its progress."""
         self._kept[ticket.identity] = ticket
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return state_of(ticket)
 
     def get(self, identity: str) -> TicketState:
-        """Return how far a command has come.
+        """Return the progress of a command.
 
         Raises
         ------
@@ -37,12 +37,12 @@ class Tickets:
         return state_of(ticket)
 
     def last(self, limit: int = 50) -> list[TicketState]:
-        """Return the last ones, newest first."""
+        """Return the last tickets, newest first."""
         return [state_of(ticket) for ticket in list(self._kept.values())[: -limit - 1 : -1]]
 
 
 def state_of(ticket: Ticket) -> TicketState:
-    """Return how far a command has come."""
+    """Return the progress of a command."""
     return TicketState(
         identity=ticket.identity,
         command=ticket.name,

@@ -7,7 +7,7 @@ import * as people from "./people.js";
 import { bar, say, whoCommands } from "./orders.js";
 import { count, degrees, h, span } from "./dom.js";
 
-const ready = store.begun.catch((error) => say(`the plant cannot be read: ${error.message}`, true));
+const ready = store.begun.catch((error) => say(`no data from the plant: ${error.message}`, true));
 
 function map(box) {
   const view = h("select", { title: "Colour by (V)", onchange: () => store.emit("view", view.value) },
@@ -16,7 +16,7 @@ function map(box) {
   const all = h("button", { className: "hx-button", title: "Show the whole field (0)", onclick: () => store.emit("fit") }, "Whole");
   const none = h("button", { className: "hx-button", title: "Clear (Escape)", onclick: () => store.select([], -1) }, "Clear");
   const query = h("input", { type: "search", className: "hx-query", spellcheck: false, "aria-label": "Query",
-    placeholder: "state = TRACKING and error > 1", title: "Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Signs: = != < > <= >= ~ (pattern with *). Press / to come here." });
+    placeholder: "state = TRACKING and error > 1", title: "Fields: state, error, measured (mrad), age (h), sightings, fault, cluster, name, on, east, north. Operators: = != < > <= >= ~ (pattern with *). Press / to type here." });
   const run = () => { try { const rows = rowsWhere(query.value); store.select(rows, rows.length === 1 ? rows[0] : -1); say(`${count(rows.length)} heliostats match`); } catch (error) { say(error.message, true); } };
   query.addEventListener("keydown", (event) => { if (event.key === "Enter") run(); event.stopPropagation(); });
   const field = h("div", { className: "hx-map-field" });
@@ -55,7 +55,7 @@ function badge(box) {
 
 function alert(box) {
   const text = h("span"), back = h("button", { className: "hx-button", onclick: async () => {
-    try { await api("DELETE", "emergency"); say("emergency withdrawn; acknowledge the alarms that it left"); } catch (error) { say(error.message, true); }
+    try { await api("DELETE", "emergency"); say("emergency withdrawn; acknowledge the alarms that remain"); } catch (error) { say(error.message, true); }
   } }, "Withdraw");
   box.append(text, me.role === "viewer" ? "" : back);
   new ResizeObserver(() => document.body.style.setProperty("--alert", `${box.offsetHeight}px`)).observe(box);

@@ -160,7 +160,7 @@ export function parseQuery(text) {
     const word = raw.replace(/"/g, "").toUpperCase();
     const number = typeof get(0) === "number";
     const value = number && sign !== "~" ? (word === "NEVER" ? NaN : Number(word)) : word;
-    if (number && word !== "NEVER" && Number.isNaN(value)) throw new Error(`${field}: "${raw}" is no number`);
+    if (number && word !== "NEVER" && Number.isNaN(value)) throw new Error(`${field}: "${raw}" is not a number`);
     either.at(-1).push(Number.isNaN(value)
       ? (row) => Number.isNaN(get(row)) === (sign === "=") : (row) => OPERATORS[sign](get(row), value));
     rest = rest.slice(whole.length);
@@ -169,7 +169,7 @@ export function parseQuery(text) {
     if (joint[1].toLowerCase() === "or") either.push([]);
     rest = rest.slice(joint[0].length);
   }
-  if (rest.trim()) throw new Error(`"${rest.trim()}" is too much; join with "and" or "or"`);
+  if (rest.trim()) throw new Error(`"${rest.trim()}" is unexpected; join conditions with "and" or "or"`);
   return (row) => either.some((all) => all.every((holds) => holds(row)));
 }
 

@@ -32,7 +32,7 @@ function whom() {
     const places = new Set(rows.map((row) => store.field.cluster[row]));
     rows = store.field.cluster.flatMap((c, row) => (places.has(c) ? [row] : []));
   }
-  if (!rows.length) throw new Error("nothing is selected; click a heliostat, draw a lasso or write a query");
+  if (!rows.length) throw new Error("nothing selected: click a heliostat, draw a lasso or type a query");
   const names = rows.map((row) => store.field.names[row]);
   return { names, text: names.length === 1 ? names[0] : `${count(names.length)} heliostats` };
 }
@@ -51,9 +51,9 @@ async function order(name, title, make, fields, sure) {
 // Declares where the axes stand: nothing moves, but all that it does afterwards hangs on it.
 async function zero() {
   const rows = [...store.selection];
-  if (rows.length !== 1) { say("Zero: select one heliostat; the counts of one are not those of another", true); return; }
+  if (rows.length !== 1) { say("Zero: select exactly one heliostat; counts differ from one to the next", true); return; }
   const name = store.field.names[rows[0]];
-  const v = await ask(`Declare where ${name} stands? It must be locked; its controller stores the counts.`, [
+  const v = await ask(`Declare the position of ${name}? It must be locked; its controller stores the counts.`, [
     { name: "primary", label: "Primary axis (steps)", type: "number", value: "0" },
     { name: "secondary", label: "Secondary axis (steps)", type: "number", value: "0" }], "Declare and store");
   if (v) await act(() => api("POST", "commands", { command: "ZERO", heliostats: [name], values: [Number(v.primary), Number(v.secondary)] }), `Zero ${name}`);
@@ -77,9 +77,9 @@ const ORDERS = [
     [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
   ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
   ["Zero…", "", zero, "engineer"],
-  ["Hold…", "", () => order("HOLD", "Hold back from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
-    [{ name: "reason", label: "Why" }]), "free"],
-  ["Automatic", "", () => order("AUTO", "Give to the automatic work", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],
+  ["Hold…", "", () => order("HOLD", "Exclude from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
+    [{ name: "reason", label: "Reason" }]), "free"],
+  ["Automatic", "", () => order("AUTO", "Give to automatic control", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],
 ];
 
 export function bar(box) {
@@ -87,10 +87,10 @@ export function bar(box) {
   new ResizeObserver(() => document.body.style.setProperty("--foot", `${box.parentElement.offsetHeight}px`)).observe(box);
   const said = h("div", { className: "hx-said", role: "status" });
   if (me.role === "viewer") {
-    box.append(h("span", { className: "hx-hint" }, "You look only. EMERGENCY is open to everybody."), said);
+    box.append(h("span", { className: "hx-hint" }, "View only. EMERGENCY is open to everybody."), said);
   } else {
-    const to = h("select", { title: "To whom (T)", onchange: () => { scope = to.value; mark(); } },
-      h("option", { value: "selection" }, "Selection"), h("option", { value: "cluster" }, "Their clusters"), h("option", { value: "field" }, "Whole field"));
+    const to = h("select", { title: "Scope (T)", onchange: () => { scope = to.value; mark(); } },
+      h("option", { value: "selection" }, "Selection"), h("option", { value: "cluster" }, "Clusters of the selection"), h("option", { value: "field" }, "Whole field"));
     const buttons = ORDERS.filter(([, , , kind]) => kind !== "engineer" || me.role === "engineer")
       .map(([title, key, go, kind]) => [h("button", { className: `hx-button ${kind === "safe" ? "safe" : ""}`, title: key ? `Alt+${key}` : "", onclick: go }, title), kind]);
     const mark = () => {
@@ -101,7 +101,7 @@ export function bar(box) {
         button.disabled = !may || (scope !== "field" && !n);
       }
     };
-    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "To ", to), buttons.map(([button]) => button)), said);
+    box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "Scope ", to), buttons.map(([button]) => button)), said);
     store.on("selection", mark); store.on("authority", mark);
     document.addEventListener("keydown", (event) => {
       const found = event.altKey && ORDERS.find(([, key]) => key && event.code === `Key${key}`);
@@ -121,7 +121,7 @@ export function whoCommands(box) {
     if (store.mine) return act(() => api("DELETE", "authority"), "authority");
     const other = head.holder && head.holder !== me.name && head.holder !== "automat";
     if (!other) return act(() => api("POST", "authority"), "authority");
-    const why = await ask(`${head.holder} has the command. Break it?`, [{ name: "reason", label: "Why" }], "Break and take");
+    const why = await ask(`${head.holder} has command. Break it?`, [{ name: "reason", label: "Reason" }], "Break and take");
     return why ? act(() => api("POST", "authority/seize", { reason: why.reason }), "authority") : null;
   };
   button.addEventListener("click", async () => { await take(); kept = 0; });
@@ -129,9 +129,9 @@ export function whoCommands(box) {
   const show = (head) => {
     const mine = head.holder === me.name && head.role === me.role;
     if (mine !== store.mine) { store.mine = mine; store.emit("authority", mine); }
-    text.textContent = mine ? "You command" : head.holder ? `${head.holder} commands` : "Nobody commands";
+    text.textContent = mine ? "You have command" : head.holder ? `${head.holder} has command` : "Nobody has command";
     text.className = mine ? "good" : "";
-    button.textContent = mine ? "Give back" : "Take command";
+    button.textContent = mine ? "Release" : "Take command";
     // Kept up only while somebody has this page before them.
     if (mine && !document.hidden && performance.now() - kept > 4000) {
       kept = performance.now();

@@ -49,7 +49,7 @@ export const VIEWS = {
     title: "Health of the cluster",
     of: (row) => store.live ? (store.head?.clusters?.[store.field.cluster[row]] ?? 3) : 3,
     colours: () => [colourOf("TRACKING"), colourOf("DEFOCUSED"), colourOf("FAULT"), colourOf("stale")],
-    legend: () => ["well", "bad frames or nodes missing", "silent", "not known"]
+    legend: () => ["healthy", "bad frames or nodes missing", "silent", "unknown"]
       .map((name, i) => ({ name, colour: VIEWS.cluster.colours()[i] })),
   },
 };

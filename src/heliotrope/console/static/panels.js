@@ -13,7 +13,7 @@ export function plant(box) {
   const name = store.field.receivers[0];
   const figures = h("div");
   box.append(h("h3", {}, "Heliostats"), states, proof, h("h3", {}, "Sun"), light,
-    ...(name ? [h("h3", {}, `Predicted light on ${name}`), figures, flux] : []));
+    ...(name ? [h("h3", {}, `Predicted flux on ${name}`), figures, flux] : []));
   let seen = null;
   const show = () => {
     const head = store.head;
@@ -23,7 +23,7 @@ export function plant(box) {
       const bar = h("i"); bar.style.width = `${Math.max(1, (100 * n) / most)}%`; bar.style.background = colourOf(state);
       return h("div", {}, h("span", {}, state), h("b", {}, bar), h("em", {}, count(n)));
     })), facts([["Clusters heard", `${count(head.clusters_alive)} of ${count(store.field.clusters.length)}`],
-      ["Wait to join the receiver", count(head.waiting)],
+      ["Waiting to join the receiver", count(head.waiting)],
       ["Calibrated", `${count(head.calibration.done)} of ${count(most)}`],
       ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
@@ -90,22 +90,22 @@ export function heliostat(box) {
 }
 
 function heliostatView(one) {
-  const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none given" : p.map((v) => number(v, 1)).join(", "));
+  const stale = one.live ? "" : "hx-stale", point = (p) => (p[0] === null ? "none" : p.map((v) => number(v, 1)).join(", "));
   return [
     h("h2", { className: stale }, one.name, h("span", { className: "hx-chip" }, one.live ? one.state : `stale: ${span(one.age)} old`)),
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
-      ["Fault", one.live ? one.fault : "not known", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
+      ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
       ["Stands at E, N, U (m)", one.position.map((v) => number(v, 1)).join(", ")], ["Mirror", `${number(one.width, 1)} × ${number(one.height, 1)} m`],
       ["Predicted error", one.error === null ? "never calibrated" : `${mrad(one.error)} mrad`],
       one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
-      ["Supply", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
+      ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
       ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
-      one.hold ? ["Held back", one.hold, "warn"] : null]),
+      one.hold ? ["On hold", one.hold, "warn"] : null]),
     h("h3", {}, "Drives"),
     one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
       ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
-      one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "not known while it is stale"),
+      one.drives.map((d, i) => ({ ...d, axis: ["primary", "secondary"][i] }))) : h("p", { className: "hx-hint" }, "unknown while stale"),
     h("h3", {}, "Parameters"),
     table([["Name", (p) => p[0]], ["Value", (p) => parameter(p[1].value, p[1].unit), "num"], ["σ", (p) => parameter(p[1].sigma, p[1].unit), "num"],
       ["Nominal", (p) => parameter(p[1].nominal, p[1].unit), "num"], ["", (p) => (p[1].unit === "rad" ? "mrad" : p[1].unit)]], Object.entries(one.parameters)),
@@ -145,11 +145,11 @@ export function calibration(box) {
     body.replaceChildren(
       h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "At work" : `Off: ${view.reason}`),
         canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
-      facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Without success", count(view.failed)]]),
-      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement goes on now")),
+      facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
+      h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress")),
       h("h3", {}, "Error of the calibrated heliostats (mrad)"), lines,
-      h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("nine of ten below", colourOf("APPROACHING"), true),
-        truth ? [key("true (twin), median", colourOf("SEARCHING")), key("nine of ten below", colourOf("SEARCHING"), true)] : ""),
+      h("p", { className: "hx-keys" }, key("predicted, median", colourOf("APPROACHING")), key("90th percentile", colourOf("APPROACHING"), true),
+        truth ? [key("true (twin), median", colourOf("SEARCHING")), key("90th percentile", colourOf("SEARCHING"), true)] : ""),
       h("h3", {}, "Last measurements"),
       table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
         ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
@@ -172,7 +172,7 @@ export function clusters(box) {
     const rank = (r) => (r.alive ? (r.live < r.heliostats ? 1 : 2) : 0);
     rows.sort((a, b) => rank(a) - rank(b) || a.name.localeCompare(b.name));
     body.replaceChildren(facts([["Heard", `${rows.filter((r) => r.alive).length} of ${rows.length}`]]),
-      table([["Cluster", (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? "● well" : "▲ missing") : "✕ silent")],
+      table([["Cluster", (r) => r.name], ["", (r) => h("span", { className: r.alive ? (rank(r) === 2 ? "good" : "warn") : "bad" }, r.alive ? (rank(r) === 2 ? "● healthy" : "▲ degraded") : "✕ silent")],
         ["Heliostats", (r) => `${r.live}/${r.heliostats}`, "num"], ["Heard", (r) => (r.age === null ? "never" : `${number(r.age, 1)} s`), "num"],
         ["Poll (ms)", (r) => number(r.cycle === null ? null : 1e3 * r.cycle, 0), "num"], ["Answered", (r) => (r.answered === null ? "–" : `${number(100 * r.answered, 1)} %`), "num"],
         ["Lease (s)", (r) => number(r.lease_left, 1), "num"], ["Clock", (r) => r.time_quality], ["", (r) => [r.acts.join(", "), r.problem].filter(Boolean).join("; ")]],
@@ -193,7 +193,7 @@ export function alarms(box) {
       ["Time", (r) => clock(r.at)], ["What", (r) => h("div", {}, h("b", {}, r.condition, r.subject ? ` · ${r.subject}` : ""), h("div", { className: "hx-hint" }, r.text))],
       ["", (r) => (r.active ? "active" : "over")],
       ["", (r) => (r.acknowledged_by ? `✓ ${r.acknowledged_by}` : canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }), "acknowledge") }, "Acknowledge") : "not acknowledged")],
-      ["×", (r) => r.count, "num"]], rows) : h("p", { className: "hx-hint" }, "No alarm so far."));
+      ["×", (r) => r.count, "num"]], rows) : h("p", { className: "hx-hint" }, "No alarms."));
   }, { key: () => store.head?.alarms, every: 4 });
 }
 
@@ -224,10 +224,10 @@ export function schedule(box) {
     const [plan, holds] = await Promise.all([api("GET", "schedule?limit=50"), api("GET", "holds")]);
     body.replaceChildren(h("h3", {}, "Next measurements"),
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
-        : h("p", { className: "hx-hint" }, "Nothing is planned."),
-      h("h3", {}, "Held back from calibration"),
+        : h("p", { className: "hx-hint" }, "No measurement is planned."),
+      h("h3", {}, "Excluded from calibration"),
       holds.length ? table([["Heliostat", (r) => r.heliostat], ["By", (r) => r.who], ["Since", (r) => clock(r.since)], ["Why", (r) => r.reason],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "unhold") }, "Give back") : "")]], holds)
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "unhold") }, "Release") : "")]], holds)
         : h("p", { className: "hx-hint" }, "None."));
   }, { every: 5 });
 }

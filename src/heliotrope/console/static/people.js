@@ -34,20 +34,20 @@ export const people = () => open("People", async (done) => {
     : h("select", { "aria-label": `Role of ${one.name}`, onchange: (event) => done(async () => { await api("PATCH", path(one.name), { role: event.target.value }); return `${one.name}: ${event.target.value}`; }) },
       ROLES.map((name) => h("option", { value: name, selected: name === one.role }, name))));
   const acts = (one) => (one.name === me.name ? h("span", { className: "hx-hint" }, "you") : h("div", { className: "hx-orders" },
-    button(one.disabled ? "Let in" : "Keep out", () => done(async () => { await api("PATCH", path(one.name), { disabled: !one.disabled }); return `${one.name} is ${one.disabled ? "let in" : "kept out"}`; })),
+    button(one.disabled ? "Enable" : "Disable", () => done(async () => { await api("PATCH", path(one.name), { disabled: !one.disabled }); return `${one.name} is ${one.disabled ? "enabled" : "disabled"}`; })),
     button("New password", () => done(async () => {
       if (!await ask(`Make a new password for ${one.name}? The old one and all sessions end.`, [], "Make")) return "";
       return once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`)).password);
     }))));
   const add = button("Add…", () => done(async () => {
-    const given = await ask("A person to let in", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
-      { name: "password", label: "Password (10 letters at least)", type: "password" }], "Let in");
+    const given = await ask("New account", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
+      { name: "password", label: "Password (at least 10 characters)", type: "password" }], "Make account");
     if (!given) return "";
     await api("POST", "accounts", given);
-    return `${given.name} is let in as ${given.role}`;
+    return `account ${given.name} made, ${given.role}`;
   }));
   return [table([["Name", (r) => r.name], ["Role", role], ["Since", (r) => day(r.created)],
-    ["", (r) => h("span", { className: r.disabled ? "warn" : "good" }, r.disabled ? "kept out" : "may come in")], ["", acts]], rows), h("div", { className: "hx-row" }, add)];
+    ["", (r) => h("span", { className: r.disabled ? "warn" : "good" }, r.disabled ? "disabled" : "enabled")], ["", acts]], rows), h("div", { className: "hx-row" }, add)];
 });
 
 export const tokens = () => open("API tokens", async (done) => {
@@ -58,19 +58,19 @@ export const tokens = () => open("API tokens", async (done) => {
     return `${one.label} is revoked`;
   }));
   const make = button("Make…", () => done(async () => {
-    const given = await ask("A token for a program", [{ name: "label", label: "What it is for" },
+    const given = await ask("New token for a program", [{ name: "label", label: "Purpose" },
       { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "90" }], "Make");
     return given ? once(`Secret of ${given.label}`, (await api("POST", "tokens", { ...given, days: Number(given.days) })).secret) : "";
   }));
   return [rows.length ? table([["For", (r) => r.label], ["Of", (r) => r.name], ["Role", (r) => r.role], ["Until", (r) => day(r.expires)],
-    ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "There is none."), h("div", { className: "hx-row" }, make)];
+    ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "No token."), h("div", { className: "hx-row" }, make)];
 });
 
 export async function password() {
-  const given = await ask("Change your password; you sign in anew", [{ name: "old", label: "Present password", type: "password" },
-    { name: "new", label: "New password (10 letters at least)", type: "password" }, { name: "again", label: "New password again", type: "password" }], "Change");
+  const given = await ask("Change your password; you sign in again afterwards", [{ name: "old", label: "Current password", type: "password" },
+    { name: "new", label: "New password (at least 10 characters)", type: "password" }, { name: "again", label: "New password again", type: "password" }], "Change");
   if (!given) return;
-  if (given.new !== given.again) { say("password: the two new ones differ; nothing was changed", true); return; }
+  if (given.new !== given.again) { say("password: the two new passwords differ; nothing was changed", true); return; }
   try {
     await api("PUT", "session/password", { old: given.old, new: given.new });
     location.assign("/login");
