@@ -12,9 +12,10 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from heliotrope.airborne.evaluate import campaign
-from heliotrope.airborne.evaluate.campaign import Campaign, Pose
+from heliotrope.airborne.evaluate import campaign, reading
+from heliotrope.airborne.evaluate.campaign import Campaign
 from heliotrope.airborne.evaluate.detection import decode
+from heliotrope.airborne.evaluate.folder import FlightData, natural_key
 from heliotrope.airborne.evaluate.reading import Seen
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import LedCamera, read_photos
@@ -22,7 +23,6 @@ from heliotrope.airborne.plan.stations import read_stations
 from heliotrope.airborne.simulate.rendering import write_photo
 from heliotrope.airborne.simulate.simulation import Errors, hover_grid, install, look_counts
 from heliotrope.airborne.standing import Standing
-from heliotrope.cli.drone.evaluate import _far_off, _natural
 from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
 from heliotrope.cli.drone.simulate import simulate as simulate_command
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -169,7 +169,7 @@ def test_campaign_gives_one_table(flown: Path, tmp_path) -> None:
 def test_flights_stand_in_the_order_of_their_numbers() -> None:
     names = ["C10-1", "C1-10", "C1-2", "C1-1b", "C2-1", "C1-1", "dusk", "7"]
     wanted = ["7", "C1-1", "C1-1b", "C1-2", "C1-10", "C2-1", "C10-1", "dusk"]
-    assert sorted(names, key=_natural) == wanted
+    assert sorted(names, key=natural_key) == wanted
 
 
 def spoil(shot: Path) -> None:
@@ -212,7 +212,7 @@ def test_what_is_wrong_with_a_flight_does_not_stop_the_others(flown: Path, tmp_p
         ("C1-2", "DJI_0001.JPG", "its XMP lacks GpsLatitude"),
         ("C1-2", "DJI_0002.JPG", "unreadable: ", "it breaks off after 9000 bytes"),
         ("C1-2", "DJI_0003.JPG", "nothing: "),
-        ("C1-2", "DJI_0004.JPG", "overexposed: 100 % of it are clipped"),
+        ("C1-2", "DJI_0004.JPG", "overexposed: 100 % of it is clipped"),
         ("C1-1", "DJI_0009.JPG", "640 × 300 px, but most photographs have 640 × 480 px"),
         ("C1-7", "camera.toml", "there is no such file"),
         ("away", "DJI_0001.JPG", "wrong_field: no mirror of the field can be in it"),
@@ -232,9 +232,7 @@ def test_what_is_wrong_with_a_flight_does_not_stop_the_others(flown: Path, tmp_p
 
 
 def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> None:
-    from heliotrope.airborne.evaluate import evaluation
-
-    read, calls = evaluation.read_photo, []
+    read, calls = reading.read_photo, []
 
     def counted(photo, *rest):
         calls.append(photo.name)
@@ -242,7 +240,7 @@ def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> N
             raise KeyboardInterrupt
         return read(photo, *rest)
 
-    monkeypatch.setattr(evaluation, "read_photo", counted)
+    monkeypatch.setattr(reading, "read_photo", counted)
     common = (
         "evaluate",
         flown / "shot",
@@ -265,18 +263,20 @@ def test_interrupted_evaluation_goes_on(flown: Path, tmp_path, monkeypatch) -> N
 
 def test_an_offset_far_beyond_what_was_said_is_told() -> None:
     found = Campaign((), (), np.array([0.02, -0.4, 0.01]), np.eye(3) * 1e-6, 1)
-    assert "offset is 400 mm, --rtk-mm 30" in _far_off(found, 0.030)[0]
-    assert _far_off(found, 0.5) == []
+    assert "offset is 400 mm, its standard deviation was given as 30 mm" in found.warnings(0.03)[0]
+    assert found.warnings(0.5) == []
 
 
-def bare(name: str, heliostats: list[int], lens: LedCamera) -> Pose:
+def bare(name: str, heliostats: list[int], lens: LedCamera) -> FlightData:
     """A flight whose one photograph shows all corners of its heliostats."""
     count = len(heliostats)
     seen = Seen(name, mirror=np.arange(count), corners=np.zeros((count, 4, 2)))
     stand = Standing(
         ("",) * count, np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 4, 3))
     )
-    return Pose(name, (), (seen,), lens, stand, np.array(heliostats), lambda _: ideal(MIRRORS, 0))
+    shapes = (ideal(MIRRORS, 0),) * count
+    rows = np.array(heliostats)
+    return FlightData(name, (), lens, stand, rows, np.zeros((count, 2)), shapes, seen=(seen,))
 
 
 def test_flights_that_share_heliostats_go_together(monkeypatch) -> None:
@@ -286,10 +286,10 @@ def test_flights_that_share_heliostats_go_together(monkeypatch) -> None:
         bare("d", [2, 3], lens), bare("e", [0, 1], other), bare("f", [6], lens),
     ]  # fmt: skip
     # d shares none with a, but both do with c; another camera is adjusted by itself.
-    assert campaign._groups(poses, range(6)) == [[0, 2, 3], [1, 5], [4]]
+    assert campaign.flight_groups(poses, range(6)) == [[0, 2, 3], [1, 5], [4]]
     # Three flights of 8 corners each are too many for one adjustment of 20.
     monkeypatch.setattr(campaign, "MOST_CORNERS", 20)
-    assert campaign._groups(poses, [0, 2, 3]) == [[0, 3], [2]]
+    assert campaign.flight_groups(poses, [0, 2, 3]) == [[0, 3], [2]]
 
 
 def test_offsets_of_groups_count_as_they_are_known() -> None:
@@ -301,6 +301,6 @@ def test_offsets_of_groups_count_as_they_are_known() -> None:
             adjusted=SimpleNamespace(state=state, offset_covariance=known * np.eye(3))
         )
 
-    offset, covariance = campaign._common([one(0.030, 0.004), one(0.020, 0.008)], 1.0)
+    offset, covariance = campaign.common_offset([one(0.030, 0.004), one(0.020, 0.008)], 1.0)
     np.testing.assert_allclose(offset, 0.8 * 0.030 + 0.2 * 0.020, rtol=1e-3)
     np.testing.assert_allclose(np.diag(covariance), 1.0 / (1 / 0.004**2 + 1 / 0.008**2), rtol=1e-3)

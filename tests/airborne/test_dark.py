@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from heliotrope.airborne.evaluate._dark import expected_feet
 from heliotrope.airborne.evaluate.bundle import Priors
-from heliotrope.airborne.evaluate.campaign import Pose, evaluate_campaign
+from heliotrope.airborne.evaluate.campaign import evaluate_campaign
 from heliotrope.airborne.evaluate.evaluation import evaluate
+from heliotrope.airborne.evaluate.folder import FlightData
+from heliotrope.airborne.evaluate.identification import expected_feet
 from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
 from heliotrope.airborne.evaluate.reading import Seen, look
 from heliotrope.airborne.evaluate.reflections import Reflections
@@ -107,7 +108,9 @@ def test_feet_are_where_flat_mirrors_show_the_lamp(night: Night) -> None:
 def test_a_dark_flight_stands_beside_the_others(night: Night) -> None:
     flown = night.flown
     heliostats = np.arange(20)
-    dark = Pose("dark", flown.told, night.seen, flown.camera, night.stand, heliostats, night.shape)
+    shapes = tuple(night.shape(row) for row in range(20))
+    field = (flown.camera, night.stand, heliostats, flown.counts, shapes)
+    dark = FlightData("dark", flown.told, *field, seen=night.seen)
     broken = tuple(Seen(s.name, "nothing: at all") for s in night.seen)
     found = evaluate_campaign([dark, replace(dark, name="none", seen=broken)], PRIORS)
     assert found.flights[0] is not None
@@ -121,8 +124,8 @@ def test_too_few_lights_say_so(night: Night) -> None:
         replace(s, spot_mirror=s.spot_mirror[:1], spot=s.spot[:1], spot_sigma=s.spot_sigma[:1])
         for s in night.seen[:1]
     ]
-    with pytest.raises(InputError, match="1 mirrors show the lamp: 4 are needed"):
+    with pytest.raises(InputError, match="1 mirrors show the lamp; 4 are needed"):
         evaluate(night.flown.told[:1], few, night.flown.camera, night.stand, night.shape)
     black = np.zeros((480, 640, 3), np.uint8)
     one = look(black, night.flown.told[0], night.flown.camera, night.stand)
-    assert one.problem == "nothing: it is dark, and 0 lights are seen, 4 are needed"
+    assert one.problem == "nothing: it is dark and shows 0 lights, 4 are needed"

@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from heliotrope.airborne.evaluate import evaluation
+from heliotrope.airborne.evaluate import evaluation, reading, rtk
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.detection import decode, find_outlines, find_patches, find_spots
 from heliotrope.airborne.evaluate.identification import identify
@@ -53,7 +53,7 @@ def case(tmp_path_factory) -> Case:
     photos, problems = read_photos(folder, ORIGIN)
     assert problems == ()
     stand = standing(flown.heliostats, flown.counts)
-    seen = evaluation.read_many(photos, read_camera(folder / "camera.toml"), stand)
+    seen = reading.read_many(photos, read_camera(folder / "camera.toml"), stand)
     return Case(folder, flown, exact, photos, stand, seen)
 
 
@@ -142,7 +142,7 @@ def test_orientations_are_those_of_the_truth(case: Case) -> None:
 
 def test_what_was_read_is_not_read_again(case: Case, tmp_path, monkeypatch) -> None:
     photos, lens = case.photos[:2], case.flown.camera
-    first = evaluation.read_many(photos, lens, case.stand, keep=tmp_path)
+    first = reading.read_many(photos, lens, case.stand, keep=tmp_path)
     (tmp_path / next(tmp_path.iterdir()).name).write_bytes(b"damaged")
     told: list[tuple[int, int]] = []
     calls = []
@@ -151,8 +151,8 @@ def test_what_was_read_is_not_read_again(case: Case, tmp_path, monkeypatch) -> N
         calls.append(photo.name)
         return read_photo(photo, *rest)
 
-    monkeypatch.setattr(evaluation, "read_photo", read)
-    again = evaluation.read_many(
+    monkeypatch.setattr(reading, "read_photo", read)
+    again = reading.read_many(
         photos, lens, case.stand, keep=tmp_path, progress=lambda a, b: told.append((a, b))
     )
     assert len(calls) == 1
@@ -163,7 +163,7 @@ def test_what_was_read_is_not_read_again(case: Case, tmp_path, monkeypatch) -> N
     # Another field: nothing that is kept fits.
     moved = replace(case.stand, vertex=case.stand.vertex + 1.0)
     calls.clear()
-    evaluation.read_many(photos, lens, moved, keep=tmp_path)
+    reading.read_many(photos, lens, moved, keep=tmp_path)
     assert len(calls) == 2
 
 
@@ -182,7 +182,7 @@ def test_pictures_that_show_no_field_say_so(case: Case, tmp_path) -> None:
         "overexposed: 100 %" in read_photo(picture_of(case, tmp_path, white), lens, stand).problem
     )
     small = read_photo(picture_of(case, tmp_path, noise[:600]), lens, stand)
-    assert "1000 × 600 px, but the camera's photographs have 1000 × 750 px" in small.problem
+    assert "1000 × 600 px, but the camera file says 1000 × 750 px" in small.problem
     broken = tmp_path / "broken.jpg"
     broken.write_bytes(case.photos[0].path.read_bytes()[:40_000])
     cut = read_photo(replace(case.photos[0], path=broken), lens, stand)
@@ -231,13 +231,13 @@ def test_without_lamp_the_campaign_says_so(case: Case) -> None:
         for s in case.seen
     ]
     shape = [ideal(case.flown.heliostats, i) for i in range(20)].__getitem__
-    with pytest.raises(InputError, match="no reflection on the mirrors of 16 photographs"):
+    with pytest.raises(InputError, match="no reflection on the mirrors in 16 photographs"):
         evaluation.evaluate(case.photos, dark, case.flown.camera, case.stand, shape)
     broken = [Seen(s.name, "nothing: at all") for s in case.seen]
     with pytest.raises(InputError, match="no photograph of 16 can be used; the first: DJI_0001"):
         evaluation.evaluate(case.photos, broken, case.flown.camera, case.stand, shape)
     with pytest.raises(InputError, match="three are needed"):
-        evaluation.check_rtk(case.photos, broken, case.flown.camera, case.stand)
+        rtk.check_rtk(case.photos, broken, case.flown.camera, case.stand)
 
 
 def test_one_bad_photograph_does_not_stop_the_others(case: Case) -> None:
@@ -250,7 +250,7 @@ def test_one_bad_photograph_does_not_stop_the_others(case: Case) -> None:
 
 
 def test_rtk_scatter_is_found(case: Case) -> None:
-    check, problems = evaluation.check_rtk(
+    check, problems = rtk.check_rtk(
         case.photos, case.seen, case.flown.camera, case.stand, Priors(position=0.001)
     )
     assert problems == ()

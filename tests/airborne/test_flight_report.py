@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from heliotrope.airborne.evaluate import pictures as flight_pictures
 from heliotrope.airborne.evaluate import report as flight_report
-from heliotrope.airborne.evaluate._report_drawing import Panel, round_below
-from heliotrope.airborne.evaluate._report_drawing import numbered as ticks_of
 from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.drawing import Panel, round_below
+from heliotrope.airborne.evaluate.drawing import numbered as ticks_of
 from heliotrope.airborne.evaluate.orientation import Orientations, measure
 from heliotrope.airborne.evaluate.reflections import (
     join,
@@ -22,18 +22,16 @@ from heliotrope.airborne.evaluate.reflections import (
     reflections,
     write_reflections,
 )
-from heliotrope.airborne.evaluate.report import (
-    Flown,
+from heliotrope.airborne.evaluate.report import write_campaign_report, write_flight_report
+from heliotrope.airborne.evaluate.tables import (
+    MeasuredFlight,
     difference_rows,
     facet_rows,
     flight_row,
     orientation_rows,
     systematic_parts,
-    write_campaign_report,
-    write_flight_report,
 )
 from heliotrope.airborne.simulate.trial import Conditions, four_facets, scene
-from heliotrope.calibration.report import page as report
 from heliotrope.errors import FormatError, InputError
 
 SHAPE = four_facets()
@@ -155,7 +153,8 @@ def test_an_arrow_leads_to_the_right_and_up() -> None:
     panel.arrows([0.5, 0.5], [0.5, 0.5], [[12.0, 5.0], [0.1, 0.1]], "red")
     # The second is too short to be seen.
     assert len(panel.parts) == 1
-    assert panel.parts[0].startswith('<path d="M50.0 25.0l12.0 -5.0l')
+    assert panel.parts[0].tag == "path"
+    assert str(panel.parts[0].attributes["d"]).startswith("M50.0 25.0l12.0 -5.0l")
     assert round_below(0.999) == 0.5
 
 
@@ -182,10 +181,12 @@ def test_several_flights_in_one_report(
     field: tuple[Orientations, np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found, places = field
-    monkeypatch.setattr(report, "MOST_SECTIONS", 3)
+    monkeypatch.setattr(flight_report, "MOST_SECTIONS", 3)
     monkeypatch.setattr(flight_report, "MOST_MAPS", 1)
     known = np.tile(1e-4 * np.eye(3), (len(NAMES), 1, 1))
-    flights = [Flown(name, found, lambda _: SHAPE, places, BUDGET, known) for name in ("1/2", "3")]
+    flights = [
+        MeasuredFlight(name, found, lambda _: SHAPE, places, BUDGET, known) for name in ("1/2", "3")
+    ]
     page = write_campaign_report(flights, tmp_path)
     text = page.read_text(encoding="utf-8")
     assert "4 heliostats measured, 2 not." in text

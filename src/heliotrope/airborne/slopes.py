@@ -86,8 +86,7 @@ def write_slopes(path: str | Path, slope: FloatArray) -> None:
             index.tolist(), (1e3 * slope).reshape(-1, 2).tolist(), strict=True
         )
     ]
-    text = "\n".join([",".join(_COLUMNS), *lines]) + "\n"
-    write_text(file, text)
+    write_text(file, "\n".join([",".join(_COLUMNS), *lines]) + "\n")
 
 
 def smooth_slopes(

@@ -1,83 +1,43 @@
-"""A campaign: flights over the same heliostats in other poses, evaluated together.
+"""Flights over the same heliostats in different poses, evaluated together.
 
-The survey errors of the heliostats and RTK's common offset are the same in all flights. From
-one place the images hardly tell them apart (`bundle`), so flights that
-share heliostats go through one adjustment, in groups that fit into memory.
+The survey errors of the heliostats and RTK's common offset are the same in all flights. From one
+position the images hardly tell the two apart (:mod:`heliotrope.airborne.evaluate.bundle`), so
+flights that share heliostats go through one adjustment, in groups that fit into memory.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.evaluation import Evaluation, evaluate
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.folder import FlightData
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing, join_standing
+from heliotrope.airborne.photo import LedCamera
+from heliotrope.airborne.standing import join_standing
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
-#: Corners of one adjustment: it takes 20 s and 0.4 GB for each hundred thousand.
+#: Most corners in one adjustment: it takes 20 s and 0.4 GB for each hundred thousand.
 MOST_CORNERS = 200_000
 
 
 @dataclass(frozen=True)
-class Pose:
-    """One flight: photographs of mirrors that stand still.
-
-    Attributes
-    ----------
-    name
-        Of the flight.
-    photos, seen
-        As told, and what each shows.
-    camera
-        With its lamp.
-    stand
-        The N mirrors as they are believed to stand.
-    heliostat
-        Numbers of the heliostats, the same in all flights, (N,).
-    shape
-        Gives the surface of a mirror's row.
-    """
-
-    name: str
-    photos: tuple[Photo, ...]
-    seen: tuple[Seen, ...]
-    camera: LedCamera
-    stand: Standing
-    heliostat: npt.NDArray[np.intp]
-    shape: Callable[[int], MirrorShape]
-
-    @property
-    def corners(self) -> int:
-        """How many corners its photographs show."""
-        return sum(int(np.isfinite(s.corners).all(axis=-1).sum()) for s in self.seen)
-
-    @property
-    def dark(self) -> bool:
-        """Whether its photographs show the lamp, but no edge of a mirror: it stands alone then."""
-        return not self.corners and any(not s.problem and len(s.spot) for s in self.seen)
-
-
-@dataclass(frozen=True)
 class Campaign:
-    """What the flights of a campaign give.
+    """Result of the flights of a campaign.
 
     Attributes
     ----------
     flights
-        In the order given; None for one that gave nothing.
+        In the order given; None for a flight without result.
     problems
-        Of each flight: a line for each photograph that was not used, or why it gave nothing.
+        Of each flight: a line for each photograph that was not used, or why it has no result.
     offset, offset_covariance
-        RTK's common offset, told less true, m, (3,), and its covariance, m², (3, 3): the mean of
-        all groups by their accuracy.
+        RTK's common offset, recorded less true, m, (3,), and its covariance, m², (3, 3): mean of
+        all groups, weighted by their accuracy.
     groups
-        How many adjustments there were.
+        Number of adjustments.
     """
 
     flights: tuple[Evaluation | None, ...]
@@ -86,14 +46,39 @@ class Campaign:
     offset_covariance: FloatArray
     groups: int
 
+    @property
+    def offset_sigma(self) -> FloatArray:
+        """Standard deviation of the offset, m, (3,)."""
+        return as_float(np.sqrt(np.diag(self.offset_covariance)))
 
-def evaluate_campaign(poses: Sequence[Pose], priors: Priors | None = None) -> Campaign:
-    """Return the reflections of all flights; one that gives nothing does not stop the others.
+    def offset_text(self) -> str:
+        """Return the offset as text."""
+        parts = [
+            f"{axis} {1e3 * o:+.1f} ± {1e3 * s:.1f}"
+            for axis, o, s in zip("ENU", self.offset, self.offset_sigma, strict=True)
+        ]
+        return f"common offset of RTK, recorded less true: {', '.join(parts)} mm"
+
+    def warnings(self, prior: float) -> list[str]:
+        """Return a line if the offset is far larger than its prior standard deviation, m."""
+        size = float(np.abs(self.offset).max())
+        if size <= 3.0 * prior:
+            return []
+        line = (
+            f"RTK's common offset is {1e3 * size:.0f} mm, its standard deviation was given as "
+            f"{1e3 * prior:.0f} mm; check the position of the base station, or give a larger "
+            "standard deviation (--rtk-mm)"
+        )
+        return [line]
+
+
+def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = None) -> Campaign:
+    """Return the reflections of all flights; one without result does not stop the others.
 
     Parameters
     ----------
-    poses
-        The flights.
+    flights
+        With their photographs read.
     priors
         Of the bundle adjustments.
 
@@ -102,71 +87,59 @@ def evaluate_campaign(poses: Sequence[Pose], priors: Priors | None = None) -> Ca
     InputError
         If no flight gives a reflection.
     """
-    found: list[Evaluation | None] = [None] * len(poses)
-    problems = [tuple(_unused(pose)) for pose in poses]
-    # Of a single flight it is the evaluation that says what is wrong.
-    usable = [k for k, pose in enumerate(poses) if pose.corners or pose.dark or len(poses) == 1]
+    found: list[Evaluation | None] = [None] * len(flights)
+    problems = [tuple(flight.unused()) for flight in flights]
+    # Of a single flight, the evaluation itself says what is wrong.
+    usable = [k for k, f in enumerate(flights) if f.corners or f.dark or len(flights) == 1]
     done = []
-    for group in _groups(poses, usable):
+    for group in flight_groups(flights, usable):
         try:
-            joint = _together([poses[k] for k in group], priors)
+            joint = _together([flights[k] for k in group], priors)
         except InputError as error:
-            if len(poses) == 1:
+            if len(flights) == 1:
                 raise
             for k in group:
                 problems[k] = (*problems[k], str(error))
             continue
         done.append(joint)
-        for k, part in zip(group, _parts([poses[k] for k in group], joint), strict=True):
+        for k, part in zip(group, _parts([flights[k] for k in group], joint), strict=True):
             if len(part.reflections):
                 found[k] = part
             else:
                 problems[k] = (*problems[k], "no reflection on any mirror in its photographs")
     if all(one is None for one in found):
         told = next(
-            (f"{p.name}: {line[-1]}" for p, line in zip(poses, problems, strict=True) if line),
-            "there is none",
+            (f"{f.name}: {line[-1]}" for f, line in zip(flights, problems, strict=True) if line),
+            "there is no flight",
         )
-        raise InputError(f"no flight of {len(poses)} gives a reflection; the first: {told}")
-    offset, covariance = _common(done, (priors or Priors()).offset)
+        raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {told}")
+    offset, covariance = common_offset(done, (priors or Priors()).offset)
     return Campaign(tuple(found), tuple(problems), offset, covariance, len(done))
 
 
-def _unused(pose: Pose) -> list[str]:
-    lines = [f"{s.name}: {s.problem}" for s in pose.seen if s.problem]
-    lines += [
-        f"{s.name}: outline: no mirror's edges could be measured"
-        for s in pose.seen
-        if not s.problem and not np.isfinite(s.corners).any() and not pose.dark
-    ]
-    if not (pose.corners or pose.dark):
-        lines.append(f"none of its {len(pose.photos)} photographs can be used")
-    return lines
-
-
-def _groups(poses: Sequence[Pose], usable: Sequence[int]) -> list[list[int]]:
+def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:
     """Return flights that share heliostats and camera, in groups of :data:`MOST_CORNERS`."""
-    groups = [[k] for k in usable if poses[k].dark]
-    left = [k for k in usable if not poses[k].dark]
+    groups = [[k] for k in usable if flights[k].dark]
+    left = [k for k in usable if not flights[k].dark]
     while left:
-        group, heliostats = [left.pop(0)], set[int]()
-        camera = poses[group[0]].camera
-        heliostats |= set(poses[group[0]].heliostat.tolist())
+        group = [left.pop(0)]
+        camera, heliostats = flights[group[0]].camera, set(flights[group[0]].heliostat.tolist())
         grown = True
         while grown:
             near = [
                 k
                 for k in left
-                if heliostats & set(poses[k].heliostat.tolist()) and _alike(camera, poses[k].camera)
+                if heliostats & set(flights[k].heliostat.tolist())
+                and _alike(camera, flights[k].camera)
             ]
             grown = bool(near)
             for k in near:
                 left.remove(k)
-                heliostats |= set(poses[k].heliostat.tolist())
+                heliostats |= set(flights[k].heliostat.tolist())
             group += near
         group.sort()
-        parts = -(-sum(poses[k].corners for k in group) // MOST_CORNERS)
-        # Dealt out in turn: each part looks from several sides.
+        parts = -(-sum(flights[k].corners for k in group) // MOST_CORNERS)
+        # Deal the flights out in turn, so that each part looks from several sides.
         groups += [group[i::parts] for i in range(min(parts, len(group)))]
     return groups
 
@@ -178,37 +151,37 @@ def _alike(one: LedCamera, other: LedCamera) -> bool:
     )
 
 
-def _together(poses: Sequence[Pose], priors: Priors | None) -> Evaluation:
+def _together(flights: Sequence[FlightData], priors: Priors | None) -> Evaluation:
     """Evaluate several flights as one, with a mirror for each heliostat and pose."""
-    if len(poses) == 1:
-        one = poses[0]
+    if len(flights) == 1:
+        one = flights[0]
         return evaluate(one.photos, one.seen, one.camera, one.stand, one.shape, priors=priors)
-    first = np.cumsum([0] + [len(p.stand) for p in poses])
-    numbers = np.concatenate([p.heliostat for p in poses])
+    first = np.cumsum([0] + [len(f.stand) for f in flights])
+    numbers = np.concatenate([f.heliostat for f in flights])
     _, owner = np.unique(numbers, return_inverse=True)
     seen = [
         replace(s, mirror=s.mirror + start, spot_mirror=s.spot_mirror + start)
-        for p, start in zip(poses, first[:-1].tolist(), strict=True)
-        for s in p.seen
+        for f, start in zip(flights, first[:-1].tolist(), strict=True)
+        for s in f.seen
     ]
 
     def shape(row: int) -> MirrorShape:
         k = int(np.searchsorted(first, row, side="right")) - 1
-        return poses[k].shape(row - int(first[k]))
+        return flights[k].shape(row - int(first[k]))
 
-    photos = [photo for p in poses for photo in p.photos]
-    stand = join_standing([p.stand for p in poses])
-    return evaluate(photos, seen, poses[0].camera, stand, shape, priors=priors, owner=owner)
+    photos = [photo for f in flights for photo in f.photos]
+    stand = join_standing([f.stand for f in flights])
+    return evaluate(photos, seen, flights[0].camera, stand, shape, priors=priors, owner=owner)
 
 
-def _parts(poses: Sequence[Pose], joint: Evaluation) -> list[Evaluation]:
+def _parts(flights: Sequence[FlightData], joint: Evaluation) -> list[Evaluation]:
     """Return the flights of a joint evaluation, each with its own rows and photographs."""
-    if len(poses) == 1:
+    if len(flights) == 1:
         return [joint]
     parts, row, photo = [], 0, 0
-    for pose in poses:
-        rows = np.arange(row, row + len(pose.stand))
-        used = sum(1 for s in pose.seen if not s.problem and np.isfinite(s.corners).any())
+    for flight in flights:
+        rows = np.arange(row, row + len(flight.stand))
+        used = sum(s.has_corners for s in flight.seen)
         here = slice(photo, photo + used)
         at = joint.reflections.photo
         mine = joint.reflections.take(np.flatnonzero((at >= photo) & (at < photo + used)))
@@ -224,15 +197,18 @@ def _parts(poses: Sequence[Pose], joint: Evaluation) -> list[Evaluation]:
                 stand=joint.stand.take(rows),
                 place_covariance=joint.place_covariance[rows],
                 reflections=replace(mine, photo=mine.photo - photo, heliostat=mine.heliostat - row),
-                problems=tuple(_unused(pose)),
+                problems=tuple(flight.unused()),
             )
         )
         row, photo = row + len(rows), photo + used
     return parts
 
 
-def _common(done: Sequence[Evaluation], prior: float) -> tuple[FloatArray, FloatArray]:
-    """Return the mean of the groups' offsets by their accuracy, the prior counted once."""
+def common_offset(done: Sequence[Evaluation], prior: float) -> tuple[FloatArray, FloatArray]:
+    """Return the groups' mean offset weighted by accuracy, m, and its covariance, m².
+
+    The prior, of standard deviation ``prior``, counts once.
+    """
     own = np.eye(3) / prior**2
     weight, drawn = own, np.zeros(3)
     for one in done:

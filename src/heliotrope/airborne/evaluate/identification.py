@@ -1,31 +1,43 @@
-"""Which mirror is which: the field is projected into a photograph and laid over its patches.
+"""Which mirror is which: the field is projected into a photograph and matched with its patches.
 
-The place of a photograph is known to centimetres, its attitude to a degree or so. What is
-unknown is therefore a small rotation. It is found by votes: each pair of a patch and an
-expected mirror votes for the shift between both, for a number of turns about the line of
-sight. The best few shifts are made exact by Wahba's problem on the pairs that then lie close.
-The one wins by which most mirrors lie most closely and fewest mirrors and patches are left
-over. If another one, with other names for the mirrors, is nearly as good, nothing is believed.
+The position of a photograph is known to centimetres, its attitude to a degree or so, so only a
+small rotation is unknown. It is found by votes: each pair of a patch and an expected mirror votes
+for the shift between the two, for a number of turns about the line of sight. The best few shifts
+are refined by Wahba's problem on the pairs that then lie close. The winner has most mirrors lying
+closest and fewest mirrors and patches left over. If another solution that names the mirrors
+differently is nearly as good, none is trusted.
+
+In a night without moon only the lamp can be seen. A mirror that stands as commanded shows it at
+the foot of the perpendicular from the drone, so these feet are matched with the spots instead.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne.evaluate.detection import Picture, Spots, find_spots
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.standing import Standing
 from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float, rotation
 
-#: Largest error of the gimbal that is looked for, rad.
+Rows = npt.NDArray[np.intp]
+
+#: Largest gimbal error that is searched, rad.
 GIMBAL = float(np.radians(4.0))
-#: Fewest mirrors that must lie on patches, and the share of those expected in the frame.
+#: Fewest mirrors that must match, and their least share of those expected in the frame.
 FEWEST, LEAST_SHARE = 4, 0.4
-#: The best solution must explain so many more mirrors and patches than another one does.
+#: The best solution must explain this many more mirrors and patches than any other.
 MARGIN = 4.0
-#: Standard deviation of a gimbal, rad: what is worth a mirror's half.
+#: Typical gimbal error, rad: a standard deviation, weighed like half a mirror.
 USUAL_GIMBAL = float(np.radians(1.5))
+#: With a median reading below this, a photograph is dark.
+DARK_READING = 25
+#: More lights than this in a dark photograph are not reflections of the lamp.
+_MOST_LIGHTS = 5000
+#: How far beside its mirror a light may appear before the camera's attitude is known, m.
+BESIDE = 0.5
 _TURNS, _CANDIDATES, _ROUNDS = 17, 10, 6
 
 
@@ -40,31 +52,28 @@ class Identified:
     mirror, patch
         Pairs of a mirror's row and a patch, (K,).
     reason
-        Why nothing is believed; "" if it is.
+        Why no solution is trusted; "" if one is.
     """
 
     rotation: FloatArray
-    mirror: npt.NDArray[np.intp]
-    patch: npt.NDArray[np.intp]
+    mirror: Rows
+    patch: Rows
     reason: str = ""
 
 
 def expected_size(
     camera: LedCamera, photo: Photo, stand: Standing
-) -> tuple[FloatArray, FloatArray]:
-    """Return sides (M,), px, of mirrors as seen by a photograph, and whether they may be in it.
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
 
-    The side is the root of the area; a mirror may be in the frame if a turn of the gimbal by
+    The side is the root of the area. A mirror may be in the frame if a gimbal error of up to
     :data:`GIMBAL` can bring it there.
     """
     local = (stand.corners - photo.position) @ photo.rotation
     depth = local[..., 2]
     safe = np.where(depth > 0.1, depth, np.nan)
     plane = local[..., :2] / safe[..., None]
-    ahead = np.roll(plane, -1, axis=1)
-    area = 0.5 * np.abs(
-        np.sum(plane[..., 0] * ahead[..., 1] - plane[..., 1] * ahead[..., 0], axis=1)
-    )
+    area = quad_area(plane)
     front = np.sum((photo.position - stand.vertex) * stand.rotation[:, :, 2], axis=-1) > 0.0
     width, height = camera.size
     limit = np.array([width, height]) / (2.0 * camera.focal) * 1.1 + np.tan(GIMBAL)
@@ -73,17 +82,33 @@ def expected_size(
     return np.sqrt(np.nan_to_num(area)) * camera.focal, seen
 
 
+def quad_area(corners: FloatArray) -> FloatArray:
+    """Return the areas of quadrilaterals (M, 4, 2), (M,); NaN where a corner is."""
+    ahead = np.roll(corners, -1, axis=1)
+    cross = corners[..., 0] * ahead[..., 1] - corners[..., 1] * ahead[..., 0]
+    return as_float(0.5 * np.abs(cross.sum(axis=1)))
+
+
+def nearest_rotation(ways: FloatArray, rays: FloatArray) -> FloatArray:
+    """Return the rotation (3, 3) that best turns unit ``rays`` into ``ways``, (K, 3) each.
+
+    Wahba's problem, solved by singular values.
+    """
+    u, _, vt = np.linalg.svd(ways.T @ rays)
+    return as_float(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
 def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArray) -> Identified:
-    """Return which mirrors patches show, and how the camera was turned.
+    """Return which mirrors the patches show, and the attitude of the camera.
 
     Parameters
     ----------
     camera
         Lens.
     photo
-        As the drone tells it.
+        As recorded by the drone.
     stand
-        All mirrors as they are believed to stand.
+        All mirrors, as they are believed to stand.
     patches
         Centres of patches, px, (K, 2).
     """
@@ -91,7 +116,7 @@ def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArr
     side, seen = expected_size(camera, photo, stand)
     rows = np.flatnonzero(seen)
     if len(rows) < FEWEST:
-        text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is it this field's?"
+        text = f"wrong_field: {len(rows)} mirrors of the field can be in it; is this the right one?"
         return Identified(photo.rotation, none, none, text)
     if len(patches) < FEWEST:
         text = f"nothing: {len(patches)} patches look like mirrors, {FEWEST} are needed"
@@ -106,16 +131,23 @@ def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArr
         _refine(start, ways, rays, side[rows] / camera.focal)
         for start in _starts(photo.rotation, ways, plane, size)
     ]
-    return _believe(tried, photo, camera, stand, rows, len(patches))
+    return _choose(tried, photo, camera, stand, rows, len(patches))
 
 
-Tried = tuple[float, FloatArray, npt.NDArray[np.intp], npt.NDArray[np.intp]]
+@dataclass(frozen=True)
+class _Tried:
+    """A solution: how closely it fits, its attitude, and pairs of a mirror and a patch."""
+
+    score: float
+    rotation: FloatArray
+    mirror: Rows
+    patch: Rows
 
 
 def _starts(
     turned: FloatArray, ways: FloatArray, plane: FloatArray, size: float
 ) -> list[FloatArray]:
-    """Return the rotations that most votes are for."""
+    """Return the rotations with the most votes."""
     from scipy.ndimage import uniform_filter
 
     local = ways @ turned
@@ -133,13 +165,13 @@ def _starts(
         for _ in range(3):
             i, j = np.unravel_index(int(np.argmax(votes)), votes.shape)
             x, y = ((np.array([i, j]) + 0.5) / cells * 2.0 - 1.0) * reach
-            # To move what is seen by (x, y) the camera turns about its down and right axes.
+            # To shift the image by (x, y) the camera turns about its down and right axes.
             move = rotation([0.0, 1.0, 0.0], x) @ rotation([1.0, 0.0, 0.0], -y)
             total = turned @ rotation([0.0, 0.0, 1.0], turn) @ move.T
             found.append((float(votes[i, j]), total))
             votes[max(i - 2, 0) : i + 3, max(j - 2, 0) : j + 3] = 0.0
     found.sort(key=lambda f: -f[0])
-    # Neighbouring turns vote for the same: others are of interest.
+    # Neighbouring turns vote for the same solution: keep different ones.
     apart = max(0.7 * size, 2.2 * GIMBAL / (_TURNS - 1))
     kept: list[FloatArray] = []
     for _, start in found:
@@ -148,8 +180,8 @@ def _starts(
     return kept
 
 
-def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatArray) -> Tried:
-    """Return score, rotation and pairs (mirror, patch) that a start leads to."""
+def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatArray) -> _Tried:
+    """Return the solution that a start converges to."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(rays)
@@ -159,7 +191,7 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
         found = tree.query(ways @ turned)
         distance, nearest = as_float(found[0]), np.asarray(found[1], dtype=np.intp)
         close = np.flatnonzero(distance < reach)
-        # A patch belongs to the mirror that is nearest to it.
+        # A patch belongs to the mirror nearest to it.
         order = close[np.argsort(distance[close])]
         _, first = np.unique(nearest[order], return_index=True)
         mirror = order[first]
@@ -167,55 +199,122 @@ def _refine(turned: FloatArray, ways: FloatArray, rays: FloatArray, size: FloatA
         score = float(np.sum(np.exp(-0.5 * (distance[mirror] / (0.12 * size[mirror])) ** 2)))
         if len(mirror) < 3:
             break
-        u, _, vt = np.linalg.svd(ways[mirror].T @ rays[patch])
-        turned = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return score, turned, mirror, patch
+        turned = nearest_rotation(ways[mirror], rays[patch])
+    return _Tried(score, turned, mirror, patch)
 
 
-def _believe(
-    tried: list[Tried],
+def _choose(
+    tried: list[_Tried],
     photo: Photo,
     camera: LedCamera,
     stand: Standing,
-    rows: npt.NDArray[np.intp],
+    rows: Rows,
     patches: int,
 ) -> Identified:
+    """Return the best solution, or why it is not trusted."""
     none = np.empty(0, dtype=np.intp)
-    ranked: list[tuple[float, int, Tried]] = []
+    ranked: list[tuple[float, int, _Tried]] = []
     for one in tried:
-        angle = rotation_angle(one[1], photo.rotation)
-        if angle > 2.0 * GIMBAL or len(one[2]) < FEWEST:
+        angle = rotation_angle(one.rotation, photo.rotation)
+        matched = len(one.mirror)
+        if angle > 2.0 * GIMBAL or matched < FEWEST:
             continue
-        pixels = photo.moved(photo.position, one[1]).pixels(camera, stand.vertex[rows])
+        pixels = photo.moved(photo.position, one.rotation).pixels(camera, stand.vertex[rows])
         inside = int(((pixels > 0) & (pixels < np.array(camera.size) - 1)).all(axis=-1).sum())
-        # What should be there and is not, and what is there and should not be.
-        absent, strange = max(inside - len(one[2]), 0), patches - len(one[2])
+        # Mirrors without a patch, and patches without a mirror.
+        absent, strange = max(inside - matched, 0), patches - matched
         usual = 0.5 * (angle / USUAL_GIMBAL) ** 2
-        ranked.append((one[0] - 0.5 * (absent + strange) - usual, inside, one))
+        ranked.append((one.score - 0.5 * (absent + strange) - usual, inside, one))
     if not ranked:
-        text = "nothing: no mirrors of the field lie on its patches"
+        text = "nothing: no mirrors of the field match its patches"
         return Identified(photo.rotation, none, none, text)
     ranked.sort(key=lambda r: -r[0])
-    merit, inside, (score, turned, mirror, patch) = ranked[0]
-    if score < LEAST_SHARE * inside:
+    merit, inside, best = ranked[0]
+    if best.score < LEAST_SHARE * inside:
         text = (
-            f"wrong_field: {len(mirror)} patches lie on the {inside} mirrors of the field that "
-            "should be in it; is it another field, or were other commands given?"
+            f"wrong_field: {len(best.mirror)} patches match the {inside} mirrors of the field that "
+            "should be in it; check the field and the commands that were given"
         )
         return Identified(photo.rotation, none, none, text)
-    named = set(zip(patch.tolist(), mirror.tolist(), strict=True))
+    named = set(zip(best.patch.tolist(), best.mirror.tolist(), strict=True))
     for other_merit, _, other in ranked[1:]:
-        same = named & set(zip(other[3].tolist(), other[2].tolist(), strict=True))
-        if len(same) < 0.5 * len(other[2]) and other_merit > merit - max(MARGIN, 0.03 * score):
+        same = named & set(zip(other.patch.tolist(), other.mirror.tolist(), strict=True))
+        close = other_merit > merit - max(MARGIN, 0.03 * best.score)
+        if len(same) < 0.5 * len(other.mirror) and close:
             text = (
-                f"ambiguous: {len(other[2])} mirrors fit if the camera looked elsewhere, "
-                f"{len(mirror)} as it is; the gimbal must be known better, or more of the field "
-                "be seen"
+                f"ambiguous: {len(other.mirror)} mirrors match if the camera pointed elsewhere, "
+                f"{len(best.mirror)} as it is; record the gimbal more accurately or photograph "
+                "more of the field"
             )
             return Identified(photo.rotation, none, none, text)
-    return Identified(as_float(turned), rows[mirror], patch)
+    return Identified(as_float(best.rotation), rows[best.mirror], best.patch)
 
 
 def rotation_angle(a: FloatArray, b: FloatArray) -> float:
     """Return the angle between two rotations (3, 3), rad."""
     return float(np.arccos(np.clip(0.5 * (np.trace(a @ b.T) - 1.0), -1.0, 1.0)))
+
+
+# -- in the dark -----------------------------------------------------------------------
+
+
+def is_dark(picture: Picture) -> bool:
+    """Return whether nothing but lights can be seen in a picture."""
+    return bool(np.median(picture[::8, ::8]) < DARK_READING)
+
+
+def expected_feet(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[FloatArray, Rows]:
+    """Return where mirrors that stand as believed show the lamp, (K, 3), and their rows, (K,)."""
+    between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
+    local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
+    half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)
+    on = (np.abs(local[:, :2]) < half + BESIDE).all(axis=1) & (local[:, 2] > 0.0)
+    rows = np.flatnonzero(on)
+    flat = np.pad(local[rows, :2], ((0, 0), (0, 1)))
+    return stand.vertex[rows] + np.einsum("nij,nj->ni", stand.rotation[rows], flat), rows
+
+
+def find_lights(
+    picture: Picture, photo: Photo, camera: LedCamera, stand: Standing
+) -> tuple[Identified, Spots]:
+    """Return the attitude of the camera, and the spots with their mirrors (rows of ``stand``).
+
+    Spots that lie on no mirror are left out.
+    """
+    width, height = camera.size
+    frame = np.array([(3, 3), (width - 4, 3), (width - 4, height - 4), (3, height - 4)], np.float64)
+    spots, _ = find_spots(picture, frame[None], most=_MOST_LIGHTS)
+    feet, rows = expected_feet(photo, camera, stand)
+    none = np.empty(0, dtype=np.intp)
+    if len(spots) < FEWEST:
+        text = f"nothing: it is dark and shows {len(spots)} lights, {FEWEST} are needed"
+        return Identified(photo.rotation, none, none, text), spots
+    found = identify(camera, photo, replace(stand.take(rows), vertex=feet), spots.pixel)
+    if found.reason:
+        text = (
+            f"ambiguous: it is dark, and its {len(spots)} lights cannot be assigned to mirrors; "
+            "check the field and the commands that were given"
+        )
+        return replace(found, reason=text), spots
+    mirror = _mirrors_of(undistort(camera, spots.pixel), photo, found.rotation, stand)
+    kept = mirror >= 0
+    named = Spots(
+        mirror[kept], spots.pixel[kept], spots.sigma[kept], spots.flux[kept], spots.clipped[kept]
+    )
+    return replace(found, mirror=rows[found.mirror]), named
+
+
+def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: Standing) -> Rows:
+    """Return the mirror that each light lies on, -1 for none."""
+    ways = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1) @ turn.T
+    start = np.einsum("nji,nj->ni", stand.rotation, photo.position - stand.vertex)
+    local = np.einsum("nji,sj->sni", stand.rotation, ways)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        length = -start[:, 2] / local[..., 2]
+        at = start[:, :2] + length[..., None] * local[..., :2]
+    half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)
+    off = np.where(length > 0.0, np.max(np.abs(at) - half, axis=-1), np.inf)
+    nearest = np.argmin(np.where(np.isfinite(off), off, np.inf), axis=1)
+    # The attitude is known to a few milliradians only: allow for that beside the mirror.
+    inside = off[np.arange(len(plane)), nearest] < BESIDE
+    return np.where(inside, nearest, -1).astype(np.intp)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate._report_drawing import Panel, around, drawing, round_below
+from heliotrope.airborne.evaluate.drawing import Panel, around, drawing, round_below
 from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.calibration.report.pictures import AFTER, OUTLIER, TESTED, figure_of

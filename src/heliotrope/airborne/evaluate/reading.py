@@ -1,16 +1,21 @@
-"""One photograph read: which mirrors it shows, their corners, the lamp's spots on them.
+"""Reading photographs: which mirrors each one shows, their corners, and the lamp's spots on them.
 
-What is found stands as places without distortion, X/Z and Y/Z in camera axes, so that nothing
-later needs the image. What is wrong with a photograph is said, not raised.
+Results are undistorted image coordinates, X/Z and Y/Z in camera axes, so that no later step needs
+the image. A photograph that cannot be used is reported with the reason; it raises nothing.
 """
 
+import hashlib
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, fields
+from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate._dark import find_lights, is_dark
 from heliotrope.airborne.evaluate.detection import (
     Picture,
     decode,
@@ -18,76 +23,108 @@ from heliotrope.airborne.evaluate.detection import (
     find_patches,
     find_spots,
 )
-from heliotrope.airborne.evaluate.identification import Identified, expected_size, identify
+from heliotrope.airborne.evaluate.identification import (
+    Identified,
+    expected_size,
+    find_lights,
+    identify,
+    is_dark,
+    nearest_rotation,
+    quad_area,
+)
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.standing import Standing
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.camera import undistort
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.geometry import FloatArray
 
-#: Mirrors of a smaller side are not measured, px.
+if TYPE_CHECKING:
+    from distributed import Client
+
+Progress = Callable[[int, int], None]
+Rows = npt.NDArray[np.intp]
+
+#: Mirrors with a shorter side are not measured, px.
 SMALLEST = 12.0
-#: A corner's deviation beyond that of its edges: texture beside the mirror, px.
+#: Corner error beyond that of the edges, from texture beside the mirror, px.
 CORNER_FLOOR = 0.07
-#: Corners that stand so far from where a rectangle's would are of another edge: px, and share
-#: of the mirror's side.
+#: Corners this far from a common shift of the outline belong to another edge: px, and share of
+#: the mirror's side.
 _SKEW, _SKEW_SHARE = 1.5, 0.03
+#: With fewer photographs, starting processes costs more time than it saves.
+FEWEST_FOR_PROCESSES = 4
 
 
-def _none(*shape: int) -> FloatArray:
+def _empty(*shape: int) -> FloatArray:
     return np.empty((0, *shape))
 
 
-def _no_rows() -> npt.NDArray[np.intp]:
+def _no_rows() -> Rows:
     return np.empty(0, dtype=np.intp)
 
 
 @dataclass(frozen=True)
 class Seen:
-    """What one photograph shows.
+    """What one photograph shows: M mirrors and S spots.
 
     Attributes
     ----------
     name
         Of the photograph.
     problem
-        Why it shows nothing that is believed; "" if it does. Begins with a name of the
-        reason: nothing, wrong_field, ambiguous, overexposed, small, unreadable.
+        Why nothing in it is trusted; "" if it is usable. Begins with a keyword: nothing,
+        wrong_field, ambiguous, overexposed, small, unreadable.
     rotation
         Camera axes to ENU, from its mirrors alone, (3, 3).
     mirror
-        Rows of the mirrors that are in it, (M,).
+        Rows of the mirrors in it, (M,).
     corners
-        Their corners' places in the order of the outline, NaN where not found, (M, 4, 2).
+        Undistorted coordinates in the order of the outline, NaN where not found, (M, 4, 2).
     corner_sigma
         Standard deviation of a corner in each direction, (M,).
     spot_mirror
-        Row of the mirror of each spot, (S,).
+        Row of each spot's mirror, (S,).
     spot, spot_sigma
-        Place of each and its standard deviation in each direction, (S, 2) and (S,).
+        Undistorted coordinates, (S, 2), and their standard deviation in each direction, (S,).
     flux
-        Of each, full scales times pixels, (S,).
+        Of each spot, full scale times pixels, (S,).
     clipped
-        Clipped pixels of each, (S,).
+        Clipped pixels of each spot, (S,).
     notes
-        Reasons of mirrors that give no spot or no outline, "" for none, M of them.
+        For each mirror why it gives no spot or no outline; "" if it gives both, (M,).
     """
 
     name: str
     problem: str = ""
     rotation: FloatArray = field(default_factory=lambda: np.eye(3))
-    mirror: npt.NDArray[np.intp] = field(default_factory=_no_rows)
-    corners: FloatArray = field(default_factory=lambda: _none(4, 2))
-    corner_sigma: FloatArray = field(default_factory=_none)
-    spot_mirror: npt.NDArray[np.intp] = field(default_factory=_no_rows)
-    spot: FloatArray = field(default_factory=lambda: _none(2))
-    spot_sigma: FloatArray = field(default_factory=_none)
-    flux: FloatArray = field(default_factory=_none)
-    clipped: npt.NDArray[np.intp] = field(default_factory=_no_rows)
+    mirror: Rows = field(default_factory=_no_rows)
+    corners: FloatArray = field(default_factory=lambda: _empty(4, 2))
+    corner_sigma: FloatArray = field(default_factory=_empty)
+    spot_mirror: Rows = field(default_factory=_no_rows)
+    spot: FloatArray = field(default_factory=lambda: _empty(2))
+    spot_sigma: FloatArray = field(default_factory=_empty)
+    flux: FloatArray = field(default_factory=_empty)
+    clipped: Rows = field(default_factory=_no_rows)
     notes: tuple[str, ...] = ()
 
+    @property
+    def has_corners(self) -> bool:
+        """Whether it shows a corner of a mirror."""
+        return not self.problem and bool(np.isfinite(self.corners).any())
+
+    @property
+    def has_lights(self) -> bool:
+        """Whether it shows the lamp."""
+        return not self.problem and len(self.spot) > 0
+
+    def why_unused(self) -> str:
+        """Return a line that says why its corners cannot be used; "" if they can."""
+        if self.has_corners:
+            return ""
+        return f"{self.name}: {self.problem or 'outline: no mirror edges could be measured'}"
+
     def save(self, path: Path) -> None:
-        """Write it as ``.npz``, whole or not at all."""
+        """Write it as ``.npz``, completely or not at all."""
         from heliotrope.files.text import write_file
 
         values = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
@@ -108,17 +145,20 @@ class Seen:
         )
 
 
+# -- one photograph --------------------------------------------------------------------
+
+
 def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
-    """Return what the file of a photograph shows.
+    """Return what a photograph's file shows.
 
     Parameters
     ----------
     photo
-        As the drone tells it, with its path.
+        As recorded by the drone, with its path.
     camera
         Lens.
     stand
-        All mirrors as they are believed to stand.
+        All mirrors, as they are believed to stand.
     """
     if photo.path is None:
         return Seen(photo.name, "unreadable: there is no file")
@@ -130,33 +170,33 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
     if (width, height) != camera.size:
         return Seen(
             photo.name,
-            f"unreadable: {width} × {height} px, but the camera's photographs have "
-            f"{camera.size[0]} × {camera.size[1]} px; give that camera's file",
+            f"unreadable: {width} × {height} px, but the camera file says "
+            f"{camera.size[0]} × {camera.size[1]} px; give the file of this camera",
         )
     return look(picture, photo, camera, stand)
 
 
 def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
-    """Return what a picture shows, see :func:`read_photo`."""
+    """Return what a decoded picture shows, as :func:`read_photo` does."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Seen(photo.name, "wrong_field: no mirror of the field can be in it")
-    usual = float(np.median(side[near]))
-    if usual < SMALLEST:
+    typical = float(np.median(side[near]))
+    if typical < SMALLEST:
         return Seen(
             photo.name,
-            f"small: mirrors are {usual:.0f} px across, less than {SMALLEST:.0f}; "
-            "fly nearer or with a longer lens",
+            f"small: mirrors are {typical:.0f} px across, less than {SMALLEST:.0f}; "
+            "fly closer or use a longer lens",
         )
     clipped = float((picture[::8, ::8] >= 254).all(axis=2).mean())
     if clipped > 0.5:
         return Seen(
-            photo.name, f"overexposed: {100 * clipped:.0f} % of it are clipped; expose shorter"
+            photo.name, f"overexposed: {100 * clipped:.0f} % of it is clipped; shorten the exposure"
         )
     found = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
-    for patches in find_patches(picture, usual**2):
+    for patches in find_patches(picture, typical**2):
         one = identify(camera, photo, stand, patches.center)
-        # The reason of the attempt that came farthest is told: any but "nothing" says more.
+        # Report the attempt that got farthest: any reason but "nothing" says more.
         if not one.reason or found.reason.startswith("nothing"):
             found = one
         if not found.reason:
@@ -171,22 +211,26 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> 
 def _measure(
     picture: Picture, photo: Photo, camera: LedCamera, stand: Standing, found: Identified
 ) -> Seen:
+    """Return the corners and spots of the mirrors that were identified."""
     rows, expected = _in_frame(photo.moved(photo.position, found.rotation), camera, stand)
     if not len(rows):
-        return Seen(photo.name, "nothing: no mirror is wholly in the frame")
-    size = np.sqrt(_area(expected))
+        return Seen(photo.name, "nothing: no mirror is completely in the frame")
+    size = np.sqrt(quad_area(expected))
     reach = float(np.clip(0.12 * np.median(size), 2.0, 6.0))
     first = find_outlines(picture, expected, reach, profiles=16)
     better = np.where(first.found[:, None, None], first.corners, expected)
     lines = find_outlines(picture, better, 2.0)
-    # Corners of a mirror move together if the camera is turned, not one by one.
+    # A turn of the camera moves the corners of a mirror together, not one by one.
     shift = lines.corners - expected
     skew = np.linalg.norm(shift - np.median(shift, axis=1, keepdims=True), axis=-1).max(axis=1)
     good = lines.found & (skew < np.maximum(_SKEW, _SKEW_SHARE * size))
     outline = np.where(good[:, None, None], lines.corners, expected)
     spots, reasons = find_spots(picture, outline)
     if all(r.startswith("overexposed") for r in reasons):
-        return Seen(photo.name, f"overexposed: all {len(rows)} mirrors are clipped; expose shorter")
+        return Seen(
+            photo.name,
+            f"overexposed: all {len(rows)} mirrors are clipped; shorten the exposure",
+        )
     notes = [
         reason or ("" if whole else "outline: hidden, or no straight edges")
         for reason, whole in zip(reasons, good, strict=True)
@@ -209,7 +253,7 @@ def _measure(
 
 
 def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
-    """Return what a photograph shows in which the mirrors cannot be seen, but the lamp can."""
+    """Return the lamp's spots in a photograph too dark to show the mirrors."""
     found, spots = find_lights(picture, photo, camera, stand)
     if found.reason:
         return Seen(photo.name, found.reason)
@@ -229,35 +273,23 @@ def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) 
     )
 
 
-def _in_frame(
-    photo: Photo, camera: LedCamera, stand: Standing
-) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """Return the mirrors whose corners are all in the frame, and those corners, px."""
+def _in_frame(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[Rows, FloatArray]:
+    """Return the mirrors with all corners in the frame, and those corners, px."""
     pixels = photo.pixels(camera, stand.corners)
     width, height = camera.size
     with np.errstate(invalid="ignore"):
         inside = (pixels > 3.0) & (pixels < np.array([width, height]) - 4.0)
     front = np.sum((photo.position - stand.vertex) * stand.rotation[:, :, 2], axis=-1) > 0.0
     whole = inside.all(axis=(1, 2)) & front
-    whole[whole] &= _area(pixels[whole]) > SMALLEST**2 / 2.0
+    whole[whole] &= quad_area(pixels[whole]) > SMALLEST**2 / 2.0
     rows = np.flatnonzero(whole)
     return rows, pixels[rows]
 
 
-def _area(corners: FloatArray) -> FloatArray:
-    ahead = np.roll(corners, -1, axis=1)
-    cross = corners[..., 0] * ahead[..., 1] - corners[..., 1] * ahead[..., 0]
-    return as_float(0.5 * np.abs(cross.sum(axis=1)))
-
-
 def _attitude(
-    start: FloatArray,
-    photo: Photo,
-    stand: Standing,
-    rows: npt.NDArray[np.intp],
-    corners: FloatArray,
+    start: FloatArray, photo: Photo, stand: Standing, rows: Rows, corners: FloatArray
 ) -> FloatArray:
-    """Return the rotation that brings all found corners closest (Wahba)."""
+    """Return the rotation that fits all corners best."""
     seen = np.isfinite(corners).all(axis=-1)
     if int(seen.sum()) < 4:
         return start
@@ -265,5 +297,119 @@ def _attitude(
     ways /= np.linalg.norm(ways, axis=-1, keepdims=True)
     rays = np.concatenate([corners[seen], np.ones((int(seen.sum()), 1))], axis=-1)
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    u, _, vt = np.linalg.svd(ways.T @ rays)
-    return as_float(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+    return nearest_rotation(ways, rays)
+
+
+# -- many photographs ------------------------------------------------------------------
+
+
+def read_many(
+    photos: Sequence[Photo],
+    camera: LedCamera,
+    stand: Standing,
+    *,
+    processes: int = 1,
+    client: "Client | None" = None,
+    keep: Path | None = None,
+    progress: Progress | None = None,
+) -> tuple[Seen, ...]:
+    """Return what photographs show, in their order.
+
+    Parameters
+    ----------
+    photos
+        As recorded by the drone.
+    camera
+        Lens.
+    stand
+        All mirrors, as they are believed to stand.
+    processes
+        On this machine.
+    client
+        Of a dask scheduler, used instead of own processes.
+    keep
+        Folder that keeps the result of each photograph. A photograph whose file, camera and
+        field are unchanged is not read again, so an interrupted run continues where it stopped.
+    progress
+        Called with (done, all).
+    """
+    found: dict[int, Seen] = {}
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        base = _digest(camera, stand)
+        marks = [_mark(photo, base) for photo in photos]
+        for k, mark in enumerate(marks):
+            seen = _kept(keep / f"{mark}.npz")
+            if seen is not None:
+                found[k] = seen
+    if progress is not None:
+        progress(len(found), len(photos))
+    missing = [k for k in range(len(photos)) if k not in found]
+    tasks = [photos[k] for k in missing]
+    for j, seen in _read(tasks, camera, stand, processes, client):
+        k = missing[j]
+        found[k] = seen
+        if keep is not None:
+            seen.save(keep / f"{marks[k]}.npz")
+        if progress is not None:
+            progress(len(found), len(photos))
+    return tuple(found[k] for k in range(len(photos)))
+
+
+def _read(
+    photos: Sequence[Photo],
+    camera: LedCamera,
+    stand: Standing,
+    processes: int,
+    client: "Client | None",
+) -> Iterator[tuple[int, Seen]]:
+    if client is not None:
+        from distributed import as_completed as completed
+
+        # Send the field once.
+        shared = client.scatter((camera, stand), broadcast=True)  # type: ignore[no-untyped-call]
+        tasks = {
+            client.submit(_read_shared, p, shared, pure=False): k for k, p in enumerate(photos)
+        }
+        for future in completed(list(tasks)):  # type: ignore[no-untyped-call]
+            yield tasks[future], future.result()
+    elif processes > 1 and len(photos) >= FEWEST_FOR_PROCESSES:
+        # A forked child would inherit the locks of this process's threads.
+        with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+            futures = {pool.submit(read_photo, p, camera, stand): k for k, p in enumerate(photos)}
+            try:
+                for done in as_completed(futures):
+                    yield futures[done], done.result()
+            finally:
+                pool.shutdown(cancel_futures=True)
+    else:
+        for k, photo in enumerate(photos):
+            yield k, read_photo(photo, camera, stand)
+
+
+def _read_shared(photo: Photo, shared: tuple[LedCamera, Standing]) -> Seen:
+    return read_photo(photo, *shared)
+
+
+def _digest(camera: LedCamera, stand: Standing) -> bytes:
+    size, lens = np.array(camera.size), (camera.matrix, camera.distortion)
+    parts = (size, *lens, stand.vertex, stand.rotation, stand.outline)
+    return b"".join(np.ascontiguousarray(p, dtype=np.float64).tobytes() for p in parts)
+
+
+def _mark(photo: Photo, base: bytes) -> str:
+    """Return a key for a photograph's file, position and attitude with this camera and field."""
+    state = photo.path.stat() if photo.path is not None and photo.path.exists() else None
+    told = photo.position.tobytes() + photo.rotation.tobytes()
+    file = "" if state is None else f"{photo.name} {state.st_size} {state.st_mtime_ns}"
+    return hashlib.sha256(base + told + file.encode()).hexdigest()[:32]
+
+
+def _kept(path: Path) -> Seen | None:
+    if not path.exists():
+        return None
+    try:
+        return Seen.load(path)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        # Written by another version, or damaged: read the photograph again.
+        return None

@@ -1,7 +1,7 @@
-"""Reflections of the drone's lamp as image evaluation finds them: the table of a flight.
+"""Reflections of the drone's lamp, as found in the images: the table of a flight.
 
-One row is one reflection in one photograph. The orientation of the mirrors is computed from
-this table and from nothing else of the images.
+One row is one reflection in one photograph. The orientations of the mirrors are computed from this
+table; nothing else of the images is needed.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,8 @@ from heliotrope.geometry import FloatArray, as_float
 
 _VECTORS = ("camera", "led")
 _AXES = ("east", "north", "up")
-_COLUMNS = (
-    "photo", "heliostat", "facet", "x_m", "y_m",
-    *(f"{end}_{axis}_m" for end in _VECTORS for axis in _AXES), "sigma_m",
-)  # fmt: skip
+_ENDS = tuple(f"{end}_{axis}_m" for end in _VECTORS for axis in _AXES)
+_COLUMNS = ("photo", "heliostat", "facet", "x_m", "y_m", *_ENDS, "sigma_m")
 
 
 @dataclass(frozen=True)
@@ -33,15 +31,15 @@ class Reflections:
     photo
         Number of the photograph, (N,).
     heliostat
-        Row of the heliostat in a list of names kept beside, (N,).
+        Row of the heliostat in a list of names kept separately, (N,).
     facet
         (N,).
     x, y
-        Where on the mirror, m in concentrator coordinates, (N,).
+        Position on the mirror, m in concentrator coordinates, (N,).
     camera, led
-        Centre of projection and lamp when the photograph was taken, ENU metres, (N, 3).
+        Projection centre and lamp at exposure, ENU metres, (N, 3).
     sigma
-        Standard deviation of x and y each, m on the mirror, (N,).
+        Standard deviation of x and of y, m on the mirror, (N,).
     """
 
     photo: npt.NDArray[np.intp]
@@ -58,18 +56,18 @@ class Reflections:
 
     @property
     def xy(self) -> FloatArray:
-        """Where on the mirror, m in concentrator coordinates, (N, 2)."""
+        """Position on the mirror, m in concentrator coordinates, (N, 2)."""
         return np.stack([self.x, self.y], axis=-1)
 
     def take(self, rows: npt.ArrayLike) -> "Reflections":
         """Return the reflections at ``rows`` (indices or a mask), in that order."""
         index = np.asarray(rows)
-        # An empty list is an array of floats to NumPy.
+        # NumPy makes an empty list an array of floats.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
     def of(self, heliostat: int) -> "Reflections":
-        """Return the reflections of one heliostat; its row stays as it is."""
+        """Return the reflections of one heliostat; its row number is kept."""
         return self.take(np.flatnonzero(self.heliostat == heliostat))
 
 
@@ -123,7 +121,7 @@ def reflections(
 
 
 def join(parts: Sequence[Reflections]) -> Reflections:
-    """Return several tables as one, in the order given; none gives an empty table."""
+    """Return several tables as one, in the order given; no parts give an empty table."""
     if not parts:
         return reflections([], [], [], np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 3)), [])
     return Reflections(
@@ -132,14 +130,14 @@ def join(parts: Sequence[Reflections]) -> Reflections:
 
 
 def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]) -> None:
-    """Write reflections as ``.csv`` or ``.parquet``: whole or not at all.
+    """Write reflections as ``.csv`` or ``.parquet``, completely or not at all.
 
     Columns: photo, heliostat (name), facet, x_m, y_m, camera_east_m …, led_up_m, sigma_m.
 
     Raises
     ------
     InputError
-        If the suffix is another one, or a row names no heliostat of ``names``.
+        If the suffix is neither, or a row has no name in ``names``.
     """
     import pandas as pd
 
@@ -166,7 +164,7 @@ def write_reflections(path: str | Path, found: Reflections, names: Sequence[str]
 
 
 def read_reflections(path: str | Path, names: Sequence[str]) -> tuple[Reflections, list[str]]:
-    """Return the reflections of a file and one line for each row that was left out.
+    """Return the reflections of a file and a line for each row that was left out.
 
     Raises
     ------

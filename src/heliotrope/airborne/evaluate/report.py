@@ -1,81 +1,89 @@
 """The report of flights: one self-contained page, and tables for other programs."""
 
-import html
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate import pictures
-from heliotrope.airborne.evaluate._report_tables import (
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.flight import CampaignResult
+from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
+from heliotrope.airborne.evaluate.pictures import field_map, heliostat_drawing
+from heliotrope.airborne.evaluate.reflections import join, write_reflections
+from heliotrope.airborne.evaluate.tables import (
+    MeasuredFlight,
     difference_rows,
     facet_rows,
     flight_row,
-    orientation_rows,
-    systematic_parts,
+    write_table,
 )
-from heliotrope.airborne.evaluate.budget import Budget
-from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
-from heliotrope.airborne.evaluate.reflections import join, write_reflections
+from heliotrope.airborne.evaluate.templates import render
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.calibration.report import page as report
 from heliotrope.calibration.report.page import STYLE, picture
+from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.errors import InputError
-from heliotrope.files.text import write_file, write_text
-from heliotrope.geometry import FloatArray, as_float
+from heliotrope.files.text import write_text
+from heliotrope.geometry import as_float
 
-__all__ = [
-    "Flown", "difference_rows", "facet_rows", "flight_row", "orientation_rows",
-    "systematic_parts", "write_campaign_report", "write_flight_report",
-]  # fmt: skip
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
-#: No more flights than this get a map.
-MOST_MAPS = 6
-_STYLE = """svg { max-width: 100%; height: auto } .wide { overflow-x: auto }
-.wide td, .wide th { padding: .1rem .45rem; font-size: 13px; line-height: 1.3 }
-"""
+Progress = Callable[[int, int], None]
+
+#: Most flights with a map, and most heliostats with a picture.
+MOST_MAPS, MOST_SECTIONS = 6, 60
+_AVERAGED = ("sigma", "sigma_plain", "sigma_mean")
+_FLIGHT_HEAD = (
+    *("flight", "heliostats", "not measured", "photographs with reflections", "points", "rejected"),
+    *("distance, m", "mean rotX, rotY", "RMS rotX, rotY", "σ", "σ/√n", "σ_mean", "systematic"),
+    "σ_tot",
+)
+_HELIOSTAT_HEAD = (
+    *("heliostat", "points", "rejected", "azimuth, °", "elevation, °", "rotX, rotY", "σ", "σ/√n"),
+    "σ_mean",
+)
 
 
-@dataclass(frozen=True)
-class Flown:
-    """One flight (one pose of the mirrors) of a report.
+def write_result(
+    result: CampaignResult,
+    folder: Path,
+    *,
+    page: bool = True,
+    progress: Progress | None = None,
+) -> None:
+    """Write the reflections, sightings and orientations of evaluated flights into a folder.
 
-    Attributes
+    ``reflections.csv`` (of a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
+    calibration, and the report of :func:`write_campaign_report`.
+
+    Parameters
     ----------
-    name
-        Of the flight; "" if it is the only one.
-    found
-        Orientations of the N heliostats.
-    shape
-        Gives the mirror of a row.
-    position
-        Of the heliostats, ENU metres, (N, 3).
-    budget
-        That they were measured with; if given, the systematic part is told by its causes.
-    places
-        Covariances of the mirrors' places that they were measured with, m², (N, 3, 3), or None.
+    result
+        Of :func:`heliotrope.airborne.evaluate.flight.evaluate_flight`.
+    folder
+        Is made if need be.
+    page
+        Whether to write the page with its pictures; otherwise only ``orientations.csv``.
+    progress
+        Called with (done, all) after each picture.
     """
-
-    name: str
-    found: Orientations
-    shape: Callable[[int], MirrorShape]
-    position: FloatArray
-    budget: Budget | None = None
-    places: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        if self.position.shape != (len(self.found.names), 3):
-            raise InputError(
-                f"flight report: positions of shape {self.position.shape} for "
-                f"{len(self.found.names)} heliostats"
-            )
-
-    def rows(self, flight: str = "") -> list[dict[str, Any]]:
-        """Return one record a heliostat, with the flight's name if it is given."""
-        return orientation_rows(self.found, self.budget, flight, self.places)
+    folder.mkdir(parents=True, exist_ok=True)
+    for one in result.flights:
+        name = f"reflections-{one.data.name}".rstrip("-")
+        write_reflections(folder / f"{name}.csv", one.evaluation.reflections, one.data.stand.names)
+    seen = result.sightings()
+    if seen is not None:
+        kinds = ["drone"] * len(seen)
+        write_sightings(folder / "sightings.csv", seen, result.plant.names, kinds)
+    if not page:
+        write_table(folder / "orientations.csv", result.orientation_rows())
+        return
+    notes = (f"{result.campaign.offset_text()}.", *result.not_used)
+    measured = [f.measured for f in result.flights]
+    write_campaign_report(measured, folder, notes=notes, progress=progress)
 
 
 def write_flight_report(
@@ -87,21 +95,21 @@ def write_flight_report(
     budget: Budget | None = None,
     places: npt.ArrayLike | None = None,
     notes: tuple[str, ...] = (),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the page and the tables of one flight; returns the page's path.
 
-    ``index.html`` (all pictures inside it), and ``orientations``, ``facets``, ``flights`` and
+    ``index.html`` (with all pictures), ``orientations``, ``facets``, ``flights`` and
     ``differences`` as ``.csv`` and ``.parquet``, and ``reflections.parquet``.
 
     Parameters
     ----------
     found, shape, position, budget, places
-        As of :class:`Flown`.
+        As :class:`heliotrope.airborne.evaluate.tables.MeasuredFlight`.
     folder
-        Where to; it is made.
+        Is made if need be.
     notes
-        Lines for the top of the page: bad photographs, the offset of RTK.
+        Lines for the top of the page, such as unusable photographs and the offset of RTK.
     progress
         Called with (done, all) after each picture.
 
@@ -111,23 +119,23 @@ def write_flight_report(
         If the positions are not those of N heliostats.
     """
     known = None if places is None else as_float(places)
-    flown = Flown("", found, shape, as_float(position), budget, known)
+    flown = MeasuredFlight("", found, shape, as_float(position), budget, known)
     return write_campaign_report([flown], folder, notes=notes, progress=progress)
 
 
 def write_campaign_report(
-    flights: Sequence[Flown],
+    flights: Sequence[MeasuredFlight],
     folder: Path,
     *,
     notes: tuple[str, ...] = (),
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the page and the tables of several flights, as :func:`write_flight_report`.
 
     Parameters
     ----------
     flights
-        With names that differ.
+        With different names.
     folder, notes, progress
         As there.
 
@@ -143,26 +151,38 @@ def write_campaign_report(
     _write_tables(flights, folder)
     every = [(f, o) for f in flights for o in f.found.found]
     worst = sorted(every, key=lambda e: (-len(e[1].warnings), -_size(e[1])))
-    # Looked up when it is needed: who wants fewer pictures sets it there.
-    shown = {_anchor(f, o) for f, o in worst[: report.MOST_SECTIONS]}
+    shown = {f.label(o) for f, o in worst[:MOST_SECTIONS]}
     maps = [_map(f) for f in flights[:MOST_MAPS]]
     sections = []
     for f, o in every:
-        if _anchor(f, o) not in shown:
-            continue
-        sections.append(_section(f, o))
-        if progress:
-            progress(len(sections), len(shown))
-    text = _page(flights, shown, maps, sections, notes)
+        if f.label(o) in shown:
+            drawn = heliostat_drawing(f.label(o), o, f.shape(o.heliostat))
+            sections.append({"label": f.label(o), "drawing": drawn, "warnings": o.warnings})
+            if progress:
+                progress(len(sections), len(shown))
+    text = render(
+        "report.html.j2",
+        style=STYLE,
+        notes=notes,
+        measured=len(every),
+        missing=sum(len(f.found.left_out) for f in flights),
+        flights=_of_flights(flights),
+        heliostats=_of_heliostats(flights, shown),
+        facets=_of_facets(flights),
+        left_out=[
+            (f"{f.name}/{name}" if f.name else name, why)
+            for f in flights
+            for name, why in f.found.left_out.items()
+        ],
+        maps=maps,
+        sections=sections,
+    )
     page = folder / "index.html"
     write_text(page, text)
     return page
 
 
-# -- tables for other programs ---------------------------------------------------------
-
-
-def _write_tables(flights: Sequence[Flown], folder: Path) -> None:
+def _write_tables(flights: Sequence[MeasuredFlight], folder: Path) -> None:
     tables: dict[str, list[dict[str, Any]]] = {
         "flights": [flight_row(f.found, f.name) for f in flights],
         "orientations": [r for f in flights for r in f.rows(f.name)],
@@ -170,24 +190,13 @@ def _write_tables(flights: Sequence[Flown], folder: Path) -> None:
         "differences": [r for f in flights for r in difference_rows(f.found, f.name)],
     }
     for name, rows in tables.items():
-        _write_table(rows, folder / name)
+        for suffix in (".csv", ".parquet"):
+            write_table(folder / f"{name}{suffix}", rows)
     for f in flights:
-        # A photograph's number counts within its flight.
+        # Photographs are numbered within their flight.
         name = f"reflections-{f.name}" if f.name else "reflections"
         own = join([o.reflections for o in f.found.found])
         write_reflections(folder / f"{name.replace('/', '-')}.parquet", own, f.found.names)
-
-
-def _write_table(rows: list[dict[str, Any]], place: Path) -> None:
-    import pandas as pd
-
-    table = pd.DataFrame(rows)
-    write_text(place.with_suffix(".csv"), table.to_csv(index=False))
-    parquet = place.with_suffix(".parquet")
-    write_file(parquet, lambda stream: table.to_parquet(stream, index=False))
-
-
-# -- the page --------------------------------------------------------------------------
 
 
 def _size(o: Orientation) -> float:
@@ -195,143 +204,81 @@ def _size(o: Orientation) -> float:
     return value if np.isfinite(value) else np.inf
 
 
-def _anchor(flight: Flown, o: Orientation) -> str:
-    name = flight.found.names[o.heliostat]
-    return f"{flight.name}/{name}" if flight.name else name
+def _map(flight: MeasuredFlight) -> "Markup":
+    from markupsafe import Markup
 
-
-def _section(flight: Flown, o: Orientation) -> str:
-    told = _anchor(flight, o)
-    figure = pictures.heliostat_drawing(told, o, flight.shape(o.heliostat))
-    listed = "".join(f"<li>{html.escape(w)}.</li>" for w in o.warnings)
-    name = html.escape(told)
-    return f'<section id="{name}"><h2>{name}</h2>{figure}<ul>{listed}</ul></section>'
-
-
-def _map(flight: Flown) -> str:
     title = f"flight {flight.name}" if flight.name else ""
-    figure = pictures.field_map(flight.found, flight.position, title)
-    return picture(figure, f"Map of the field {title}".strip())
+    figure = field_map(flight.found, flight.position, title)
+    return Markup(picture(figure, f"Map of the field {title}".strip()))  # noqa: S704  # escaped there
 
 
-def _page(
-    flights: Sequence[Flown],
-    shown: set[str],
-    maps: list[str],
-    sections: list[str],
-    notes: tuple[str, ...],
-) -> str:
-    measured = sum(len(f.found.found) for f in flights)
-    missing = sum(len(f.found.left_out) for f in flights)
-    told = (
-        "rotX and rotY: how a mirror stands turned, about its own horizontal and upward axes, from "
-        "where it was expected. σ: of a single difference. σ/√n takes the points as independent; "
-        "σ_mean counts the slopes as one fixed field; σ_tot holds the systematic part too. All in "
-        "mrad of the mirror's normal, rotX and rotY; the beam turns by twice that."
-    )
-    lines = [f"{measured} heliostats measured, {missing} not.", told, *notes]
-    if len(sections) < measured:
-        lines.append(
-            f"Pictures of {len(sections)} of them, those with the most warnings and the largest "
-            "σ_tot; the others' figures are in the tables and in differences.csv."
-        )
-    text = "".join(f"<p>{html.escape(line)}</p>" for line in lines)
-    return (
-        '<!doctype html><html lang="en"><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width">'
-        f"<title>Flight</title><style>{STYLE}{_STYLE}</style><h1>Orientations from the air</h1>"
-        f"{text}{_of_flights(flights)}{_of_maps(maps)}<h2>Heliostats</h2>"
-        f"{_of_heliostats(flights, shown)}<details><summary>facets</summary>"
-        f"{_of_facets(flights)}</details>{_left_out(flights)}{''.join(sections)}</html>"
-    )
+# -- tables of the page ----------------------------------------------------------------
 
 
-def _of_maps(maps: list[str]) -> str:
-    if len(maps) < 2:
-        return "".join(maps)
-    rest = "".join(maps[1:])
-    return f"{maps[0]}<details><summary>maps of other flights</summary>{rest}</details>"
+@dataclass(frozen=True)
+class _Table:
+    """A table: its head, and rows of cells."""
+
+    head: Sequence[str]
+    rows: Iterable[Sequence[object]]
 
 
-def _of_flights(flights: Sequence[Flown]) -> str:
-    head = (
-        "flight", "heliostats", "not measured", "photographs with reflections", "points",
-        "rejected", "distance, m", "mean rotX, rotY", "RMS rotX, rotY", "σ", "σ/√n", "σ_mean",
-        "systematic", "σ_tot",
-    )  # fmt: skip
+def _of_flights(flights: Sequence[MeasuredFlight]) -> _Table:
     body = []
     for f in flights:
         row = flight_row(f.found, f.name)
+        counts = ("heliostats", "not_measured", "photographs_with_reflections", "points")
+        averages = ("rot_rms", *_AVERAGED, "systematic", "sigma_tot")
         body.append(
             [
-                html.escape(f.name) or "–",
-                row["heliostats"],
-                row["not_measured"],
-                row["photographs_with_reflections"],
-                row["points"],
-                row["outliers"],
+                f.name or "–",
+                *(row[name] for name in (*counts, "outliers")),
                 f"{row['distance_m']:.0f}",
                 _both(row, "rot_mean", "+"),
-                *(
-                    _both(row, name)
-                    for name in (
-                        "rot_rms",
-                        "sigma",
-                        "sigma_plain",
-                        "sigma_mean",
-                        "systematic",
-                        "sigma_tot",
-                    )
-                ),
+                *(_both(row, name) for name in averages),
             ]
         )
-    return _table(head, body)
+    return _Table(_FLIGHT_HEAD, body)
 
 
-def _of_heliostats(flights: Sequence[Flown], shown: set[str]) -> str:
+def _of_heliostats(flights: Sequence[MeasuredFlight], shown: set[str]) -> _Table:
     causes = _causes(flights)
-    head = (
-        "heliostat", "points", "rejected", "azimuth, °", "elevation, °", "rotX, rotY", "σ", "σ/√n",
-        "σ_mean", *(f"σ of {cause}" for cause in causes), "systematic", "σ_tot",
-        "p (rotX, rotY)", "warnings",
-    )  # fmt: skip
+    named = [f"σ of {cause}" for cause in causes]
+    head = [*_HELIOSTAT_HEAD, *named, "systematic", "σ_tot", "p (rotX, rotY)", "warnings"]
     body = []
     for f in flights:
         for o, row in zip(f.found.found, f.rows(), strict=True):
-            name = html.escape(_anchor(f, o))
+            parts = (*_AVERAGED, *(f"systematic_{c}" for c in causes), "systematic", "sigma_tot")
             body.append(
                 [
-                    f'<a href="#{name}">{name}</a>' if _anchor(f, o) in shown else name,
+                    render("link.html.j2", to=f.label(o)) if f.label(o) in shown else f.label(o),
                     o.count,
                     int(o.outlier.sum()),
                     f"{row['azimuth_deg']:.4f}",
                     f"{row['elevation_deg']:.4f}",
                     _both(row, "rot", "+"),
-                    *(_both(row, w) for w in ("sigma", "sigma_plain", "sigma_mean")),
-                    *(_both(row, f"systematic_{cause}") for cause in causes),
-                    *(_both(row, w) for w in ("systematic", "sigma_tot")),
+                    *(_both(row, part) for part in parts),
                     f"{o.normality[0]:.2f}, {o.normality[1]:.2f}",
                     len(o.warnings) or "",
                 ]
             )
-    return _table(head, body)
+    return _Table(head, body)
 
 
-def _causes(flights: Sequence[Flown]) -> list[str]:
-    """Return the causes of the systematic part that are known of every flight."""
+def _causes(flights: Sequence[MeasuredFlight]) -> list[str]:
+    """Return the causes of the systematic part that are known for every flight."""
     if any(f.budget is None for f in flights):
         return []
-    told = {f.places is None for f in flights}
-    if told == {True}:
+    without = {f.places is None for f in flights}
+    if without == {True}:
         return [c.name for c in fields(Budget)]
-    return ["place", "lamp"] if told == {False} else []
+    return ["place", "lamp"] if without == {False} else []
 
 
-def _of_facets(flights: Sequence[Flown]) -> str:
-    head = ("heliostat", "facet", "points", "rotX, rotY", "σ of the mean")
+def _of_facets(flights: Sequence[MeasuredFlight]) -> _Table:
     body = [
         [
-            html.escape(f"{f.name}/{row['heliostat']}" if f.name else row["heliostat"]),
+            f"{f.name}/{row['heliostat']}" if f.name else row["heliostat"],
             row["facet"],
             row["points"],
             _both(row, "rot", "+"),
@@ -340,24 +287,9 @@ def _of_facets(flights: Sequence[Flown]) -> str:
         for f in flights
         for row in facet_rows(f.found)
     ]
-    return _table(head, body)
-
-
-def _left_out(flights: Sequence[Flown]) -> str:
-    body = [
-        [html.escape(f"{f.name}/{name}" if f.name else name), html.escape(why)]
-        for f in flights
-        for name, why in f.found.left_out.items()
-    ]
-    return f"<h2>Not measured</h2>{_table((), body)}" if body else ""
+    return _Table(("heliostat", "facet", "points", "rotX, rotY", "σ of the mean"), body)
 
 
 def _both(row: dict[str, Any], name: str, sign: str = "") -> str:
     """Return the figures of rotX and rotY as one cell."""
     return ", ".join(f"{row[f'{name}_{a}_mrad']:{sign}.3f}" for a in ("x", "y"))
-
-
-def _table(head: Iterable[str], body: Iterable[Sequence[object]]) -> str:
-    named = "".join(f"<th>{name}</th>" for name in head)
-    rows = "".join("<tr>" + "".join(f"<td>{c}</td>" for c in cells) + "</tr>" for cells in body)
-    return f'<div class="wide"><table>{f"<tr>{named}</tr>" if named else ""}{rows}</table></div>'

@@ -1,7 +1,8 @@
-"""The tables of a flight's report: one record a heliostat, a facet, a reflection, a flight."""
+"""Tables of a flight: one record for each heliostat, facet, reflection and flight."""
 
-from collections.abc import Sequence
-from dataclasses import fields
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,56 @@ import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.orientation import Orientation, Orientations
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.errors import InputError
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _AXES = ("x", "y")
+
+
+@dataclass(frozen=True)
+class MeasuredFlight:
+    """Orientations of one flight (one pose of the mirrors), with what they were measured with.
+
+    Attributes
+    ----------
+    name
+        Of the flight; "" if it is the only one.
+    found
+        Orientations of the N heliostats.
+    shape
+        Gives the mirror of a row.
+    position
+        Of the heliostats, ENU metres, (N, 3).
+    budget
+        If given, the systematic part is split by cause.
+    places
+        Covariances of the mirrors' positions relative to the drone, m², (N, 3, 3), or None.
+    """
+
+    name: str
+    found: Orientations
+    shape: Callable[[int], MirrorShape]
+    position: FloatArray
+    budget: Budget | None = None
+    places: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        if self.position.shape != (len(self.found.names), 3):
+            raise InputError(
+                f"flight report: positions of shape {self.position.shape} for "
+                f"{len(self.found.names)} heliostats"
+            )
+
+    def rows(self, flight: str = "") -> list[dict[str, Any]]:
+        """Return one record for each heliostat, with the flight's name if it is given."""
+        return orientation_rows(self.found, self.budget, flight, self.places)
+
+    def label(self, o: Orientation) -> str:
+        """Return the name of an orientation's heliostat, with that of the flight if it has one."""
+        name = self.found.names[o.heliostat]
+        return f"{self.name}/{name}" if self.name else name
 
 
 def orientation_rows(
@@ -20,18 +68,18 @@ def orientation_rows(
     flight: str = "",
     places: npt.ArrayLike | None = None,
 ) -> list[dict[str, Any]]:
-    """Return one record a heliostat, for tables and JSON; angles in mrad and degrees.
+    """Return one record for each heliostat, for tables and JSON; angles in mrad and degrees.
 
     Parameters
     ----------
     found
         Of one flight.
     budget
-        If given, the systematic part is also told by its causes.
+        If given, the systematic part is also split by cause.
     flight
-        Its name, for a column of that name; none if "".
+        Its name, for a column of that name; no column if "".
     places
-        As :func:`heliotrope.airborne.evaluate.orientation.measure_field` had them, (N, 3, 3).
+        As given to :func:`heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
     """
     known = None if places is None else as_float(places)
     return [
@@ -40,7 +88,7 @@ def orientation_rows(
 
 
 def facet_rows(found: Orientations, flight: str = "") -> list[dict[str, Any]]:
-    """Return one record a facet: its mean difference, which is its canting error, mrad."""
+    """Return one record for each facet: its mean difference is its canting error, mrad."""
     return [
         {
             **_of(flight),
@@ -56,7 +104,7 @@ def facet_rows(found: Orientations, flight: str = "") -> list[dict[str, Any]]:
 
 
 def difference_rows(found: Orientations, flight: str = "") -> list[dict[str, Any]]:
-    """Return one record a reflection: where it stands on the mirror, and its difference."""
+    """Return one record for each reflection: its position on the mirror, and its difference."""
     return [
         {
             **_of(flight),
@@ -76,8 +124,8 @@ def difference_rows(found: Orientations, flight: str = "") -> list[dict[str, Any
 def flight_row(found: Orientations, flight: str = "") -> dict[str, Any]:
     """Return the record of a flight: counts, and means over its heliostats, mrad.
 
-    ``rot_mean`` is the mean deviation, which all share; ``rot_rms`` the size of all; the
-    standard deviations are root mean squares.
+    ``rot_mean`` is the mean deviation, common to all; ``rot_rms`` their size. The standard
+    deviations are root mean squares.
     """
     every = found.found
     row: dict[str, Any] = {
@@ -105,17 +153,17 @@ def flight_row(found: Orientations, flight: str = "") -> dict[str, Any]:
 def systematic_parts(
     o: Orientation, budget: Budget, place: npt.ArrayLike | None = None
 ) -> dict[str, FloatArray]:
-    """Return what each cause of a budget turns an orientation by, rotX and rotY, rad, (2,).
+    """Return the share of each cause in the systematic part of an orientation, rad, (2,) each.
 
     Parameters
     ----------
     o
-        Measured with this budget: the squares sum to the square of its systematic part.
+        Measured with this budget: the squares add up to the square of its systematic part.
     budget
         Its lengths are the causes.
     place
-        Covariance of the mirror's place as seen from the drone, m², (3, 3), if a bundle
-        adjustment found it: it is one cause, "place", instead of position, kinematics and RTK.
+        Covariance of the mirror's position relative to the drone, m², (3, 3), if a bundle
+        adjustment found it: one cause, "place", instead of position, kinematics and RTK.
     """
     kept = o.reflections.take(~o.outlier)
     # A turn about x moves the normal towards −y, one about y towards x.
@@ -132,6 +180,17 @@ def systematic_parts(
     return parts
 
 
+def write_table(path: Path, rows: Sequence[dict[str, Any]]) -> None:
+    """Write records as ``.csv`` or ``.parquet``, by the suffix; completely or not at all."""
+    import pandas as pd
+
+    table = pd.DataFrame(rows)
+    if path.suffix.casefold() == ".csv":
+        write_text(path, table.to_csv(index=False))
+    else:
+        write_file(path, lambda stream: table.to_parquet(stream, index=False))
+
+
 def _spread(covariance: FloatArray) -> FloatArray:
     return as_float(np.sqrt(np.diag(covariance)))
 
@@ -145,7 +204,7 @@ def _pair(name: str, values: FloatArray) -> dict[str, float]:
 
 
 def _over(values: Sequence[FloatArray], mean: bool = False) -> FloatArray:
-    """Return mean or root mean square of pairs that are finite, (2,); NaN without any."""
+    """Return the mean or root mean square of the finite pairs, (2,); NaN without any."""
     table = as_float(values).reshape(-1, 2)
     table = table[np.isfinite(table).all(axis=-1)]
     if not len(table):

@@ -1,4 +1,4 @@
-"""``heliotrope drone rtk``: how well the drone's RTK positions are known (HelioPoint, A)."""
+"""``heliotrope drone rtk``: the accuracy of the drone's RTK positions (HelioPoint, appendix A)."""
 
 import sys
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from heliotrope.cli import _calibration as calibration
-from heliotrope.cli._common import print_json, print_table
+from heliotrope.cli._common import open_plant, print_json, print_table
 from heliotrope.cli.drone import _shared as shared
 
 
@@ -24,14 +24,27 @@ def rtk(
     scheduler: calibration.SchedulerOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Compare RTK's positions with those that the photographs themselves give."""
-    import numpy as np
-
+    """Compare RTK positions with those from the photographs alone."""
     from heliotrope.airborne.evaluate.bundle import Priors
-    from heliotrope.airborne.evaluate.evaluation import check_rtk
+    from heliotrope.airborne.evaluate.folder import designed_shape, open_flight
+    from heliotrope.airborne.evaluate.reading import read_many
+    from heliotrope.airborne.evaluate.rtk import check_rtk
 
-    flight = shared.open_flight(folder, field, camera, commands, cluster, point, None)
-    seen = shared.read_flight(flight, out / "photographs", processes, scheduler, as_json)
+    plant = open_plant(field)
+    flight = open_flight(folder, plant, designed_shape(plant), camera, commands, cluster, point)
+    with (
+        calibration.connected(scheduler) as client,
+        calibration.progress("reading", as_json) as advance,
+    ):
+        seen = read_many(
+            flight.photos,
+            flight.camera,
+            flight.stand,
+            processes=shared.cores(processes),
+            client=client,
+            keep=out / "photographs",
+            progress=advance,
+        )
     check, problems = check_rtk(
         flight.photos, seen, flight.camera, flight.stand, Priors(position=1e-3 * survey_mm)
     )
@@ -50,14 +63,13 @@ def rtk(
             }
         )
         return
-    scale = np.array([1e3, 1e3, 1e3])
     columns = (check.mean, check.mean_sigma, check.sigma, check.photogrammetry)
     rows = [
-        [axis, *(f"{column[k] * scale[k]:.1f}" for column in columns)]
+        [axis, *(f"{1e3 * column[k]:.1f}" for column in columns)]
         for k, axis in enumerate(("east", "north", "up"))
     ]
     print_table(
-        ["axis", "common offset", "± of it", "σ of one", "of that photogrammetry"],
+        ["axis", "common offset", "± of it", "σ of one", "σ of photogrammetry"],
         rows,
         f"RTK less photogrammetry, {len(check.names)} photographs, mm",
     )

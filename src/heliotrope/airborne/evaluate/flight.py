@@ -1,0 +1,258 @@
+"""The evaluation of a drone's flight, from its folder of photographs to sightings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliotrope.airborne.evaluate.budget import Budget
+from heliotrope.airborne.evaluate.bundle import Priors
+from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
+from heliotrope.airborne.evaluate.evaluation import Evaluation
+from heliotrope.airborne.evaluate.folder import FlightData, open_flights
+from heliotrope.airborne.evaluate.orientation import measure_field
+from heliotrope.airborne.evaluate.reading import read_many
+from heliotrope.airborne.evaluate.sightings import to_sightings
+from heliotrope.airborne.evaluate.tables import MeasuredFlight
+from heliotrope.calibration.sightings import Sightings, join
+from heliotrope.field.plant import Plant
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+#: Called with what is being done, how many are done, and of how many.
+Progress = Callable[[str, int, int], None]
+
+#: Survey (10 mm) and kinematics (30 mm) as HelioPoint assumes them; the 30 mm of RTK base are ours.
+PRIORS = Priors(offset=0.030, position=0.010, kinematics=0.030)
+
+
+@dataclass(frozen=True)
+class FlightResult:
+    """One flight with its result.
+
+    Attributes
+    ----------
+    data
+        Photographs and commanded mirrors.
+    evaluation
+        Exterior orientations, and reflections.
+    measured
+        Orientations of the mirrors, with what they were measured with.
+    """
+
+    data: FlightData
+    evaluation: Evaluation
+    measured: MeasuredFlight
+
+    def label(self, name: str) -> str:
+        """Return a name within this flight as the whole campaign calls it."""
+        return f"{self.data.name}/{name}" if self.data.name else name
+
+    def sightings(self) -> Sightings | None:
+        """Return one sighting of each orientation, heliostats as rows of the plant."""
+        if not self.measured.found.found:
+            return None
+        times = [p.time.timestamp() for p in self.evaluation.photos if p.time is not None]
+        made = to_sightings(
+            self.measured.found,
+            self.data.counts,
+            time=float(np.mean(times)) if times else 0.0,
+            per="orientation",
+        )
+        return replace(made, heliostat=self.data.heliostat[made.heliostat])
+
+
+@dataclass(frozen=True)
+class CampaignResult:
+    """The flights of a folder with their results.
+
+    Attributes
+    ----------
+    plant
+        The field.
+    data
+        All flights that could be opened.
+    campaign
+        RTK's common offset, and what became of each flight.
+    flights
+        Those with a result.
+    not_used
+        A line for each flight and photograph that was not used.
+    warnings
+        A line for each slope map that is missing, and if RTK's offset is implausible.
+    """
+
+    plant: Plant
+    data: tuple[FlightData, ...]
+    campaign: Campaign
+    flights: tuple[FlightResult, ...]
+    not_used: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    def sightings(self) -> Sightings | None:
+        """Return the sightings of all flights for the calibration; None if there are none."""
+        parts = [s for s in (f.sightings() for f in self.flights) if s is not None]
+        return join(parts) if parts else None
+
+    def orientation_rows(self) -> list[dict[str, Any]]:
+        """Return one record for each orientation, its systematic part split by cause."""
+        return [row for f in self.flights for row in f.measured.rows(f.data.name)]
+
+    def orientation_warnings(self) -> list[tuple[str, str]]:
+        """Return pairs of a heliostat and a warning about its orientation."""
+        return [
+            (f.label(f.measured.found.names[o.heliostat]), warning)
+            for f in self.flights
+            for o in f.measured.found.found
+            for warning in o.warnings
+        ]
+
+    def left_out(self) -> dict[str, str]:
+        """Return the heliostats that could not be measured, with the reasons."""
+        return {
+            f.label(name): reason
+            for f in self.flights
+            for name, reason in f.measured.found.left_out.items()
+        }
+
+    def document(self) -> dict[str, Any]:
+        """Return the result as a record for JSON."""
+        warnings: dict[str, list[str]] = {}
+        for name, warning in self.orientation_warnings():
+            warnings.setdefault(name, []).append(warning)
+        return {
+            "photographs": [f.label(p.name) for f in self.flights for p in f.evaluation.photos],
+            "not_used": list(self.not_used),
+            "reflections": sum(len(f.evaluation.reflections) for f in self.flights),
+            "rtk_offset_m": self.campaign.offset.tolist(),
+            "rtk_offset_sigma_m": self.campaign.offset_sigma.tolist(),
+            "orientations": self.orientation_rows(),
+            "warnings": warnings,
+            "left_out": self.left_out(),
+        }
+
+
+def evaluate_flight(
+    folder: str | Path,
+    plant: Plant,
+    *,
+    camera: Path | None = None,
+    commands: Path | None = None,
+    cluster: str = "",
+    point: str = "",
+    slopes: Path | None = None,
+    focal: float = np.inf,
+    priors: Priors = PRIORS,
+    keep: Path | None = None,
+    processes: int = 1,
+    client: "Client | None" = None,
+    progress: Progress | None = None,
+) -> CampaignResult:
+    """Return the orientations of a flight's mirrors, from the folder of its photographs.
+
+    A folder of such folders is a campaign: its flights are evaluated together. The way of a
+    photograph, each step once and in this order:
+
+    1. ``folder.open_flights``: photographs, camera and commands become a ``FlightData``.
+    2. ``reading.read_many``: each photograph is read, and what it shows is a ``Seen``.
+       ``reading.read_photo``, ``detection.find_patches``, ``identification.identify``,
+       ``detection.find_outlines``, ``detection.find_spots``.
+    3. ``campaign.evaluate_campaign``: flights that share heliostats go together.
+    4. ``evaluation.evaluate``: one adjustment, and its ``Evaluation``.
+    5. ``bundle.adjust``: all corners give the exterior orientations and RTK's offset.
+    6. ``rays.spot_reflections``: spots become ``Reflections`` on mirrors.
+    7. ``orientation.measure_field``: reflections become ``Orientations`` with their accuracy.
+       ``orientation.measure``.
+    8. ``sightings.to_sightings``: orientations become ``Sightings`` for the calibration, when
+       :meth:`CampaignResult.sightings` is called.
+
+    :func:`heliotrope.airborne.evaluate.report.write_result` writes the result to files.
+
+    Parameters
+    ----------
+    folder, camera, commands, cluster, point, slopes, focal
+        As :func:`heliotrope.airborne.evaluate.folder.open_flights`.
+    plant
+        The field.
+    priors
+        Standard deviations of what is known beforehand.
+    keep, processes, client
+        As :func:`heliotrope.airborne.evaluate.reading.read_many`.
+    progress
+        Called with what is being done, and (done, all) photographs.
+
+    Raises
+    ------
+    InputError
+        If no flight can be used or none gives a reflection.
+    """
+    opened, unusable, warnings = open_flights(
+        Path(folder),
+        plant,
+        camera=camera,
+        commands=commands,
+        cluster=cluster,
+        point=point,
+        slopes=slopes,
+        focal=focal,
+    )
+    flights = [_read(flight, keep, processes, client, progress) for flight in opened]
+    campaign = evaluate_campaign(flights, priors)
+    # The RTK base is part of each mirror's position as the adjustment knows it.
+    budget = Budget(priors.position, priors.kinematics, 0.0)
+    results = [
+        _measure(flight, found, budget)
+        for flight, found in zip(flights, campaign.flights, strict=True)
+        if found is not None
+    ]
+    lines = [(f.name, line) for f in flights for line in f.problems]
+    for flight, problems in zip(flights, campaign.problems, strict=True):
+        lines += [(flight.name, line) for line in problems]
+    not_used = (*unusable, *(f"{name}: {line}" if name else line for name, line in lines))
+    told = (*warnings, *campaign.warnings(priors.offset))
+    return CampaignResult(plant, tuple(flights), campaign, tuple(results), not_used, told)
+
+
+def _read(
+    flight: FlightData,
+    keep: Path | None,
+    processes: int,
+    client: "Client | None",
+    progress: Progress | None,
+) -> FlightData:
+    what = f"reading {flight.name}".strip()
+    seen = read_many(
+        flight.photos,
+        flight.camera,
+        flight.stand,
+        processes=processes,
+        client=client,
+        keep=keep,
+        progress=None if progress is None else lambda done, of: progress(what, done, of),
+    )
+    return replace(flight, seen=seen)
+
+
+def _measure(flight: FlightData, found: Evaluation, budget: Budget) -> FlightResult:
+    """Measure the mirrors of one flight where the photographs showed them to stand."""
+    orientations = measure_field(
+        found.reflections,
+        flight.stand.names,
+        flight.shape,
+        flight.stand.rotation,
+        found.stand.vertex,
+        budget=budget,
+        places=found.place_covariance,
+    )
+    measured = MeasuredFlight(
+        flight.name,
+        orientations,
+        flight.shape,
+        found.stand.vertex,
+        budget,
+        found.place_covariance,
+    )
+    return FlightResult(flight, found, measured)

@@ -1,0 +1,109 @@
+"""Spots to reflections: the ray of each spot is intersected with the surface of its mirror."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
+from heliotrope.airborne.mirror import MirrorShape
+from heliotrope.airborne.photo import LedCamera, Photo
+from heliotrope.airborne.standing import Standing
+from heliotrope.geometry import FloatArray, as_float
+
+ShapeOf = Callable[[int], MirrorShape]
+
+#: The position of a spot on a mirror is not known better than this share of a pixel.
+SPOT_FLOOR = 0.15
+
+
+def spot_reflections(
+    photos: Sequence[Photo],
+    seen: Sequence[Seen],
+    camera: LedCamera,
+    stand: Standing,
+    shape: ShapeOf,
+    *,
+    shifts: FloatArray | None = None,
+    beside: float = 0.0,
+) -> Reflections:
+    """Return the reflections of all spots of P photographs on N mirrors.
+
+    Parameters
+    ----------
+    photos, seen
+        Photographs where they were taken, and what each shows.
+    camera
+        With its lamp.
+    stand
+        The mirrors.
+    shape
+        Gives the surface of a mirror's row; slopes do not matter here.
+    shifts
+        Displacement of each mirror's image in each photograph, undistorted coordinates,
+        (P, N, 2); none if omitted.
+    beside
+        Rays that miss all facets by more than this (and a few per cent of a facet) are left
+        out, m.
+    """
+    number = np.concatenate([np.full(len(s.spot_mirror), k) for k, s in enumerate(seen)])
+    mirror = np.concatenate([s.spot_mirror for s in seen])
+    place = np.concatenate([s.spot for s in seen])
+    if shifts is not None:
+        place = place - shifts[number, mirror]
+    spread = np.hypot(np.concatenate([s.spot_sigma for s in seen]), SPOT_FLOOR / camera.focal)
+    turns = as_float([p.rotation for p in photos])
+    position = as_float([p.position for p in photos])
+    lamp = as_float([p.led_position(camera) for p in photos])
+    ways = np.concatenate([place, np.ones((len(place), 1))], axis=-1)
+    ways = np.einsum("kij,kj->ki", turns[number], ways)
+    parts = []
+    for row in np.unique(mirror).tolist():
+        mine = np.flatnonzero(mirror == row)
+        turned = stand.rotation[row]
+        start = (position[number[mine]] - stand.vertex[row]) @ turned
+        facet, xy = _intersect(shape(int(row)), start, ways[mine] @ turned, beside)
+        kept = facet >= 0
+        distance = np.linalg.norm(start, axis=-1)
+        # Foreshortening blurs the position of a spot along an oblique mirror.
+        slant = np.maximum(np.abs(start[:, 2]) / distance, 0.2)
+        sigma = np.maximum(spread[mine] * distance / slant, 1e-4)
+        at = number[mine[kept]]
+        parts.append(
+            reflections(at, row, facet[kept], xy[kept], position[at], lamp[at], sigma[kept])
+        )
+    found = join([p for p in parts if len(p)])
+    return found.take(np.lexsort((found.heliostat, found.photo)))
+
+
+def _intersect(
+    shape: MirrorShape, start: FloatArray, ways: FloatArray, beside: float
+) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    """Return the facet (-1 beside the mirror) and position (S, 2) where rays meet the surface."""
+    height = np.zeros(len(ways))
+    facet = np.full(len(ways), -1, dtype=np.intp)
+    xy = np.zeros((len(ways), 2))
+    for _ in range(3):
+        length = (height - start[:, 2]) / ways[:, 2]
+        xy = start[:, :2] + length[:, None] * ways[:, :2]
+        facet = _nearest_facet(shape, xy, beside)
+        kept = facet >= 0
+        height[kept] = shape.point_at(facet[kept], xy[kept])[:, 2]
+    return facet, xy
+
+
+def _nearest_facet(shape: MirrorShape, xy: FloatArray, beside: float) -> npt.NDArray[np.intp]:
+    """Return the facet at each position, in a gap the nearer one, or -1 beside the mirror."""
+    facet = shape.facet_at(xy)
+    left = np.flatnonzero(facet < 0)
+    if len(left):
+        every = np.tile(np.arange(len(shape)), len(left))
+        uv = shape.along_facet(every, np.repeat(xy[left], len(shape), axis=0))
+        beyond = np.maximum(np.abs(uv) - shape.half_size[every], 0.0)
+        off = np.hypot(beyond[:, 0], beyond[:, 1]).reshape(len(left), len(shape))
+        nearest = np.argmin(off, axis=1)
+        limit = 0.05 * shape.half_size.max(axis=1) + 0.02 + beside
+        near = off[np.arange(len(left)), nearest] < limit[nearest]
+        facet[left[near]] = nearest[near]
+    return facet
