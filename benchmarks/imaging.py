@@ -15,13 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks._centroids import moments_centroid, threshold_centroid
 from benchmarks._run import BenchmarkError, Call, Result, Row, Times, timed
 from heliotrope.field.formats.paint import read_tower
 from heliotrope.field.target import Target
 from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.photograph import read_photograph
 from heliotrope.imaging.spots.background import from_frame
-from heliotrope.imaging.spots.baseline import moments_centroid, threshold_centroid
 from heliotrope.imaging.synthetic.rendering import (
     Scene,
     Sensor,

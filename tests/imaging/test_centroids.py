@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from benchmarks._centroids import moments_centroid, threshold_centroid
 
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.photograph import read_crop
 from heliotrope.imaging.spots.background import from_frame
-from heliotrope.imaging.spots.baseline import moments_centroid, threshold_centroid
 from heliotrope.imaging.targets.rectify import Rectified, from_crop
 
 TARGET = Target(

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FetchError, FormatError, InputError, TimeError
-from heliotrope.imaging import sources
 from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.sources import (
@@ -478,7 +477,7 @@ def test_what_goes_wrong_in_the_thread_is_told() -> None:
 
 def test_a_device_that_is_absent_is_a_clear_error() -> None:
     with (
-        pytest.raises(InputError, match=r"usb:/dev/video97: there is no such device; there: "),
+        pytest.raises(InputError, match=r"usb:/dev/video97: there is no such device; present: "),
         UsbSource(97),
     ):
         pass
@@ -490,7 +489,7 @@ def test_a_device_that_is_no_camera(tmp_path: Path, capfd: pytest.CaptureFixture
     source = UsbSource(96)
     source.device = str(tmp_path / "video96")
     (tmp_path / "video96").touch()
-    with pytest.raises(InputError, match="cannot be opened; another program"), source:
+    with pytest.raises(InputError, match="cannot be opened: another program"), source:
         pass
     assert capfd.readouterr().err == ""
 
@@ -499,7 +498,7 @@ def test_a_device_gets_its_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     (tmp_path / "video96").touch()
 
     def played(capture: _Capture, **more: Any) -> UsbSource:
-        monkeypatch.setattr(sources, "_capture", lambda *_: capture)
+        monkeypatch.setattr("heliotrope.imaging.sources.video._capture", lambda *_: capture)
         source = UsbSource("/dev/video96", clock=lambda: START, **more)
         source.device = str(tmp_path / "video96")
         return source
@@ -520,9 +519,7 @@ def test_a_device_gets_its_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert set(plain.settings) == {cv2.CAP_PROP_BUFFERSIZE}
     other = _Capture(refuses=True)
     with (
-        pytest.raises(
-            InputError, match="width 1600 px is not taken, the camera says 640; see v4l2"
-        ),
+        pytest.raises(InputError, match="does not accept width 1600 px but says 640; see v4l2"),
         played(other, width=1600),
     ):
         pass
@@ -577,7 +574,7 @@ def test_a_source_is_chosen_by_its_text(video: Path) -> None:
 def test_texts_that_are_no_source(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").touch()
     for text, wanted in {
-        "": "no source is given; name a folder",
+        "": "no source given; name a folder",
         "ftp://me:secret@host/a": r"source ftp://host/a: frames come by rtsp://, rtsps://, http://",
         "none": "there is no such file: give a folder, an image or a video",
         "a.xyz": "is neither a folder, an image or a video",
@@ -642,7 +639,7 @@ def test_frames_that_have_no_average() -> None:
     with pytest.raises(InputError, match="no frame to average"):
         average([])
     for other in (_pixels(1), still.pixels.astype(np.uint16), np.dstack([still.pixels] * 3)):
-        with pytest.raises(InputError, match="have no mean; give frames alike"):
+        with pytest.raises(InputError, match="have no mean; give frames of a kind"):
             average([still, Frame(other, "other")])
 
 

@@ -14,7 +14,6 @@ from heliotrope.field.formats.paint import read_tower
 from heliotrope.imaging.annotate import LONGEST, annotate
 from heliotrope.imaging.files import read_image
 from heliotrope.imaging.photograph import Photograph, read_photograph
-from heliotrope.imaging.synthetic.hybrid import compose
 from support.data import juelich
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -174,10 +173,10 @@ def _blank(value: float, shape: tuple[int, int] = (40, 40)) -> Any:
     return np.full(shape, value)
 
 
-def test_composition_has_the_truth_and_the_contrast_it_says() -> None:
+def test_composition_has_the_truth_and_the_contrast_it_says(figures: ModuleType) -> None:
     y, x = np.mgrid[:40, :40]
     beam = np.exp(-((x - 18.0) ** 2 + (y - 21.0) ** 2) / 18.0)
-    made = compose(_blank(100.0), beam, (4, -3), contrast=0.5, peak=0.9)
+    made = figures.compose(_blank(100.0), beam, (4, -3), contrast=0.5, peak=0.9)
     assert made.truth == pytest.approx([22.0, 18.0], abs=1e-3)
     pixels = made.frame.pixels.astype(float)
     assert pixels.max() == pytest.approx(0.9 * 255.0, abs=0.5)
@@ -194,6 +193,6 @@ def test_composition_has_the_truth_and_the_contrast_it_says() -> None:
         (_blank(1.0), _blank(0.0), "the beam has no light"),
     ],
 )
-def test_composition_refuses(empty: Any, beam: Any, text: str) -> None:
+def test_composition_refuses(figures: ModuleType, empty: Any, beam: Any, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        compose(empty, beam, (0, 0), 1.0, 0.9)
+        figures.compose(empty, beam, (0, 0), 1.0, 0.9)

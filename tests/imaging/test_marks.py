@@ -12,7 +12,8 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets import refinement
 from heliotrope.imaging.targets.marks import polygons, tag_cells, tag_dictionary
-from heliotrope.imaging.targets.refinement import Refined, coverage, locate, refine
+from heliotrope.imaging.targets.refinement import Refined, locate, refine
+from heliotrope.optics.coverage import coverage
 
 ORIGIN = np.zeros(3)
 MARKS = {
@@ -94,7 +95,7 @@ def test_tags_are_those_of_opencv() -> None:
         side = 8 * len(tag_cells(mark))
         dictionary = cv2.aruco.getPredefinedDictionary(number)
         wanted = cv2.aruco.generateImageMarker(dictionary, tag_dictionary(mark)[1], side)
-        cells = [(p * [1, -1] + 0.5 * mark.size) * (side / mark.size) for p in polygons(mark)]
+        cells = [(p * [1, -1] + 0.5 * mark.size) * (side / mark.size) - 0.5 for p in polygons(mark)]
         np.testing.assert_allclose(1.0 - coverage(cells, (side, side)), wanted / 255.0, atol=1e-9)
 
 
@@ -112,7 +113,7 @@ def test_covered_areas_are_exact() -> None:
     y, x = (np.mgrid[0 : 16 * fine, 0 : 16 * fine] + 0.5) / fine
     for _ in range(5):
         triangle = rng.uniform(1.0, 15.0, (3, 2))
-        share = coverage([triangle], (16, 16))
+        share = coverage([triangle - 0.5], (16, 16))
         assert share.sum() == pytest.approx(area(triangle), abs=1e-9)
         sides = [
             (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) > 0.0
@@ -122,7 +123,7 @@ def test_covered_areas_are_exact() -> None:
         counted = inside.reshape(16, fine, 16, fine).mean(axis=(1, 3))
         np.testing.assert_allclose(share, counted, atol=0.03)
     box = np.array([(1.5, 2.25), (6.75, 2.25), (6.75, 16.0), (1.5, 16.0)])
-    share = coverage([box], (16, 16))
+    share = coverage([box - 0.5], (16, 16))
     np.testing.assert_allclose(share[[2, 2, 15], [1, 3, 3]], [0.375, 0.75, 1.0])
 
 

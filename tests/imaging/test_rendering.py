@@ -27,13 +27,13 @@ from heliotrope.imaging.synthetic.rendering import (
     point_spread,
     render,
 )
+from heliotrope.optics.coverage import coverage
 from heliotrope.optics.mirror_image import (
     Beam,
     flat_top_beam,
     gaussian_beam,
     reflected_beam,
 )
-from heliotrope.optics.render_kernels import coverage
 
 TARGET = example_target()
 #: Small frames, and a lens five times as bent as the example's.

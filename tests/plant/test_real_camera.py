@@ -18,8 +18,13 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import normalize
 from heliotrope.imaging.files import read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.snapshot import SnapshotSource, is_snapshot
-from heliotrope.imaging.sources import SimulatedSource, Source, open_source
+from heliotrope.imaging.sources import (
+    SimulatedSource,
+    SnapshotSource,
+    Source,
+    is_snapshot,
+    open_source,
+)
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
@@ -154,7 +159,7 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
         ("", "names no source of its frames; add source"),
         ("night.avi", "is a recording; give a source of live frames"),
         ("nowhere", "there is no such file"),
-        ("ftp://a/b", "not by ftp"),
+        ("ftp://a/b", "not over ftp"),
     ],
 )
 def test_a_source_that_none_is(plant: Plant, tmp_path: Path, source: str, text: str) -> None:
@@ -217,7 +222,7 @@ def test_a_snapshot_that_none_is(camera_server: str) -> None:
     with pytest.raises(FetchError, match=r"no answer \(ConnectError\)") as refused:
         next(iter(source))
     assert "secret" not in str(refused.value)
-    with pytest.raises(InputError, match="no address of an image"):
+    with pytest.raises(InputError, match="not the address of an image"):
         SnapshotSource("http://camera/video")
 
 

@@ -19,7 +19,7 @@ from heliotrope.geometry import (
     tangent_axes,
 )
 from heliotrope.optics.beam import SUN_RADIUS
-from heliotrope.optics.render_kernels import coverage
+from heliotrope.optics.coverage import coverage
 
 #: Where Buie's aureole ends, rad.
 AUREOLE_RADIUS = 43.6e-3

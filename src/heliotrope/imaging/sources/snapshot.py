@@ -1,6 +1,5 @@
-"""A network camera that gives one photograph for each question over HTTP."""
+"""A network camera that answers each HTTP request with one photograph."""
 
-import re
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -12,12 +11,12 @@ from urllib.parse import urlsplit
 from heliotrope.errors import FetchError, InputError
 from heliotrope.imaging.files import IMAGE_SUFFIXES, read_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.sources import Source
+from heliotrope.imaging.sources.source import Source, hide_password
 
 if TYPE_CHECKING:
     import httpx
 
-#: A photograph that is larger is none, bytes.
+#: Larger answers are not photographs, bytes.
 _LARGEST = 64 * 2**20
 
 
@@ -29,25 +28,25 @@ def is_snapshot(text: str) -> bool:
 
 @dataclass
 class SnapshotSource(Source):
-    """Photographs that a camera takes when it is asked.
+    """Photographs that a camera takes on request.
 
-    A frame's time is that of the file if it says one; else the middle of question and answer, with
-    half of the time between them as its deviation. A user and a password in the address are sent
-    as such, and stand in no message.
+    A frame's time is the one in the file, if there is one; otherwise the middle between request and
+    answer, with half of the time between them as its deviation. A user and a password in the
+    address are sent as credentials and never shown.
 
     Attributes
     ----------
     url
-        Of the image.
+        Address of the image.
     interval
-        Between questions, s.
+        Between requests, s.
     timeout
         For an answer, s.
 
     Raises
     ------
     InputError
-        An address that is none of an image.
+        If the address is not that of an image.
     """
 
     url: str
@@ -55,22 +54,22 @@ class SnapshotSource(Source):
     timeout: float = 10.0
 
     def __post_init__(self) -> None:
-        self.name = self.name or re.sub(r"(?<=://)[^/?#]*@", "", self.url)
+        self.name = self.name or hide_password(self.url)
         if not is_snapshot(self.url):
             raise InputError(
-                f"source {self.name}: no address of an image; give http://host/…, ending in "
+                f"source {self.name}: not the address of an image; give http://host/… ending in "
                 f"{', '.join(IMAGE_SUFFIXES)}"
             )
 
     def _frames(self) -> Iterator[Frame]:
-        """Give photographs until it is stopped.
+        """Yield photographs until stopped.
 
         Raises
         ------
         FetchError
-            If the camera does not answer, or with something else.
+            If the camera does not answer, or not with an image.
         FormatError
-            If what it gives is broken.
+            If the image is broken.
         """
         import httpx
 

@@ -11,9 +11,10 @@ from heliotrope.field.camera import Camera, project, undistort
 from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
+from heliotrope.imaging.synthetic._kernels import sample_plane
 from heliotrope.imaging.synthetic.scenes import Paint, Scene, Surroundings
 from heliotrope.imaging.targets.marks import polygons
-from heliotrope.optics.render_kernels import coverage, sample_plane
+from heliotrope.optics.coverage import coverage
 
 Image = npt.NDArray[np.float32]
 

@@ -16,6 +16,7 @@ from heliotrope.field.marks import Mark
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.imaging.frame import Frame, Pixels
+from heliotrope.imaging.synthetic._kernels import ambient_field, expose, sample_plane
 from heliotrope.imaging.synthetic._painting import Image, Plane, background, mark_shapes
 from heliotrope.imaging.synthetic.scenes import (
     Lens,
@@ -29,8 +30,8 @@ from heliotrope.imaging.synthetic.scenes import (
     example_target,
     exposed,
 )
+from heliotrope.optics.coverage import coverage
 from heliotrope.optics.mirror_image import deposit
-from heliotrope.optics.render_kernels import ambient_field, coverage, expose, sample_plane
 
 __all__ = [
     "BeamTruth",

@@ -17,7 +17,7 @@ from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.marks import polygons, tag_dictionary
-from heliotrope.imaging.targets.refinement import coverage
+from heliotrope.optics.coverage import coverage
 
 #: Least correlation of a candidate's shape with a drawing.
 _ALIKE = 0.72
@@ -123,7 +123,7 @@ def _drawing(kind: str, size: float, stroke: float) -> Drawing:
     high = np.concatenate(shapes).max(axis=0) + 0.5 * size
     step = size / 48
     columns, rows = np.ceil((high - low) / step).astype(int).tolist()
-    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step for p in shapes]
+    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step - 0.5 for p in shapes]
     raster = coverage(cells, (rows, columns))
     y, x = np.mgrid[0:rows, 0:columns]
     spots = np.stack([x.ravel(), y.ravel()], axis=-1).astype(np.float64)

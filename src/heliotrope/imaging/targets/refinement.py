@@ -15,6 +15,7 @@ from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.marks import polygons
+from heliotrope.optics.coverage import coverage
 
 Values = npt.NDArray[np.float32]
 
@@ -236,50 +237,13 @@ def _drawn(kind: str, key: tuple[float, float, float], code: str, count: int) ->
     margin = max(_MARGIN * float(np.ptp(points, axis=0).max()), 3.0 * step)
     low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
     columns, rows = np.ceil((high - low) / step).astype(int).tolist()
-    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step for p in shapes]
+    # The centre of the first cell is half a step inside the grid.
+    cells = [np.column_stack([p[:, 0] - low[0], high[1] - p[:, 1]]) / step - 0.5 for p in shapes]
     soft = cv2.GaussianBlur(coverage(cells, (rows, columns)), (0, 0), _SOFT)
     values = np.asarray(soft, dtype=np.float64)
     first = np.array([low[0] + 0.5 * step, high[1] - 0.5 * step])
     broad = (stroke or size) / step
     return _Template(values, first, step, _basis(values, first, step), -1.0, broad)
-
-
-def coverage(shapes: list[FloatArray], size: tuple[int, int]) -> FloatArray:
-    """Return how much of each cell (row, column) polygons cover, exactly, (H, W).
-
-    Parameters
-    ----------
-    shapes
-        Polygons (K, 2) of columns and rows, apart from each other; cell (0, 0) is from 0 to
-        1 in both. They lie within the grid.
-    size
-        Rows and columns.
-
-    Notes
-    -----
-    Green's theorem: each piece of an edge within a cell adds its height to all cells right
-    of it, and in its own cell what lies right of the piece.
-    """
-    # One more each way for edges on the grid's own edge.
-    out = np.zeros((size[0] + 1, size[1] + 2))
-    for shape in shapes:
-        total = np.zeros_like(out)
-        for a, b in zip(shape, np.roll(shape, -1, axis=0), strict=True):
-            crossings = [np.array([0.0, 1.0])]
-            for k in range(2):
-                if a[k] != b[k]:
-                    lines = np.arange(np.ceil(min(a[k], b[k])), max(a[k], b[k]))
-                    crossings.append((lines - a[k]) / (b[k] - a[k]))
-            part = np.unique(np.clip(np.concatenate(crossings), 0.0, 1.0))
-            ends = a + part[:, None] * (b - a)
-            middle = 0.5 * (ends[1:] + ends[:-1])
-            column, row = np.floor(middle).astype(int).T
-            rise = np.diff(ends[:, 1])
-            within = middle[:, 0] - column
-            np.add.at(total, (row, column), rise * (1.0 - within))
-            np.add.at(total, (row, column + 1), rise * within)
-        out += np.abs(np.cumsum(total, axis=1))
-    return np.clip(out[:-1, :-2], 0.0, 1.0)
 
 
 def _basis(values: FloatArray, first: FloatArray, step: float) -> Values:

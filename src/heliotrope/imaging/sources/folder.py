@@ -1,0 +1,107 @@
+"""Frames from image files: a folder, read once or watched."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from heliotrope.errors import FormatError, InputError
+from heliotrope.imaging.files import IMAGE_SUFFIXES, find_images, read_image
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.sources.source import Source
+
+
+@dataclass
+class FolderSource(Source):
+    """The images of a folder in natural order and, if it is watched, those that arrive later.
+
+    A file in a watched folder is read once it has been unchanged for one poll and is whole. A file
+    that changes later is read again, so a camera may always write the same file. If the folder
+    disappears, as a network folder may, the source waits for it.
+
+    Attributes
+    ----------
+    path
+        The folder, or one image.
+    watch
+        Whether to go on with files that appear later.
+    poll, patience
+        Interval between looks at the folder, and time after which an unreadable file in a
+        watched folder counts as broken, s.
+    skip_broken
+        Leave out broken files and note them in ``skipped``, rather than raise FormatError;
+        None: leave them out if the folder is watched.
+    read
+        Reads a file; by default :func:`heliotrope.imaging.files.read_image`.
+    wait
+        Waits for a number of seconds; by default until ``stop`` is set.
+    """
+
+    path: str | Path
+    watch: bool = False
+    poll: float = 0.5
+    patience: float = 10.0
+    skip_broken: bool | None = None
+    read: Callable[[Path], Frame] = read_image
+    wait: Callable[[float], object] | None = None
+    skipped: list[FormatError] = field(default_factory=list, init=False)
+
+    def __post_init__(self) -> None:
+        self.name = self.name or str(self.path)
+        if not 0.0 < self.poll < math.inf:
+            raise InputError(f"source {self.name}: poll {self.poll} s must be above 0")
+
+    def _begin(self) -> None:
+        self._listed()
+
+    def _listed(self) -> list[Path]:
+        path = Path(self.path)
+        if path.suffix.lower() in IMAGE_SUFFIXES and not path.is_dir():
+            return [path]
+        return find_images(path)
+
+    def _broken(self, error: FormatError) -> None:
+        if not (self.watch if self.skip_broken is None else self.skip_broken):
+            raise error
+        self.skipped.append(error)
+
+    def _frames(self) -> Iterator[Frame]:
+        done: dict[Path, tuple[int, ...]] = {}  # state of each file when it was dealt with
+        looks: dict[Path, tuple[tuple[int, ...], int]] = {}  # looks for which it has been the same
+        needed, patience = (2, self.patience) if self.watch else (1, 0.0)
+        while not self.stop.is_set():
+            paths: dict[Path, None] = {}
+            with suppress(*[InputError] if self.watch else []):  # a watched folder may be missing
+                paths = dict.fromkeys(self._listed())
+            done = {path: state for path, state in done.items() if path in paths or not paths}
+            for path in paths:
+                state = _state(path)
+                if self.stop.is_set() or (self.watch and state in ((), done.get(path))):
+                    continue
+                seen, times = looks.get(path, (state, 0))
+                looks[path] = state, times + 1 if seen == state else 1
+                if looks[path][1] < needed:
+                    continue
+                try:
+                    frame = self.read(path)
+                except FormatError as error:
+                    if looks[path][1] * self.poll >= patience:
+                        done[path] = looks.pop(path)[0]
+                        self._broken(error)
+                    continue
+                if not self.watch or _state(path) == state:
+                    done[path] = looks.pop(path)[0]
+                    yield frame
+            if not self.watch:
+                return
+            (self.wait or self.stop.wait)(self.poll)
+
+
+def _state(path: Path) -> tuple[int, ...]:
+    """Return inode, size and time of change of a file; () if it does not exist."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ()
+    return found.st_ino, found.st_size, found.st_mtime_ns
