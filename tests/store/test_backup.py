@@ -168,7 +168,7 @@ class TestRefusals:
         with pytest.raises(StoreError, match=r"backup .*: it exists"):
             backups.backup(Database(tmp_path / "data"), made, NOW)
         backups.restore(made, tmp_path / "new")
-        with pytest.raises(StoreError, match="there is one already"):
+        with pytest.raises(StoreError, match="it exists already"):
             backups.restore(made, tmp_path / "new")
 
     def test_not_under_a_plant_that_runs(self, made: Path, tmp_path: Path) -> None:
@@ -179,14 +179,14 @@ class TestRefusals:
         data = bytearray((made / "store.sqlite").read_bytes())
         data[len(data) // 2] ^= 1
         (made / "store.sqlite").write_bytes(data)
-        with pytest.raises(FormatError, match=r"store\.sqlite: its checksum is another"):
+        with pytest.raises(FormatError, match=r"store\.sqlite: its checksum differs"):
             backups.restore(made, tmp_path / "new")
         assert not (tmp_path / "new").exists()
 
     @pytest.mark.parametrize(
         ("change", "wanted"),
         [
-            (lambda m: None, "this is no manifest"),
+            (lambda m: None, "this is not the manifest"),
             (lambda m: m["files"].clear(), r"store\.sqlite is not in it"),
             (lambda m: m["files"].update({"../x": "0"}), "lies outside the backup"),
             (lambda m: m["files"].update({"gone": "0"}), "the file is missing"),
@@ -206,7 +206,7 @@ class TestRefusals:
     def test_no_backup_and_no_store(self, tmp_path: Path) -> None:
         with pytest.raises(FormatError, match="give the folder of a backup"):
             backups.restore(tmp_path, tmp_path / "new")
-        with pytest.raises(StoreError, match="there is none"):
+        with pytest.raises(StoreError, match="no store here"):
             backups.backup(Database(tmp_path / "none"), tmp_path / "backup", NOW)
         assert not (tmp_path / "none").exists()
 

@@ -88,12 +88,12 @@ class TestAudit:
 
     def test_records_that_contradict_each_other(self, keeper: Keeper, audit: KeptAudit) -> None:
         audit.begin(RECORD)
-        with pytest.raises(InputError, match="a record p-1 exists; identities are unique"):
+        with pytest.raises(InputError, match="record p-1 exists already; identities are unique"):
             audit.begin(replace(RECORD, who="ben"))
         audit.finish("p-1", "done", START.isoformat())
-        with pytest.raises(InputError, match="no record p-1 waits for a result"):
+        with pytest.raises(InputError, match="no record p-1 is waiting for a result"):
             audit.finish("p-1", "failed", START.isoformat())
-        with pytest.raises(InputError, match="no record p-9 waits for a result"):
+        with pytest.raises(InputError, match="no record p-9 is waiting for a result"):
             audit.finish("p-9", "done", START.isoformat())
         assert [(e.who, e.result) for e in entries(keeper)] == [("anna", "done")]
 

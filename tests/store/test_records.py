@@ -171,7 +171,7 @@ class TestParameters:
         keeper.record_parameters(version("A", np.array([77])))
         keeper.record_event(Event(1.0, "test", "goes on"))
         asyncio.run(keeper.confirm())
-        assert "a record is refused" in keeper.refused
+        assert "a record was refused" in keeper.refused
         assert keeper.parameter_history("A") == []
         assert [e.text for e in keeper.events()] == ["goes on"]
 
@@ -333,7 +333,7 @@ class TestOpening:
 
     def test_a_place_where_no_folder_can_be(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(StoreError, match=r"file/data.*may be written to"):
+        with pytest.raises(StoreError, match=r"file/data.*can be written"):
             Keeper(tmp_path / "file" / "data")
 
     def test_a_file_that_is_no_database(self, tmp_path: Path) -> None:

@@ -64,5 +64,5 @@ def test_export_migrate_and_query(data: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["info", "migrate"])
 def test_a_store_that_is_not_there(tmp_path: Path, command: str) -> None:
     done = run(command, tmp_path / "none")
-    assert "there is none" in str(done.exception)
+    assert "no store here" in str(done.exception)
     assert not (tmp_path / "none").exists()

@@ -299,7 +299,7 @@ class TestQueries:
             query(folder, sql)
 
     def test_need_an_archive(self, tmp_path: Path) -> None:
-        with pytest.raises(StoreError, match="there is no such folder"):
+        with pytest.raises(StoreError, match="no such folder"):
             query(tmp_path / "none", "SELECT 1")
         (tmp_path / "empty").mkdir()
         assert rows(tmp_path / "empty") == []

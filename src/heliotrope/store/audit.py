@@ -17,17 +17,19 @@ Places = Mapping[str, tuple[float, ...]]
 
 
 def begin(connection: Connection, entry: AuditEntry) -> None:
-    """Keep a record without result; to do so twice is to do it once.
+    """Keep a record without a result; keeping it twice is the same as once.
 
     Raises
     ------
     InputError
-        An identity that another record has.
+        If another record has its identity.
     """
     known = _find(connection, entry.identity)
     if known is not None:
         if (known.who, known.what, known.at) != (entry.who, entry.what, entry.at):
-            raise InputError(f"audit: a record {entry.identity} exists; identities are unique")
+            raise InputError(
+                f"audit: record {entry.identity} exists already; identities are unique"
+            )
         return
     number = (connection.scalar(select(func.max(_AUDIT.c.number))) or 0) + 1
     values = [float(v) for v in entry.values]
@@ -36,12 +38,12 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
 
 
 def finish(connection: Connection, identity: str, result: str, at: str) -> None:
-    """Add the result to a record; to do so twice is to do it once.
+    """Add the result to a record; adding it twice is the same as once.
 
     Raises
     ------
     InputError
-        A record that was not begun, or has another result.
+        If the record was not begun, or has another result.
     """
     open_ = (_AUDIT.c.identity == identity) & (_AUDIT.c.result == "")
     values = {"result": result, "finished": at}
@@ -49,17 +51,17 @@ def finish(connection: Connection, identity: str, result: str, at: str) -> None:
         return
     known = _find(connection, identity)
     if known is None or known.result != result:
-        raise InputError(f"audit: no record {identity} waits for a result")
+        raise InputError(f"audit: no record {identity} is waiting for a result")
 
 
 def finish_open(connection: Connection, result: str, at: str) -> int:
-    """Give one result to all records that have none; return how many they were."""
+    """Give one result to all records without one; return their number."""
     open_ = update(_AUDIT).where(_AUDIT.c.result == "")
     return connection.execute(open_.values(result=result, finished=at)).rowcount
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
-    """Return records, the last begun first; those before a place in their order if given."""
+    """Return records, the last begun first; only those before a place in that order, if given."""
     query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
     if before:
         query = query.where(_AUDIT.c.number < before)
@@ -79,7 +81,7 @@ def _entry(row: Any) -> AuditEntry:
 
 
 def probe(connection: Connection) -> None:
-    """Write something of no meaning: only a write shows that the disk takes one."""
+    """Write something meaningless: only a write shows that the disk accepts one."""
     about = tables.about
     known = connection.scalar(select(about.c.value).where(about.c.name == "probe"))
     row = {"name": "probe", "value": str(int(known or 0) + 1)}
@@ -101,7 +103,7 @@ def points(connection: Connection) -> dict[str, dict[str, tuple[float, ...]]]:
 def change_points(
     connection: Connection, new: Mapping[str, Places], gone: Mapping[str, Iterable[str]]
 ) -> None:
-    """Keep new points in place of those of before, and let go of others, by kind."""
+    """Replace the assigned points, by kind."""
     table = tables.assigned_point
     for kind, names in gone.items():
         for name in names:

@@ -1,8 +1,8 @@
-"""Backup and restore: one state of everything, taken while the plant runs.
+"""Backup and restore: one consistent state of everything, taken while the plant runs.
 
-A backup is a folder: ``store.sqlite`` (also of a store in PostgreSQL, so that each may be restored
+A backup is a folder: ``store.sqlite`` (of a store in PostgreSQL too, so each kind can be restored
 into the other), the telemetry if wanted, and ``manifest.json`` with the checksum of every file. It
-is there whole or not at all. A restore goes into an empty place only: nothing is ever overwritten.
+is there whole or not at all. A restore needs an empty place: nothing is ever overwritten.
 """
 
 import hashlib
@@ -33,7 +33,7 @@ _ROWS = 5000
 
 @dataclass(frozen=True)
 class Backup:
-    """A backup: its folder, revision of the tables, when it was made, and its size in bytes."""
+    """A backup: folder, revision of the tables, time, size in bytes."""
 
     folder: Path
     revision: str
@@ -49,13 +49,13 @@ def backup(
     Parameters
     ----------
     database
-        May be written meanwhile.
+        It may be written meanwhile.
     folder
-        Is made; it must not exist.
+        Folder to make; it must not exist.
     now
-        Goes into the manifest.
+        Time for the manifest.
     telemetry
-        Folder of the archive that is to be in it.
+        Folder of the archive to include.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def backup(
     final = Path(folder)
     database.require()
     if final.exists():
-        raise StoreError(f"backup {final}: it exists; give a folder that does not")
+        raise StoreError(f"backup {final}: it exists already; give a new folder")
     beside = final.with_name(f".{final.name}.{os.getpid()}.part")
     try:
         beside.mkdir(parents=True)
@@ -98,12 +98,12 @@ def backup(
 
 
 def check(folder: str | Path) -> Backup:
-    """Return what a backup is, every file of it compared with its checksum.
+    """Return a backup after comparing every file with its checksum.
 
     Raises
     ------
     FormatError
-        If it is none, or a file is missing or not as it was.
+        If it is not a backup, or a file is missing or altered.
     """
     place = Path(folder)
     path = place / MANIFEST
@@ -114,40 +114,40 @@ def check(folder: str | Path) -> Backup:
     except OSError as error:
         raise FormatError(path, f"{error.strerror}; give the folder of a backup") from None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise FormatError(path, "this is no manifest of a backup") from None
+        raise FormatError(path, "this is not the manifest of a backup") from None
     if FILE not in wanted:
-        raise FormatError(path, f"{FILE} is not in it; this is no manifest of a backup")
+        raise FormatError(path, f"{FILE} is not in it; this is not the manifest of a backup")
     size = 0
     for name, sum_ in wanted.items():
         file = place / name
         if ".." in Path(name).parts or Path(name).is_absolute():
             raise FormatError(path, f"the file {name!r} lies outside the backup")
         if not file.is_file():
-            raise FormatError(file, "the file is missing; take another backup")
+            raise FormatError(file, "the file is missing; use another backup")
         if checksum(file) != sum_:
-            raise FormatError(file, "its checksum is another; take another backup")
+            raise FormatError(file, "its checksum differs; use another backup")
         size += file.stat().st_size
     return Backup(place, revision, made, size)
 
 
 def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None = None) -> Backup:
-    """Put a backup into an empty place.
+    """Restore a backup into an empty place.
 
     Parameters
     ----------
     folder
-        Of the backup.
+        Folder of the backup.
     place
-        As in `Database`: there must be no store yet.
+        As in `Database`; there must be no store yet.
     telemetry
-        Where its telemetry goes to, if it has any; None: left out.
+        Destination of its telemetry, if it has any; None: left out.
 
     Raises
     ------
     FormatError
         If the backup is damaged.
     StoreError
-        If there is a store already, another process has it, or it cannot be written.
+        If there is a store already, another process holds it, or it cannot be written.
     """
     found = check(folder)
     database = Database(place)
@@ -157,7 +157,7 @@ def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None 
         database.lock()
         if database.revision():
             raise StoreError(
-                f"store {database.name}: there is one already; give an empty place, or move it away"
+                f"store {database.name}: it exists already; give an empty place, or move it away"
             )
         if telemetry is not None and (found.folder / TELEMETRY).is_dir():
             if Path(telemetry).exists() and any(Path(telemetry).iterdir()):
@@ -183,12 +183,12 @@ def restore(folder: str | Path, place: str | Path, telemetry: str | Path | None 
 
 
 def summary(database: Database) -> dict[str, Any]:
-    """Return what is in a store: revision, rows of each table, times of the first and last.
+    """Return a store's revision, rows of each table, and times of the first and last.
 
     Raises
     ------
     StoreError
-        If there is none, or it cannot be read.
+        If there is no store, or it cannot be read.
     """
     revision = database.revision()
     if not revision:
@@ -211,15 +211,15 @@ def summary(database: Database) -> dict[str, Any]:
 
 
 def migrate(place: str | Path) -> tuple[str, Path | None]:
-    """Bring a store up to date; return its revision before, and the copy that was made of it.
+    """Bring a store up to date; return its old revision, and the copy that was made of it.
 
-    A file is copied first, to ``store.before-REVISION.sqlite`` beside it; PostgreSQL changes its
+    A file is first copied to ``store.before-REVISION.sqlite`` beside it; PostgreSQL changes its
     tables in one transaction.
 
     Raises
     ------
     StoreError
-        If there is no store, another process has it, it is newer than the program, or that fails.
+        If there is no store, another process holds it, it is newer than the program, or it fails.
     """
     with Database(place) as database:
         found = database.revision()
@@ -260,7 +260,7 @@ def _sync(path: Path) -> None:
 
 
 def _copy_file(source: Path, target: Path) -> None:
-    """Copy an SQLite database in one step: one state of it, whoever writes meanwhile."""
+    """Copy an SQLite database in one step: a consistent state, even while it is written."""
     with (
         closing(sqlite3.connect(f"file:{source}?mode=ro", uri=True, timeout=10.0)) as old,
         closing(sqlite3.connect(target)) as new,
@@ -275,7 +275,7 @@ def _copy_file(source: Path, target: Path) -> None:
 
 
 def _close_log(file: Path) -> None:
-    """Make one file of a database and its log."""
+    """Merge a database and its log into one file."""
     with closing(sqlite3.connect(file)) as connection:
         connection.execute("PRAGMA journal_mode=DELETE")
 
@@ -305,7 +305,7 @@ def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]
 
 
 def _copy_telemetry(source: Path, target: Path) -> None:
-    """Copy an archive; parts may become Parquet files meanwhile."""
+    """Copy an archive, of which parts may become Parquet files meanwhile."""
     target.mkdir()
     for _ in range(2):
         for path in sorted(source.glob("????-??-??/*.*")):
@@ -315,5 +315,5 @@ def _copy_telemetry(source: Path, target: Path) -> None:
                 try:
                     shutil.copyfile(path, copy)
                 except FileNotFoundError:
-                    # It is a Parquet file now: the second round takes it.
+                    # It has become a Parquet file: the second round takes it.
                     copy.unlink(missing_ok=True)

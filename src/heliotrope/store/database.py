@@ -1,8 +1,8 @@
 """A database: SQLite in a folder, or PostgreSQL by URL; opened, locked, brought up to date.
 
 One process at a time writes (the plant); others may read meanwhile. SQLite runs in WAL mode, and
-what is committed is synced to the disk. Its one writing connection is also the only one that
-moves the log into the file.
+every commit is synced to the disk. Its one writing connection is also the only one that moves the
+log into the file.
 """
 
 import fcntl
@@ -21,17 +21,17 @@ from heliotrope.store.records import StoreError
 #: Revision of the tables that this program knows.
 HEAD = "0001"
 FILE = "store.sqlite"
-#: Who may read and write its files.
+#: Permissions of its files.
 MODE = 0o640
-#: For PostgreSQL's advisory lock; the second number is that of the schema.
+#: Key of PostgreSQL's advisory lock; the second number stands for the schema.
 _LOCK = 0x48454C49
-#: How long it is waited for, s.
+#: Time limit for taking it, s.
 _PATIENCE = 2
 _LOCK_TIMEOUT = "55P03"
 
 
 class Database:
-    """Where rows are kept.
+    """A database.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ class Database:
     Attributes
     ----------
     url
-        Of the database.
+        URL of the database.
     file
-        Of SQLite, None for PostgreSQL.
+        File of SQLite, None for PostgreSQL.
 
     Raises
     ------
@@ -56,7 +56,7 @@ class Database:
         self.url, self.file = _place(place)
         options: dict[str, Any] = {}
         if self.file is None:
-            # A server that does not answer is told within seconds; the loop never waits for it.
+            # A silent server is reported within seconds; the loop never waits for it.
             options["connect_args"] = {"connect_timeout": 3, "tcp_user_timeout": 5000}
         self._reader = create_engine(
             self.url, pool_pre_ping=self.file is None, isolation_level=self._isolation(), **options
@@ -70,17 +70,17 @@ class Database:
         self.locked = False
 
     def _isolation(self) -> Any:
-        # What is read in one transaction belongs together; SQLite's always does.
+        # Reads of one transaction must be consistent; SQLite's always are.
         return "REPEATABLE READ" if self.file is None else "SERIALIZABLE"
 
     @property
     def name(self) -> str:
-        """For messages: the file, or the URL without its password."""
+        """Name for messages: the file, or the URL without its password."""
         return str(self.file) if self.file is not None else self.url.render_as_string()
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Give a connection that sees one state of everything, and cannot write.
+        """Yield a read-only connection with one consistent state.
 
         Raises
         ------
@@ -96,12 +96,12 @@ class Database:
             raise StoreError(f"store {self.name}: cannot be read ({cause(error)})") from None
 
     def connect(self) -> Connection:
-        """Return a connection to write with; on PostgreSQL it has the lock if the store has.
+        """Return a connection for writing; on PostgreSQL it holds the lock if the store does.
 
         Raises
         ------
         StoreError
-            If another process has the lock meanwhile.
+            If another process has taken the lock.
         """
         spare, self._spare = self._spare, None
         if spare is not None:
@@ -117,7 +117,7 @@ class Database:
         Raises
         ------
         StoreError
-            If another one is, or the folder cannot be written to.
+            If another process is, or the folder cannot be written.
         """
         if self.file is None:
             self.locked = True
@@ -143,12 +143,12 @@ class Database:
             ) from None
         except OSError as error:
             raise StoreError(
-                f"store {self.file}: {error.strerror}; give a folder that may be written to"
+                f"store {self.file}: {error.strerror}; give a folder that can be written"
             ) from None
         self.locked = True
 
     def _lock_server(self, connection: Connection) -> None:
-        """Take the server's lock, which it may not have taken back yet from a connection before."""
+        """Take the server's lock, which an earlier connection may still hold for a moment."""
         key = {"key": _LOCK}
         try:
             with connection.begin():
@@ -179,19 +179,19 @@ class Database:
             return str(connection.scalar(text("SELECT version_num FROM alembic_version")) or "")
 
     def require(self) -> None:
-        """See that the tables are there, and are those that this program knows.
+        """Check that the tables exist and have this program's revision.
 
         Raises
         ------
         StoreError
-            If not.
+            If they do not.
         """
         found = self.revision()
         if not found:
-            raise StoreError(f"store {self.name}: there is none; `heliotrope run` makes one")
+            raise StoreError(f"store {self.name}: no store here; `heliotrope run` makes one")
         if found != HEAD:
             raise StoreError(
-                f"store {self.name}: its tables are of revision {found}, this program's of {HEAD}; "
+                f"store {self.name}: its tables have revision {found}, this program needs {HEAD}; "
                 + ("run `heliotrope store migrate`" if found < HEAD else "update the program")
             )
 
@@ -201,7 +201,7 @@ class Database:
         Raises
         ------
         StoreError
-            If it is of another revision, or cannot be made.
+            If it has another revision, or cannot be made.
         """
         if not self.revision():
             self.migrate()
@@ -213,7 +213,7 @@ class Database:
         Raises
         ------
         StoreError
-            If that fails; everything is as before.
+            If that fails; the store is unchanged.
         """
         from alembic import command
         from alembic.config import Config
@@ -224,7 +224,8 @@ class Database:
         config.set_main_option("script_location", folder.replace("%", "%%"))
         try:
             if self.file is not None:
-                # Hashes of passwords are in it: it is not for everybody's eyes. Its log follows it.
+                # It holds password hashes, so only its owner may read it; its log gets the same
+                # permissions.
                 os.close(os.open(self.file, os.O_RDWR | os.O_CREAT, MODE))
             with self._writer.connect() as connection:
                 config.attributes["connection"] = connection
@@ -242,7 +243,7 @@ class Database:
         self.close()
 
     def close(self) -> None:
-        """Give everything back."""
+        """Close connections and release the lock."""
         if self._spare is not None:
             self._spare.close()
             self._spare = None
@@ -264,11 +265,11 @@ _WRITER = (
 
 
 def _prepare(engine: Engine, begin: str, pragmas: tuple[str, ...]) -> None:
-    """Let SQLAlchemy's transactions be SQLite's own, and set up each connection."""
+    """Make SQLAlchemy's transactions SQLite's own, and set up each connection."""
 
     @event.listens_for(engine, "connect")
     def connected(connection: Any, _: object) -> None:
-        connection.isolation_level = None  # the driver begins no transactions by itself
+        connection.isolation_level = None  # the driver does not begin transactions by itself
         for pragma in pragmas:
             connection.execute(pragma)
 
@@ -298,7 +299,7 @@ def _place(place: str | Path) -> tuple[URL, Path | None]:
 
 
 def cause(error: Exception) -> str:
-    """Return one line on why a database refused."""
+    """Return in one line why a database refused."""
     inner = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     lines = str(inner).strip().splitlines()
     return lines[0] if lines else type(inner).__name__

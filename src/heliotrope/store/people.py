@@ -1,8 +1,8 @@
 """People: accounts with their roles, sessions that expire, tokens for programs.
 
-Passwords are hashed by whoever asks for them (argon2); here only the hash is kept. Of the secrets
-of sessions and tokens, which are made here from 32 random bytes, only their SHA-256 is kept: who
-reads the database cannot use them. Times are POSIX seconds and always arguments.
+The caller hashes passwords (argon2); only the hash is kept here. Secrets of sessions and tokens are
+made here from 32 random bytes, and only their SHA-256 is kept, so nobody who reads the database can
+use them. Times are POSIX seconds and always arguments.
 """
 
 import hashlib
@@ -25,20 +25,20 @@ ROLES = ("viewer", "operator", "engineer")
 
 @dataclass(frozen=True)
 class Account:
-    """A person.
+    """A person's account.
 
     Attributes
     ----------
     name
-        Unique; case counts.
+        Unique; case-sensitive.
     role
         One of `ROLES`.
     password_hash
-        As it was given; never shown.
+        As given; never shown.
     disabled
-        Whether the person is kept out.
+        Whether the account is disabled.
     created, changed
-        When.
+        POSIX s.
     """
 
     name: str
@@ -51,9 +51,9 @@ class Account:
 
 @dataclass(frozen=True)
 class Session:
-    """A person who is logged in: name and present role, since and until when.
+    """A signed-in person: name and current role, beginning and end.
 
-    ``key`` names the session without giving its secret away: for a list of sessions.
+    ``key`` identifies the session in lists without revealing its secret.
     """
 
     key: str
@@ -71,15 +71,15 @@ class ApiToken:
     Attributes
     ----------
     key
-        Names it without giving its secret away.
+        Identifies the token without revealing its secret.
     name
-        Of the account that it belongs to.
+        Account that it belongs to.
     label
-        What it is for.
+        Purpose.
     role
-        What it may do: at most what its account may do now.
+        Its role: at most the current role of its account.
     created, expires, last_used
-        When; None for never.
+        POSIX s; None for never.
     """
 
     key: str
@@ -91,24 +91,24 @@ class ApiToken:
     last_used: float | None
 
 
-#: What only its SHA-256 is kept of: random bytes.
+#: A secret of which only the SHA-256 is kept: random bytes.
 _SECRET = 32
-#: The last use of a token is noted no more often than this, s.
+#: The last use of a token is recorded at most this often, s.
 _NOTED = 60.0
 
 
 class People:
     """Accounts, sessions and tokens in a database.
 
-    What is read and written here is small; a call takes below a millisecond to read and a commit
-    to write. All methods may be called from any thread.
+    All of them are small: a read takes less than a millisecond, a write one commit. Any thread may
+    call any method.
 
     Parameters
     ----------
     database, writer
-        Of the keeper.
+        The keeper's.
     entropy
-        Gives random bytes.
+        Returns random bytes.
     """
 
     def __init__(
@@ -122,13 +122,13 @@ class People:
 
     @property
     def near(self) -> bool:
-        """Whether the database is a file of this machine, and no server that may be slow."""
+        """Whether the database is a file on this machine, not a server that may be slow."""
         return self._database.file is not None
 
     # -- accounts ------------------------------------------------------------------------
 
     def empty(self) -> bool:
-        """Whether there is no account yet: the first start."""
+        """Whether there is no account yet, as at the first start."""
         return not self.accounts()
 
     def accounts(self) -> tuple[Account, ...]:
@@ -138,7 +138,7 @@ class People:
             return tuple(Account(**row) for row in found)
 
     def account(self, name: str) -> Account | None:
-        """Return an account, None if there is none of that name."""
+        """Return an account, None if the name is unknown."""
         with self._database.reading() as connection:
             row = connection.execute(select(_ACCOUNT).where(_ACCOUNT.c.name == name))
             found = row.mappings().first()
@@ -152,7 +152,7 @@ class People:
         InputError
             A name that exists, is empty or too long; an empty hash.
         UnknownNameError
-            If there is no such role.
+            An unknown role.
         StoreError
             If it could not be written.
         """
@@ -160,12 +160,14 @@ class People:
         if not name.strip() or len(name) > 100 or not name.isprintable():
             raise InputError(f"account {name!r}: give a name of 1 to 100 printable characters")
         if not password_hash:
-            raise InputError(f"account {name}: without a hash of its password nobody can log in")
+            raise InputError(f"account {name}: a password hash is needed to sign in")
         made = Account(name, role, password_hash, disabled=False, created=now, changed=now)
 
         def work(connection: Connection) -> None:
             if _find(connection, name) is not None:
-                raise InputError(f"account {name}: it exists; change it, or give another name")
+                raise InputError(
+                    f"account {name}: it exists already; change it, or give another name"
+                )
             connection.execute(_ACCOUNT.insert().values(asdict(made)))
 
         self._writer.do(work)
@@ -180,14 +182,14 @@ class People:
         role: str | None = None,
         disabled: bool | None = None,
     ) -> Account:
-        """Change an account. A new password, and disabling, end its sessions.
+        """Change an account. A new password, and disabling it, end its sessions.
 
         Raises
         ------
         InputError
             If no engineer would be left.
         UnknownNameError
-            If there is no such account or role.
+            An unknown account or role.
         StoreError
             If it could not be written.
         """
@@ -196,7 +198,7 @@ class People:
         if role is not None:
             _check_role(role)
         if password_hash == "":
-            raise InputError(f"account {name}: without a hash of its password nobody can log in")
+            raise InputError(f"account {name}: a password hash is needed to sign in")
 
         def work(connection: Connection) -> Account:
             _need(connection, name)
@@ -217,7 +219,7 @@ class People:
         InputError
             If no engineer would be left.
         UnknownNameError
-            If there is no such account.
+            An unknown account.
         StoreError
             If it could not be written.
         """
@@ -240,7 +242,7 @@ class People:
         InputError
             If the account is disabled.
         UnknownNameError
-            If there is no such account.
+            An unknown account.
         StoreError
             If it could not be written.
         """
@@ -256,7 +258,7 @@ class People:
         return secret
 
     def session(self, secret: str, now: float) -> Session | None:
-        """Return the session of a secret; None if there is none, or it may not go on."""
+        """Return the session of a secret; None if there is none, or it is no longer valid."""
         joined = select(_SESSION, _ACCOUNT.c.role, _ACCOUNT.c.disabled).join(_ACCOUNT)
         query = joined.where(_SESSION.c.key == _key(secret), _SESSION.c.expires > now)
         with self._database.reading() as connection:
@@ -268,21 +270,21 @@ class People:
         )
 
     def sessions(self, now: float) -> tuple[Session, ...]:
-        """Return all sessions that have not expired, the oldest first."""
+        """Return all unexpired sessions, the oldest first."""
         joined = select(_SESSION, _ACCOUNT.c.role).join(_ACCOUNT)
         query = joined.where(_SESSION.c.expires > now).order_by(_SESSION.c.since, _SESSION.c.key)
         with self._database.reading() as connection:
             return tuple(Session(**row) for row in connection.execute(query).mappings())
 
     def keep_session(self, secret: str, now: float, lifetime: float) -> None:
-        """Let a session that has not expired end ``lifetime`` s from now; written behind."""
+        """Extend an unexpired session to ``lifetime`` s from now; written in the background."""
         which = (_SESSION.c.key == _key(secret)) & (_SESSION.c.expires > now)
         self._writer.put(
             lambda c: c.execute(_SESSION.update().where(which).values(expires=now + lifetime))
         )
 
     def close_session(self, secret: str) -> None:
-        """End a session; nothing is done if there is none."""
+        """End a session, if it exists."""
         self._writer.do(lambda c: _delete(c, _SESSION, _SESSION.c.key == _key(secret)))
 
     def close_sessions(self, name: str) -> None:
@@ -299,9 +301,9 @@ class People:
         Raises
         ------
         InputError
-            If the account may not do what the token should.
+            If its role is above that of the account.
         UnknownNameError
-            If there is no such account or role.
+            An unknown account or role.
         StoreError
             If it could not be written.
         """
@@ -322,7 +324,7 @@ class People:
         return made, secret
 
     def token(self, secret: str, now: float) -> ApiToken | None:
-        """Return the token of a secret and note its use; None if there is none that may act."""
+        """Return the token of a secret and record its use; None if there is no valid one."""
         role = _ACCOUNT.c.role.label("owner_role")
         query = select(_TOKEN, role, _ACCOUNT.c.disabled).join(_ACCOUNT)
         with self._database.reading() as connection:
@@ -349,7 +351,7 @@ class People:
         if last is None or abs(now - last) >= _NOTED:
             self._noted[key] = now
             which = _TOKEN.c.key == key
-            # Who may act does not hang on a disk that is full.
+            # A full disk must not keep anybody out.
             with suppress(StoreError):
                 self._writer.put(
                     lambda c: c.execute(_TOKEN.update().where(which).values(last_used=now))
@@ -364,11 +366,11 @@ class People:
             return tuple(ApiToken(**row) for row in connection.execute(query).mappings())
 
     def revoke_token(self, key: str) -> None:
-        """Remove a token by its key; nothing is done if there is none."""
+        """Remove a token by its key, if it exists."""
         self._writer.do(lambda c: _delete(c, _TOKEN, _TOKEN.c.key == key))
 
     def forget_expired(self, now: float) -> None:
-        """Let go of sessions and tokens that have expired; written behind."""
+        """Remove expired sessions and tokens; written in the background."""
 
         def work(connection: Connection) -> None:
             for table in (_SESSION, _TOKEN):

@@ -1,14 +1,14 @@
-"""Telemetry: what every heliostat did, day by day, in Parquet.
+"""Telemetry: the history of every heliostat, day by day, in Parquet.
 
-A folder holds one folder for each day (UTC), and that holds segments: ``0001.parquet``,
-``0002.parquet``, … and, while it is written, ``0003.part``, a stream of Arrow batches. A part
-is readable up to its last whole batch whatever happened to its writer; when it is long enough,
-when its day is over, and at the next start, it becomes a Parquet file: written beside, synced,
-renamed. A row is written when it differs from the last one of its heliostat, and all rows are at
-every keyframe, so that any instant can be told from what lies within one keyframe before it.
+The archive has one folder for each day (UTC) with its segments: ``0001.parquet``, ``0002.parquet``,
+… and, while it is written, ``0003.part``, a stream of Arrow batches. A part is readable up to its
+last whole batch whatever happened to its writer; when it is long enough, when its day is over, and
+at the next start, it becomes a Parquet file: written beside, synced, renamed. A row is written when
+it differs from the heliostat's last one, and every keyframe holds all rows, so the field at any
+instant follows from the rows of one keyframe interval before it.
 
-Rows hold: ``time``, ``heliostat``, ``state``, ``fault``, ``flags``, ``primary`` and ``secondary``
-(counts), ``age`` (s, of the values at that time).
+Columns: ``time``, ``heliostat``, ``state``, ``fault``, ``flags``, ``primary`` and ``secondary``
+(counts), ``age`` (s, of the values at that time). `telemetry_query` answers questions in SQL.
 """
 
 import os
@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,9 +29,9 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 from heliotrope.store.records import StoreError
 
-#: Code and name of the state of a heliostat whose values are too old.
+#: State of a heliostat whose values are stale.
 STALE = 255
-#: Pieces of work that may wait for the disk.
+#: Number of pieces of work that may wait for the disk.
 _WAITING = 64
 SCHEMA = pa.schema(
     [
@@ -50,20 +49,20 @@ SCHEMA = pa.schema(
 
 @dataclass(frozen=True)
 class TelemetrySettings:
-    """Of the archive.
+    """Settings of the archive.
 
     Attributes
     ----------
     period
-        Between two looks at the field, s.
+        Interval between two snapshots of the field, s.
     keyframe
-        Between two looks of which every row is written, s.
+        Interval between two snapshots that are written in full, s.
     deadband
-        Steps by which a drive may have moved without a row.
+        Motion of a drive that is not yet written, steps.
     days
-        Days that are kept beside the present one.
+        Number of days kept besides the current one.
     rows
-        Of one segment, after which the next begins.
+        Length of a segment.
     """
 
     period: float = 60.0
@@ -75,8 +74,8 @@ class TelemetrySettings:
     def __post_init__(self) -> None:
         if not 0.0 < self.period <= self.keyframe:
             raise InputError(
-                f"telemetry: a period of {self.period} s and a keyframe each {self.keyframe} s; "
-                "give a period above 0 and not above the keyframe's"
+                f"telemetry: a period of {self.period} s with a keyframe every "
+                f"{self.keyframe} s; give a period above 0 and not above the keyframe's"
             )
         if self.deadband < 0 or self.days < 0 or self.rows < 1:
             raise InputError(
@@ -92,13 +91,13 @@ class Look:
     Attributes
     ----------
     state
-        Codes; `STALE` where the values are too old, (N,).
+        Codes; `STALE` where the values are stale, (N,).
     fault, flags
         Codes, (N,).
     counts
-        Of both drives, (N, 2).
+        Step counts of both drives, (N, 2).
     age
-        Of these values, s, (N,).
+        Age of these values, s, (N,).
     """
 
     state: npt.NDArray[np.uint8]
@@ -114,11 +113,11 @@ class Telemetry:
     Parameters
     ----------
     folder
-        Of the archive; made if need be.
+        Folder of the archive; made if missing.
     names
-        Of the N heliostats.
+        Names of the N heliostats.
     states
-        Names of the states, by their codes.
+        Names of the states, by code.
     settings
         See `TelemetrySettings`.
     inline
@@ -162,14 +161,14 @@ class Telemetry:
         self._later(lambda: finish_parts(self.folder))
 
     def take(self, at: float, look: Look) -> int:
-        """Take a look at the field, if one is due; return how many rows it gave.
+        """Take a snapshot of the field, if one is due; return the number of rows written.
 
         Parameters
         ----------
         at
             POSIX s.
         look
-            Of N rows; it must not be changed afterwards.
+            N rows; must not be changed afterwards.
         """
         gone = at - self._looked_at
         if 0.0 <= gone < self.settings.period:
@@ -187,14 +186,8 @@ class Telemetry:
             self._later(lambda: self._write(at, look, rows))
         return len(rows)
 
-    def query(self, sql: str, parameters: Sequence[Any] = ()) -> pa.Table:
-        """Return the answer to one SELECT; see `telemetry_query.query`. Call it in a thread."""
-        from heliotrope.store import telemetry_query
-
-        return telemetry_query.query(self.folder, sql, parameters)
-
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and end; the part that is open is left to the next start."""
+        """Write what waits, and close; the next start finishes the open part."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join(timeout)
@@ -221,7 +214,7 @@ class Telemetry:
         except (OSError, pa.ArrowException) as error:
             why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
             self.problem = f"telemetry {self.folder}: cannot be written ({why}); see to its disk"
-            # Behind a batch that is torn nothing can be read, and rows are missing now.
+            # Nothing behind a torn batch is readable, and rows are missing now.
             self._lost = True
             self._drop_segment()
 
@@ -250,7 +243,7 @@ class Telemetry:
             pa.DictionaryArray.from_arrays(pa.array(look.state[rows], pa.int16()), self._states),
             pa.array(look.fault[rows], pa.uint8()), pa.array(look.flags[rows], pa.uint16()),
             pa.array(look.counts[rows, 0], pa.int32()), pa.array(look.counts[rows, 1], pa.int32()),
-            # More digits of an age tell nothing and take room.
+            # More digits of an age are noise and take space.
             pa.array(np.round(look.age[rows], 1), pa.float32()),
         ]  # fmt: skip
         return pa.RecordBatch.from_arrays(columns, schema=SCHEMA)
@@ -280,13 +273,13 @@ class _Segment:
         try:
             self._file.close()
         except OSError:
-            return  # what could not be written was told already
+            return  # the failed write has been reported already
 
 
 def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
     """Return which rows differ, (N,): in state, fault or flags, or counts beyond a deadband.
 
-    Of a row that is and was stale nothing is known, so nothing differs.
+    Nothing is known of a row that was and is stale, so it does not differ.
     """
     moved = np.abs(look.counts.astype(np.int64) - last.counts).max(axis=-1) > deadband
     other = (look.fault != last.fault) | (look.flags != last.flags) | moved
@@ -295,7 +288,7 @@ def changed(last: Look, look: Look, deadband: int) -> npt.NDArray[np.bool_]:
 
 
 def _merged(last: Look, look: Look, rows: npt.NDArray[np.intp]) -> Look:
-    """Return what was written last of each heliostat."""
+    """Return the values last written for each heliostat."""
     arrays = []
     for name in ("state", "fault", "flags", "counts", "age"):
         array = getattr(last, name).copy()
@@ -317,10 +310,10 @@ def read_part(path: Path) -> list[pa.RecordBatch]:
 
 
 def finish_parts(folder: Path) -> None:
-    """Turn all parts of an archive into Parquet; none of them may be written any more."""
+    """Turn all parts of an archive into Parquet; none of them may be open."""
     for part in sorted(folder.glob("????-??-??/*.part")):
         final = part.with_suffix(".parquet")
-        # A crash between the two steps below leaves both: the Parquet file is whole.
+        # A crash between the two steps below leaves both; the Parquet file is then whole.
         if not final.exists():
             table = pa.Table.from_batches(read_part(part), SCHEMA)
             if table.num_rows:
@@ -330,7 +323,7 @@ def finish_parts(folder: Path) -> None:
 
 def _write_parquet(table: pa.Table, final: Path) -> None:
     table = table.unify_dictionaries()
-    # Of one heliostat after the other: its counts then differ little from row to row.
+    # Sorted by heliostat, counts differ little from row to row.
     heliostat = table["heliostat"].combine_chunks().indices.to_numpy()
     order = np.lexsort((table["time"].to_numpy(), heliostat))
     beside = final.with_suffix(".tmp")
@@ -357,7 +350,7 @@ def _write_parquet(table: pa.Table, final: Path) -> None:
 
 
 def retain(folder: Path, days: int, today: date) -> list[str]:
-    """Remove the days of an archive that lie more than some days back; return them."""
+    """Remove the days of an archive that are older than some days; return them."""
     gone = []
     for place in sorted(folder.glob("????-??-??")):
         try:

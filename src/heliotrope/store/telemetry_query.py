@@ -1,8 +1,7 @@
-"""Questions to the telemetry archive in SQL, by DuckDB; reading only.
+"""SQL queries of the telemetry archive, by DuckDB; read-only.
 
-The table is called ``telemetry``; its columns stand in `telemetry`; times are UTC without a zone.
-The day that is being written
-is in it up to its last whole batch.
+The table is called ``telemetry``; `telemetry` lists its columns; times are UTC without a zone. The
+current day is included up to its last whole batch.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from heliotrope.store.telemetry import SCHEMA, read_part
 
 #: A part may become a Parquet file while it is being looked for.
 _TRIES = 5
-#: Extensions would be sought on the network.
+#: DuckDB would look for extensions on the network.
 _CONFIG: dict[str, Any] = {
     "memory_limit": "1GB",
     "autoinstall_known_extensions": False,
@@ -32,23 +31,23 @@ def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Ta
     Parameters
     ----------
     folder
-        Of the archive.
+        Folder of the archive.
     sql
-        One statement that reads, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
+        One reading statement, such as ``SELECT heliostat, max(time) FROM telemetry WHERE
         state = ? GROUP BY ALL``. It sees no files, settings or variables.
     parameters
-        For its question marks.
+        Values of its question marks.
 
     Raises
     ------
     InputError
-        If it cannot be understood, or does something else than read.
+        If it is malformed, or does anything but read.
     StoreError
         If there is no archive, or it cannot be read.
     """
     place = Path(folder)
     if not place.is_dir():
-        raise StoreError(f"telemetry {place}: there is no such folder; is it the right one?")
+        raise StoreError(f"telemetry {place}: no such folder; check the path")
     files, parts = _content(place)
     with duckdb.connect(config=_CONFIG) as connection:
         try:
@@ -66,7 +65,7 @@ def query(folder: str | Path, sql: str, parameters: Sequence[Any] = ()) -> pa.Ta
 
 
 def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa.Table) -> None:
-    """Make the archive the one thing that a connection sees."""
+    """Show a connection the archive and nothing else."""
     connection.register("parts", parts)
     sources = ["SELECT * FROM parts"]
     if files:
@@ -89,7 +88,7 @@ def _show(connection: duckdb.DuckDBPyConnection, files: Sequence[str], parts: pa
 def _check(statements: Sequence[Any]) -> None:
     kinds = [statement.type for statement in statements]
     if kinds not in ([duckdb.StatementType.SELECT], [duckdb.StatementType.EXPLAIN]):
-        raise InputError("query: give one SELECT; nothing else is done here")
+        raise InputError("query: give one SELECT; nothing else is allowed")
 
 
 def _line(error: Exception) -> str:
@@ -97,7 +96,7 @@ def _line(error: Exception) -> str:
 
 
 def _content(folder: Path) -> tuple[list[str], pa.Table]:
-    """Return the Parquet files, and what stands in parts that are not among them."""
+    """Return the Parquet files, and the rows of parts that are not among them."""
     for _ in range(_TRIES):
         found = sorted(folder.glob("????-??-??/*.*"))
         files = [p for p in found if p.suffix == ".parquet"]
@@ -107,4 +106,4 @@ def _content(folder: Path) -> tuple[list[str], pa.Table]:
         except FileNotFoundError:
             continue
         return [str(file) for file in files], pa.Table.from_batches(batches, SCHEMA)
-    raise StoreError(f"telemetry {folder}: its files change all the time; try again")
+    raise StoreError(f"telemetry {folder}: its files keep changing; try again")

@@ -1,10 +1,11 @@
-"""One thread that writes: a bounded queue before it, one commit for all that waits.
+"""One writing thread behind a bounded queue, with one commit for everything that waits.
 
-Whoever records something puts a piece of work into the queue and goes on. The thread takes what
-is there, runs it in one transaction, and only then tells those who wait for it. If the database
+A caller puts a piece of work into the queue and continues. The thread takes everything that is
+there, runs it in one transaction, and only then tells the callers that wait for it. If the database
 fails (disk full, read-only, server gone) nothing is lost and the queue is kept: the thread tries
-again, and `Writer.problem` says why. A piece of work that the database refuses for what it is
-(not for the state of the disk) is given up, told in `Writer.refused`, and holds up nothing else.
+again, and `Writer.problem` gives the reason. A piece of work that the database refuses for its own
+content (not for the state of the disk) is dropped, reported in `Writer.refused`, and holds up
+nothing else.
 """
 
 import threading
@@ -30,17 +31,17 @@ from heliotrope.store.records import StoreError
 T = TypeVar("T")
 Work = Callable[[Connection], T]
 
-#: Pieces of work in one transaction at most: nobody waits long behind the others.
+#: Largest number of pieces of work in one transaction: nobody waits long behind the others.
 MOST = 256
-#: Wait after a failure, s: the first, and at most.
+#: Wait after a failure, s: the first, and the longest.
 _PAUSE = (0.25, 5.0)
-#: How long work may wait for other work to share its commit, s.
+#: How long work may wait for more work to share its commit, s.
 _LINGER = 0.05
 
 
 @dataclass
 class _Entry:
-    """Work that waits; ``kept``: until it is written, else only for one attempt."""
+    """Work that waits; ``kept`` until it is written, otherwise for one attempt."""
 
     work: Work[Any]
     future: "Future[Any] | None"
@@ -55,7 +56,7 @@ class Writer:
     database
         Ready, and locked by this process.
     limit
-        Pieces of work that may wait.
+        Number of pieces of work that may wait.
     inline
         Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
     """
@@ -69,7 +70,7 @@ class Writer:
         self._closing = self._hasty = False
         #: Why nothing can be written now, "" if it can.
         self.problem = ""
-        #: The last work that was given up, and how many there were.
+        #: The last work that was dropped, and the number dropped so far.
         self.refused, self.refused_count = "", 0
         self._thread: threading.Thread | None = None
         if not inline:
@@ -78,63 +79,64 @@ class Writer:
 
     @property
     def backlog(self) -> int:
-        """How many pieces of work wait."""
+        """Number of pieces of work that wait."""
         return len(self._queue)
 
     def put(self, work: Work[Any]) -> None:
-        """Let work be done, whenever that is possible.
+        """Queue work, to be done whenever that is possible.
 
         Raises
         ------
         StoreError
-            If too much waits already, or the writer was closed.
+            If too much waits already, or the writer is closed.
         """
         if len(self._queue) >= self._limit:
             raise StoreError(
-                f"store {self._database.name}: {len(self._queue)} records wait to be written, and "
-                f"no more are taken ({self.problem or 'the disk is too slow'}); see to its disk"
+                f"store {self._database.name}: {len(self._queue)} records are waiting to be "
+                f"written, and no more are accepted "
+                f"({self.problem or 'the disk is too slow'}); see to its disk"
             )
         self._add(_Entry(work, None, kept=True))
 
     def do(self, work: Work[T], timeout: float = 5.0) -> T:
-        """Let work be done, and return what it gives: it is safe then.
+        """Do work and return its result once it is safely on the disk.
 
         Raises
         ------
         StoreError
-            If it could not be written, now; it is given up. After a timeout (s) it may still come
-            through: work must bear to be given again.
+            If it could not be written now; it is dropped. After a timeout (s) it may still be
+            written: repeating the work must do no harm.
         """
         future = self.attempt(work)
         try:
             return future.result(timeout)
         except NotYetError:
             future.cancel()
-            why = self.problem or f"it took more than {timeout:g} s"
+            why = self.problem or f"it took longer than {timeout:g} s"
             raise StoreError(f"store {self._database.name}: not written: {why}") from None
         except CancelledError:
             raise StoreError(f"store {self._database.name}: it is closed") from None
 
     def attempt(self, work: Work[T]) -> "Future[T]":
-        """Let work be done at the next attempt; what is returned is done when it is safe.
+        """Queue work for the next attempt; return a future that is done when it is safe.
 
-        It fails with `StoreError` if that attempt fails: then the work is given up.
+        The future fails with `StoreError` if that attempt fails: the work is then dropped.
 
         Raises
         ------
         StoreError
-            If the writer was closed.
+            If the writer is closed.
         """
         future: Future[T] = Future()
         self._add(_Entry(work, future, kept=False))
         return future
 
     def confirmed(self) -> "Future[None]":
-        """Return what is done when all work of before is safe, or fails when an attempt has."""
+        """Return a future that is done when all earlier work is safe, and fails with an attempt."""
         return self.attempt(_nothing)
 
     def close(self, timeout: float = 10.0) -> None:
-        """Write what waits, and end.
+        """Write what waits, and close.
 
         Raises
         ------
@@ -152,8 +154,8 @@ class Writer:
             self._drop_connection()
         if self._queue:
             raise StoreError(
-                f"store {self._database.name}: {len(self._queue)} records are lost, since they "
-                f"could not be written ({self.problem or 'no time was left'})"
+                f"store {self._database.name}: {len(self._queue)} records are lost: they could "
+                f"not be written ({self.problem or 'no time was left'})"
             )
 
     def _add(self, entry: _Entry) -> None:
@@ -161,7 +163,7 @@ class Writer:
             if self._closing:
                 raise StoreError(f"store {self._database.name}: it is closed")
             self._queue.append(entry)
-            # Whoever waits does not wait for a pause to end.
+            # A waiting caller does not wait for a pause to end.
             self._hasty |= entry.future is not None
             self._news.notify_all()
         if self.inline:
@@ -174,7 +176,7 @@ class Writer:
                 self._news.wait_for(lambda: self._queue or self._closing)
                 if not self._queue:
                     return
-                # Nobody waits for it: let some more come for the same commit.
+                # No caller waits for it: let more work join the same commit.
                 self._news.wait_for(self._in_haste, _LINGER)
             self._hasty = False
             if self._step():
@@ -190,7 +192,7 @@ class Writer:
         return self._hasty or self._closing or len(self._queue) >= MOST
 
     def _step(self) -> bool:
-        """Write all that waits; False if the database failed."""
+        """Write everything that waits; return False if the database failed."""
         with self._attempt:
             while self._queue:
                 batch = [self._queue[i] for i in range(min(MOST, len(self._queue)))]
@@ -217,7 +219,7 @@ class Writer:
         return True
 
     def _write_singly(self, batch: list[_Entry], wanted: list[_Entry]) -> bool:
-        """Find the work that was refused; the others of its batch are written."""
+        """Find the work that was refused; the rest of its batch is written."""
         left = {id(entry) for entry in wanted}
         self._remove([entry for entry in batch if id(entry) not in left])
         for count, entry in enumerate(wanted):
@@ -242,7 +244,7 @@ class Writer:
             with self._connection.begin():
                 return [entry.work(self._connection) for entry in entries]
         except BaseException:
-            # Whatever it was: the next attempt begins with a connection that knows nothing of it.
+            # Whatever it was, the next attempt begins with a fresh connection.
             self._drop_connection()
             raise
 
@@ -255,11 +257,11 @@ class Writer:
                 connection.invalidate()
 
     def _remove(self, entries: list[_Entry]) -> None:
-        """Take work that is done out of the queue, at whose head it stands."""
+        """Remove finished work from the head of the queue."""
         with self._news:
             for entry in entries:
                 if self._queue[0] is not entry:
-                    raise AssertionError("the writer's queue has lost its order")
+                    raise AssertionError("the writer's queue is out of order")
                 self._queue.popleft()
 
     def _deliver(self, entries: list[_Entry], results: list[Any]) -> None:
@@ -268,7 +270,7 @@ class Writer:
                 entry.future.set_result(result)
 
     def _refuse(self, entry: _Entry, error: Exception) -> None:
-        text = f"store {self._database.name}: a record is refused: {cause(error)}"
+        text = f"store {self._database.name}: a record was refused: {cause(error)}"
         if entry.future is not None:
             own = not isinstance(error, SQLAlchemyError)
             entry.future.set_exception(error if own else StoreError(text))
@@ -276,7 +278,7 @@ class Writer:
             self.refused, self.refused_count = text, self.refused_count + 1
 
     def _fail(self, entries: list[_Entry], error: Exception) -> None:
-        """Tell those who wait, who then are out; what is to be kept stays in its order."""
+        """Tell the waiting callers, whose work is dropped; kept work stays in order."""
         why = str(error) if isinstance(error, StoreError) else cause(error)
         self.problem = f"store {self._database.name}: cannot be written ({why}); see to its disk"
         with self._news:
@@ -290,7 +292,7 @@ class Writer:
 
 
 def _is_of_database(error: Exception) -> bool:
-    """Whether the state of the database is at fault, and not the work."""
+    """Whether the state of the database is at fault, not the work."""
     if isinstance(error, StatementError) and not isinstance(error, DBAPIError):
         return False  # a value that cannot be written
     if isinstance(error, IntegrityError | DataError):
