@@ -58,8 +58,8 @@ def test_a_notebook_from_plant_to_calibrated_error() -> None:
     training = ht.split(seen, "chronological", 0.7)
     fitted = ht.fit(nominal[:1], seen.take(training), "guo6")
     fresh = seen.take(~training)
-    before = ht.evaluate(nominal[:1], fresh).beam
-    after = ht.evaluate(nominal[:1].with_parameters(fitted.parameters), fresh).beam
+    before = ht.beam_errors(nominal[:1], fresh).beam
+    after = ht.beam_errors(nominal[:1].with_parameters(fitted.parameters), fresh).beam
     assert np.median(before) > 5e-3
     assert np.median(after) < 0.05 * np.median(before)
     learned = ht.learn(nominal[:1], seen, "guo6", used=training)

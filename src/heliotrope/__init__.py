@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from heliotrope import geometry as geometry
     from heliotrope import optics as optics
     from heliotrope import sun as sun
-    from heliotrope.calibration.evaluation import beam_errors as evaluate
-    from heliotrope.calibration.evaluation import split, summarise
+    from heliotrope.calibration.evaluation import beam_errors, split, summarise
     from heliotrope.calibration.fit.estimator import fit
     from heliotrope.calibration.learn.learning import Learned, learn, predict
     from heliotrope.calibration.sighting_table import read_sightings, write_sightings
     from heliotrope.calibration.sightings import Sightings, camera_target, sightings
+    from heliotrope.calibration.workflow import evaluate
     from heliotrope.field import Heliostats, Plant, Receiver, Target, prototype, roughly_installed
     from heliotrope.field.formats import open_plant
     from heliotrope.field.formats.plant_file import read_plant, write_plant
@@ -46,8 +46,9 @@ _HOMES = {
     "Site": "heliotrope.sun",
     "Target": "heliotrope.field",
     "Tracking": "heliotrope.mechanism",
+    "beam_errors": "heliotrope.calibration.evaluation",
     "camera_target": "heliotrope.calibration.sightings",
-    "evaluate": "heliotrope.calibration.evaluation:beam_errors",
+    "evaluate": "heliotrope.calibration.workflow",
     "fit": "heliotrope.calibration.fit.estimator",
     "image_offsets": "heliotrope.optics",
     "learn": "heliotrope.calibration.learn.learning",
@@ -84,6 +85,7 @@ __all__ = [
     "Target",
     "Tracking",
     "__version__",
+    "beam_errors",
     "camera_target",
     "evaluate",
     "fit",

@@ -13,7 +13,8 @@ from heliotrope.calibration.learn import learning, models
 from heliotrope.calibration.learn import on_dask as cluster
 from heliotrope.calibration.learn.assessment import assess
 from heliotrope.calibration.report import results
-from heliotrope.calibration.report.page import CalibrationReport, blind_spots, write_report
+from heliotrope.calibration.report.content import CalibrationReport
+from heliotrope.calibration.report.page import write_report
 from heliotrope.calibration.sightings import Sightings, of_measurements
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.example import prototype
@@ -107,7 +108,7 @@ def test_report_is_one_page_that_reads_back(learnt: learning.Learned, tmp_path: 
     table = pandas.read_parquet(tmp_path / "out" / "calibration.parquet")
     assert list(table["name"]) == list(NAMES)
     assert (table["tilt_north_sigma_rad"] > 0).all()
-    assert all(b.remaining > 0.9 for b in blind_spots(result, 0))
+    assert all(b.remaining > 0.9 for b in result.blind_spots(0))
 
 
 def test_the_simplest_model_that_explains_is_chosen() -> None:

@@ -1,1 +1,108 @@
-"""From sightings to the parameters of each mirror, with their covariance."""
+"""From sightings to the parameters of each mirror, with their covariance.
+
+A sighting is one measurement of where a mirror points; `camera_target`, `drone`, `sun_sensor` and
+`field_camera` make `Sightings` of every kind, `read_sightings` reads a table. The rooms:
+
+- `calibration.fit`: parameters of each heliostat (`fit`);
+- `calibration.learn`: a whole field, with drift, steps and outliers (`learn`, `predict`);
+- `calibration.plan`: the measurements that tell most (`plan_sightings`, `plan_campaign`);
+- `calibration.report`: a page and files for other programs (`write_report`).
+
+`calibrate` and `evaluate` run all steps from files to figures. Functions with the name of their
+room or module are imported from there: ``from heliotrope.calibration.fit import fit``,
+``from heliotrope.calibration.learn import learn``, ``from heliotrope.calibration.sightings import
+sightings``.
+"""
+
+from heliotrope.calibration.evaluation import (
+    BeamErrors,
+    ErrorSummary,
+    Split,
+    beam_errors,
+    split,
+    summarise,
+)
+from heliotrope.calibration.fit import FieldFit, FitOutcome
+from heliotrope.calibration.learn import Assessment, Learned, Prediction, assess, predict
+from heliotrope.calibration.plan import (
+    Fleet,
+    SightingLimits,
+    candidate_sightings,
+    plan_campaign,
+    plan_sightings,
+)
+from heliotrope.calibration.report import CalibrationReport, FieldParameters, write_report
+from heliotrope.calibration.sighting_table import read_malan, read_sightings, write_sightings
+from heliotrope.calibration.sightings import (
+    Sightings,
+    camera_target,
+    drone,
+    field_camera,
+    join,
+    of_measurements,
+    sun_sensor,
+)
+from heliotrope.calibration.uncertainty import (
+    BlindSpot,
+    YearMap,
+    error_form,
+    expected_error,
+    precision,
+    suns_of_year,
+    unobservable,
+    year_map,
+)
+from heliotrope.calibration.workflow import (
+    Evaluation,
+    FieldSightings,
+    calibrate,
+    evaluate,
+    read_field_sightings,
+)
+
+__all__ = [
+    "Assessment",
+    "BeamErrors",
+    "BlindSpot",
+    "CalibrationReport",
+    "ErrorSummary",
+    "Evaluation",
+    "FieldFit",
+    "FieldParameters",
+    "FieldSightings",
+    "FitOutcome",
+    "Fleet",
+    "Learned",
+    "Prediction",
+    "SightingLimits",
+    "Sightings",
+    "Split",
+    "YearMap",
+    "assess",
+    "beam_errors",
+    "calibrate",
+    "camera_target",
+    "candidate_sightings",
+    "drone",
+    "error_form",
+    "evaluate",
+    "expected_error",
+    "field_camera",
+    "join",
+    "of_measurements",
+    "plan_campaign",
+    "plan_sightings",
+    "precision",
+    "predict",
+    "read_field_sightings",
+    "read_malan",
+    "read_sightings",
+    "split",
+    "summarise",
+    "sun_sensor",
+    "suns_of_year",
+    "unobservable",
+    "write_report",
+    "write_sightings",
+    "year_map",
+]

@@ -1,11 +1,12 @@
-"""``heliotrope evaluate``: how well a field is learnt, on sightings that were held out."""
+"""``heliotrope evaluate``: how well held-out sightings are predicted."""
 
+import math
 from typing import Annotated, Any
 
 import typer
 
 from heliotrope.cli import _calibration as shared
-from heliotrope.cli._common import print_json, print_table
+from heliotrope.cli._common import open_plant, print_json, print_table
 
 
 def evaluate(
@@ -22,51 +23,44 @@ def evaluate(
 ) -> None:
     """Learn from a part of each heliostat's sightings and print the errors of the rest.
 
-    Everything, the model and what is common to the field included, is learnt from the
+    Everything, the model and the hyperparameters of the field included, is learnt from the
     training part alone.
     """
-    from heliotrope.calibration import evaluation
-    from heliotrope.calibration.learn import assessment
+    from heliotrope.calibration import evaluation, workflow
+    from heliotrope.calibration.learn.models import describe
 
     evaluation.check_fraction(fraction)
     priors = shared.parse_priors(prior or [])
-    loaded = shared.load(place, centroid, sightings)
-    training = evaluation.split(loaded.seen, split, fraction, seed)
-    chosen, scored = shared.choose_model(loaded, model, as_json, training)
-    learned = shared.learn(
-        loaded, chosen, used=training, priors=priors, scheduler=scheduler, quiet=as_json
-    )
-    found = assessment.assess(loaded.heliostats.names, learned)
-    document: dict[str, Any] = {
+    field = workflow.read_field_sightings(open_plant(place), place, sightings, centroid=centroid)
+    with shared.workers(scheduler) as runner, shared.progress_of_steps(as_json) as steps:
+        found = workflow.evaluate(
+            field.heliostats.names,
+            field.heliostats.mechanism,
+            field.seen,
+            shared.parse_model(model),
+            split=split,
+            fraction=fraction,
+            seed=seed,
+            priors=priors,
+            runner=runner,
+            steps=steps,
+        )
+    document = {
         "split": split,
         "fraction": fraction,
         "seed": seed,
-        "model": list(learned.model),
         **found.document(),
-        "left_out": list(loaded.left_out),
+        "left_out": list(field.left_out),
     }
-    if scored:
-        document["models"] = {
-            c.name: {
-                "parameters": len(c.parameters),
-                "log_predictive": c.log_predictive,
-                "behind": c.behind,
-                "behind_error": c.behind_error,
-                "log_evidence": c.log_evidence,
-            }
-            for c in scored
-        }
     if as_json:
         print_json(document)
         return
     _print(document)
-    for line in shared.describe(scored):
+    for line in describe(found.scores):
         print(line)
 
 
 def _print(document: dict[str, Any]) -> None:
-    import math
-
     def shown(value: Any, digits: int = 2) -> str:
         return f"{value:.{digits}f}" if value is not None and math.isfinite(value) else "–"
 
@@ -99,11 +93,11 @@ def _print(document: dict[str, Any]) -> None:
         rows,
         title=f"beam error of held-out sightings, mrad ({document['split']} split)",
     )
-    whose = f"heliostats with {document['enough']} or more"
+    group = f"heliostats with {document['enough']} or more"
     if not document["enough"]:
-        whose = "all heliostats (none has 20 sightings)"
+        group = "all heliostats (none has 20 sightings)"
     print(
-        f"{whose}: median of medians "
+        f"{group}: median of medians "
         f"{shown(document['median_of_medians_mrad'])} mrad, mean of means "
         f"{shown(document['mean_of_means_mrad'])} mrad, "
         f"{shown(100 * document['coverage_90'], 1)} % within the 90 % ellipse"

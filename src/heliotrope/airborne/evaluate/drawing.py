@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate.templates import render
+from heliotrope.files.html import render
 from heliotrope.geometry import FloatArray, as_float
 
 # Length of a tick, px.
@@ -170,7 +170,14 @@ class Panel:
 
 def drawing(panels: Sequence[Panel], width: float, height: float, title: str) -> str:
     """Return panels as one SVG drawing, for a page or a file of its own."""
-    return render("drawing.svg.j2", panels=panels, width=width, height=height, title=title)
+    return render(
+        "heliotrope.airborne.evaluate",
+        "drawing.svg.j2",
+        panels=panels,
+        width=width,
+        height=height,
+        title=title,
+    )
 
 
 def around(values: npt.ArrayLike, share: float = 0.08) -> tuple[float, float]:

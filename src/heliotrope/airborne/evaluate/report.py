@@ -20,11 +20,10 @@ from heliotrope.airborne.evaluate.tables import (
     flight_row,
     write_table,
 )
-from heliotrope.airborne.evaluate.templates import render
 from heliotrope.airborne.mirror import MirrorShape
-from heliotrope.calibration.report.page import STYLE, picture
 from heliotrope.calibration.sighting_table import write_sightings
 from heliotrope.errors import InputError
+from heliotrope.files.html import STYLE, picture, render
 from heliotrope.files.text import write_text
 from heliotrope.geometry import as_float
 
@@ -161,6 +160,7 @@ def write_campaign_report(
             if progress:
                 progress(len(sections), len(shown))
     text = render(
+        "heliotrope.airborne.evaluate",
         "report.html.j2",
         style=STYLE,
         notes=notes,
@@ -205,11 +205,9 @@ def _size(o: Orientation) -> float:
 
 
 def _map(flight: MeasuredFlight) -> "Markup":
-    from markupsafe import Markup
-
     title = f"flight {flight.name}" if flight.name else ""
     figure = field_map(flight.found, flight.position, title)
-    return Markup(picture(figure, f"Map of the field {title}".strip()))  # noqa: S704  # escaped there
+    return picture(figure, f"Map of the field {title}".strip())
 
 
 # -- tables of the page ----------------------------------------------------------------
@@ -251,7 +249,9 @@ def _of_heliostats(flights: Sequence[MeasuredFlight], shown: set[str]) -> _Table
             parts = (*_AVERAGED, *(f"systematic_{c}" for c in causes), "systematic", "sigma_tot")
             body.append(
                 [
-                    render("link.html.j2", to=f.label(o)) if f.label(o) in shown else f.label(o),
+                    render("heliotrope.airborne.evaluate", "link.html.j2", to=f.label(o))
+                    if f.label(o) in shown
+                    else f.label(o),
                     o.count,
                     int(o.outlier.sum()),
                     f"{row['azimuth_deg']:.4f}",

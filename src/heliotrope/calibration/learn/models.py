@@ -1,9 +1,9 @@
-"""Which parameters a field needs: models compared by what they predict and by their evidence.
+"""Chooses the parameters that a field needs, by prediction; the evidence is shown beside it.
 
-Every candidate is learnt on a sample of the field. What counts is the logarithm of the
-probability of each sighting given the heliostat's others (leave-one-out
-cross-validation, in closed form: Rasmussen & Williams 2006, (5.10)-(5.12)); the simplest
-candidate that is within one standard error of the best is chosen (Breiman et al. 1984).
+Every candidate is learnt on a sample of the field. Its score is the mean logarithm of the
+probability density of each sighting given the others of its heliostat (leave-one-out
+cross-validation in closed form: Rasmussen & Williams 2006, (5.10)-(5.12)). The simplest
+candidate within one standard error of the best is chosen (Breiman et al. 1984).
 """
 
 from collections.abc import Callable, Mapping
@@ -20,11 +20,11 @@ from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS
 
-#: Heliostats that models are compared on: those with the most sightings.
+#: Models are compared on this many heliostats, those with the most sightings.
 HELIOSTATS = 16
-#: A model must gain this much a sighting (in the logarithm: one per cent) to be worth it.
+#: A larger model must gain more than this in mean log density, about one per cent.
 WORTH = 0.01
-#: A left-out sighting cannot count worse than this: outliers do not choose the model.
+#: Lowest log density that counts for one sighting, so that outliers do not choose the model.
 WORST = -25.0
 
 
@@ -37,10 +37,9 @@ class ScoredModel:
     name, parameters
         Of the model.
     log_predictive
-        Mean over the sightings of the log probability density given the others.
-    behind
-        How far that is below the best candidate's, and the standard error of this
-        difference.
+        Mean log probability density of a sighting given the others.
+    behind, behind_error
+        Distance of ``log_predictive`` to the best candidate's, and its standard error.
     log_evidence
         Of all sightings under the learnt hyperparameters.
     """
@@ -52,9 +51,19 @@ class ScoredModel:
     behind_error: float
     log_evidence: float
 
+    def document(self) -> dict[str, float]:
+        """Return the score for JSON."""
+        return {
+            "parameters": len(self.parameters),
+            "log_predictive": self.log_predictive,
+            "behind": self.behind,
+            "behind_error": self.behind_error,
+            "log_evidence": self.log_evidence,
+        }
+
 
 def candidate_models(mechanism: Mechanism) -> dict[str, tuple[str, ...]]:
-    """Return the models that this kind of mechanism can have, by name, the simplest first."""
+    """Return the models that fit this kind of mechanism, by name, the simplest first."""
     known = mechanism.parameters
     found: dict[str, tuple[str, ...]] = {}
     for name in ("guo6", "jacks", "khalsa8", "malan8"):
@@ -95,7 +104,7 @@ def compare_models(
     used: npt.ArrayLike | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> tuple[ScoredModel, ...]:
-    """Return the candidates with their scores, the simplest first.
+    """Return models with their scores, the simplest first.
 
     Parameters
     ----------
@@ -104,11 +113,11 @@ def compare_models(
     sightings
         M of these heliostats.
     models
-        Parameters by name, by default `candidate_models`.
+        Parameters by name; default: `candidate_models`.
     used
         Mask of the sightings to learn from, (M,).
     progress
-        Called with the name of each model before it is tried.
+        Called with the name of each model before it is learnt.
 
     Raises
     ------
@@ -154,8 +163,17 @@ def choose_model(scored: tuple[ScoredModel, ...]) -> ScoredModel:
     return min(able, key=lambda c: len(c.parameters))
 
 
+def describe(scored: tuple[ScoredModel, ...]) -> tuple[str, ...]:
+    """Return a line on the comparison of models; nothing if there was none."""
+    if not scored:
+        return ()
+    listed = ", ".join(f"{c.name} {c.behind:.3f}±{c.behind_error:.3f}" for c in scored)
+    line = f"Model {choose_model(scored).name}, the simplest that explains the data. Mean log "
+    return (f"{line}predictive density below the best: {listed}.",)
+
+
 def _scores(found: learning.Learned) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Log predictive density of each sighting, and those that are outliers."""
+    """Log predictive density of each sighting, and the mask of outliers."""
     score = np.full(len(found.sightings), WORST)
     for i, member in enumerate(found.members):
         rows = found.rows[i][~found.outlier[found.rows[i]]]

@@ -1,1 +1,32 @@
-"""Reports of a calibration: the page, its pictures, and files for other programs."""
+"""Reports a calibration: one page with its pictures, and files for other programs.
+
+A `CalibrationReport` holds the content, `write_report` writes the page and all files beside it.
+`FieldParameters` are the parameters at one moment as they stand in ``calibration.json``:
+`read_json` reads them, `apply_to_plant` puts them into a plant.
+"""
+
+from heliotrope.calibration.report.content import CalibrationReport, HeliostatRow
+from heliotrope.calibration.report.page import write_parameters, write_report
+from heliotrope.calibration.report.results import (
+    FieldParameters,
+    apply_to_plant,
+    at_moment,
+    calibrated_plant,
+    read_json,
+    write_json,
+    write_parquet,
+)
+
+__all__ = [
+    "CalibrationReport",
+    "FieldParameters",
+    "HeliostatRow",
+    "apply_to_plant",
+    "at_moment",
+    "calibrated_plant",
+    "read_json",
+    "write_json",
+    "write_parameters",
+    "write_parquet",
+    "write_report",
+]

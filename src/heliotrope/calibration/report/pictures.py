@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.report.content import CalibrationReport
 from heliotrope.calibration.uncertainty import year_map
 from heliotrope.geometry import FloatArray, azimuth_elevation
 
@@ -13,7 +14,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from heliotrope.calibration.report.page import CalibrationReport
 
 #: Grey, blue, orange and vermilion of Okabe and Ito, told apart by the colour-blind too.
 BEFORE, AFTER, TESTED, OUTLIER = "#999999", "#0072b2", "#e69f00", "#d55e00"
@@ -21,7 +21,7 @@ REGIMES = ("#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#f0e442")
 
 
 def figure_of(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figure", Any]:
-    """Return a figure without a window, and its axes."""
+    """Return a figure that needs no display, and its axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -30,15 +30,15 @@ def figure_of(rows: int, columns: int, size: tuple[float, float]) -> tuple["Figu
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
-def overview(result: "CalibrationReport") -> "Figure":
-    """Return the picture of all heliostats: median beam error before, after and held out."""
-    rows = result.rows()
+def overview(result: CalibrationReport) -> "Figure":
+    """Return a picture of all heliostats: median beam error before, after and held out."""
+    rows = result.rows
     figure, axes = figure_of(1, 1, (min(24.0, max(6.0, 0.32 * len(rows) + 2.0)), 4.2))
     ax: Axes = axes[0, 0]
     place = np.arange(len(rows))
     for values, label, colour, marker in (
         ([r.before.median for r in rows], "before", BEFORE, "o"),
-        ([r.after.median for r in rows], "after, each seen from the others", AFTER, "s"),
+        ([r.after.median for r in rows], "after, each predicted from the others", AFTER, "s"),
         ([r.held.median for r in rows], "after, held out", TESTED, "D"),
     ):
         if np.isfinite(values).any():
@@ -54,13 +54,13 @@ def overview(result: "CalibrationReport") -> "Figure":
     return figure
 
 
-def field_map(result: "CalibrationReport") -> "Figure":
-    """Return the map of the field coloured by the median beam error after calibration."""
+def field_map(result: CalibrationReport) -> "Figure":
+    """Return a map of the field coloured by the median beam error after calibration."""
     figure, axes = figure_of(1, 1, (7.0, 5.5))
     ax: Axes = axes[0, 0]
     places = result.learned.mechanism.position
     errors = dict.fromkeys(result.names, np.nan)
-    errors.update({r.name: r.after.median for r in result.rows()})
+    errors.update({r.name: r.after.median for r in result.rows})
     values = 1e3 * np.array([errors[n] for n in result.names])
     known = np.isfinite(values)
     ax.plot(places[~known, 0], places[~known, 1], ".", color="#cccccc", ms=4, label="no sightings")
@@ -96,8 +96,8 @@ def field_map(result: "CalibrationReport") -> "Figure":
     return figure
 
 
-def heliostat_figure(result: "CalibrationReport", i: int) -> "Figure":
-    """Return the picture of one heliostat: target, residuals, parameters, the year."""
+def heliostat_figure(result: CalibrationReport, i: int) -> "Figure":
+    """Return a picture of one heliostat: target, residuals, parameters, the year."""
     figure, axes = figure_of(3, 3, (13.0, 11.0))
     mine = np.flatnonzero(result.learned.sightings.heliostat == i)
     learned = result.learned
@@ -112,7 +112,7 @@ def heliostat_figure(result: "CalibrationReport", i: int) -> "Figure":
         for mask, colour, label in groups
     ]
     _target(axes[0, 0], before, "before")
-    _target(axes[0, 1], after, "after, each seen from the others")
+    _target(axes[0, 1], after, "after, each predicted from the others")
     _year(axes[0, 2], result, i)
     azimuth, elevation = azimuth_elevation(learned.sightings.source[mine])
     beam = 1e3 * result.after[mine]
@@ -129,7 +129,7 @@ def heliostat_figure(result: "CalibrationReport", i: int) -> "Figure":
 
 
 def _groups(
-    result: "CalibrationReport", mine: npt.NDArray[np.intp]
+    result: CalibrationReport, mine: npt.NDArray[np.intp]
 ) -> list[tuple[npt.NDArray[np.bool_], str, str]]:
     label, out = result.learned.regime[mine], result.learned.outlier[mine]
     found = []
@@ -172,7 +172,7 @@ def _residual(
         ax.plot(x[mask], beam[mask, 0], ".", color=colour, ms=4)
         ax.plot(x[mask], beam[mask, 1], "^", color=colour, ms=3, mfc="none", mew=0.7)
     if good.any():
-        # Outliers are drawn at the border rather than let them flatten the rest.
+        # The limits leave outliers out of view, so that they do not flatten the rest.
         limit = max(0.5, 1.3 * float(np.percentile(np.abs(beam[good]), 99)))
         ax.set_ylim(-limit, limit)
     ax.set_xlabel(label)
@@ -182,7 +182,7 @@ def _residual(
 
 def _in_time(
     ax: "Axes",
-    result: "CalibrationReport",
+    result: CalibrationReport,
     i: int,
     mine: npt.NDArray[np.intp],
     groups: list[tuple[npt.NDArray[np.bool_], str, str]],
@@ -200,12 +200,12 @@ def _in_time(
     ax.set_title("in time (dotted: steps of the zeros)", fontsize=10)
 
 
-def _year(ax: "Axes", result: "CalibrationReport", i: int) -> None:
+def _year(ax: "Axes", result: CalibrationReport, i: int) -> None:
     r = result.results
     machine = result.learned.mechanism[i].with_parameters(
         {n: r.values[i, p] for p, n in enumerate(r.names)}
     )
-    found = year_map(machine, r.names, r.covariance[i], result.aim, result.latitude_deg)
+    found = year_map(machine, r.names, r.covariance[i], result.aim, result.plant.site.latitude_deg)
     shown = 1e3 * found.rms
     if np.isfinite(shown).any():
         mesh = ax.pcolormesh(
@@ -223,7 +223,7 @@ def _year(ax: "Axes", result: "CalibrationReport", i: int) -> None:
     ax.set_ylabel("declination, °")
 
 
-def _parameters(ax: "Axes", result: "CalibrationReport", i: int) -> None:
+def _parameters(ax: "Axes", result: CalibrationReport, i: int) -> None:
     r = result.results
     learned = result.learned
     priors = np.array([learned.mechanism.parameter(n).prior for n in r.names])

@@ -1,0 +1,156 @@
+"""Content of a calibration report: figures of every heliostat, computed once."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from heliotrope.calibration.evaluation import BeamErrors, ErrorSummary, beam_errors, summarise
+from heliotrope.calibration.fit.estimator import FitOutcome
+from heliotrope.calibration.learn.assessment import Assessment
+from heliotrope.calibration.learn.learning import Learned, left_out_errors
+from heliotrope.calibration.report.results import FieldParameters, at_moment
+from heliotrope.calibration.uncertainty import BlindSpot, unobservable
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+
+
+@dataclass(frozen=True)
+class HeliostatRow:
+    """Beam errors of one heliostat, rad: before, after, and of the held-out sightings."""
+
+    index: int
+    name: str
+    before: ErrorSummary
+    after: ErrorSummary
+    held: ErrorSummary
+    outliers: int
+    outcome: FitOutcome
+
+
+@dataclass(frozen=True)
+class CalibrationReport:
+    """A calibration with all that its report shows.
+
+    Attributes
+    ----------
+    names
+        Names of the N heliostats.
+    learned
+        Learnt from all sightings.
+    plant, group
+        The plant, and the name of the group of these heliostats.
+    assessment
+        Of a second learning with a part of the sightings held out, or None.
+    ids
+        Name of each sighting, for the list of outliers.
+    left_out
+        One line for each measurement that could not be used.
+    note
+        How the held-out part was chosen.
+    comparison
+        Lines on the comparison of models.
+    """
+
+    names: tuple[str, ...]
+    learned: Learned
+    plant: Plant
+    group: str
+    assessment: Assessment | None = None
+    ids: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    note: str = ""
+    comparison: tuple[str, ...] = ()
+
+    @cached_property
+    def results(self) -> FieldParameters:
+        """The parameters at the time of the last sighting."""
+        return at_moment(self.names, self.learned)
+
+    @cached_property
+    def before(self) -> BeamErrors:
+        """Errors under the nominal mechanisms."""
+        return beam_errors(self.learned.mechanism, self.learned.sightings)
+
+    @cached_property
+    def after(self) -> FloatArray:
+        """Beam errors of each sighting as predicted from the others, rad right and up, (M, 2)."""
+        return left_out_errors(self.learned)
+
+    @cached_property
+    def distance(self) -> FloatArray:
+        """From mirror to destination, m; 1 where that is at infinity, (M,)."""
+        s = self.learned.sightings
+        way = s.destination - self.learned.mechanism[s.heliostat].pose(s.counts).vertex
+        return np.where(s.destination_at_infinity, 1.0, np.linalg.norm(way, axis=-1))
+
+    @property
+    def targets(self) -> FloatArray:
+        """Centres of the targets, (K, 3)."""
+        return np.array([t.center for t in self.plant.targets]).reshape(-1, 3)
+
+    @property
+    def aim(self) -> FloatArray:
+        """Aim point for the map of the year: the first target, or the mean destination."""
+        if len(self.targets):
+            return np.asarray(self.targets[0])
+        s = self.learned.sightings
+        return np.asarray(np.mean(s.destination[~s.destination_at_infinity], axis=0))
+
+    @cached_property
+    def rows(self) -> tuple[HeliostatRow, ...]:
+        """Figures of the heliostats that have sightings."""
+        held = {h.name: h.beam for h in self.assessment.heliostats} if self.assessment else {}
+        size = np.linalg.norm(self.after, axis=-1)
+        nothing = summarise(np.empty(0))
+        found = []
+        for i, name in enumerate(self.names):
+            mine = self.learned.sightings.heliostat == i
+            if mine.any():
+                row = HeliostatRow(
+                    i,
+                    name,
+                    summarise(self.before.beam[mine]),
+                    summarise(size[mine]),
+                    held.get(name, nothing),
+                    int(self.learned.outlier[mine].sum()),
+                    FitOutcome(int(self.learned.static.outcome[i])),
+                )
+                found.append(row)
+        return tuple(found)
+
+    def blind_spots(self, i: int) -> tuple[BlindSpot, ...]:
+        """Return the combinations of parameters that heliostat ``i``'s sightings do not show."""
+        r, count = self.results, len(self.learned.model)
+        line = self.aim - self.learned.mechanism.position[i]
+        covariance = r.covariance[i][:count, :count]
+        return unobservable(r.names[:count], covariance, self.learned.hyper.spread[:count], line)
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        found = self.results
+        tested = {h.name: h for h in self.assessment.heliostats} if self.assessment else {}
+        heliostats = {
+            row.name: {
+                "n": row.before.count,
+                "outliers": row.outliers,
+                "before_median_beam_mrad": 1e3 * row.before.median,
+                "after_median_beam_mrad": 1e3 * row.after.median,
+                "after_rms_beam_mrad": 1e3 * row.after.rms,
+                "n_held_out": row.held.count,
+                "held_out_median_beam_mrad": 1e3 * row.held.median,
+                "held_out_rms_beam_mrad": 1e3 * row.held.rms,
+                "held_out_p95_beam_mrad": 1e3 * row.held.p95,
+                "held_out_coverage_90": tested[row.name].coverage if row.name in tested else None,
+                "outcome": row.outcome.name.lower(),
+                "parameters": dict(zip(found.names, found.values[row.index].tolist(), strict=True)),
+                "sigma": dict(zip(found.names, found.sigma[row.index].tolist(), strict=True)),
+            }
+            for row in self.rows
+        }
+        document: dict[str, Any] = {"model": list(self.learned.model), "heliostats": heliostats}
+        if self.assessment is not None:
+            document["held_out_median_of_medians_mrad"] = 1e3 * self.assessment.median_of_medians
+            document["held_out_coverage_90"] = self.assessment.coverage
+        return document

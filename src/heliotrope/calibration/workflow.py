@@ -1,0 +1,300 @@
+"""Calibrates a field from its files: read the sightings, choose a model, learn, test, report.
+
+`read_field_sightings` reads a folder or a table, `calibrate` gives the content of a report,
+`evaluate` only tests how well held-out sightings are predicted.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration import evaluation
+from heliotrope.calibration.evaluation import Split
+from heliotrope.calibration.learn import models
+from heliotrope.calibration.learn.assessment import Assessment, assess
+from heliotrope.calibration.learn.learning import FEWEST, Learned, Runner, learn
+from heliotrope.calibration.learn.models import ScoredModel
+from heliotrope.calibration.report.content import CalibrationReport
+from heliotrope.calibration.sighting_table import read_sightings
+from heliotrope.calibration.sightings import Sightings, of_measurements
+from heliotrope.errors import FormatError, InputError
+from heliotrope.field.formats import measurements
+from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
+from heliotrope.mechanism.chain import Mechanism
+
+#: Called with (name of the step, done, all).
+Steps = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class FieldSightings:
+    """Sightings with the heliostats that they show.
+
+    Attributes
+    ----------
+    plant, group
+        The plant, and the name of the group with the heliostats.
+    seen
+        The sightings.
+    ids
+        Name of each sighting.
+    left_out
+        One line for each measurement that could not be used.
+    """
+
+    plant: Plant
+    group: str
+    seen: Sightings
+    ids: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+    @property
+    def heliostats(self) -> Heliostats:
+        """The heliostats of the group."""
+        return self.plant.groups[self.group]
+
+
+def read_field_sightings(
+    plant: Plant,
+    place: Path,
+    table: Path | None = None,
+    *,
+    centroid: Literal["utis", "helios"] = "utis",
+) -> FieldSightings:
+    """Return the sightings of a folder in PAINT's form, or of a table.
+
+    Parameters
+    ----------
+    plant
+        With one group of heliostats.
+    place
+        The folder or file that the plant was read from.
+    table
+        Table of sightings; without one ``place`` must be a folder with measurements.
+    centroid
+        Which published centroid to use.
+
+    Raises
+    ------
+    InputError
+        If the plant has several groups, or there are no measurements.
+    FormatError
+        If no measurement can be used.
+    """
+    if table is not None:
+        found = _read_table(plant, place, table)
+    elif place.is_dir():
+        found = _read_folder(plant, place, centroid)
+    else:
+        raise InputError(
+            f"{place}: a plant without measurements; give --sightings TABLE, or a folder with both"
+        )
+    if not len(found.seen):
+        reason = f"; the first: {found.left_out[0]}" if found.left_out else ""
+        raise FormatError(table or place, f"no measurement can be used{reason}")
+    return found
+
+
+def _read_table(plant: Plant, place: Path, table: Path) -> FieldSightings:
+    if len(plant.groups) != 1:
+        raise InputError(
+            f"{place}: {len(plant.groups)} groups of heliostats; calibrate them one by one: "
+            "give a plant with one group"
+        )
+    ((group, heliostats),) = plant.groups.items()
+    seen, _, left = read_sightings(table, heliostats.names)
+    ids = tuple(f"{heliostats.names[h]} {k}" for k, h in enumerate(seen.heliostat))
+    return FieldSightings(plant, group, seen, ids, tuple(left))
+
+
+def _read_folder(plant: Plant, place: Path, centroid: Literal["utis", "helios"]) -> FieldSightings:
+    ((group, heliostats),) = plant.groups.items()
+    found = measurements.read_measurements(place, centroid=centroid)
+    seen, left = of_measurements(found, heliostats)
+    known = set(heliostats.names)
+    pairs = zip(found.heliostat, found.ids, strict=True)
+    ids = tuple(f"{name} {number}" for name, number in pairs if name in known)
+    return FieldSightings(plant, group, seen, ids, (*found.left_out, *left))
+
+
+def find_model(
+    mechanism: Mechanism,
+    sightings: Sightings,
+    used: npt.NDArray[np.bool_] | None = None,
+    steps: Steps | None = None,
+) -> tuple[tuple[str, ...], tuple[ScoredModel, ...]]:
+    """Return the parameters of the simplest model that explains the sightings, and all scores.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,).
+    sightings
+        M of these heliostats; with too few for a comparison the smallest model is returned
+        without scores.
+    used
+        Mask of the sightings to learn from, (M,).
+    steps
+        Progress.
+    """
+    trials = models.candidate_models(mechanism)
+    keep = np.ones(len(sightings), np.bool_) if used is None else used
+    counts = np.bincount(sightings.heliostat[keep], minlength=len(mechanism))
+    if counts.max(initial=0) < FEWEST:
+        return next(iter(trials.values())), ()
+    tried: list[str] = []
+
+    def next_model(name: str) -> None:
+        if steps:
+            steps("comparing models", len(tried), len(trials))
+        tried.append(name)
+
+    scored = models.compare_models(mechanism, sightings, trials, used=keep, progress=next_model)
+    return models.choose_model(scored).parameters, scored
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How well held-out sightings are predicted.
+
+    Attributes
+    ----------
+    learned
+        Learnt from the training part alone.
+    assessment
+        Figures of the held-out part.
+    scores
+        The models that were compared; empty if the model was given.
+    """
+
+    learned: Learned
+    assessment: Assessment
+    scores: tuple[ScoredModel, ...] = ()
+
+    def document(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        document = {"model": list(self.learned.model), **self.assessment.document()}
+        if self.scores:
+            document["models"] = {c.name: c.document() for c in self.scores}
+        return document
+
+
+def evaluate(
+    names: tuple[str, ...],
+    mechanism: Mechanism,
+    sightings: Sightings,
+    model: str | tuple[str, ...] = "auto",
+    *,
+    split: Split = "random",
+    fraction: float = 0.7,
+    seed: int = 0,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    runner: Runner | None = None,
+    steps: Steps | None = None,
+) -> Evaluation:
+    """Learn from a part of each heliostat's sightings and assess the rest.
+
+    Everything, the model and the hyperparameters of the field included, is learnt from the
+    training part alone.
+
+    Parameters
+    ----------
+    names, mechanism
+        Names and nominal mechanisms of N heliostats.
+    sightings
+        M of these heliostats.
+    model
+        Name of a model, names of parameters, or "auto".
+    split, fraction, seed
+        Choose the training part; see `heliotrope.calibration.evaluation.split`.
+    priors
+        Standard deviations that replace the table's, by name.
+    runner
+        Learns chunks elsewhere; see `heliotrope.calibration.learn.on_dask`.
+    steps
+        Progress.
+
+    Raises
+    ------
+    InputError
+        If the fraction is not between 0 and 1 or the split is unknown.
+    """
+    training = evaluation.split(sightings, split, fraction, seed)
+    scores: tuple[ScoredModel, ...] = ()
+    if model == "auto":
+        model, scores = find_model(mechanism, sightings, training, steps)
+    learned = learn(
+        mechanism,
+        sightings,
+        model,
+        used=training,
+        priors=priors,
+        runner=runner,
+        progress=_step(steps, "learning from the training part"),
+    )
+    return Evaluation(learned, assess(names, learned), scores)
+
+
+def calibrate(
+    field: FieldSightings,
+    model: str | tuple[str, ...] = "auto",
+    *,
+    split: Split = "random",
+    fraction: float = 0.7,
+    seed: int = 0,
+    priors: Mapping[str, npt.ArrayLike] | None = None,
+    runner: Runner | None = None,
+    steps: Steps | None = None,
+) -> CalibrationReport:
+    """Learn every heliostat from all its sightings, and test on a held-out part.
+
+    Parameters
+    ----------
+    field
+        Heliostats and sightings.
+    model, split, seed, priors, runner, steps
+        As for `evaluate`; the model is chosen once, from all sightings.
+    fraction
+        Share to learn from when testing; 1: no test.
+    """
+    if fraction != 1.0:
+        evaluation.check_fraction(fraction)
+    names, mechanism = field.heliostats.names, field.heliostats.mechanism
+    scores: tuple[ScoredModel, ...] = ()
+    if model == "auto":
+        model, scores = find_model(mechanism, field.seen, None, steps)
+    options: dict[str, Any] = {"priors": priors, "runner": runner}
+    tested = None
+    if fraction != 1.0:
+        tested = evaluate(
+            names,
+            mechanism,
+            field.seen,
+            model,
+            split=split,
+            fraction=fraction,
+            seed=seed,
+            steps=steps,
+            **options,
+        ).assessment
+    learned = learn(mechanism, field.seen, model, progress=_step(steps, "learning"), **options)
+    return CalibrationReport(
+        names,
+        learned,
+        field.plant,
+        field.group,
+        tested,
+        field.ids,
+        field.left_out,
+        f"{split} split, {100 * fraction:.0f} % to learn from, seed {seed}",
+        models.describe(scores),
+    )
+
+
+def _step(steps: Steps | None, name: str) -> Callable[[int, int], None] | None:
+    return None if steps is None else lambda done, total: steps(name, done, total)

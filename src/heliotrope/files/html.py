@@ -1,0 +1,62 @@
+"""HTML pages that are one file: templates with escaping on, one style, pictures in the page."""
+
+import base64
+import io
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from markupsafe import Markup
+    from matplotlib.figure import Figure
+
+#: Style sheet of every report.
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 76rem; padding: 0 1rem }
+table { border-collapse: collapse } td, th { padding: .15rem .8rem; text-align: right }
+td:first-child, th:first-child, td:last-child, th:last-child { text-align: left }
+tr:nth-child(even) { background: #8881 } img { max-width: 100%; background: #fff }
+section { border-top: 1px solid #8886; margin-top: 2rem } :root { color-scheme: light dark }
+"""
+
+
+def render(package: str, name: str, **values: object) -> "Markup":
+    """Return a template filled with values, which are escaped unless they are markup.
+
+    Parameters
+    ----------
+    package
+        Package with the folder ``templates`` that holds the template.
+    name
+        File name of the template.
+    values
+        Variables of the template; an undefined one is an error.
+    """
+    from markupsafe import Markup
+
+    text = _environment(package).get_template(name).render(**values)
+    return Markup(text)  # noqa: S704  # the template escaped it
+
+
+@lru_cache
+def _environment(package: str) -> "Environment":
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    return Environment(
+        loader=PackageLoader(package),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+
+
+def picture(figure: "Figure", alt: str, dpi: int = 80) -> "Markup":
+    """Return a figure as an image inside a page; ``alt`` describes it for a screen reader."""
+    from markupsafe import Markup
+
+    data = io.BytesIO()
+    figure.savefig(data, dpi=dpi, format="png")
+    code = base64.b64encode(data.getvalue()).decode("ascii")
+    image = Markup('<img loading="lazy" src="data:image/png;base64,{}" alt="{}">')
+    return image.format(code, alt)
