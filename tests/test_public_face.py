@@ -24,7 +24,7 @@ def test_every_public_name_is_there() -> None:
     for name in ht.__all__:
         assert getattr(ht, name) is getattr(ht, name)
     assert ht.track is import_module("heliotrope.mechanism.tracking").track
-    assert ht.evaluate is import_module("heliotrope.calibration.evaluation").beam_errors
+    assert ht.evaluate is import_module("heliotrope.calibration").evaluate
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
@@ -32,7 +32,21 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         ht.trakc  # noqa: B018
 
 
-@pytest.mark.parametrize("package", ["field", "files", "mechanism", "optics", "sun"])
+@pytest.mark.parametrize(
+    "package",
+    [
+        "calibration",
+        "calibration.fit",
+        "calibration.learn",
+        "calibration.plan",
+        "calibration.report",
+        "field",
+        "files",
+        "mechanism",
+        "optics",
+        "sun",
+    ],
+)
 def test_faces_list_what_they_show(package: str) -> None:
     face = import_module(f"heliotrope.{package}")
     modules = {info.name for info in pkgutil.iter_modules(face.__path__)}
