@@ -19,7 +19,7 @@ MINIMUM_ROWS = 256
 
 
 def threads() -> int:
-    """Return the number of threads: ``HELIOTROPE_THREADS`` or the cores at hand.
+    """Return the number of threads: ``HELIOTROPE_THREADS`` or the number of available cores.
 
     Raises
     ------
@@ -59,7 +59,7 @@ def run_blocks(
     if workers == 1 or rows < minimum_rows:
         kernel(0, rows)
         return
-    # Four blocks a thread even out rows of unequal cost.
+    # Four blocks per thread even out rows of unequal cost.
     blocks = min(4 * workers, rows)
     edges = [rows * k // blocks for k in range(blocks + 1)]
     pool = _pool(workers)

@@ -1,7 +1,7 @@
-"""Compile the numeric kernels once, so that what comes after starts at full speed.
+"""Compile the numeric kernels once, so that programs start at full speed.
 
 ``python -m heliotrope.warm`` takes about half a minute after an installation and a
-second later on; the compiled code stays in the package's ``__pycache__``.
+second afterwards; the compiled code stays in the package's ``__pycache__``.
 """
 
 

@@ -142,7 +142,7 @@ def test_file(tmp_path: Path) -> None:
         ('{"keep_out": [{"name": "x", "centre": [0, 0], "radius_m": 0}]}', "0.* is outside"),
         ('{"keep_out": [{"name": "x", "polygon": [[0, 0], [1, 1]]}]}', "give three or more"),
         ('{"min_height_m": 200}', "heights 200 m to 120 m"),
-        ("[", "no JSON"),
+        ("[", "not valid JSON"),
     ],
 )
 def test_file_refusals(tmp_path: Path, text: str, message: str) -> None:

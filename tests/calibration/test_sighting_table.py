@@ -354,15 +354,15 @@ BAD: list[tuple[str, int, str, str]] = [
     ("broken name", 0, '"AA\n39"', "heliostat AA 39, column heliostat: there is no heliostat"),
     ("nobody", 0, "", "line 3, column heliostat: the cell is empty; name a heliostat"),
     ("naive", 1, "2026-06-21T12:00:00", "column time: 2026-06-21T12:00:00 has no time zone; app"),
-    ("no time", 1, "noon", "column time: 'noon' is no ISO 8601 time; write it like"),
-    ("no day", 1, "2026-02-30T12:00Z", "column time: '2026-02-30T12:00Z' is no time (day"),
+    ("no time", 1, "noon", "column time: 'noon' is not an ISO 8601 time; write it like"),
+    ("no day", 1, "2026-02-30T12:00Z", "column time: '2026-02-30T12:00Z' is not a valid time (day"),
     ("unknown kind", 2, "camera", "column kind: there is no kind of sighting 'camera'; did you"),
     ("no count", 3, "", "column count_1: the cell is empty; give drive counts"),
-    ("words", 4, "two", "column count_2: 'two' is no finite number; give drive counts"),
-    ("underscore", 4, "1_000", "column count_2: '1_000' is no finite number"),
-    ("decimal comma", 5, '"0,5"', "column source_east: '0,5' is no finite number; give metres"),
-    ("NaN", 6, "nan", "column source_north: 'nan' is no finite number"),
-    ("infinite", 10, "inf", "column destination_north: 'inf' is no finite number"),
+    ("words", 4, "two", "column count_2: 'two' is not a finite number; give drive counts"),
+    ("underscore", 4, "1_000", "column count_2: '1_000' is not a finite number"),
+    ("decimal comma", 5, '"0,5"', "column source_east: '0,5' is not a finite number; give metres"),
+    ("NaN", 6, "nan", "column source_north: 'nan' is not a finite number"),
+    ("infinite", 10, "inf", "column destination_north: 'inf' is not a finite number"),
     ("neither", 8, "far", "column source_at_infinity: 'far' is neither true nor false"),
     ("another kind's end", 8, "false", "column source_at_infinity: false, but of kind camera_t"),
     ("another kind's end", 12, "1", "column destination_at_infinity: true, but of kind camera_"),
@@ -373,7 +373,7 @@ BAD: list[tuple[str, int, str, str]] = [
     ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; give m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),
     ("not definite", 15, "2e-4", "is no covariance (not positive semidefinite); correct them"),
-    ("covariance NaN", 16, "nan", "column destination_cov_eu: 'nan' is no finite number"),
+    ("covariance NaN", 16, "nan", "column destination_cov_eu: 'nan' is not a finite number"),
 ]  # fmt: skip
 
 
@@ -466,10 +466,10 @@ def test_parquet_rows_are_named_too(tmp_path: Path) -> None:
         ("destination_cov_nu", "cov_nu", "there is no column destination_cov_nu"),
         ("count_2", "count_b", "column count_b is not known; did you mean count_2?"),
         ("kind", "sigma_rad", "sigma is given in rad and mrad; keep one column"),
-        ("time", "kind", "column kind stands there twice; name each column once"),
+        ("time", "kind", "column kind occurs twice; name each column once"),
         ("kind", "", "column 3 has no name"),
         ("heliostat", '"a\nb"', "there is no column heliostat; add it. There are a b, time,"),
-        ("AA39", '"AA39', "no table in CSV (unexpected end of data)"),
+        ("AA39", '"AA39', "not a CSV table (unexpected end of data)"),
     ],
 )
 def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: Path) -> None:
@@ -486,13 +486,13 @@ def test_an_unusable_table_is_refused(old: str, new: str, says: str, tmp_path: P
     [
         ("s.csv", None, "there is no such file; give the path of a table of sightings"),
         ("s.csv", b"", "the file is empty"),
-        ("s.csv", b"\n\n \n", "there is nothing in it"),
+        ("s.csv", b"\n\n \n", "the file has no rows"),
         ("s.csv", b"\x7fELF\0\0", "the file is binary"),
         ("s.csv", "Jülich,".encode("latin-1"), "not UTF-8"),
         ("s.txt", b"x", "the name ends in '.txt'; sightings are .csv or .parquet"),
         ("s.parquet", None, "there is no such file"),
-        ("s.parquet", b"", "no Parquet table"),
-        ("s.parquet", b"PAR1" + bytes(200), "no Parquet table"),
+        ("s.parquet", b"", "not a Parquet table"),
+        ("s.parquet", b"PAR1" + bytes(200), "not a Parquet table"),
     ],
 )
 def test_an_unreadable_file_is_refused(
@@ -510,7 +510,7 @@ def test_an_unreadable_file_is_refused(
 def test_parquet_of_broken_texts_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "s.parquet"
     pq.write_table(pa.table({"heliostat": pa.array([b"\xff"]).view(pa.string())}), path)
-    with pytest.raises(FormatError, match=r"no Parquet table \('utf-8' codec"):
+    with pytest.raises(FormatError, match=r"not a Parquet table \('utf-8' codec"):
         read_sightings(path, NAMES)
 
 
@@ -530,7 +530,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
         write_sightings(path.with_suffix(".tsv"), seen, NAMES)
     with pytest.raises(InputError, match="cannot be written"):
         write_sightings(tmp_path / "nowhere" / "s.csv", seen, NAMES)
-    monkeypatch.setattr(sighting_table, "LIMIT", 2**12)
+    monkeypatch.setattr(sighting_table, "SIZE_LIMIT", 2**12)
     with pytest.raises(InputError, match=r"more than the 0 MiB that are read again; write \.parq"):
         write_sightings(path, seen, NAMES)
     assert path.read_text() == "before"
@@ -575,10 +575,10 @@ MALAN_GOOD = "2026-06-21T12:00:00Z;30;45;0.25;-0.5;1000;2000"
         ("2026-06-21T12:00:00Z", "", "column timestamp: the cell is empty; give a time in ISO"),
         (";30;", ";400;", "column sun_azimuth_deg: 400° is outside −180° to 360°; give degrees"),
         (";45;", ";95;", "column sun_elevation_deg: 95° is outside −5° to 90°"),
-        ("0.25", "0,25", "column horizontal_offset_m: '0,25' is no finite number; give metres"),
+        ("0.25", "0,25", "column horizontal_offset_m: '0,25' is not a finite number; give metres"),
         ("-0.5", "-500", "column vertical_offset_m: -500 m is more than 50 m; is it in another"),
         ("1000", "", "column azimuth_counts: the cell is empty; give drive counts"),
-        ("2000", "nan", "column elevation_counts: 'nan' is no finite number"),
+        ("2000", "nan", "column elevation_counts: 'nan' is not a finite number"),
         (";2000", "", "6 cells under 7 columns"),
     ],
 )

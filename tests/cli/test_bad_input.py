@@ -106,7 +106,7 @@ def _one_line(text: str) -> None:
 
 REPLACED: list[tuple[str, str, str, str, str]] = [
     # name, which file, what, by what, what the line says
-    ("not TOML", "toml", "[site]", "[site", "no TOML"),
+    ("not TOML", "toml", "[site]", "[site", "not valid TOML"),
     ("another format", "toml", '"heliotrope-plant"', '"gltf"', "format is 'gltf'"),
     ("a newer version", "toml", "version = 1", "version = 9", "9: input should be 1"),
     ("no site", "toml", "[site]\nlatitude_deg = -33.93\nlongitude_deg = 18.87\n", "",
@@ -149,7 +149,7 @@ REPLACED: list[tuple[str, str, str, str, str]] = [
     ("duplicate name", "csv", "A2,azel", "A1,azel", "heliostat A1 stands in line 2 already"),
     ("no name", "csv", "A2,azel", ",azel", "a heliostat without a name"),
     ("unknown group", "csv", "A2,azel", "A2,azle", "group 'azle' is not in plant.toml"),
-    ("too many cells", "csv", "A2,azel,10,-30,0", "A2,azel,10,-30,0,7,8", "no table in CSV"),
+    ("too many cells", "csv", "A2,azel,10,-30,0", "A2,azel,10,-30,0,7,8", "not a CSV table"),
     ("unknown parameter", "csv", CSV,
      "name,group,east_m,north_m,up_m,parameters.tilt_nord_rad\nA1,azel,0,-30,0,0.001\n",
      "tilt_nord_rad"),
@@ -291,7 +291,7 @@ SPOILT: list[tuple[str, str, list[Any], Any, str]] = [
     ("width a text", "heliostat", ["width"], "3.22", "expected a number, found '3.22'"),
     ("one actuator", "heliostat", ["kinematics_properties", "actuators"], [1],
      "1 actuators; a heliostat has 2"),
-    ("no triangle", "heliostat", [*JACK, "initial_stroke_length"], 0.9, "make no triangle"),
+    ("no triangle", "heliostat", [*JACK, "initial_stroke_length"], 0.9, "do not form a triangle"),
     ("increment 0", "heliostat", [*JACK, "increment"], 0, "must not be 0"),
     ("stops reversed", "heliostat", [*JACK, "min_increment"], 99999, "above the upper stop"),
     ("NaN", "heliostat", [*JACK, "offset"], math.nan, "nan is outside"),
@@ -326,7 +326,7 @@ def test_paint(which, place, value, says, tmp_path, capsys, monkeypatch) -> None
 
 
 TEXTS = [
-    ("truncated JSON", "heliostat", json.dumps(PAINT)[:300], "no JSON"),
+    ("truncated JSON", "heliostat", json.dumps(PAINT)[:300], "not valid JSON"),
     ("a list", "heliostat", "[1, 2]", "expected an object"),
     ("empty JSON", "tower", "", "the file is empty"),
     ("missing column", "measured", MEASURED.replace("utis_lat", "lat"), "no column utis_lat"),

@@ -122,7 +122,7 @@ def test_the_tower_comes(database: Database, tmp_path: Path) -> None:
 
 def test_what_the_database_lacks_is_said(database: Database, tmp_path: Path) -> None:
     fetched = get(database, tmp_path, kinds=("properties", "deflectometry"))
-    assert fetched.missing == ("heliostat AA39: the database has no deflectometry of it",)
+    assert fetched.missing == ("heliostat AA39: the database has no deflectometry data",)
     assert len(fetched.files) == 1
 
 
@@ -268,8 +268,8 @@ def test_giving_up_keeps_what_is_there_for_the_next_run(database: Database, tmp_
     text = str(error.value)
     assert re.match(
         r"heliostat AA39: http://127\.0\.0\.1:\d+/WRI1030197/AA39/Properties/AA39-heliostat-properties"
-        r"\.json: the server answers 503 Service Unavailable; gave up after 4 attempts, run it "
-        r"again later, what is there is kept$",
+        r"\.json: the server answers 503 Service Unavailable; gave up after 4 attempts; run it "
+        r"again later, completed parts are kept$",
         text,
     )
     assert not (tmp_path / BIG).exists()

@@ -48,11 +48,11 @@ def test_an_unknown_heliostat_is_named_with_its_neighbours(
     database: Database, tmp_path: Path
 ) -> None:
     with pytest.raises(
-        FetchError, match=r"heliostat AA93: .* has none of this name; did you mean AA39\?"
+        FetchError, match=r"heliostat AA93: .* has no heliostat of this name; did you mean AA39\?"
     ):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
     del database.files[f"/{PLANT}/{PLANT}-catalog-stac.json"]
-    with pytest.raises(FetchError, match="has none of this name; look at its catalogue"):
+    with pytest.raises(FetchError, match="has no heliostat of this name; look at its catalogue"):
         fetch_heliostats("AA93", tmp_path, base_url=database.base, settings=FAST)
 
 
@@ -90,17 +90,21 @@ ITEM = "AA39/Properties/AA39-item-stac.json"
 @pytest.mark.parametrize(
     ("path", "content", "problem"),
     [
-        (CATALOGUE, b"<html>busy</html>", "what came is not JSON; it begins '<html>busy</html>'"),
-        (CATALOGUE, b"", "what came is not JSON; it begins ''"),
-        (CATALOGUE, b'{"links": [', "what came is not JSON"),
-        (CATALOGUE, b"\xff\xfe\x00", "what came is not JSON"),
-        (CATALOGUE, b"[1, 2]", "no STAC document, but a list or value"),
-        (CATALOGUE, b"{}", "no STAC catalogue, it has no list of links"),
-        (CATALOGUE, b'{"links": [3]}', "no STAC catalogue, it has no list of links"),
-        (CATALOGUE, b'{"links": [{"rel": "child"}]}', "no STAC catalogue, a link has no address"),
-        (ITEM, b'{"links": []}', "no STAC item, it names no files with addresses"),
-        (ITEM, b'{"assets": {"a": {"href": 7}}}', "no STAC item, it names no files"),
-        (BIG, b"<html>moved</html>", "what came is not JSON; it begins '<html>moved</html>'"),
+        (CATALOGUE, b"<html>busy</html>", "the answer is not JSON; it begins '<html>busy</html>'"),
+        (CATALOGUE, b"", "the answer is not JSON; it begins ''"),
+        (CATALOGUE, b'{"links": [', "the answer is not JSON"),
+        (CATALOGUE, b"\xff\xfe\x00", "the answer is not JSON"),
+        (CATALOGUE, b"[1, 2]", "not a STAC document but a list or value"),
+        (CATALOGUE, b"{}", "not a STAC catalogue: it has no list of links"),
+        (CATALOGUE, b'{"links": [3]}', "not a STAC catalogue: it has no list of links"),
+        (
+            CATALOGUE,
+            b'{"links": [{"rel": "child"}]}',
+            "not a STAC catalogue: a link has no address",
+        ),
+        (ITEM, b'{"links": []}', "not a STAC item: it names no files with addresses"),
+        (ITEM, b'{"assets": {"a": {"href": 7}}}', "not a STAC item: it names no files"),
+        (BIG, b"<html>moved</html>", "the answer is not JSON; it begins '<html>moved</html>'"),
     ],
 )
 def test_garbage_is_refused(
@@ -117,7 +121,7 @@ def test_an_endless_catalogue_is_refused(
 ) -> None:
     monkeypatch.setattr("heliotrope.field.formats._download.DOCUMENT_LIMIT", 2**20)
     database.put(CATALOGUE, b"[" * (2**20 + 1))
-    assert "more than 1 MiB; this is no catalogue" in refused(database, tmp_path)
+    assert "more than 1 MiB; this is not a catalogue" in refused(database, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,7 @@ def test_names_that_lead_elsewhere_are_refused(
     href = f"{database.base}/AA39/Properties/{name}"
     database.put(ITEM, {"assets": {"a": {"href": href}}})
     inside = tmp_path / "inside"
-    assert "is not a plain one; refused" in refused(database, inside)
+    assert "is not a plain file name; refused" in refused(database, inside)
     assert list(tmp_path.iterdir()) == [inside]
 
 
@@ -154,7 +158,7 @@ def test_other_kinds_of_addresses_are_refused(
 
 def test_what_is_no_address_is_refused(database: Database, tmp_path: Path) -> None:
     database.put(ITEM, {"assets": {"a": {"href": "http://[x"}}})
-    assert "'http://[x' is no address (Invalid IPv6 URL)" in refused(database, tmp_path)
+    assert "'http://[x' is not a valid address (Invalid IPv6 URL)" in refused(database, tmp_path)
 
 
 def test_two_files_in_one_place_are_refused(database: Database, tmp_path: Path) -> None:
@@ -175,7 +179,7 @@ def test_size_and_checksum_of_the_catalogue_are_checked(database: Database, tmp_
     right = "1220" + hashlib.sha256(content).hexdigest()
     checked(database, size=len(content) + 1)
     text = refused(database, tmp_path)
-    assert f"{len(content)} bytes came, but the catalogue says {len(content) + 1}" in text
+    assert f"{len(content)} bytes arrived, but the catalogue says {len(content) + 1}" in text
     checked(database, checksum="1220" + "0" * 64)
     assert "its checksum is not the one in the catalogue" in refused(database, tmp_path)
     assert not list(tmp_path.rglob("AA39-heliostat-properties*"))
@@ -200,7 +204,7 @@ def test_a_full_disk_is_said(database: Database, tmp_path: Path) -> None:
     part.parent.mkdir(parents=True)
     part.symlink_to("/dev/full")
     text = refused(database, tmp_path)
-    assert f"{tmp_path / BIG}: the disk is full; make room and run it again" in text
+    assert f"{tmp_path / BIG}: the disk is full; free some space and run it again" in text
     assert not (tmp_path / BIG).exists()
 
 
@@ -240,7 +244,7 @@ def test_compressed_answers(database: Database, tmp_path: Path) -> None:
     get(database, tmp_path)
     assert (tmp_path / BIG).read_bytes() == database.files[f"/{PLANT}/{BIG}"]
     database.fail(CATALOGUE, *[lambda _: Answer(200, packed, b"no gzip")] * 9)
-    assert "what came cannot be unpacked" in refused(database, tmp_path)
+    assert "the answer cannot be unpacked" in refused(database, tmp_path)
 
 
 def test_endless_redirects_are_said(database: Database, tmp_path: Path) -> None:
@@ -257,7 +261,7 @@ def test_a_bad_address_is_said(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "../AA39", "AA 39", "AA39/x", "x" * 65])
 def test_names_of_heliostats_are_checked(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="give a name of letters and digits, as AA39"):
+    with pytest.raises(InputError, match="give a name of letters and digits, such as AA39"):
         fetch_heliostats(name, tmp_path)
 
 

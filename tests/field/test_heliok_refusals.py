@@ -140,7 +140,7 @@ def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
         stream.write(b"<HelioK>")
         stream.truncate(200 * 2**20)
     start = time.perf_counter()
-    with pytest.raises(FormatError, match="200 MiB are more than the limit of 64 MiB"):
+    with pytest.raises(FormatError, match="200 MiB exceed the limit of 64 MiB"):
         heliok.read(path)
     assert time.perf_counter() - start < 1.0
 

@@ -187,7 +187,11 @@ def test_keep_out_volumes_and_eyes_are_read_and_survive(tmp_path: Path) -> None:
         ('kind = "sphere"', 'kind = "ball"', "keep_out.3: "),
         ("radius_m = 10", "radius_m = 0", "keep_out.3.sphere.radius_m: 0: input should be greater"),
         ("radius_m = 1.5", "radius = 1.5", "keep_out.1.cylinder.radius"),
-        ("end_m = [0, 0, 60]", "end_m = [0, 0, 0]", "keep_out[1]: volume mast: its ends are one"),
+        (
+            "end_m = [0, 0, 60]",
+            "end_m = [0, 0, 0]",
+            "keep_out[1]: volume mast: its two ends coincide",
+        ),
         ("top_m = 8", "top_m = 2", "keep_out[2]: volume walkway: top 2 m must be above bottom 4 m"),
         ('name = "mast"', 'name = "walkway"', "keep-out volume walkway: the name occurs twice"),
         ("gate = [0, 120, 1.7]", "gate = [0, 120]", "eyes_m.gate: "),

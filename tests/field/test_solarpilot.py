@@ -191,5 +191,5 @@ def test_200_mb_are_refused_unread(tmp_path: Path) -> None:
     with path.open("wb") as stream:
         stream.write(ROW.encode())
         stream.truncate(200 * 2**20)
-    with pytest.raises(FormatError, match="200 MiB are more than the limit of 64 MiB"):
+    with pytest.raises(FormatError, match="200 MiB exceed the limit of 64 MiB"):
         solarpilot.read_layout(path)

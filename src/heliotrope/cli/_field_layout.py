@@ -1,4 +1,4 @@
-"""``heliotrope field layout``: a generated field as a plant file."""
+"""``heliotrope field layout``: generate a field as a plant file."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,24 +15,22 @@ if TYPE_CHECKING:
 def layout(
     kind: Annotated[str, typer.Argument(help="six-packs, radial or rows.")],
     out: Annotated[Path, typer.Option("--out", help="Plant file to write (TOML).")],
-    heliostats: Annotated[int, typer.Option(help="How many.")] = 10_000,
-    width: Annotated[float, typer.Option(help="Of a mirror, m.")] = 2.5,
-    height: Annotated[float, typer.Option(help="Of a mirror, m.")] = 2.0,
+    heliostats: Annotated[int, typer.Option(help="Number of heliostats.")] = 10_000,
+    width: Annotated[float, typer.Option(help="Width of a mirror, m.")] = 2.5,
+    height: Annotated[float, typer.Option(help="Height of a mirror, m.")] = 2.0,
     pivot: Annotated[
         float | None, typer.Option(help="Height of the pivots, m; default 0.7 above half a mirror.")
     ] = None,
-    clearance: Annotated[
-        float, typer.Option(help="Between two mirrors however they turn, m.")
-    ] = 0.3,
+    clearance: Annotated[float, typer.Option(help="Gap between two mirrors in any pose, m.")] = 0.3,
     tower: Annotated[
         float | None,
         typer.Option(help="Receiver above the pivots, m; default in proportion to the field."),
     ] = None,
-    latitude: Annotated[float, typer.Option(help="Degrees, north positive.")] = -28.5,
-    longitude: Annotated[float, typer.Option(help="Degrees, east positive.")] = 21.2,
-    altitude: Annotated[float, typer.Option(help="Of the site, m.")] = 830.0,
-    name: Annotated[str, typer.Option(help="Of the plant; default the kind.")] = "",
-    table: Annotated[str, typer.Option(help="Of the heliostats: csv or parquet.")] = "csv",
+    latitude: Annotated[float, typer.Option(help="Latitude, degrees north.")] = -28.5,
+    longitude: Annotated[float, typer.Option(help="Longitude, degrees east.")] = 21.2,
+    altitude: Annotated[float, typer.Option(help="Altitude of the site, m.")] = 830.0,
+    name: Annotated[str, typer.Option(help="Name of the plant; default the kind.")] = "",
+    table: Annotated[str, typer.Option(help="Table of heliostats: csv or parquet.")] = "csv",
     picture: Annotated[
         Path | None, typer.Option(help="Draw the field to this file (PNG, SVG or PDF).")
     ] = None,
@@ -40,7 +38,7 @@ def layout(
 ) -> None:
     """Write a plant of a pattern: heliostats in clusters, tower, two targets with cameras.
 
-    The field lies on the side of the tower that is away from the equator; rows lie on both.
+    The field lies on the side of the tower away from the equator; rows lie on both sides.
     """
     from heliotrope.errors import InputError
     from heliotrope.field.formats.plant_file import write_plant
@@ -64,10 +62,10 @@ def layout(
     write_plant(plant, out, _table(table))
     if picture is not None:
         _draw(plant, picture)
-    _tell(plant, mirror, out, as_json)
+    _report(plant, mirror, out, as_json)
 
 
-def _tell(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
+def _report(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
     from heliotrope.field.layouts import nearest_gap
 
     area = mirror.width * mirror.height
@@ -87,7 +85,7 @@ def _tell(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
         f"{out}: {facts['heliostats']:,} heliostats of {area:g} m² in "
         f"{facts['clusters']:,} clusters, receiver at {facts['receiver_height_m']:.0f} m, the "
         f"farthest {facts['farthest_m']:.0f} m away; mirrors keep {facts['nearest_gap_m']:.2f} m "
-        "apart however they turn"
+        "apart in any pose"
     )
 
 

@@ -1,4 +1,4 @@
-"""``heliotrope fetch``: bring published measurements here."""
+"""``heliotrope fetch``: download published measurements."""
 
 from pathlib import Path
 from typing import Annotated
@@ -14,11 +14,11 @@ def fetch(
     heliostats: Annotated[list[str], typer.Argument(help="Names, for example AA39.")],
     into: Annotated[Path, typer.Option(help="Folder to put the files in.")],
     base_url: Annotated[
-        str | None, typer.Option(help="Address of another copy of the catalogue.")
+        str | None, typer.Option(help="Address of a copy of the catalogue.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Fetch properties and measurements of heliostats; what is already there is kept."""
+    """Download properties and measurements of heliostats; files already there are kept."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from heliotrope.field.formats import fetch as fetching

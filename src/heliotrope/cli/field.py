@@ -1,4 +1,4 @@
-"""``heliotrope field``: make and look at plant files."""
+"""``heliotrope field``: make and check plant files."""
 
 from pathlib import Path
 from typing import Annotated
@@ -34,7 +34,7 @@ def check(
             plant = plant_file.read_plant(file)
             print(
                 f"{file}: {len(plant)} heliostats, {len(plant.targets)} targets: "
-                f"{'can run, see above' if findings else 'all is well'}"
+                f"{'it can run; see the warnings above' if findings else 'no problems found'}"
             )
     if wrong:
         raise typer.Exit(2)

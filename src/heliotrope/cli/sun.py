@@ -1,4 +1,4 @@
-"""``heliotrope sun``: where the sun stands."""
+"""``heliotrope sun``: position of the sun."""
 
 from typing import Annotated
 
@@ -13,12 +13,12 @@ def sun(
     height: Annotated[float, typer.Option(help="Metres above the ellipsoid.")] = 120.0,
     time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
     pressure: Annotated[
-        float | None, typer.Option(help="hPa at the site; default from the height.")
+        float | None, typer.Option(help="Air pressure at the site, hPa; default from the height.")
     ] = None,
-    temperature: Annotated[float, typer.Option(help="°C.")] = 12.0,
+    temperature: Annotated[float, typer.Option(help="Air temperature, °C.")] = 12.0,
     every: Annotated[
         str | None,
-        typer.Option(help="The whole day of TIME at this interval: 30s, 10min."),
+        typer.Option(help="Print the whole day of TIME at this interval: 30s, 10min."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""``heliotrope track``: where the drives of a heliostat must stand."""
+"""``heliotrope track``: drive positions of a heliostat."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -23,18 +23,19 @@ def track(
     field: Annotated[Path, typer.Argument(help="Plant file (TOML), HelioK XML or PAINT folder.")],
     heliostat: Annotated[str, typer.Option(help="Name of the heliostat.")],
     aim: Annotated[
-        str | None, typer.Option(help="East,north,up in metres; default the first target.")
+        str | None,
+        typer.Option(help="Aim east,north,up in metres; default the first target."),
     ] = None,
     target: Annotated[str | None, typer.Option(help="Aim at the centre of this target.")] = None,
     time: Annotated[str, typer.Option(help="ISO 8601 with a zone, or now.")] = "now",
     sun: Annotated[
-        str | None, typer.Option(help="Vector to the sun east,north,up instead of the time's.")
+        str | None, typer.Option(help="Vector to the sun east,north,up, instead of that at TIME.")
     ] = None,
     every: Annotated[
         str | None, typer.Option(help="Track the whole day of TIME at this interval: 30s, 10min.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="calibration.json of heliotrope calibrate, to apply.")
+        Path | None, typer.Option(help="calibration.json of heliotrope calibrate to apply first.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:

@@ -3,7 +3,7 @@
 The thesis gives the place (−33.93, 18.87), eighteen heliostats in six groups of three,
 the calibrated heliostat 30.8 m south and 19.2 m east of the tower with its pivot 1.2 m
 above ground, and a target 13 m up. The other positions, the sizes of mirrors and target
-and the gears are ours, chosen so that the field could stand and work.
+and the gears are ours, chosen so that the field could be built.
 """
 
 import numpy as np
@@ -79,7 +79,7 @@ def azimuth_elevation(position: FloatArray) -> Mechanism:
 
 
 def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
-    """Return mechanisms as a quick installation leaves them, for simulations.
+    """Return mechanisms with the errors of a quick installation, for simulations.
 
     Standard deviations: tilts 10 mrad, encoder zeros 5 mrad, non-orthogonality and
     canting 2 mrad, position 20 mm.
@@ -97,7 +97,7 @@ def roughly_installed(nominal: Mechanism, seed: int = 0) -> Mechanism:
 
 def _square(center: tuple[float, float, float], size: float) -> FloatArray:
     """Corners of an upright square that faces south, from the upper left seen from the front."""
-    # Who looks north at it has west to the left.
+    # Seen by someone looking north, west is to the left.
     half = 0.5 * size
     shifts = np.array([(-half, half), (half, half), (half, -half), (-half, -half)])
     plane = np.stack([shifts[:, 0], 0 * shifts[:, 0], shifts[:, 1]], axis=-1)

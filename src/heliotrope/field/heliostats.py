@@ -44,18 +44,18 @@ class Heliostats:
     names
         Unique.
     mechanism
-        Nominal mechanisms, batch shape (N,), in ENU metres about the plant's reference.
+        Nominal mechanisms, batch shape (N,), in ENU metres about the plant's reference point.
     width, height
-        Of the mirror, m, (N,).
+        Size of the mirror, m, (N,).
     facets
-        If known.
+        Facets of the mirrors, if known.
     parameters
-        Deviations from the nominal mechanism as calibration found them, by name of the
-        parameter table, in rad, m or 1, each (N,).
+        Calibrated deviations from the nominal mechanism, by parameter name, in rad, m or 1,
+        each (N,).
     aim
-        Where each is aimed in operation, ENU metres, (N, 3); NaN where not given.
+        Aim points in operation, ENU metres, (N, 3); NaN where not given.
     cluster
-        Name of the controller each hangs on, "" if none.
+        Name of each heliostat's cluster, "" if none.
     """
 
     names: tuple[str, ...]
@@ -128,7 +128,7 @@ class Heliostats:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no heliostat of that name.
         """
         try:
             return self._index[name]

@@ -1,4 +1,4 @@
-"""What stands in the middle of a generated field: targets with marks, their cameras, receivers."""
+"""The middle of a generated field: targets with marks, their cameras, receivers."""
 
 import numpy as np
 
@@ -53,9 +53,9 @@ def watching_camera(target: Target, name: str, away: float, height: float, aside
     Parameters
     ----------
     target
-        What it looks at.
+        The target that it looks at.
     name
-        Of the camera.
+        Name of the camera.
     away, aside
         From the target's centre along its normal and to the right of it, m.
     height

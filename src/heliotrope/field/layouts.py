@@ -1,12 +1,12 @@
-"""Generated fields: where heliostats stand, and whole plants around them.
+"""Generated fields: positions of heliostats, and whole plants around them.
 
 Three patterns: rings whose mirrors stand before the gaps of the ring in front (radial staggered),
 rows in two fields north and south of the tower, and Malan's triangles of six on arcs. A mirror
 turns in any direction about its pivot, so two mirrors stand further apart than a diagonal and a
-clearance; each generator keeps to it, and `nearest_gap` proves it.
+clearance; every generator keeps this distance, and `nearest_gap` checks it.
 
-What can be known from the sources of Malan's plant is its size: 5 MWe, 10,000 heliostats of 5 m²,
-a cluster controller for every 32 of them. Place, tower, receiver, targets and gears are ours.
+Malan's sources give only the size of his plant: 5 MWe, 10,000 heliostats of 5 m²,
+a cluster controller for every 32 of them. Site, tower, receiver, targets and gears are ours.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,11 +46,11 @@ class Mirror:
     Attributes
     ----------
     width, height
-        Of the mirror, m.
+        Size of the mirror, m.
     pivot_height, pivot_offset
-        Of the crossing of the axes above ground, and of the mirror in front of it, m.
+        Height of the axes above ground, and distance of the mirror in front of them, m.
     clearance
-        Between two mirrors however they turn, m.
+        Gap between two mirrors in any pose, m.
     """
 
     width: float = 2.5
@@ -83,19 +83,19 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Ground:
-    """Where mirrors may stand.
+    """The ground that mirrors may occupy.
 
     Attributes
     ----------
     tower_height
-        Of the receiver's centre above the pivots, m.
+        Height of the receiver's centre above the pivots, m.
     nearest
-        From the tower to the nearest mirror, m.
+        Distance from the tower to the nearest mirror, m.
     bearing, half_angle
-        Azimuth from the tower to the middle of the field, and how far it goes to either side
-        of it, rad; π is all around.
+        Azimuth from the tower to the middle of the field, and its extent to either side, rad;
+        π is all around.
     free
-        Circles that are kept free, (east, north, radius) each, m.
+        Circles without mirrors, (east, north, radius) each, m.
     """
 
     tower_height: float = 80.0
@@ -140,14 +140,14 @@ class Ground:
 
 @dataclass(frozen=True)
 class Places:
-    """Where heliostats stand.
+    """Positions of heliostats.
 
     Attributes
     ----------
     names
         Unique, (N).
     position
-        Of their feet, ENU m, (N, 3).
+        Feet, ENU m, (N, 3).
     """
 
     names: tuple[str, ...]
@@ -311,14 +311,14 @@ def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
 
 
 def nearest_gap(position: FloatArray, mirror: Mirror) -> float:
-    """Return the least gap between two mirrors however they turn, m; below 0 they can touch.
+    """Return the smallest gap between two mirrors in any pose, m; below 0 they can touch.
 
     Parameters
     ----------
     position
-        Of the pivots or feet, (N, 3); inf is returned for fewer than two.
+        Pivots or feet, (N, 3); fewer than two give inf.
     mirror
-        Of all; its clearance counts as gap.
+        Common size; its clearance counts as part of the gap.
     """
     from scipy.spatial import cKDTree
 
@@ -394,19 +394,19 @@ def lay_out(
     heliostats
         1 to `MOST`.
     mirror
-        By default of 5 m².
+        Default: 5 m².
     tower_height
-        Of the receiver above the pivots, m, 20 to 500; by default in proportion to the field:
-        80 m for 10,000 heliostats of 5 m², at least 30 m and at most 250 m.
+        Height of the receiver above the pivots, m, 20 to 500; default in proportion to the
+        field: 80 m for 10,000 heliostats of 5 m², at least 30 m and at most 250 m.
     site
-        By default in the Northern Cape.
+        Default: in the Northern Cape.
     name
-        Of the plant; default the kind.
+        Name of the plant; default the kind.
 
     Raises
     ------
     InputError
-        If a number cannot be built, or two mirrors could touch.
+        If a number is out of range, or two mirrors could touch.
     UnknownNameError
         If there is no such kind.
     """

@@ -28,20 +28,22 @@ class Plant:
     Attributes
     ----------
     name
-        Of the plant.
+        Name of the plant.
     site
-        Its reference point: the origin of ENU.
+        Reference point: the origin of ENU.
     groups
-        Heliostats by kind of mechanism, by name of the group; names of heliostats are
+        Heliostats of one kind of mechanism each, by group name; names of heliostats are
         unique over all groups.
     targets, receivers
         Surfaces that beams are sent to.
+    notes
+        Remarks of the reader, by subject.
     cameras
-        That look at the targets.
+        Cameras that look at the targets.
     keep_outs
-        Where no beam may be.
+        Volumes that no beam may enter.
     eyes
-        From where people may look into beams at rest, ENU, m, (3,), by name.
+        Points from which people may look into standby beams, ENU, m, (3,), by name.
     """
 
     name: str
@@ -101,7 +103,7 @@ class Plant:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no heliostat of that name.
         """
         try:
             group, row = self._place[name]

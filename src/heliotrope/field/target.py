@@ -24,11 +24,11 @@ class Target:
         Upper left, upper right, lower right, lower left as seen from the front (from
         where the beams come), ENU metres, (4, 3).
     center
-        Where heliostats are aimed, ENU metres, (3,).
+        Aim point of the heliostats, ENU metres, (3,).
     markers
         Further known points by name, ENU metres.
     marks
-        What is painted on it for cameras to find it by.
+        Marks painted on it, by which cameras find it.
     """
 
     name: str
@@ -97,7 +97,7 @@ class Target:
         return self.center + np.asarray(plane, dtype=np.float64) @ self.axes
 
     def intersect(self, origin: npt.ArrayLike, direction: npt.ArrayLike) -> FloatArray:
-        """Return where rays (..., 3) meet the target's plane, ENU; NaN where they never do."""
+        """Return where rays (..., 3) meet the target's plane, ENU; NaN where they miss it."""
         o, d = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         towards = np.asarray(d @ self.normal)
         gap = np.asarray((self.center - o) @ self.normal)
@@ -109,7 +109,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Receiver:
-    """What the field heats.
+    """A receiver: the surface that the field heats.
 
     Attributes
     ----------
@@ -122,11 +122,11 @@ class Receiver:
     normal
         Unit normal out of the aperture, (3,).
     width, height
-        Of the aperture, m; of an external cylinder the diameter and height.
+        Size of the aperture, m; diameter and height of an external cylinder.
     corners
-        Of the aperture as for :class:`Target`, (4, 3), if known.
+        Corners of the aperture in the order of `Target`, (4, 3), if known.
     radius, opening_angle
-        Of a curved receiver, m and rad; 0 if flat.
+        Curvature, m and rad; 0 if flat.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""Keep-out volumes: where no beam may be."""
+"""Keep-out volumes, which no beam may enter."""
 
 from dataclasses import dataclass
 
@@ -29,13 +29,13 @@ class Box:
     Attributes
     ----------
     name
-        What an operator calls it.
+        Name shown to operators.
     center
         ENU, m, (3,).
     size
-        To its right, forwards and up, m, (3,).
+        Extent to the right, forwards and up, m, (3,).
     azimuth
-        Of its forward direction, clockwise from north, rad.
+        Azimuth of the forward direction, clockwise from north, rad.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Cylinder:
     Attributes
     ----------
     name
-        What an operator calls it.
+        Name shown to operators.
     start, end
         Centres of its two ends, ENU, m, (3,).
     radius
@@ -73,7 +73,7 @@ class Cylinder:
     def __post_init__(self) -> None:
         way = _point(self.name, "end", self.end) - _point(self.name, "start", self.start)
         if not np.linalg.norm(way) > 0.0:
-            raise InputError(f"volume {self.name}: its ends are one point; give two")
+            raise InputError(f"volume {self.name}: its two ends coincide; give two points")
         _positive(self.name, "radius", self.radius)
 
 
@@ -84,9 +84,9 @@ class Prism:
     Attributes
     ----------
     name
-        What an operator calls it.
+        Name shown to operators.
     corners
-        Of the polygon in order, either way round, east and north, m, (K, 2), K ≥ 3.
+        Polygon, in order, either way round, east and north, m, (K, 2), K ≥ 3.
     bottom, top
         Heights, m.
     """
@@ -110,12 +110,12 @@ class Prism:
                 f"volume {self.name}: top {self.top:g} m must be above bottom {self.bottom:g} m"
             )
         if (np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1) == 0.0).any():
-            raise InputError(f"volume {self.name}: two neighbouring corners are one point")
+            raise InputError(f"volume {self.name}: two neighbouring corners coincide")
 
 
 Volume = Sphere | Box | Cylinder | Prism
 
-#: Points of a circle on a map.
+#: Number of points that draw a circle on a map.
 _ROUND = 24
 
 

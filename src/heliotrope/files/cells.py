@@ -1,4 +1,4 @@
-"""Rows of a table, cell by cell: the bad ones are named and left out, one line each."""
+"""Tables cell by cell: a row that cannot be used is left out and named in one line."""
 
 import csv
 import io
@@ -39,13 +39,13 @@ class Rows:
     path
         The file.
     places
-        Where each row stands ("line 12"), (M,).
+        Place of each row in the file ("line 12"), (M,).
     columns
         Cells by column, (M,) each.
     header
-        Where the names of the columns stand, "" if nowhere in particular.
+        Place of the column names in the file, "" if not known.
     heliostat
-        As each row names it, for the messages, (M,).
+        Name of the heliostat in each row, for messages, (M,).
     reasons
         Why a row cannot be used, by its index.
     """
@@ -62,7 +62,7 @@ class Rows:
 
     @property
     def good(self) -> npt.NDArray[np.intp]:
-        """Indices of the rows that nothing was found wrong with."""
+        """Indices of the rows without a fault."""
         return np.array([i for i in range(len(self)) if i not in self.reasons], dtype=np.intp)
 
     @property
@@ -71,9 +71,9 @@ class Rows:
         lines = []
         for i, reason in sorted(self.reasons.items()):
             name = self.heliostat[i] if len(self.heliostat) else ""
-            whose = f", heliostat {name}" if name else ""
+            of = f", heliostat {name}" if name else ""
             # A quoted cell may hold line breaks; a message is one line.
-            lines.append(" ".join(f"{self.path.name}: {self.places[i]}{whose}, {reason}".split()))
+            lines.append(" ".join(f"{self.path.name}: {self.places[i]}{of}, {reason}".split()))
         return lines
 
     def need(self, names: Sequence[str]) -> None:
@@ -86,7 +86,7 @@ class Rows:
                 )
 
     def refuse(self, i: "int | np.integer[Any]", column: str, reason: str) -> None:
-        """Leave a row out; the first reason is the one that is told."""
+        """Leave a row out; only the first reason is kept."""
         self.reasons.setdefault(int(i), f"column {column}: {reason}")
 
     def texts(self, column: str) -> list[str]:
@@ -105,18 +105,18 @@ class Rows:
         Parameters
         ----------
         column
-            That is there.
+            Name of an existing column.
         what
-            What to give instead, with its unit.
+            Value to give instead, with its unit, for the message.
         empty
-            What an empty cell stands for; None refuses it.
+            Value of an empty cell; None refuses it.
         """
         cells = self.columns[column]
         values = cells if isinstance(cells, np.ndarray) else np.array([_number(c) for c in cells])
         values = np.asarray(values, dtype=np.float64).copy()
         for i in np.flatnonzero(~np.isfinite(values)):
             if not _empty(cells[i]):
-                self.refuse(i, column, f"{_shown(cells[i])} is no finite number; give {what}")
+                self.refuse(i, column, f"{_shown(cells[i])} is not a finite number; give {what}")
             elif empty is None:
                 self.refuse(i, column, f"the cell is empty; give {what}")
             else:
@@ -124,12 +124,12 @@ class Rows:
         return values
 
     def check(self, column: str, wrong: npt.ArrayLike, values: FloatArray, reason: str) -> None:
-        """Leave out the rows that are ``wrong``, with their value and what stands behind it."""
+        """Leave out the rows where ``wrong`` holds; ``reason`` follows the value in the message."""
         for i in np.flatnonzero(wrong):
             self.refuse(i, column, f"{values[i]:.10g}{reason}")
 
     def flags(self, column: str) -> npt.NDArray[np.bool_]:
-        """Return truths; cells that are neither true nor false leave their rows out."""
+        """Return booleans; cells that are neither true nor false leave their rows out."""
         flags = np.zeros(len(self), dtype=np.bool_)
         for i, cell in enumerate(self.columns[column]):
             text = str(int(cell) if isinstance(cell, float) and cell in (0.0, 1.0) else cell)
@@ -141,7 +141,7 @@ class Rows:
         return flags
 
     def times(self, column: str, optional: bool) -> FloatArray:
-        """Return unix seconds; NaN where the cell is empty and may be."""
+        """Return unix seconds; NaN where the cell is empty and ``optional`` holds."""
         seconds = np.full(len(self), np.nan)
         for i, cell in enumerate(self.columns[column]):
             if _empty(cell):
@@ -175,22 +175,22 @@ def read_rows(path: Path, what: str) -> Rows:
     before = 0
     try:
         for cells in reader:
-            # A quoted cell may run over several lines; the row is named by its first.
+            # A quoted cell may span several lines; the row is named by its first.
             if any(cell.strip() for cell in cells):
                 table.append(cells)
                 places.append(f"line {before + 1}")
             before = reader.line_num
     except csv.Error as error:
-        raise FormatError(path, f"no table in CSV ({error})", f"line {reader.line_num}") from None
+        raise FormatError(path, f"not a CSV table ({error})", f"line {reader.line_num}") from None
     if not table:
-        raise FormatError(path, f"there is nothing in it; it should be {what}")
+        raise FormatError(path, f"the file has no rows; it should be {what}")
     names = [_tidy(cell) for cell in table.pop(0)]
     place = places.pop(0)
     while names and not names[-1]:
         names.pop()
     for k, name in enumerate(names):
         if not name or name in names[:k]:
-            wrong = f"column {name} stands there twice" if name else f"column {k + 1} has no name"
+            wrong = f"column {name} occurs twice" if name else f"column {k + 1} has no name"
             raise FormatError(path, f"{wrong}; name each column once", place)
     rows = Rows(path, places, {}, place)
     for i, cells in enumerate(table):
@@ -226,7 +226,7 @@ def read_parquet(path: Path, what: str) -> Rows:
         ]
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
-        raise FormatError(path, f"no Parquet table ({reason}); it should be {what}") from None
+        raise FormatError(path, f"not a Parquet table ({reason}); it should be {what}") from None
     if len(set(names)) != len(names):
         raise FormatError(path, "two columns have the same name; name each column once")
     columns = dict(zip(names, cells, strict=True))
@@ -234,7 +234,7 @@ def read_parquet(path: Path, what: str) -> Rows:
 
 
 def rows_of(names: Sequence[str]) -> dict[str, int]:
-    """Return the row of each heliostat by its name.
+    """Return the row of each heliostat by name.
 
     Raises
     ------
@@ -249,7 +249,7 @@ def rows_of(names: Sequence[str]) -> dict[str, int]:
 
 
 def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
-    """Return the row of each heliostat that the table names; strangers are left out."""
+    """Return the row of each heliostat named in the table; unknown names are left out."""
     index = rows_of(names)
     rows.heliostat = rows.texts(column)
     found = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
@@ -266,11 +266,13 @@ def parse_time(text: str) -> float:
     Raises
     ------
     InputError
-        If it is no time, or one without a time zone.
+        If it is not a time, or has no time zone.
     """
     found = _TIME.fullmatch(text.strip())
     if found is None:
-        raise InputError(f"{_shown(text)} is no ISO 8601 time; write it like 2026-06-21T12:00:00Z")
+        raise InputError(
+            f"{_shown(text)} is not an ISO 8601 time; write it like 2026-06-21T12:00:00Z"
+        )
     day, clock, digits, zone = found.groups()
     if zone is None:
         raise InputError(
@@ -281,7 +283,7 @@ def parse_time(text: str) -> float:
         whole = (moment - _EPOCH) // timedelta(seconds=1)
         return float(whole + (Fraction(int(digits), 10 ** len(digits)) if digits else 0))
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{_shown(text)} is no time ({error}); correct it") from None
+        raise InputError(f"{_shown(text)} is not a valid time ({error}); correct it") from None
 
 
 def format_time(seconds: float) -> str:

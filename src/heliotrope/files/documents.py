@@ -1,4 +1,4 @@
-"""TOML files of a format and version of our own: read, checked against their tables, explained."""
+"""TOML files of our own formats, checked against pydantic models with errors in plain words."""
 
 import tomllib
 from collections.abc import Iterable
@@ -15,18 +15,18 @@ D = TypeVar("D", bound=BaseModel)
 
 
 def read_toml(path: str | Path, what: str) -> dict[str, Any]:
-    """Return what a TOML file holds; ``what`` it should be, as an error calls it.
+    """Return the content of a TOML file; ``what`` names the expected kind of file in errors.
 
     Raises
     ------
     FormatError
-        If it cannot be read or is no TOML.
+        If it cannot be read or is not TOML.
     """
     text = read_text(path, what)
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise FormatError(path, f"no TOML: {error}") from None
+        raise FormatError(path, f"not valid TOML: {error}") from None
 
 
 def read_document(
@@ -37,13 +37,13 @@ def read_document(
     Parameters
     ----------
     path
-        Of the file.
+        The file.
     kind
         "plant", "cluster", …
     model
-        Of the whole file.
+        Model of the whole file.
     tables
-        All tables whose keys may be meant where one is not known.
+        Models whose keys are suggested for an unknown one.
 
     Raises
     ------

@@ -17,16 +17,16 @@ class Node:
     path
         The file.
     value
-        What stands there.
+        Its value.
     where
-        The keys that lead to it, "" at the root.
+        Path of keys that leads to it, "" at the root.
     """
 
     def __init__(self, path: Path, value: Any, where: str = "") -> None:
         self.path, self.value, self.where = path, value, where
 
     def fail(self, problem: str) -> FormatError:
-        """Return the error that says what is wrong here."""
+        """Return an error about this place."""
         return FormatError(self.path, problem, self.where)
 
     def has(self, key: str) -> bool:
@@ -71,7 +71,7 @@ class Node:
         return float(value)
 
     def text(self) -> str:
-        """Return a text."""
+        """Return a string."""
         if not isinstance(self.value, str):
             raise self.fail(f"expected a text, found {self.value!r:.60}")
         return self.value
@@ -101,7 +101,7 @@ def read_json(path: str | Path, what: str) -> Node:
     Raises
     ------
     FormatError
-        If it is no readable text of a plausible size, or no JSON.
+        If it is not a readable text file of a plausible size, or not JSON.
     """
     text = read_text(path, what)
     try:
@@ -110,5 +110,5 @@ def read_json(path: str | Path, what: str) -> Node:
         line = getattr(error, "lineno", 1)
         reason = getattr(error, "msg", "nested too deeply")
         raise FormatError(
-            path, f"no JSON ({reason}); the file may be cut off", f"line {line}"
+            path, f"not valid JSON ({reason}); the file may be cut off", f"line {line}"
         ) from None

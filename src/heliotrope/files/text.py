@@ -1,4 +1,4 @@
-"""Reads and writes whole text files: one line for each refusal, nothing half-written."""
+"""Whole files, read with one-line refusals and written whole or not at all."""
 
 import os
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from typing import BinaryIO
 
 from heliotrope.errors import FormatError, InputError
 
-#: A layout of 400,000 heliostats is 60 MB; more is not a file of this kind.
+#: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
 SIZE_LIMIT = 64 * 2**20
 
 
@@ -19,15 +19,15 @@ def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
     path
         The file.
     what
-        What it should be, as an error calls it ("a HelioK file").
+        Kind of file expected, as an error names it ("a HelioK file").
     binary
-        Whether it need not begin like text.
+        Accept files that do not begin like text.
 
     Raises
     ------
     FormatError
         If it does not exist, is a folder, cannot be read, is empty, is larger than
-        64 MiB or begins like no text.
+        64 MiB or does not begin like text.
     """
     file = Path(path)
     try:
@@ -45,7 +45,7 @@ def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
     if size > SIZE_LIMIT:
         raise FormatError(
             file,
-            f"{size / 2**20:.0f} MiB are more than the limit of {SIZE_LIMIT / 2**20:.0f} MiB; "
+            f"{size / 2**20:.0f} MiB exceed the limit of {SIZE_LIMIT / 2**20:.0f} MiB; "
             f"this is not {what}",
         )
     if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
@@ -59,7 +59,7 @@ def read_text(path: str | Path, what: str) -> str:
     Raises
     ------
     FormatError
-        As :func:`check_file`, and if it is not UTF-8.
+        As `check_file`, or if it is not UTF-8.
     """
     file = check_file(path, what)
     try:
@@ -78,12 +78,12 @@ def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:
     path
         The file; an existing one is replaced in one step.
     write
-        Writes the content to the stream that it is given.
+        Called with the stream; writes the content to it.
 
     Raises
     ------
     InputError
-        If the folder does not exist or cannot be written to.
+        If the folder does not exist or is not writable.
     """
     file = Path(path)
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")

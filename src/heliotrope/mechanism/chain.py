@@ -18,7 +18,7 @@ from heliotrope.mechanism.kernels.chain import armature_block, jacobian_block, p
 from heliotrope.mechanism.parameters import Parameter
 from heliotrope.parallel import run_blocks
 
-#: What a mechanism may be indexed with.
+#: Valid index of a mechanism.
 Index = (
     int
     | slice
@@ -31,7 +31,7 @@ Index = (
 
 @dataclass(frozen=True)
 class Pose:
-    """Where mirrors are.
+    """Normals and vertices of mirrors.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Jacobian:
 class Mechanism:
     """One mechanism, or an array of mechanisms of one kind; batch shape (...).
 
-    Build it with a function of :mod:`heliotrope.mechanism.kinds`.
+    Build one with a function of `heliotrope.mechanism.kinds`.
 
     Attributes
     ----------
@@ -158,7 +158,7 @@ class Mechanism:
             ) from None
 
     def codes(self, names: tuple[str, ...]) -> npt.NDArray[np.int64]:
-        """Return what the kernels move for each parameter, shape (P, 3)."""
+        """Return the kernels' code of each parameter, shape (P, 3)."""
         rows = [self.parameter(name).code for name in names]
         return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
@@ -213,7 +213,7 @@ class Mechanism:
         Parameters
         ----------
         counts
-            Shape (..., D); its batch axes broadcast against the mechanism's.
+            Shape (..., D); batch axes broadcast against the mechanism's.
         """
         flat, rows, shape = self._flatten(counts)
         normal, vertex = np.empty((len(rows), 3)), np.empty((len(rows), 3))
@@ -227,7 +227,7 @@ class Mechanism:
         Parameters
         ----------
         counts
-            Shape (..., D); its batch axes broadcast against the mechanism's.
+            Shape (..., D); batch axes broadcast against the mechanism's.
         names
             Parameters of the table, P of them.
 
@@ -235,7 +235,7 @@ class Mechanism:
         -----
         The screw formula: a joint's small turn moves the normal by w × n and the
         vertex by w × (m − o). It is exact wherever the chain itself is differentiable,
-        so in every pose but a jack stretched flat.
+        that is, in every pose except that of a jack stretched flat.
         """
         flat, rows, shape = self._flatten(counts)
         codes = self.codes(names)

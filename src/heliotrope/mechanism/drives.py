@@ -1,20 +1,19 @@
 r"""Drives: motor counts to the angle of a joint, and back.
 
-A drive turns counts into an ideal angle φ and that into the angle of the joint
+A drive turns counts into an ideal angle φ, and that into the angle of the joint
 
-.. math:: θ = bias + (1 + scale)\,φ + worm_{cos} \cos u + worm_{sin} \sin u
-          + sag \cos(φ + phase)
+$$θ = bias + (1 + scale)\,φ + worm_{cos} \cos u + worm_{sin} \sin u + sag \cos(φ + phase)$$
 
-where u is the worm's angle (a known ratio times φ, or times the stroke of a jack).
-For a rotary drive φ is linear in the counts. For a linear drive (jack) the law of
-cosines holds in the triangle of joint, fixed end and moving end:
+where u is the worm's angle (a known ratio times φ, or times the stroke of a jack). For a rotary
+drive φ is linear in the counts. For a linear drive (jack) the law of cosines holds in the triangle
+of joint, fixed end and moving end:
 
-.. math:: Φ(L) = \arccos\frac{c^2 + r^2 - L^2}{2 c r}, \qquad
-          φ = φ_0 + σ\,(Φ(k) - Φ(k + counts \cdot rate))
+$$Φ(L) = \arccos\frac{c^2 + r^2 - L^2}{2 c r}, \qquad
+φ = φ_0 + σ\,(Φ(k) - Φ(k + counts \cdot rate))$$
 
-A linear drive has been written in three ways, all of which are this one: PAINT
-(:func:`linear_paint`), Grigoriev et al. 2021 (:func:`linear_grigoriev`) and Guo et
-al. 2013, (41)-(42) (:func:`linear_guo`).
+The literature writes a linear drive in three ways, all of them equivalent: PAINT
+(`linear_paint`), Grigoriev et al. 2021 (`linear_grigoriev`) and Guo et al. 2013, (41)-(42)
+(`linear_guo`).
 """
 
 from dataclasses import dataclass
@@ -38,8 +37,8 @@ class Drive:
     ----------
     table
         Shape (..., 19), the numbers that the kernels read. Build it with
-        :func:`rotary`, :func:`direct`, :func:`linear_paint`,
-        :func:`linear_grigoriev` or :func:`linear_guo`.
+        `rotary`, `direct`, `linear_paint`,
+        `linear_grigoriev` or `linear_guo`.
     """
 
     table: FloatArray
@@ -60,8 +59,8 @@ class Drive:
     def counts(self, angles: npt.ArrayLike) -> FloatArray:
         """Return the (real) counts at joint angles in radians, both of shape (...).
 
-        Exact to 1e-9 rad with all periodic terms on. A jack's angle beyond its
-        triangle gives the counts of its end.
+        Exact to 1e-9 rad with all periodic terms on. An angle beyond the reach of a jack
+        gives the counts of its end.
         """
         return self._run(counts_block, angles, "angles")
 
@@ -99,7 +98,7 @@ class Drive:
         return out.reshape(shape)
 
 
-#: Names of a drive's numbers, for :meth:`Drive.replace` and the parameter table.
+#: Names of a drive's numbers, for `Drive.replace` and the parameter table.
 SLOTS = {
     "zero": slot.ZERO,
     "initial_angle": slot.ZERO,
@@ -144,7 +143,7 @@ def _build(kind: float, numbers: dict[int, npt.ArrayLike]) -> Drive:
 
 
 def _checked(drive: Drive) -> Drive:
-    """Return the drive if its numbers describe a machine that can move.
+    """Return the drive if its numbers describe one that can move.
 
     Raises
     ------
@@ -184,7 +183,7 @@ def _check_triangles(jacks: FloatArray) -> None:
         i = int(np.flatnonzero(wrong)[0])
         raise InputError(
             f"linear drive: offset {c[i]:g} m, pivot radius {r[i]:g} m and initial stroke "
-            f"length {k[i]:g} m make no triangle; the stroke must lie between "
+            f"length {k[i]:g} m do not form a triangle; the stroke must lie between "
             f"{abs(c[i] - r[i]):g} m and {c[i] + r[i]:g} m"
         )
 
@@ -235,7 +234,7 @@ def rotary(
     Raises
     ------
     InputError
-        If a number makes no drive.
+        If the numbers describe no drive that can move.
     """
     per_turn = as_float(steps_per_turn) * as_float(microsteps) * as_float(gear_ratio)
     if not (np.isfinite(per_turn) & (per_turn > 0)).all():

@@ -4,20 +4,19 @@ Six small angles and the offset of the mirror describe the machine; its two join
 angles follow from the position of the sun without iteration. In the frame ENU the
 normal at drive positions (γ, α) is
 
-.. math:: n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ + γ_0))\,R_N(-τ_1)\,R_E(α + α_0)
-          \,(\sin μ, \cos μ, 0)
+$$n = R_{tilt}(ψ_a, ψ_t)\,R_U(-(γ + γ_0))\,R_N(-τ_1)\,R_E(α + α_0)\,(\sin μ, \cos μ, 0)$$
 
 where R_X is the right-handed rotation about X and R_tilt leans the azimuth axis by ψ_t
-towards the azimuth ψ_a. :func:`forward` evaluates it, :func:`angles` inverts it,
-:func:`track` inverts it for the normal that the sun and the target demand.
+towards the azimuth ψ_a. `forward` evaluates it, `angles` inverts it,
+`track` inverts it for the normal that the sun and the target demand.
 
 Source: Guo, Sun, Wang and Zhang, "Properties of a general azimuth-elevation tracking
 angle formula for a heliostat with a mirror-pivot offset and other angular errors",
 Solar Energy 96 (2013) 159-167; here "Guo". Its frame is left-handed (north, east,
 height); the angles are the same in ours. Its actuator, (41)-(42), is
-:func:`heliotrope.mechanism.drives.linear_guo`. An equation called *reconstructed* is
+`heliotrope.mechanism.drives.linear_guo`. An equation called *reconstructed* is
 derived here; its printed form may look different. The derivations, and the proof that
-:func:`regularise` uses every symmetry there is, stand in ``docs/explanation/guo.md``.
+`regularise` uses every symmetry there is, are in `docs/explanation/guo.md`.
 """
 
 from collections.abc import Callable, Mapping
@@ -76,8 +75,8 @@ class GuoParameters:
         ``azimuth_bias`` and ``elevation_bias``. A zero that a paper subtracts from the
         nominal angle enters with the opposite sign.
     tau_1
-        τ₁, angle by which the end of the elevation axis at the right hand of someone who
-        looks the way the mirror faces is raised out of square with the azimuth axis, rad.
+        τ₁, angle by which the right-hand end of the elevation axis (looking the way the
+        mirror faces) is raised out of square with the azimuth axis, rad.
     mu
         μ, angle of the mirror's normal towards that end, out of square with the axis, rad.
     offset
@@ -151,7 +150,7 @@ class GuoTracking:
     residual, reachable
         Angle from the demanded normal to the one that the positions give, rad, the
         larger of the two branches (a tracking error), and whether it is no more than
-        :data:`REACHED`, shape (...).
+        `REACHED`, shape (...).
     """
 
     alpha: FloatArray
@@ -372,13 +371,13 @@ def track(
 ) -> GuoTracking:
     """Return the drive positions that send the sun to the target: Guo's formula.
 
-    Validity, accuracy, source: see :func:`mirror_normal` and :func:`angles`. Stops are
+    Validity, accuracy, source: see `mirror_normal` and `angles`. Stops are
     not considered.
 
     Parameters
     ----------
     to_target, sun, exact
-        As :func:`mirror_normal` takes them.
+        As `mirror_normal` takes them.
     parameters
         Shapes that broadcast against (...): a field of N at T times takes ``to_target``
         (N, 3), ``sun`` (T, 1, 3) and parameters (N,).
@@ -386,7 +385,7 @@ def track(
     Raises
     ------
     InputError
-        As :func:`mirror_normal` and :func:`angles`.
+        As `mirror_normal` and `angles`.
     """
     demanded = mirror_normal(to_target, sun, parameters.offset, exact=exact)
     return angles(demanded.normal, parameters)
@@ -398,7 +397,7 @@ def regularise(parameters: GuoParameters) -> GuoParameters:
     A fit may stop at any of the equivalent sets. This one has ψ_t in [0, π/2] (in
     (π/2, π] only if the azimuth axis points below the horizon, which no relation can
     raise), ψ_a in [0, 2π), γ₀ and α₀ in [−π, π), τ₁ and μ in [−π/2, π/2]; ψ_a is 0
-    where there is no tilt. :func:`forward` is the same to 1e-14 for every drive position.
+    where there is no tilt. `forward` is the same to 1e-14 for every drive position.
     Values already in their ranges are not touched, so a second call changes nothing.
 
     Source: Guo (31)-(40), reconstructed from (29) except (37).
@@ -465,13 +464,13 @@ def to_heliotrope(parameters: GuoParameters) -> dict[str, FloatArray]:
 def from_heliotrope(values: Mapping[str, npt.ArrayLike]) -> GuoParameters:
     """Return Guo's parameters of our azimuth-elevation chain.
 
-    The inverse of :func:`to_heliotrope` up to the relations of :func:`regularise`; the
+    The inverse of `to_heliotrope` up to the relations of `regularise`; the
     tilt comes out in [0, π]. Exact to 1e-15.
 
     Parameters
     ----------
     values
-        Any of the names that :func:`to_heliotrope` gives; the others are 0.
+        Any of the names that `to_heliotrope` gives; the others are 0.
 
     Raises
     ------

@@ -56,15 +56,15 @@ def two_axis(
         The two directions ("east", "north", "up") that the primary axis can lean to;
         by default the two that are most perpendicular to the first mechanism's axis.
     pole
-        The end of the primary axis that the leaning refers to; default ``axis_1``.
+        End of the primary axis to which the names of the tilts refer; default ``axis_1``.
     origin_1
         Point on the primary axis, from the position, m.
     origin_2
         Point on the secondary axis, from ``origin_1``, m.
     arm
-        From ``origin_2`` to where canting turns the mirror, m.
+        From ``origin_2`` to the point about which canting turns the mirror, m.
     vertex
-        Mirror's vertex from there, m; it turns with the canting.
+        From that point to the mirror's vertex, m; it turns with the canting.
     orientation
         Rotation from the heliostat's frame to ENU, (..., 3, 3); default identity.
     drives
@@ -180,11 +180,11 @@ def azimuth_elevation(
     position
         Foot of the pedestal, ENU metres, (..., 3).
     pivot_height
-        Height of the crossing of the axes above it, m, (...).
+        Height of the intersection of the axes above it, m, (...).
     pivot_offset
         Distance of the mirror's surface in front of the pivot, m, (...).
     orientation, drives
-        As for :func:`two_axis`.
+        As for `two_axis`.
     """
     height, front = as_float(pivot_height), as_float(pivot_offset)
     return two_axis(
@@ -272,7 +272,7 @@ def target_aligned(
     position, aim
         ENU metres, (..., 3).
     pivot_height, pivot_offset, drives
-        As for :func:`tilt_roll`.
+        As for `tilt_roll`.
     """
     p, a = as_vectors(position, "position"), as_vectors(aim, "aim")
     towards = a - (p + as_float(pivot_height)[..., None] * UP)
@@ -334,7 +334,7 @@ def polar(
     latitude
         Radians, north positive, (...).
     pivot_height, pivot_offset, drives
-        As for :func:`tilt_roll`.
+        As for `tilt_roll`.
     """
     phi = as_float(latitude)
     zero = np.zeros_like(phi)
@@ -374,7 +374,7 @@ def two_jacks(
     position
         ENU metres, (..., 3).
     drives
-        Two of :func:`heliotrope.mechanism.drives.linear_paint`.
+        Two drives made by `linear_paint`.
     joint_translation_1, joint_translation_2, concentrator_translation
         As in PAINT's heliostat properties, m, (..., 3).
     """
@@ -404,8 +404,8 @@ def single_axis(
 ) -> Mechanism:
     """Return single-axis trackers (parabolic trough, linear Fresnel).
 
-    Only the plane perpendicular to the axis can be served: source and destination are
-    projected on it (Grigoriev et al. 2021, (9)).
+    Only the plane perpendicular to the axis can be reached: source and destination are
+    projected onto it (Grigoriev et al. 2021, (9)).
 
     Parameters
     ----------

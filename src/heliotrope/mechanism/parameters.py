@@ -1,8 +1,8 @@
 """The parameters of a mechanism: one row each in one table, and the models.
 
-A parameter is never addressed by a number outside the compiled kernels. Its row says
-its unit, its physical cause with its positive sense, its names in the literature, and
-how far installation and survey let it stray (the prior's standard deviation).
+Outside the compiled kernels a parameter is never addressed by a number. Its row gives its
+unit, its physical cause with its positive sense, its names in the literature, and the
+standard deviation that installation and survey leave (the prior).
 """
 
 from dataclasses import dataclass, replace
@@ -22,15 +22,15 @@ class Parameter:
     unit
         "rad", "m" or "1" (relative).
     cause
-        What it is in the machine.
+        Physical cause in the machine.
     positive
-        What a positive value means.
+        Meaning of a positive value.
     prior
         Standard deviation before any measurement, in ``unit``.
     aliases
         Names in the literature.
     code
-        What the kernels move: (kind, joint or drive, component).
+        For the kernels: (kind, joint or drive, component).
     """
 
     name: str
@@ -272,7 +272,7 @@ _JACKS = (
     "elevation_offset", "azimuth_offset",
 )  # fmt: skip
 
-#: Named subsets to be estimated. ``full`` is every row but the worm, whose ratio must be known.
+#: Named subsets to be estimated. ``full`` is every row except the worm, whose ratio must be known.
 MODELS: dict[str, tuple[str, ...]] = {
     "malan8": _POSITION + _AZEL,
     "guo6": (*_AZEL, "canting"),

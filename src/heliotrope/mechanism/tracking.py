@@ -1,4 +1,4 @@
-"""Tracking: where the drives must stand so that the beam reaches its aim.
+"""Tracking: the drive positions at which the beam reaches its aim.
 
 Global aiming sends light from a direction (the sun) to a point in the field; local
 aiming sends it to a point that is fixed to the mirror (dish, CPV, trough). Both run
@@ -32,7 +32,7 @@ Branch = Literal["both", 0, 1]
 
 
 class Status(IntEnum):
-    """How a solution ended."""
+    """Outcome of a solution."""
 
     OK = OK
     UNREACHABLE = UNREACHABLE
@@ -69,9 +69,9 @@ class Tracking:
     normal, vertex
         Pose of the mirror, ENU, (..., B, 3).
     status
-        :class:`Status` as integers, (..., B).
+        `Status` as integers, (..., B).
     residual
-        Angle of the normal from where it should be, rad, (..., B).
+        Angle between the normal and the demanded one, rad, (..., B).
     iterations
         (..., B).
     best
@@ -125,13 +125,13 @@ def track(
     sun
         Unit vectors to the source, ENU, (..., 3).
     aim
-        Points in ENU metres, (..., 3); with ``local`` the points fixed to the mirror,
-        where they are at zero joint angles.
+        Points in ENU metres, (..., 3); with ``local`` points fixed to the mirror, at their
+        positions for zero joint angles.
     drives
         Batch shape (..., D); default the mechanism's, or radians for an armature.
     current
-        Counts where the drives stand, (..., D). Decides between the branches and
-        between angles that differ by a turn; without it the middle of the stops does.
+        Present counts, (..., D). They decide between the branches and between angles that
+        differ by a turn; without them the middle of the stops decides.
     branch
         "both", or the one to solve (0: −, 1: + in Paden-Kahan), which takes half the time.
     local
@@ -139,14 +139,14 @@ def track(
     tolerance
         Largest miss of the beam at the aim, m.
     max_iterations
-        Of the fixed point.
+        Limit on fixed-point steps.
     newton
         Whether Newton takes over where the fixed point converges slowly.
 
     Returns
     -------
-    Poses that cannot be reached are the nearest ones, and say so in ``status`` and
-    ``residual``; they raise nothing.
+    For an aim that cannot be reached, the nearest pose; ``status`` and ``residual`` say
+    so, and nothing is raised.
 
     Raises
     ------

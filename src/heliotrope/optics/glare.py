@@ -1,15 +1,15 @@
-"""Glare: what a look into heliostats' beams does to an eye, and where standby points are safe.
+"""Glare: the hazard to an eye that looks into heliostats' beams, and safe standby points.
 
 After Ho, Ghanbari and Diver, "Methodology to assess potential glint and glare hazards from
 concentrating solar power plants", J. Sol. Energy Eng. 133 (2011) 031021. The formulae and
-constants are written down from memory of the paper, hence without its equation numbers; the
-tests hold its anchor of looking at the bare sun. Inside, irradiances are in W/m² (the paper:
+constants are given without equation numbers, because the paper was not at hand; the tests
+hold its anchor, a look at the bare sun. Inside, irradiances are in W/m² (the paper:
 W/cm², 1 W/cm² = 10⁴ W/m²).
 
 Limits. The thresholds are for a short look (0.15 s, the blink) through the naked eye in
 daylight: not for binoculars, telescopes or cameras, and not for a forced stare. The sun is a
 uniform disk; its centre is about a fifth brighter than its mean. Mirrors are disks with an
-ideal focus and no slope error, which errs to the safe side. Air takes nothing away.
+ideal focus and no slope error, which errs to the safe side. Attenuation in air is ignored.
 """
 
 import math
@@ -23,13 +23,13 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, tangent_axes
 from heliotrope.optics.beam import NOMINAL_DNI, SUN_RADIUS, Beams, crossing
 
-#: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and
-#: the angle from which on the irradiance alone counts, rad; 1 W/cm² there.
+#: Retinal irradiance times subtended angle that burns, W/m² · rad (0.118 W/cm² · rad), and the
+#: angle above which the irradiance alone counts, rad (1 W/cm² there).
 BURN, WIDE = 1180.0, 0.118
 #: Retinal irradiance that leaves an after-image at 1 rad, W/m² (3.59e-5 W/cm²), and the power
-#: of the angle that it falls with.
+#: of the angle by which the threshold falls.
 FLASH, FLASH_POWER = 0.359, 1.77
-#: Sources smaller than this (rad) count as so large: far below the blur of any eye.
+#: Smaller sources count as this large, rad: far below the blur of any eye.
 SMALLEST = 1e-6
 
 
@@ -55,7 +55,7 @@ DAYLIGHT = Eye()
 
 
 class Hazard(IntEnum):
-    """What a short look does."""
+    """Effect of a short look."""
 
     LOW = 0
     AFTER_IMAGE = 1
@@ -112,16 +112,17 @@ def flash_threshold(subtended: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class Glare:
-    """What an eye gets at each place (...).
+    """The exposure of an eye at each place (...).
 
     Attributes
     ----------
     burn, flash
-        Retinal irradiance over the thresholds of damage and of an after-image; 1 is at it.
+        Retinal irradiance over the thresholds of damage and of an after-image; 1 is at the
+        threshold.
     corneal
         Irradiance of all sources together at the eye, W/m².
     subtended
-        Full angle of a disk as large as all sources together, rad; 0 if there is none.
+        Full angle of a disk as large as all sources together, rad; 0 without sources.
     """
 
     burn: FloatArray
@@ -131,7 +132,7 @@ class Glare:
 
     @property
     def hazard(self) -> npt.NDArray[np.int8]:
-        """`Hazard` as integers; reaching a threshold counts as beyond it."""
+        """`Hazard` as integers; at a threshold counts as above it."""
         worse = np.where(self.flash >= 1.0, Hazard.AFTER_IMAGE, Hazard.LOW)
         return np.asarray(np.where(self.burn >= 1.0, Hazard.DAMAGE, worse), dtype=np.int8)
 
@@ -147,9 +148,9 @@ def glare_of_one(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DA
 def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = DAYLIGHT) -> Glare:
     """Return an upper bound of the hazard of several sources seen at once.
 
-    Images of sources that lie side by side may touch on the retina and heat it as one. Any
-    part of the sources may do so, and how they lie is not asked for: the worst selection
-    counts, as one disk of the solid angles' sum. A further source can only add.
+    Images of sources that lie side by side may touch on the retina and heat it as one. Their
+    arrangement is not considered: the worst selection counts, as one disk with the sum of
+    their solid angles. A further source can only add.
 
     Parameters
     ----------
@@ -177,7 +178,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     room = np.cumsum(np.take_along_axis(size, order, axis=-1), axis=-1)
     corner_light, corner_room = _corner(light, room)
     every_light = np.concatenate([light, corner_light[..., None]], axis=-1)
-    # More than the half space there is not; a smaller angle errs to the safe side.
+    # No source is wider than the half space; a smaller angle errs to the safe side.
     angle = np.minimum(np.sqrt(np.concatenate([room, corner_room[..., None]], axis=-1)), math.pi)
     dark = angle == 0.0
     one = glare_of_one(every_light, np.where(dark, 1.0, angle), eye)
@@ -191,7 +192,7 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
 
 
 def _corner(light: FloatArray, room: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return g and W where ω = 0.118 rad is passed; 0 and 0 where it is not."""
+    """Return g and W where ω passes 0.118 rad; 0 and 0 where it does not."""
     wide = WIDE * WIDE
     before = np.concatenate([np.zeros((*room.shape[:-1], 1)), room[..., :-1]], axis=-1)
     below = np.concatenate([np.zeros((*light.shape[:-1], 1)), light[..., :-1]], axis=-1)
@@ -225,20 +226,20 @@ def safe_range(
     reflectivity: float = 1.0,
     eye: Eye = DAYLIGHT,
 ) -> tuple[float, float]:
-    """Return from and to which distance along one beam a look into it may burn, m.
+    """Return the distances along one beam between which a look into it may burn, m.
 
-    (0, 0) if it never may. On the axis the ratio to the threshold is K ω with
+    (0, 0) if it nowhere does. On the axis the ratio to the threshold is K ω with
     K = ρ DNI d² τ / (4 β² f² · 0.118 W/cm²) while ω < 0.118 rad, and ω = 2 min(R / x,
     β / |1 − x/b|): it is reached where ω = 1 / K.
 
     Parameters
     ----------
     area, focus
-        Of the mirror, m² and m.
+        Area and focal length of the mirror, m² and m.
     dni, reflectivity
-        W/m²; of the mirror.
+        W/m²; 0 to 1.
     eye
-        Whose.
+        The eye that looks.
     """
     _irradiance(dni)
     if not (area > 0.0 and math.isfinite(area) and focus > 0.0 and 0.0 < reflectivity <= 1.0):
@@ -260,7 +261,7 @@ def safe_range(
 
 @dataclass(frozen=True)
 class GlareMap:
-    """Hazards on a flat grid through a standby point.
+    """Hazards on a plane grid through a standby point.
 
     Attributes
     ----------
@@ -301,7 +302,7 @@ def glare_map(
     Parameters
     ----------
     given
-        The beams that stand by there, and any others.
+        Beams that stand by there, and any others.
     center
         ENU, m, (3,).
     size
@@ -309,11 +310,11 @@ def glare_map(
     cells
         Points on a side, at least 2.
     normal
-        Of its plane, (3,).
+        Normal of its plane, (3,).
     dni
         W/m².
     eye
-        Whose.
+        The eye that looks.
     """
     middle = as_vectors(center, "center")
     if not (math.isfinite(size) and size > 0.0 and cells >= 2):
@@ -344,23 +345,23 @@ def safe_distance(
 ) -> float:
     """Return the radius about a standby point beyond which no beam's axis reaches ``limit``.
 
-    The axes of all beams are sampled on both sides of the point: there a beam is strongest.
-    Points between the axes are not; `glare_map` looks at those.
+    The axes of all beams are sampled on both sides of the point, where a beam is strongest.
+    Points between the axes are not sampled; `glare_map` covers them.
 
     Parameters
     ----------
     given
-        The beams that stand by there.
+        Beams that stand by there.
     center
         ENU, m, (3,).
     limit
-        What must not be reached outside.
+        Hazard that must not occur outside.
     reach, step
-        How far from the point to look, and how finely, m.
+        Largest distance from the point, and spacing of the samples, m.
     dni
         W/m².
     eye
-        Whose.
+        The eye that looks.
 
     Returns
     -------

@@ -1,12 +1,12 @@
-"""Beam paths: which beams enter keep-out volumes, at rest and in motion, and the safe way.
+"""Beams and keep-out volumes: which beams enter them, at rest and in motion, and the safe way.
 
 A beam is followed as a solid of revolution about its axis that surely holds it: as wide as
-the mirror's diagonal, wider with the sun's half angle and a stated error, and wider again
-beyond the mirror's focus (see `_keep_out_kernels`). "Clear" is therefore proven; "enters" means
+the mirror's diagonal, widening by the sun's radius and a stated error, and further beyond
+the mirror's focus (see `_keep_out_kernels`). "Clear" is therefore proven; "enters" means
 that this solid comes within a millimetre of the volume. The solid is made of balls, so it
-reaches half a mirror's diagonal behind and before its ends: what lies within the swing of a
-mirror counts as entered. Nothing shades a beam here: neither the ground nor other mirrors nor
-the tower.
+extends half a mirror's diagonal beyond both ends: a volume within the swing of a mirror
+counts as entered. Nothing shades a beam here, neither the ground nor other mirrors nor the
+tower.
 """
 
 from collections.abc import Sequence
@@ -62,7 +62,8 @@ class Entries:
     point
         On the axis at the first contact, ENU, (N, V, 3).
     irradiance
-        Largest on the axis from the first to the last contact, W/m², (N, V); 0 where clear.
+        Largest value on the axis from the first to the last contact, W/m², (N, V); 0 where
+        clear.
     """
 
     volumes: tuple[str, ...]
@@ -73,12 +74,12 @@ class Entries:
 
     @property
     def entered(self) -> npt.NDArray[np.bool_]:
-        """Whether the beam enters, (N, V)."""
+        """Whether each beam enters, (N, V)."""
         return np.asarray(np.isfinite(self.first))
 
 
 def find_entries(given: Beams, volumes: Sequence[Volume], *, dni: float = NOMINAL_DNI) -> Entries:
-    """Return where beams at rest enter volumes, and how strongly.
+    """Return where beams at rest enter volumes, and their irradiance there.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ def _strongest(mirrors: Mirrors, first: FloatArray, last: FloatArray, dni: float
     """Return the largest irradiance on the axis between two distances (N, V), W/m²."""
     area, focus = mirrors.area[:, None], mirrors.focus[:, None]
     radius = np.sqrt(area / np.pi)
-    # Up to here 1 / (1 − x/b) grows; from here on everything falls.
+    # 1 / (1 − x/b) grows up to here; beyond, everything falls.
     peak = radius / (SUN_RADIUS + radius / focus)
     at = np.maximum(np.clip(peak, first, np.fmax(first, last)), 1e-6)
     strength = dni * mirrors.reflectivity[:, None] * concentration(at, area, focus)
@@ -130,16 +131,17 @@ class Sweep:
     volumes
         Names, V of them.
     at
-        Up to where the path is clear: index of its corner plus share of the leg behind it,
+        End of the clear part of the path: index of its corner plus share of the next leg,
         (N, V).
     distance
         Along the beam to the contact, m, (N, V).
     point
         On the axis at the contact, ENU, (N, V, 3).
     irradiance
-        Largest on the axis within the volume in that pose, W/m², (N, V); 0 where clear.
+        Largest value on the axis within the volume in that pose, W/m², (N, V); 0 where
+        clear.
     poses
-        How many poses were tried for all pairs together.
+        Number of poses tried for all pairs together.
     """
 
     volumes: tuple[str, ...]
@@ -168,8 +170,8 @@ def sweep(
 ) -> Sweep:
     """Return where beams enter volumes while the joints move along a path.
 
-    The whole path is proven, not samples of it: see `_keep_out_kernels`. Where nothing can be
-    proven at the given resolution, the beam counts as entering.
+    The whole path is proven, not samples of it: see `_keep_out_kernels`. Where no proof is
+    found at the given resolution, the beam counts as entering.
 
     Parameters
     ----------
@@ -177,14 +179,14 @@ def sweep(
         (N,) or ().
     path
         Joint angles of the corners, rad, (N, K, 2) or (K, 2). On each leg both joints move
-        in proportion; where one arrives before the other, that is a corner.
+        in proportion; if one arrives before the other, that is a further corner.
     sun
-        Unit vector to the sun, (3,) or (N, 3); its motion meanwhile is part of the mirrors'
+        Unit vector to the sun, (3,) or (N, 3); its motion meanwhile belongs to the mirrors'
         ``error``.
     mirrors, volumes
         N or one; V.
     reach
-        How far beams are followed, m.
+        Distance up to which beams are followed, m.
     resolution
         Turn of the beam below which a span of the path is not split further, rad.
     dni
@@ -262,7 +264,7 @@ def _leaving(
 
 @dataclass(frozen=True)
 class Way:
-    """A way of one heliostat from stow to its standby point.
+    """The way of one heliostat from stow to its standby point.
 
     Attributes
     ----------
@@ -275,9 +277,9 @@ class Way:
         Whether every beam on it is proven to stay out of every volume, and every aim is
         reachable.
     motion
-        What the check found.
+        Result of the check.
     text
-        One line on it.
+        One line for an operator.
     """
 
     aims: FloatArray
@@ -288,9 +290,9 @@ class Way:
 
     @property
     def back(self) -> FloatArray:
-        """The same poses the other way, rad, (M, 2): down, away, elevation, azimuth last.
+        """The same poses in reverse, rad, (M, 2): down, away, elevation, azimuth last.
 
-        It is proven for the sun of the check; hours later a way must be made anew.
+        They are proven for the sun of the check; hours later a new way is needed.
         """
         return self.path[::-1]
 
@@ -333,11 +335,11 @@ def safe_way(
     """Return the way of one heliostat from stow to its standby point, verified.
 
     From stow the azimuth turns first, then the elevation, until the beam meets the ground
-    ``first_distance`` away; it goes along the ground to the foot of the tower and up. The
-    first point is tried towards the foot and then ever further to both sides: the sweep of
-    the elevation draws the beam through the plane of that point, and to the side of the
-    tower it meets nothing of it. Of the ways tried the first clear one is returned, else
-    the one that gets furthest, with what is in its way.
+    ``first_distance`` away; the beam then goes along the ground to the foot of the tower and
+    up. The first point is tried towards the foot, then further and further to both sides:
+    turning the elevation moves the beam through the vertical plane of that point, which
+    misses the tower if the point lies to its side. The first clear way is returned, else the
+    one that gets furthest, with the obstacle.
 
     Parameters
     ----------
@@ -348,17 +350,17 @@ def safe_way(
     sun
         Unit vector to the sun, (3,).
     foot, standby
-        Where beams meet the ground before they rise, and where they end, ENU, m, (3,).
+        Point on the ground where beams begin to rise, and their end, ENU, m, (3,).
     mirrors
-        One.
+        One mirror.
     volumes
-        Where no beam may be.
+        Volumes that no beam may enter.
     drives
-        Of the two joints, for their stops; default none.
+        Drives of the two joints, for their stops; default none.
     first_distance
         m.
     reach
-        How far beams are followed, m.
+        Distance up to which beams are followed, m.
     """
     if armature.shape:
         raise InputError(f"safe_way: armature of shape {armature.shape}; give one heliostat")
@@ -392,7 +394,7 @@ def _verified(
     drives: Drive | None,
     reach: float,
 ) -> Way:
-    """Return the way over given aims with its check."""
+    """Return the way over the given aims with its check."""
     poses, status = _angles(armature, stow, aims, sun, drives)
     path = np.stack([stow, np.array([poses[0, 0], stow[1]]), *poses])
     motion = sweep(armature, path, sun, mirrors, volumes, reach=reach)

@@ -1,4 +1,4 @@
-"""The sun: where it stands, as angles and as a vector, and when it rises and sets.
+"""The position of the sun, as angles and as a vector, and when it rises and sets.
 
 Positions come from NREL's solar position algorithm (Reda & Andreas 2004, "SPA") as
 pvlib implements it, with the pressure and temperature of the site. *True* means
@@ -25,7 +25,7 @@ from heliotrope.parallel import run_blocks
 if TYPE_CHECKING:
     import pandas as pd
 
-#: What is taken as time: an aware datetime, an ISO 8601 text with an offset or Z, unix
+#: Accepted as times: an aware datetime, an ISO 8601 text with an offset or Z, unix
 #: seconds (UTC), a list or an array of these, or a time-zone aware pandas index or column.
 Times: TypeAlias = datetime | Sequence[datetime] | npt.ArrayLike
 
@@ -63,7 +63,7 @@ class Site:
     temperature_c
         Air temperature in °C, −90 to 60.
     name
-        For people; nothing depends on it.
+        Shown to people; nothing depends on it.
     delta_t
         TT − UT1 in s, −8000 to 8000; None takes pvlib's polynomials by year and month
         (Espenak & Meeus), which were 5 s too high in 2025: 1 µrad of sun.
@@ -120,7 +120,7 @@ _SITE_LIMITS = (
 
 @dataclass(frozen=True, eq=False)
 class SunPosition:
-    """Where the sun stands; the shape (...) is that of the times asked for.
+    """The position of the sun; the shape (...) is that of the times.
 
     Attributes
     ----------
@@ -152,15 +152,15 @@ class SunEvents:
     Attributes
     ----------
     sunrise, sunset
-        None where the sun does not cross the elevation asked for: both in a polar
-        night; in a polar day at least one (the first and last day of it have one).
+        None where the sun does not cross the given elevation: both in a polar night,
+        at least one in a polar day (its first and last day have one).
     culmination
-        When the sun crosses the meridian on its upper side.
+        Time at which the sun crosses the meridian on its upper side.
     culmination_elevation
         Apparent elevation then, rad.
     kind
-        "polar night": below the elevation asked for when it culminates; "normal": it
-        rises and sets; "polar day": any other.
+        "polar night": below the given elevation at culmination; "normal": it rises and
+        sets; "polar day": any other.
     """
 
     sunrise: datetime | None
@@ -230,7 +230,7 @@ def vector(times: Times, site: Site, *, apparent: bool = True) -> FloatArray:
     times, site
         As for `position`, with its errors and accuracy.
     apparent
-        With refraction, as mirrors see it (default), or without.
+        Include refraction, as mirrors see the sun.
     """
     sun = position(times, site)
     return sun.vector if apparent else sun.true_vector
@@ -253,8 +253,8 @@ def events(
         Of the sun's centre when it rises and sets, rad. By default the convention for
         the upper limb, −0.8333° of true elevation.
     apparent
-        Whether ``elevation`` is the apparent one. It must then not be negative, for
-        the apparent elevation jumps below the horizon (see `SunPosition`).
+        Whether ``elevation`` is apparent. It must then not be negative, because the
+        apparent elevation jumps below the horizon (see `SunPosition`).
 
     Raises
     ------
@@ -265,7 +265,7 @@ def events(
 
     Notes
     -----
-    At sunrise and sunset `position` gives the elevation asked for to 0.1 µrad, which is
+    At sunrise and sunset `position` gives the requested elevation to 0.1 µrad, which is
     2 ms where the sun climbs by 11° an hour. The weather's refraction makes a real
     sunrise uncertain by a minute.
     """
@@ -410,7 +410,7 @@ def _true_level(apparent: float, site: Site) -> float:
 
 
 def _number(value: object) -> float:
-    """Return a number as float, and NaN, which no range holds, for anything else."""
+    """Return a number as a float; anything else becomes NaN, which no range holds."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return np.nan
     return float(value)
@@ -475,7 +475,7 @@ def _unix_seconds(times: Times) -> FloatArray:
 
 
 def _one_time(value: Any, index: Sequence[int]) -> float:
-    """Return unix seconds, and NaN for what is not a time."""
+    """Return unix seconds, or NaN if the value is not a time."""
     import pandas as pd
 
     time = value
@@ -502,7 +502,7 @@ def _label(index: Sequence[int]) -> str:
 
 
 def _check_years(seconds: FloatArray, site: Site) -> None:
-    """Refuse times for which SPA, or its ΔT, is not made."""
+    """Refuse times outside the validity of SPA or of its ΔT."""
     _refuse_outside(
         seconds, _FIRST_YEAR, _LAST_YEAR, "the validity of SPA; numbers are unix seconds"
     )

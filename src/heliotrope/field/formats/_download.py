@@ -1,9 +1,9 @@
-"""One file from a server to the disk: resumed where it broke off, whole or not there.
+"""Downloads one file: resumed where it broke off, and on the disk whole or not at all.
 
-A file grows under its name with ``.part`` behind it and gets its own name when it is
-complete and checked. What the server said of it (ETag, date, size) is kept in a journal,
-one line of JSON a file, so that a later run asks only whether it has changed, and a
-broken one goes on only if it has not.
+A file grows under its name with the suffix ``.part`` and gets its own name when it is complete
+and checked. Its ETag, date and size are kept in a journal, one line of JSON per file, so
+that a later run only asks whether the file has changed, and a broken one resumes only if it
+has not. `docs/decisions` says why pooch does not do this job.
 """
 
 import errno
@@ -37,11 +37,11 @@ class NotFoundError(FetchError):
 
 
 class StoppedError(FetchError):
-    """Another download failed or the user broke off; what is there is kept."""
+    """Another download failed or the user interrupted; completed parts are kept."""
 
 
 class _LaterError(Exception):
-    """It may work if tried again, after a pause (s) if the server asks for one."""
+    """A failure that may pass, after a pause (s) if the server asks for one."""
 
     def __init__(self, problem: str, pause: float = 0.0) -> None:
         super().__init__(problem)
@@ -50,14 +50,14 @@ class _LaterError(Exception):
 
 @dataclass(frozen=True)
 class Entry:
-    """What the server said of a file.
+    """The server's description of a file.
 
     Attributes
     ----------
     etag, modified
-        Its ETag and Last-Modified, "" if none.
+        ETag and Last-Modified, "" if absent.
     size
-        Of the whole file, bytes; −1 if it did not say.
+        Bytes of the whole file; −1 if not known.
     done
         Whether the file is complete.
     """
@@ -69,12 +69,12 @@ class Entry:
 
 
 class Journal:
-    """Entries by name of the file, appended to a file in the folder.
+    """Entries by file name, appended to a file in the folder.
 
     Parameters
     ----------
     folder
-        Where the files go; names are relative to it.
+        Folder of the files; names are relative to it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -91,7 +91,7 @@ class Journal:
                 name = str(record.pop("file"))
                 self._entries[name] = Entry(**record)
             except (ValueError, KeyError, TypeError, AttributeError):
-                # A line that a power cut broke off: its file is asked for again.
+                # A line cut off by a power failure: its file is requested again.
                 continue
 
     def get(self, name: str) -> Entry | None:
@@ -99,8 +99,8 @@ class Journal:
         return self._entries.get(name)
 
     def put(self, name: str, entry: Entry) -> None:
-        """Note an entry."""
-        # The line end stands first, so that it also ends a line that was broken off.
+        """Store an entry."""
+        # The line end comes first, so that it also ends a line that was cut off.
         line = "\n" + json.dumps({"file": name, **asdict(entry)})
         with self._lock:
             self._entries[name] = entry
@@ -110,16 +110,16 @@ class Journal:
 
 @dataclass(frozen=True)
 class Job:
-    """A file to be fetched.
+    """A file to fetch.
 
     Attributes
     ----------
     url
-        Where it is.
+        Address.
     path, name
-        Where it goes, and its name in the journal.
+        Destination, and name in the journal.
     size, sha256
-        What the catalogue says of it, bytes and hexadecimal digits, if it does.
+        Bytes and hexadecimal digits as the catalogue gives them, if it does.
     """
 
     url: str
@@ -130,26 +130,26 @@ class Job:
 
     @property
     def part(self) -> Path:
-        """Where it grows."""
+        """The incomplete file."""
         return self.path.with_name(self.path.name + ".part")
 
 
 @dataclass(frozen=True)
 class Channel:
-    """What all downloads of a run share.
+    """State shared by all downloads of a run.
 
     Attributes
     ----------
     client
-        Of HTTP.
+        HTTP client.
     journal
-        Of the folder.
+        Journal of the folder.
     retries
-        How often in a row a download may fail without a byte more.
+        Failures in a row without a new byte before a download is given up.
     backoff
         Pause after the first failure, s; it doubles with each.
     received
-        Called with the number of bytes that came.
+        Called with the number of bytes received.
     stop
         Ends all downloads when set.
     """
@@ -163,12 +163,12 @@ class Channel:
 
 
 def download(job: Job, channel: Channel) -> bool:
-    """Fetch a file; return whether it came, or False if it was there and has not changed.
+    """Fetch a file; return False if it was there already and has not changed.
 
     Raises
     ------
     FetchError
-        If it cannot be had, is not what the catalogue says, or cannot be stored.
+        If it cannot be downloaded, differs from the catalogue, or cannot be stored.
     """
     if job.sha256 is not None and job.path.is_file() and _sha256(job.path) == job.sha256:
         return False
@@ -177,18 +177,19 @@ def download(job: Job, channel: Channel) -> bool:
     except OSError as error:
         if error.errno == errno.ENOSPC:
             raise FetchError(
-                f"{job.path}: the disk is full; make room and run it again, what is there is kept"
+                f"{job.path}: the disk is full; free some space and run it again, completed "
+                "parts are kept"
             ) from None
         raise FetchError(f"{job.path}: cannot be written ({error.strerror})") from None
 
 
 def get_document(url: str, channel: Channel) -> tuple[Any, str]:
-    """Return a JSON document and the address that it came from in the end.
+    """Return a JSON document and its final address after redirects.
 
     Raises
     ------
     FetchError
-        If it cannot be had, is larger than 64 MiB or is not JSON.
+        If it cannot be downloaded, is larger than 64 MiB or is not JSON.
     """
 
     def attempt() -> tuple[Any, str]:
@@ -200,7 +201,8 @@ def get_document(url: str, channel: Channel) -> tuple[Any, str]:
                 content += chunk
                 if len(content) > DOCUMENT_LIMIT:
                     raise FetchError(
-                        f"{url}: more than {DOCUMENT_LIMIT / 2**20:.0f} MiB; this is no catalogue"
+                        f"{url}: more than {DOCUMENT_LIMIT / 2**20:.0f} MiB; this is not a "
+                        "catalogue"
                     )
             return _json(url, bytes(content)), str(response.url)
 
@@ -210,7 +212,7 @@ def get_document(url: str, channel: Channel) -> tuple[Any, str]:
 def _repeated(
     url: str, channel: Channel, attempt: Callable[[], Result], part: Path | None = None
 ) -> Result:
-    """Return what ``attempt`` gives, after pauses if it fails for a while."""
+    """Return the result of ``attempt``, repeated after pauses while it fails."""
     import httpx
 
     failures = 0
@@ -225,12 +227,12 @@ def _repeated(
             problem = _LaterError(f"{_cause(error)} ({str(error) or type(error).__name__})")
         except _LaterError as error:
             problem = error
-        # A line that breaks often but moves on is not given up.
+        # A connection that breaks often but makes progress is not given up.
         failures = 1 if _size(part) > before else failures + 1
         if failures > channel.retries:
             raise FetchError(
-                f"{url}: {problem}; gave up after {failures} attempts, run it again later, what "
-                "is there is kept"
+                f"{url}: {problem}; gave up after {failures} attempts; run it again later, "
+                "completed parts are kept"
             )
         pause = max(problem.pause, channel.backoff * 2.0 ** (failures - 1))
         channel.stop.wait(min(pause, _LONGEST_PAUSE))
@@ -244,13 +246,13 @@ def _cause(error: Exception) -> str:
     if isinstance(error, httpx.TimeoutException):
         return "the server does not answer in time"
     if isinstance(error, httpx.DecodingError):
-        return "what came cannot be unpacked"
+        return "the answer cannot be unpacked"
     return "the connection broke off"
 
 
 def _check_stop(channel: Channel) -> None:
     if channel.stop.is_set():
-        raise StoppedError("stopped; what is there is kept, run it again to go on")
+        raise StoppedError("stopped; completed parts are kept, run it again to resume")
 
 
 def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> None:
@@ -269,7 +271,7 @@ def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> No
 def _attempt(job: Job, channel: Channel) -> bool:
     have, entry = _size(job.path), channel.journal.get(job.name)
     if job.sha256 is not None or (job.size is not None and job.size != have):
-        have = -1  # the catalogue has another file than the one that is there
+        have = -1  # the catalogue describes another file
     # Compressed bytes could be neither counted nor resumed.
     headers, start = {"Accept-Encoding": "identity"}, 0
     if entry is not None and entry.done and entry.size == have:
@@ -284,7 +286,7 @@ def _attempt(job: Job, channel: Channel) -> bool:
             return False
         if start and not _fits(response, start):
             job.part.unlink(missing_ok=True)
-            raise _LaterError("the part that is there does not fit")
+            raise _LaterError("the incomplete file does not fit the one on the server")
         _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
         start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
         said = Entry(
@@ -293,7 +295,7 @@ def _attempt(job: Job, channel: Channel) -> bool:
             _whole(response),
             done=False,
         )
-        # A part would mean that the file that is there is older than what the entry says.
+        # An incomplete file would mean that the complete one is older than the entry.
         same = entry is None or (entry.etag, entry.modified) == (said.etag, said.modified)
         if have == said.size >= 0 and same and not job.part.exists():
             channel.journal.put(job.name, replace(said, done=True))
@@ -310,12 +312,12 @@ def _if_changed(entry: Entry) -> dict[str, str]:
 
 
 def _unchanged_mark(entry: Entry) -> str:
-    """Return what If-Range takes: a weak ETag does not promise the same bytes."""
+    """Return the value for If-Range: a weak ETag does not promise the same bytes."""
     return entry.modified if entry.etag.startswith("W/") or not entry.etag else entry.etag
 
 
 def _fits(response: "httpx.Response", start: int) -> bool:
-    """Return whether an answer to a request for the rest is the rest, or no rest at all."""
+    """Return whether an answer to a range request is that range, or the whole file."""
     if response.status_code == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE:
         return False
     span = response.headers.get("content-range", "")
@@ -337,7 +339,7 @@ def _store(job: Job, channel: Channel, response: "httpx.Response", start: int, s
     with job.part.open("ab" if start else "wb") as stream:
         if not start:
             channel.journal.put(job.name, said)
-        # Pieces as they come: what is still being gathered when a line breaks is lost.
+        # Chunks as they arrive: larger ones would be lost when the connection breaks.
         for chunk in response.iter_bytes():
             _check_stop(channel)
             stream.write(chunk)
@@ -350,10 +352,10 @@ def _finish(job: Job, channel: Channel, said: Entry) -> None:
     """Give a complete file its name."""
     size = _size(job.part)
     if said.size >= 0 and size != said.size:
-        raise _LaterError(f"{size} of {said.size} bytes came")
+        raise _LaterError(f"{size} of {said.size} bytes arrived")
     try:
         if job.size is not None and size != job.size:
-            raise FetchError(f"{job.url}: {size} bytes came, but the catalogue says {job.size}")
+            raise FetchError(f"{job.url}: {size} bytes arrived, but the catalogue says {job.size}")
         if job.sha256 is not None and _sha256(job.part) != job.sha256:
             raise FetchError(f"{job.url}: its checksum is not the one in the catalogue")
         if job.path.suffix == ".json":
@@ -370,7 +372,7 @@ def _json(url: str, content: bytes) -> Any:
         return json.loads(content)
     except ValueError:
         start = content[:40].decode("utf-8", "replace")
-        raise FetchError(f"{url}: what came is not JSON; it begins {start!r}") from None
+        raise FetchError(f"{url}: the answer is not JSON; it begins {start!r}") from None
 
 
 def _size(path: Path | None) -> int:

@@ -76,7 +76,7 @@ def read_table(path: Path) -> HeliostatTable:
             # Since pandas 3.1 numbers are read to the last digit.
             frame = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""])
         except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-            raise FormatError(path, f"no table in CSV: {str(error).strip()}") from None
+            raise FormatError(path, f"not a CSV table: {str(error).strip()}") from None
     missing = [name for name in REQUIRED if name not in frame.columns]
     if missing:
         there = ", ".join(map(str, frame.columns[:10]))
@@ -111,7 +111,7 @@ def _read_parquet(path: Path) -> Any:
         return pd.read_parquet(path)
     except (pa.ArrowInvalid, OSError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
-        raise FormatError(path, f"no Parquet table: {reason}") from None
+        raise FormatError(path, f"not a Parquet table: {reason}") from None
 
 
 def _check_names(path: Path, names: Sequence[str], problems: list[FormatError]) -> None:

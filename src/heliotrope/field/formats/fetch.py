@@ -1,4 +1,4 @@
-"""Fetches heliostats and the tower from PAINT's public database.
+"""Downloads heliostats and the tower from PAINT's public database.
 
 The database is a tree of static files after the STAC convention. A heliostat has a
 catalogue, which links to collections (properties, calibration, deflectometry), these to
@@ -10,9 +10,8 @@ items, and an item names its files::
     AA39/Calibration/123456-calibration-item-stac.json    an item: files by address
 
 Files are stored as PAINT's own client stores them: ``AA39/Properties/…`` and
-``AA39/Calibration/…`` below the folder given, the tower's beside the heliostats. A run
-that was broken off goes on where it stopped; a file that is there and has not changed is
-not fetched again.
+``AA39/Calibration/…`` below the given folder, the tower's beside the heliostats. An
+interrupted run resumes where it stopped; files that have not changed are not fetched again.
 
 The data are published by DLR and KIT under CDLA-Permissive-2.0.
 """
@@ -43,9 +42,9 @@ if TYPE_CHECKING:
 
 #: The power plant of Jülich in the database.
 DEFAULT_BASE_URL = "https://paint-database.org/WRI1030197"
-#: What there is of a heliostat; a collection is known by this word in its file's name.
+#: Kinds of data of a heliostat; a collection has this word in its file name.
 KINDS = ("properties", "calibration", "deflectometry")
-#: Photographs that belong to a calibration measurement, by the name of their asset.
+#: Photographs of a calibration measurement, by asset name.
 IMAGES = ("raw_image", "cropped_image", "flux_image", "flux_centered_image")
 
 _HELIOSTAT = re.compile(r"[A-Za-z0-9_-]{1,64}")
@@ -59,18 +58,18 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class FetchState:
-    """How far a run is.
+    """Progress of a run.
 
     Attributes
     ----------
     stage
         "looking" through the catalogue or "fetching" files.
     done, total
-        Documents read and known so far, or files ready and to be fetched.
+        Documents read and known so far, or files fetched and requested.
     received
-        Bytes of files that came.
+        Bytes of files received.
     name
-        The document or file that is ready; "" if nothing new is.
+        Document or file just completed, "" if none.
     """
 
     stage: str
@@ -81,24 +80,24 @@ class FetchState:
 
 
 class Progress(Protocol):
-    """Is told how far a run is, from one thread at a time."""
+    """Receives the progress of a run, from one thread at a time."""
 
     def __call__(self, state: FetchState, /) -> None:
-        """Take note of the state."""
+        """Take the state."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to fetch.
+    """Settings of a run.
 
     Attributes
     ----------
     workers
         Files at a time, 1 to 32.
     timeout
-        For a connection and for the next bytes, s.
+        Limit for connecting and for the next bytes, s.
     retries
-        How often in a row a file may fail without a byte more.
+        Failures in a row without a new byte before a file is given up.
     backoff
         Pause after the first failure, s; it doubles with each.
 
@@ -125,18 +124,18 @@ class Settings:
 
 @dataclass(frozen=True)
 class Fetched:
-    """What a run left on the disk.
+    """Result of a run.
 
     Attributes
     ----------
     files
-        All files that were asked for, in the order of the catalogue.
+        All requested files, in the order of the catalogue.
     new
-        Those of them that came in this run; the others were there.
+        Files downloaded in this run; the others were there.
     received
-        Bytes that came.
+        Bytes downloaded.
     missing
-        What the catalogue does not have, in words.
+        Data that the catalogue does not have, in words.
     """
 
     files: tuple[Path, ...]
@@ -161,35 +160,35 @@ def fetch_heliostats(
     Parameters
     ----------
     ids
-        Their names, as "AA39".
+        Names, such as "AA39".
     into
-        The folder; it is made if need be.
+        Folder; created if needed.
     base_url
-        Of the plant in the database or in a copy of it.
+        Address of the plant in the database or in a copy of it.
     kinds
         Some of ``KINDS``.
     images
-        Some of ``IMAGES``, to come with the calibration measurements; they are large.
+        Some of ``IMAGES``, to be fetched with the calibration measurements; they are large.
     progress
-        Told of each document, file and piece of a file.
+        Called for each document, file and chunk of a file.
     client
-        Of HTTP, with its own timeout; the caller closes it. Default: one for this run.
+        HTTP client with its own timeout; the caller closes it. Default: one for this run.
     settings
-        How to fetch; default ``Settings()``.
+        Default ``Settings()``.
 
     Raises
     ------
     InputError
-        If a name, a kind or an image is none.
+        If a name is malformed, or a kind or image is not known.
     FetchError
         If a heliostat is not in the database, the network or the server fails, the
-        catalogue is not one, a file is not what it should be or cannot be stored. What is
-        there is kept, so that the next run goes on.
+        catalogue cannot be read, or a file is wrong or cannot be stored. Completed parts
+        are kept, and the next run resumes.
     """
     names = [ids] if isinstance(ids, str) else list(dict.fromkeys(ids))
     for name in names:
         if not _HELIOSTAT.fullmatch(name):
-            raise InputError(f"heliostat {name!r}: give a name of letters and digits, as AA39")
+            raise InputError(f"heliostat {name!r}: give a name of letters and digits, such as AA39")
     for what, given, known in (("kind", kinds, KINDS), ("image", images, IMAGES)):
         for one in given:
             if one not in known:
@@ -214,14 +213,14 @@ def fetch_tower(
 ) -> Fetched:
     """Fetch the measurements of the tower: its targets and its receiver.
 
-    Parameters and errors are those of :func:`fetch_heliostats`.
+    Parameters and errors are those of `fetch_heliostats`.
     """
     return _run(lambda run: run.tower(), into, base_url, progress, client, settings)
 
 
 @dataclass(frozen=True)
 class _Link:
-    """A document of the catalogue that belongs to a heliostat ("" for the tower)."""
+    """A document of the catalogue, of a heliostat or ("") of the tower."""
 
     heliostat: str
     kind: str
@@ -230,7 +229,7 @@ class _Link:
 
 @dataclass(frozen=True)
 class _Document:
-    """A document and where it came from, to which relative addresses refer."""
+    """A document with its final address, to which relative addresses refer."""
 
     link: _Link
     url: str
@@ -246,10 +245,10 @@ class _Document:
         """
         links = self.content.get("links")
         if not isinstance(links, list) or not all(isinstance(link, dict) for link in links):
-            raise FetchError(f"{self.url}: no STAC catalogue, it has no list of links")
+            raise FetchError(f"{self.url}: not a STAC catalogue: it has no list of links")
         found = [link.get("href") for link in links if link.get("rel") in relations]
         if not all(isinstance(href, str) for href in found):
-            raise FetchError(f"{self.url}: no STAC catalogue, a link has no address")
+            raise FetchError(f"{self.url}: not a STAC catalogue: a link has no address")
         return [self.address(str(href)) for href in found]
 
     def address(self, href: str) -> str:
@@ -258,12 +257,12 @@ class _Document:
         Raises
         ------
         FetchError
-            If it is none.
+            If it is not a valid address.
         """
         try:
             return urljoin(self.url, href)
         except ValueError as error:
-            raise FetchError(f"{self.url}: {href!r} is no address ({error})") from None
+            raise FetchError(f"{self.url}: {href!r} is not a valid address ({error})") from None
 
     def assets(self) -> dict[str, dict[str, Any]]:
         """Return the files that an item names.
@@ -271,14 +270,14 @@ class _Document:
         Raises
         ------
         FetchError
-            If there are none, or one has no address.
+            If it names no files, or one without an address.
         """
         assets = self.content.get("assets")
         if not isinstance(assets, dict) or not all(
             isinstance(asset, dict) and isinstance(asset.get("href"), str)
             for asset in assets.values()
         ):
-            raise FetchError(f"{self.url}: no STAC item, it names no files with addresses")
+            raise FetchError(f"{self.url}: not a STAC item: it names no files with addresses")
         return assets
 
 
@@ -328,7 +327,7 @@ class _Run:
         self._channel = Channel(client, journal, settings.retries, settings.backoff, self._received)
 
     def fetch(self, jobs: list[Job]) -> list[bool]:
-        """Fetch the files; return for each whether it came or was there."""
+        """Fetch the files; return for each whether it was downloaded now."""
         self._done = self._total = 0
         return self._each("fetching", self._download, jobs)
 
@@ -347,7 +346,7 @@ class _Run:
                 found = [url for url in children if f"{kind}-collection" in url.split("/")[-1]]
                 collections += [_Link(name, kind, url) for url in found]
                 if not found:
-                    self.missing.append(f"heliostat {name}: the database has no {kind} of it")
+                    self.missing.append(f"heliostat {name}: the database has no {kind} data")
         items = [
             _Link(collection.link.heliostat, collection.link.kind, url)
             for collection in self._each("looking", self._document, collections)
@@ -373,12 +372,12 @@ class _Run:
             return self._document(link)
         except NotFoundError:
             raise FetchError(
-                f"heliostat {link.heliostat}: {self.base} has none of this name"
+                f"heliostat {link.heliostat}: {self.base} has no heliostat of this name"
                 + self._suggestion(link.heliostat)
             ) from None
 
     def _suggestion(self, name: str) -> str:
-        """Return names that are close to one that is not there."""
+        """Return a hint with names close to an unknown one."""
         plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         try:
             root = self._document(_Link("", "", f"{self.base}/{plant}-catalog-stac.json"))
@@ -397,11 +396,11 @@ class _Run:
         except FetchError as error:
             raise FetchError(_of(link.heliostat, error)) from None
         if not isinstance(content, dict):
-            raise FetchError(_of(link.heliostat, f"{url}: no STAC document, but a list or value"))
+            raise FetchError(_of(link.heliostat, f"{url}: not a STAC document but a list or value"))
         return _Document(link, source, content)
 
     def _address(self, url: str) -> str:
-        """Return an address in the database or in the copy of it that was asked for."""
+        """Return an address in the database, or in the requested copy of it."""
         if url.startswith(DEFAULT_BASE_URL + "/"):
             url = self.base + url[len(DEFAULT_BASE_URL) :]
         if not re.match(r"https?://", url):
@@ -415,7 +414,7 @@ class _Run:
             raise FetchError(
                 _of(
                     item.link.heliostat,
-                    f"{item.url}: the file's name {name!r} is not a plain one; refused",
+                    f"{item.url}: the file's name {name!r} is not a plain file name; refused",
                 )
             )
         place = [item.link.heliostat, item.link.kind.capitalize(), name]
@@ -444,7 +443,7 @@ class _Run:
     def _each(
         self, stage: str, work: Callable[[Task], Result], tasks: Sequence[Task]
     ) -> list[Result]:
-        """Return what ``work`` gives for each task, in order; the first failure ends all."""
+        """Return the result of ``work`` for each task, in order; the first failure ends all."""
 
         def one(task: Task) -> Result:
             result = work(task)

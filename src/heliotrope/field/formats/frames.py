@@ -1,4 +1,4 @@
-"""The mirror's own frame in a mechanism's last frame, and Euler angles of files."""
+"""The mirror's frame in a mechanism's last frame, and Euler angles of files."""
 
 import numpy as np
 import numpy.typing as npt

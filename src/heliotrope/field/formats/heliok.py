@@ -118,7 +118,7 @@ class Model:
     point, normal
         Vertex (m) and unit normal that tracking uses, beyond the secondary axis, (3,).
     aim
-        Where it is aimed, ENU metres, (3,); None if the file does not say.
+        Aim point, ENU metres, (3,); None if the file gives none.
     """
 
     name: str
@@ -138,9 +138,9 @@ class PlacedModel:
     Attributes
     ----------
     name
-        Of its node.
+        Name of its node.
     model
-        What stands there.
+        Its model.
     position
         ENU metres, (3,).
     orientation
@@ -332,7 +332,7 @@ def heliostats(document: Document) -> list[PlacedModel]:
     Raises
     ------
     FormatError
-        As :func:`models`, and if a node has no name, a name occurs twice or a model is
+        As `models`, and if a node has no name, a name occurs twice or a model is
         not known.
     """
     values, known = Values(document), models(document)
@@ -403,23 +403,22 @@ def sun(document: Document) -> FloatArray:
 def to_plant(document: Document, site: Site) -> Plant:
     """Return the plant that a document describes.
 
-    Heliostats become mechanisms of kind "two_axis" with angles as counts; those whose
-    primary axes point alike and that have as many facets share a group. Surfaces below a
-    node named "Targets" become targets, all others receivers. What a plant has no place
-    for (materials, curved shapes, the sun and its shape, starting angles) stays in the
-    document.
+    Heliostats become mechanisms of kind "two_axis" with angles as counts; those with parallel
+    primary axes and the same number of facets share a group. Surfaces below a
+    node named "Targets" become targets, all others receivers. Materials, curved
+    shapes, the sun and starting angles have no place in a plant and stay in the document.
 
     Parameters
     ----------
     document
-        From :func:`read`.
+        From `read`.
     site
-        The plant's reference point; see :func:`site`.
+        The plant's reference point; see `site`.
 
     Raises
     ------
     FormatError
-        As :func:`heliostats` and :func:`surfaces`, and if a mirror has no facet, axes are
+        As `heliostats` and `surfaces`, and if a mirror has no facet, axes are
         parallel or a name occurs twice.
     """
     path = document.path or "HelioK document"

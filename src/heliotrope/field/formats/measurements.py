@@ -1,4 +1,4 @@
-"""Camera-target measurements: where the beam of a heliostat stood on a target.
+"""Camera-target measurements: positions of heliostats' beams on a target.
 
 Read from ``measurements.csv`` or from PAINT's calibration properties. A row that cannot
 be used is left out and named.
@@ -41,7 +41,7 @@ class Measurements:
     sun
         Apparent sun, unit vectors in ENU, (M, 3).
     centroid
-        Of the beam on the target, ENU metres about the plant's reference, (M, 3).
+        Centroid of the beam on the target, ENU metres about the plant's reference, (M, 3).
     left_out
         One line for each row that could not be used.
     """
@@ -67,7 +67,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
     folder
         With ``measurements.csv``, or ``ID/Calibration/*-calibration-properties.json``.
     centroid
-        Which published extractor to believe.
+        Published extractor whose centroid is used.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def _read_table(path: Path, centroid: Centroid) -> "pd.DataFrame":
     try:
         frame = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise FormatError(path, f"no table in CSV ({str(error).strip()})") from None
+        raise FormatError(path, f"not a CSV table ({str(error).strip()})") from None
     wanted = [*_COLUMNS, *(f"{centroid}_{c}" for c in ("lat", "lon", "alt"))]
     for column in wanted:
         if column not in frame.columns:
@@ -128,7 +128,7 @@ def _read_files(place: Path, centroid: Centroid) -> "pd.DataFrame":
 def _seconds(texts: "pd.Series[str]") -> FloatArray:
     import pandas as pd
 
-    # A text without a zone is no time; PAINT writes Z.
+    # A text without a zone is refused; PAINT writes Z.
     zoned = texts.where(texts.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", regex=True), "")
     times = pd.to_datetime(zoned, utc=True, errors="coerce", format="ISO8601")
     seconds = (times - pd.Timestamp(0, tz="UTC")) / pd.Timedelta(seconds=1)

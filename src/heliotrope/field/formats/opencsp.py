@@ -62,7 +62,7 @@ class Field:
     pivot_height
         m, (N,).
     pivot_offset
-        Of the mirror's face in front of the pivot, m, (N,).
+        Distance of the mirror's face in front of the pivot, m, (N,).
     facet_width, facet_height
         m, (N,).
     extra
@@ -146,7 +146,7 @@ def read_centroids(path: str | Path) -> Centroids:
     Raises
     ------
     FormatError
-        As :func:`read_field`.
+        As for `read_field`.
     """
     table = _Table.read(path, "an OpenCSP table of facet centroids", FACET_COLUMNS)
     center = np.stack([table.numbers(axis) for axis in "XYZ"], axis=-1)
@@ -258,23 +258,23 @@ class _Table:
 def to_plant(table: Field, site: Site, centroids: Centroids | None = None) -> Plant:
     """Return the plant of a field: azimuth-elevation heliostats.
 
-    Heliostats with as many facets share a group. Each one's foot stands the pivot height
+    Heliostats with the same number of facets share a group. Each one's foot stands the pivot height
     below the location of its pivot.
 
     Parameters
     ----------
     table
-        From :func:`read_field`.
+        From `read_field`.
     site
         The plant's reference point: the field's origin.
     centroids
-        From :func:`read_centroids`; they also give the size of the mirror. Without them
+        From `read_centroids`; they also give the size of the mirror. Without them
         the facets stand edge to edge.
 
     Raises
     ------
     InputError
-        If a heliostat has another number of facets than there are centroids.
+        If the number of facets of a heliostat differs from that of the centroids.
     """
     if centroids is not None and (table.facets != len(centroids)).any():
         i = int(np.flatnonzero(table.facets != len(centroids))[0])

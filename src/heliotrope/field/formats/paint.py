@@ -30,7 +30,7 @@ _AXIS_1_ZERO = -0.5 * np.pi
 
 #: Length and breadth of the strokes of Jülich's marks, m, read off photographs.
 MARK_SIZE, MARK_STROKE = 0.735, 0.15
-# What stands at the measured points: kind and turn.
+# Marks at the measured points: kind and turn.
 _MARKS = {
     "upper_left": ("corner", 0.0),
     "upper_middle": ("tee", 0.0),
@@ -48,17 +48,17 @@ class Properties:
     Attributes
     ----------
     name
-        From the file's name.
+        Taken from the file's name.
     geodetic
         Latitude and longitude in degrees, height in m.
     width, height
         m.
     drives
-        Of the two actuators.
+        The two actuators.
     translations
         First joint, second joint, concentrator, m, (3, 3).
     tilts
-        Deviations of the joints that the file may hold, by parameter name, rad.
+        Tilts of the joints given in the file, by parameter name, rad.
     facets
         Centre and half edges in the mirror's frame, (F, 3) each; empty if not given.
     renovation
@@ -89,7 +89,7 @@ def read_heliostat(path: str | Path, name: str | None = None) -> Properties:
     Raises
     ------
     FormatError
-        If something is missing or cannot be; the text names file, key and value.
+        If something is missing or invalid; the text names file, key and value.
     """
     root = read_json(path, "PAINT heliostat properties")
     chain = root.any_of("kinematics_properties", "kinematic_properties", "kinematic")
@@ -198,7 +198,7 @@ def read_tower(path: str | Path) -> Tower:
     Raises
     ------
     FormatError
-        If something is missing or cannot be.
+        If something is missing or invalid.
     """
     root = read_json(path, "PAINT tower measurements")
     origin = root["power_plant_properties"]["coordinates"].geodetic()
@@ -244,7 +244,7 @@ def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
     """Return targets with the marks that stand at their measured points at Jülich.
 
     Ls stand at free corners, Ts at the middles and where two targets meet; the points are
-    on their outer edges. The files do not say so: it is read off published photographs,
+    on their outer edges. The files do not say so; it was measured in published photographs,
     sizes to a centimetre.
     """
     marked = []
@@ -311,7 +311,9 @@ def read_plant(folder: str | Path) -> Plant:
     """
     place = Path(folder)
     if not place.is_dir():
-        raise FormatError(place, "this is no folder; give one with properties and the tower's file")
+        raise FormatError(
+            place, "this is not a folder; give one with properties and the tower's file"
+        )
     tower = read_tower(find_tower(place))
     files = find_properties(place)
     if not files:

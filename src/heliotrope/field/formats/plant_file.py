@@ -1,9 +1,9 @@
 """Our own format: one TOML file for the plant, and a table of its heliostats beside it.
 
-The TOML holds what is one for all (site, tower, kinds of mechanism); the table holds
+The TOML holds what all heliostats share (site, tower, kinds of mechanism); the table holds
 what differs: name, group, position, and any number of the mechanism or the drives in a
-column of its dotted name. Written files give every number with all its digits, so that
-what is read again is the same plant.
+column of its dotted name. Numbers are written with all their digits, so that reading a
+written plant gives the same plant.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -45,7 +45,7 @@ COLUMNS = (
     ("Cant vect.", "<i>"), ("Cant vect.", "<j>"), ("Cant vect.", "<k>"),
     ("Aim pt. X", "[m]"), ("Aim pt. Y", "[m]"), ("Aim pt. Z", "[m]"),
 )  # fmt: skip
-#: Columns that a file may have, and whether the two flags are among them.
+#: Possible numbers of columns, and whether the two flags are among them.
 WIDTHS = {14: True, 12: False, 6: True, 4: False}
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 
@@ -88,16 +88,16 @@ class Layout:
 
 @dataclass(frozen=True)
 class Template:
-    """What a layout does not say of its heliostats.
+    """The dimensions of a heliostat, which a layout does not give.
 
     Attributes
     ----------
     width, height
-        Of the mirror, m.
+        Size of the mirror, m.
     pivot_height
-        Of the crossing of the axes above the foot, m.
+        Height of the axes above the foot, m.
     pivot_offset
-        Of the mirror's surface in front of the pivot, m.
+        Distance of the mirror's surface in front of the pivot, m.
     """
 
     width: float
@@ -117,8 +117,8 @@ def read_layout(path: str | Path) -> Layout:
     Raises
     ------
     FormatError
-        If the file cannot be read, has no rows, rows of another or of different length,
-        or a cell that is not what its column needs; with line and column.
+        If the file cannot be read, has no rows, has rows of a wrong or of differing length,
+        or a cell that does not fit its column; with line and column.
     """
     file = Path(path)
     rows = _rows(file, read_text(file, _WHAT))
@@ -280,11 +280,11 @@ def to_plant(layout: Layout, site: Site, templates: Mapping[int, Template]) -> P
     Parameters
     ----------
     layout
-        From :func:`read_layout`.
+        From `read_layout`.
     site
         The plant's reference point.
     templates
-        The heliostats' measures by number of the template.
+        Dimensions of the heliostats, by template number.
 
     Raises
     ------
