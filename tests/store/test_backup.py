@@ -269,7 +269,7 @@ class TestMigrations:
                     text("UPDATE alembic_version SET version_num = :r"), {"r": r}
                 )
             )
-            with pytest.raises(StoreError, match=f"of revision {revision}.*{advice}"):
+            with pytest.raises(StoreError, match=f"have revision {revision}.*{advice}"):
                 keeper.database.require()
 
     def test_nothing_to_do(self, keeper: Keeper, place: str | Path) -> None:
