@@ -1,4 +1,4 @@
-"""``heliotrope ctl``: look at and command a plant that runs, through its console."""
+"""``heliotrope ctl``: look at and command a running plant, through its console."""
 
 import os
 import time
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from heliotrope.console.client import Client
 
 app = typer.Typer(
-    help="Look at and command a plant that runs, through its console.", no_args_is_help=True
+    help="Look at and command a running plant, through its console.", no_args_is_help=True
 )
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 Whom = Annotated[list[str] | None, typer.Argument(help="Heliostats.", show_default=False)]
 All = Annotated[bool, typer.Option("--all", help="The whole field.")]
-Wait = Annotated[float, typer.Option("--wait", help="Wait so long for the end, s; 0: do not.")]
+Wait = Annotated[float, typer.Option("--wait", help="Longest wait for the end, s; 0: none.")]
 
 
 @app.callback()
@@ -34,7 +34,7 @@ def _where(
         typer.Option(help="File with the API token; else HELIOTROPE_TOKEN.", show_default=False),
     ] = None,
 ) -> None:
-    """Look at and command a plant that runs, through its console."""
+    """Look at and command a running plant, through its console."""
     context.obj = (url, token_file)
 
 
@@ -59,12 +59,13 @@ def _client(context: typer.Context, *, token: bool = True) -> "Client":
 @app.command()
 def token(
     context: typer.Context,
-    label: Annotated[str, typer.Argument(help="What it is for.")],
-    name: Annotated[str, typer.Option(help="Of your account.")] = "engineer",
+    label: Annotated[str, typer.Argument(help="Purpose of the token.")],
+    name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "operator",
-    days: Annotated[float, typer.Option(help="How long it is valid.")] = 90.0,
+    days: Annotated[float, typer.Option(help="Validity in days.")] = 90.0,
     password: Annotated[
-        str, typer.Option(prompt=True, hide_input=True, help="Of your account; asked for.")
+        str,
+        typer.Option(prompt=True, hide_input=True, help="Password of your account; prompted for."),
     ] = "",
 ) -> None:
     """Make an API token; it is printed once."""
@@ -78,15 +79,15 @@ def token(
 @app.command()
 def account(
     context: typer.Context,
-    name: Annotated[str, typer.Argument(help="Of the person.")],
+    name: Annotated[str, typer.Argument(help="Name of the account.")],
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "viewer",
     by: Annotated[str, typer.Option(help="Your account; it must be an engineer's.")] = "engineer",
-    disable: Annotated[bool, typer.Option("--disable", help="Keep the person out.")] = False,
+    disable: Annotated[bool, typer.Option("--disable", help="Disable the account.")] = False,
     reset: Annotated[
         bool, typer.Option("--reset", help="Make a new password; it is printed once.")
     ] = False,
 ) -> None:
-    """Let a person in, keep them out, or give them a new password."""
+    """Make or disable an account, or give it a new password."""
     if disable and reset:
         raise InputError("ctl: give --disable or --reset, not both")
     own = typer.prompt("Your password", hide_input=True)
@@ -105,12 +106,12 @@ def account(
             client.ask("POST", "accounts", new)
         client.ask("DELETE", "session")
     if not reset:
-        print(f"account {name}: {'kept out' if disable else role}")
+        print(f"account {name}: {'disabled' if disable else role}")
 
 
 @app.command()
 def status(context: typer.Context, as_json: Json = False) -> None:
-    """Show the plant in one look."""
+    """Print a summary of the plant."""
     with _client(context) as client:
         found = client.get("summary")
     if as_json:
@@ -118,8 +119,8 @@ def status(context: typer.Context, as_json: Json = False) -> None:
         return
     print(f"{found['name']}, {found['at']}")
     print_table(("state", "heliostats"), [(k, str(v)) for k, v in found["states"].items()])
-    print(f"{found['clusters_alive']} of {found['clusters']} clusters are heard")
-    print(f"{found['alarms']} alarms are active or not acknowledged")
+    print(f"{found['clusters_alive']} of {found['clusters']} clusters heard")
+    print(f"{found['alarms']} alarms active or not acknowledged")
     print(f"{found['holder'] or 'nobody'} has the command authority")
     if found["emergency"]:
         print("EMERGENCY")
@@ -136,7 +137,7 @@ def show(
         ),
     ],
 ) -> None:
-    """Print something of the plant as JSON."""
+    """Print a view of the plant as JSON."""
     from urllib.parse import quote
 
     known = (
@@ -182,11 +183,12 @@ def command(
     heliostats: Whom = None,
     everybody: All = False,
     value: Annotated[
-        list[float] | None, typer.Option(help="Values, in their order.", show_default=False)
+        list[float] | None,
+        typer.Option(help="Values of the command, in order.", show_default=False),
     ] = None,
     wait: Wait = 60.0,
 ) -> None:
-    """Take the authority, give a command, wait for its end, and give the authority back."""
+    """Take the authority, give a command, wait for its end, and release the authority."""
     _give(context, name.upper(), _names(heliostats, everybody), tuple(value or ()), wait)
 
 
@@ -198,12 +200,12 @@ def aim(
     everybody: All = False,
     wait: Wait = 60.0,
 ) -> None:
-    """Aim heliostats at something."""
+    """Aim heliostats at a receiver, a target or a point."""
     names = _names(heliostats, everybody)
     order: dict[str, Any] = {"heliostats": names, "where": where}
     if "," in where:
         if not names:
-            raise InputError("ctl: a point is given to named heliostats, not to all")
+            raise InputError("ctl: a point needs named heliostats, not --all")
         order = {"points": dict.fromkeys(names, parse_point(where, "aim"))}
     with _client(context) as client:
         client.ask("POST", "authority")
@@ -217,23 +219,25 @@ def aim(
 def emergency(
     context: typer.Context,
     act: Annotated[str, typer.Option(help="DEFOCUS or STOW.")] = "DEFOCUS",
-    reason: Annotated[str, typer.Option(help="Why, for the audit.")] = "",
-    withdraw: Annotated[bool, typer.Option("--withdraw", help="Take it back instead.")] = False,
+    reason: Annotated[str, typer.Option(help="Reason, for the audit.")] = "",
+    withdraw: Annotated[
+        bool, typer.Option("--withdraw", help="Withdraw the emergency instead.")
+    ] = False,
 ) -> None:
-    """Take all beams off the receiver, now."""
+    """Take all beams off the receiver now."""
     with _client(context) as client:
         if withdraw:
             found = client.ask("DELETE", "emergency")
         else:
             found = client.ask("POST", "emergency", {"act": act.upper(), "reason": reason})
-    print(f"emergency {'holds' if found['on'] else 'does not hold'}: {found['text']}")
+    print(f"emergency {'in force' if found['on'] else 'not in force'}: {found['text']}")
 
 
 @app.command()
 def acknowledge(
     context: typer.Context,
-    condition: Annotated[str, typer.Argument(help="As the alarm tells it.")],
-    subject: Annotated[str, typer.Argument(help="Of what, as the alarm tells it.")] = "",
+    condition: Annotated[str, typer.Argument(help="Condition of the alarm.")],
+    subject: Annotated[str, typer.Argument(help="Subject of the alarm, if it has one.")] = "",
 ) -> None:
     """Acknowledge an alarm."""
     with _client(context) as client:
@@ -243,12 +247,12 @@ def acknowledge(
 @app.command()
 def calibration(
     context: typer.Context,
-    on: Annotated[bool, typer.Option("--on/--off", help="Let it work, or not.")],
+    on: Annotated[bool, typer.Option("--on/--off", help="On or off.")],
 ) -> None:
-    """Switch the automatic calibration."""
+    """Switch automatic calibration on or off."""
     with _client(context) as client:
         found = client.ask("PUT", "calibration", {"on": on})
-    print(f"calibration {'works' if found['on'] else 'is off'}; {found['done']} calibrated")
+    print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
 
 
 def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:
@@ -272,7 +276,7 @@ def _give(
 
 
 def _follow(client: "Client", ticket: dict[str, Any], wait: float) -> None:
-    """Wait for the end of a command and print it; exit code 1 if it did not come about."""
+    """Wait for the end of a command and print it; exit code 1 if it failed."""
     until = time.monotonic() + wait
     while not ticket["finished"] and time.monotonic() < until:
         time.sleep(0.5)

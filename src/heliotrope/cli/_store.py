@@ -1,4 +1,4 @@
-"""``heliotrope store``: look at, back up, restore, export and migrate what a plant remembers."""
+"""``heliotrope store``: look at, back up, restore, export and migrate the store of a plant."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -7,7 +7,9 @@ import typer
 
 from heliotrope.cli._common import parse_time, print_json, print_table
 
-app = typer.Typer(help="What a plant remembers: look, back up, export.", no_args_is_help=True)
+app = typer.Typer(
+    help="Look at, back up, restore and export the store of a plant.", no_args_is_help=True
+)
 
 Place = Annotated[
     str, typer.Argument(help="Data folder of a plant, or postgresql://user@host/name.")
@@ -20,12 +22,12 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 @app.callback()
 def _root() -> None:
-    """What a plant remembers: look, back up, export."""
+    """Look at, back up, restore and export the store of a plant."""
 
 
 @app.command()
 def info(place: Place, as_json: JsonOption = False) -> None:
-    """Print what is in a store."""
+    """Print the contents of a store."""
     from heliotrope.files.cells import format_time
     from heliotrope.store.backup import summary
     from heliotrope.store.database import Database
@@ -43,20 +45,20 @@ def info(place: Place, as_json: JsonOption = False) -> None:
     if rows:
         print_table(["table", "rows"], [[name, str(count)] for name, count in rows.items()])
     else:
-        print("its tables are of another revision: `heliotrope store migrate` brings it up to date")
+        print("its tables have another revision: run `heliotrope store migrate`")
 
 
 @app.command()
 def backup(
     place: Place,
-    to: Annotated[Path, typer.Option("--to", help="Folder that is made.")],
+    to: Annotated[Path, typer.Option("--to", help="Folder to make.")],
     telemetry: TelemetryOption = None,
     without_telemetry: Annotated[
         bool, typer.Option("--without-telemetry", help="Leave the telemetry out.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a backup; the plant may run meanwhile."""
+    """Make a backup; the plant may keep running."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
 
@@ -73,7 +75,7 @@ def restore(
     telemetry: TelemetryOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check a backup and put it into an empty place."""
+    """Check a backup and restore it into an empty place."""
     from heliotrope.store import backup as backups
     from heliotrope.store.database import Database
 
@@ -85,7 +87,7 @@ def restore(
 @app.command()
 def export(
     place: Place,
-    to: Annotated[Path, typer.Option("--to", help="Folder that is made.")],
+    to: Annotated[Path, typer.Option("--to", help="Folder to make.")],
     heliostat: Annotated[
         list[str] | None, typer.Option(help="Only these; may be given several times.")
     ] = None,
@@ -110,7 +112,7 @@ def migrate(place: Place) -> None:
         print(f"{place}: up to date (revision {HEAD})")
         return
     kept = "" if copy is None else f"; what was before is in {copy}"
-    print(f"{place}: brought from revision {before} to {HEAD}{kept}")
+    print(f"{place}: migrated from revision {before} to {HEAD}{kept}")
 
 
 @app.command()
@@ -119,7 +121,7 @@ def query(
     sql: Annotated[str, typer.Argument(help="One SELECT from telemetry.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Ask the telemetry archive in SQL (DuckDB)."""
+    """Query the telemetry archive in SQL (DuckDB)."""
     from heliotrope.store import telemetry_query
     from heliotrope.store.backup import TELEMETRY
 
@@ -133,7 +135,7 @@ def query(
 
 
 def _telemetry(database: Any) -> Path | None:
-    """Return the folder of the telemetry that lies beside a store, if there is one."""
+    """Return the folder of the telemetry beside a store, if there is one."""
     from heliotrope.store.backup import TELEMETRY
 
     if database.file is None:
