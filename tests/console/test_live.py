@@ -122,7 +122,7 @@ def ctl(
 def test_ctl_looks(ctl: Callable[..., Any], console: LiveConsole) -> None:
     shown = ctl("viewer", "status")
     assert shown.exit_code == 0, shown.output
-    assert "2 of 2 clusters are heard" in shown.stdout
+    assert "2 of 2 clusters heard" in shown.stdout
     shown = ctl("viewer", "show", console.live.names[0])
     assert shown.exit_code == 0
     assert '"cluster": "C' in shown.stdout
