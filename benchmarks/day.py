@@ -18,8 +18,8 @@ from benchmarks._run import BenchmarkError, Result, Row
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD
 from heliotrope.links.clock import VirtualClock, VirtualLoop
-from heliotrope.plant.schedule.live import settings_for
-from heliotrope.plant.schedule.schedule import Scheduler, Weather
+from heliotrope.plant.schedule.plant_schedule import settings_for
+from heliotrope.plant.schedule.scheduler import Scheduler, Weather
 from heliotrope.sun import vector
 from heliotrope.twin.days import Days
 from heliotrope.twin.live.live import CYCLE, LiveOptions, LivePlant
@@ -97,7 +97,7 @@ def _rms(error: np.ndarray) -> float:
 
 async def _live(count: int, minutes: float, looks: int) -> list[Row]:
     clock = VirtualClock(asyncio.get_running_loop().time, MORNING)
-    options = LiveOptions(rendered=False, threads=0, plain=True)
+    options = LiveOptions(rendered=False, threads=0)
     rows: list[Row] = []
     live = LivePlant(malan_plant(count), clock, options)
     async with live.running():

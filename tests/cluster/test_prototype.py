@@ -36,7 +36,7 @@ from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings, Shot
+from heliotrope.plant.visits import CalibrationCycle, CycleSettings, Shot
 from heliotrope.sun import Site
 from heliotrope.twin.boards import outfit
 from support.boards_process import PrototypeField, key_of, prototype_field

@@ -12,7 +12,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.layouts import lay_out
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.zero import zero
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
@@ -29,7 +29,7 @@ def _live(work: Callable[[LivePlant], Awaitable[None]], records: Keeper | None =
     (group,) = design.groups.values()
     two = replace(design, groups={"azel": group.take([0, 1])})
     options = LiveOptions(
-        rendered=False, threads=0, boards=True, work=WorkSettings(calibrate=False, events=30.0)
+        rendered=False, threads=0, boards=True, work=AutomaticSettings(calibrate=False, events=30.0)
     )
 
     async def main(clock: VirtualClock) -> None:
@@ -128,5 +128,5 @@ def test_old_events_are_let_go_once_a_day(tmp_path: Path) -> None:
 
 
 def test_events_are_kept_for_some_time() -> None:
-    with pytest.raises(InputError, match="events of 0"):
-        WorkSettings(events=0.0)
+    with pytest.raises(InputError, match="events are kept for 0"):
+        AutomaticSettings(events=0.0)

@@ -21,10 +21,10 @@ from heliotrope.links.link import Outcome, Statistics
 from heliotrope.links.messages import Ask, Lease, Status, encode
 from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
-from heliotrope.plant.operations.log import Logbook
-from heliotrope.plant.operations.operations import WorkSettings
-from heliotrope.plant.visits.calibration_cycle import Shot
-from heliotrope.plant.visits.centring import Centring, seen, spiral
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.visits.photographs import Shot, seen, spiral
+from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store.records import StoreError
 from heliotrope.twin.live.live import LiveOptions, LivePlant
@@ -237,7 +237,7 @@ def test_a_store_that_keeps_nothing_is_an_alarm_and_stops_nothing() -> None:
 
 def live(
     work: Callable[[LivePlant], Awaitable[None]],
-    settings: WorkSettings,
+    settings: AutomaticSettings,
     keep_out: tuple[int, float] | None = None,
 ) -> None:
     """Run four heliostats on two clusters in virtual time.
@@ -252,7 +252,7 @@ def live(
         design = replace(design, keep_outs=(Sphere("mast", place, 0.2),))
     (group,) = design.groups.values()
     group = replace(group, cluster=("C1", "C1", "C2", "C2"))
-    options = LiveOptions(rendered=False, threads=0, plain=True, work=settings)
+    options = LiveOptions(rendered=False, threads=0, work=settings)
 
     async def main(clock: VirtualClock) -> None:
         made = LivePlant(replace(design, groups={"azel": group}), clock, options)
@@ -289,7 +289,7 @@ def test_whose_beam_has_no_way_is_named_and_the_others_join() -> None:
         assert field.of(name, plant.plant.now()).state == "TRACKING"
         assert not [a for a in shown.alarms() if a.condition == "beam_blocked" and a.active]
 
-    live(work, WorkSettings(wanted=True, calibrate=False, margin=0.0), keep_out=(3, 0.3))
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0), keep_out=(3, 0.3))
 
 
 def test_what_a_plant_shows() -> None:
@@ -332,13 +332,13 @@ def test_what_a_plant_shows() -> None:
         assert shown.heliostat(shown.names[3]).state == ""
         assert shown.summary().states == {"STOWED": 2, "stale": 2}
 
-    live(work, WorkSettings(calibrate=False))
+    live(work, AutomaticSettings(calibrate=False))
 
 
 def test_persons_come_before_the_automat() -> None:
     async def work(plant: LivePlant) -> None:
         shown, names = plant.operations, plant.operations.names
-        assert shown.summary().holder == "automat"
+        assert shown.summary().holder == "automatic control"
         with pytest.raises(RefusedError, match="Vera is viewer"):
             shown.take_authority(VIEWER)
         for refused in (
@@ -390,7 +390,7 @@ def test_persons_come_before_the_automat() -> None:
             shown.emergency(VIEWER, "DANCE")
         assert any("EMERGENCY STOW: a fire" in event.text for event in shown.events())
 
-    live(work, WorkSettings(wanted=True, calibrate=False))
+    live(work, AutomaticSettings(wanted=True, calibrate=False))
 
 
 def test_the_work_survives_a_camera_that_fails() -> None:
@@ -419,9 +419,9 @@ def test_the_work_survives_a_camera_that_fails() -> None:
         assert one.error < 6 * MRAD
         assert one.parameters["tilt_north"].sigma < 10 * MRAD
 
-    live(work, WorkSettings(wanted=True))
+    live(work, AutomaticSettings(wanted=True))
 
 
 def test_work_settings_that_are_none() -> None:
     with pytest.raises(InputError, match="heliostats a second, a beat of"):
-        WorkSettings(rate=0.0)
+        AutomaticSettings(rate=0.0)

@@ -8,7 +8,7 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Stage
 from heliotrope.mechanism.board_items import checksums, items_of
 from heliotrope.plant.audit import read
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings
+from heliotrope.plant.visits import CalibrationCycle, CycleSettings
 from heliotrope.safety import Act
 from support.whole_plant import ENGINEER, MACHINE, WholePlant
 
@@ -46,10 +46,11 @@ def test_from_power_on_to_tracking_to_calibration_to_stow(tmp_path: Path, seed: 
         cycle = CalibrationCycle(plant, whole, CycleSettings(interval=5.0))
         result = await cycle.run(ENGINEER, token, worst, "white")
         assert result.text.startswith("calibrated: beam error"), result.text
-        assert len(result.sightings or ()) == 3
+        assert result.new == 3
+        assert result.record is not None
         assert result.after < 0.3e-3 < 2e-3 < result.before
-        assert set(result.pushed) >= {"armature", "biases"}
-        new = items_of(cycle.mechanism(worst)[1][0], MACHINE)
+        assert set(result.record.pushed) >= {"armature", "biases"}
+        new = items_of(plant.beliefs.present(worst)[0], MACHINE)
         stored = await plant.stored(worst)
         assert {n: stored[n] for n in new} == checksums(new)
         await whole.wait(20.0)

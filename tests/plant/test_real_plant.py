@@ -26,7 +26,7 @@ from heliotrope.plant.assembly import RealPlant
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.links_file import PlantLinks
-from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.cameras import PEAK
 from heliotrope.twin.live.live import LiveOptions, LivePlant
 
@@ -72,7 +72,7 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
             clock,
             JsonLines(tmp_path / "audit.jsonl", clock.utc()),
             cameras=cameras,
-            work=WorkSettings(wanted=True),
+            work=AutomaticSettings(wanted=True),
         )
         async with asyncio.TaskGroup() as group:
             turning = group.create_task(world._turn())
@@ -82,7 +82,7 @@ def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
                     while plant.operations.calibration().done < LEARNT:
                         await asyncio.sleep(0.5)
                 after = world.errors()
-                rows = np.flatnonzero(np.isfinite(plant.operations.work.book.error))
+                rows = np.flatnonzero(np.isfinite(plant.operations.automatic.book.error))
                 found = {str(row): (float(before[row]), float(after[row])) for row in rows}
                 assert await plant.stowed()
                 assert plant.left() == ""

@@ -13,8 +13,8 @@ from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD, direction
 from heliotrope.lcu import states
-from heliotrope.plant.schedule import schedule
-from heliotrope.plant.schedule.schedule import (
+from heliotrope.plant.schedule import scheduler as schedule
+from heliotrope.plant.schedule.scheduler import (
     Assignment,
     Finished,
     Scheduler,
@@ -23,7 +23,6 @@ from heliotrope.plant.schedule.schedule import (
     Weather,
     compare,
 )
-from heliotrope.plant.visits.calibration_cycle import CycleResult
 from heliotrope.sun import vector
 from heliotrope.twin.days import Days, Standing
 
@@ -107,7 +106,7 @@ def test_holds_and_states_are_kept_to() -> None:
     seen.state[7] = 255
     one = scheduler()
     assert ask(one, states=seen) is None
-    assert one.reason == "nobody stands ready"
+    assert one.reason == "no heliostat is ready"
 
 
 @pytest.mark.parametrize(
@@ -233,10 +232,10 @@ def test_growth_of_the_expected_error_brings_a_heliostat_back() -> None:
     world.holds = PLANT.names[1:]
     world.live(timedelta(hours=8), timedelta(minutes=20))
     assert still.expected(world.now)[0] < 2 * MRAD
-    creeps.learn(only, world.known[only], world.now)
+    creeps.learn(world.records[only])
     morrow = MORNING + timedelta(days=5)
     assert ask(still, morrow, holds=world.holds) is None
-    assert still.reason == "1 stand ready, and all are known well enough"
+    assert still.reason == "1 are ready, and all are known well enough"
     back = ask(creeps, morrow, holds=world.holds)
     assert back is not None
     assert back.heliostat == only
@@ -262,31 +261,38 @@ def test_a_surprise_at_a_visit_is_told_and_doubted() -> None:
     one = world.scheduler
     again = [a for a in world.made if a.heliostat in world.values]
     name = again[0].heliostat
-    row, seen = PLANT.names.index(name), world.known[name]
+    row = PLANT.names.index(name)
     one.running[name] = replace(again[0], predicted=1 * MRAD)
-    one.done(Visited(name, "left", world.now.timestamp(), True, seen, 0.9 * MRAD))
+    one.done(Visited(name, "left", world.now.timestamp(), True, 0.9 * MRAD))
     calm = one.expected(world.now)[row]
     one.running[name] = replace(again[0], predicted=1 * MRAD)
-    finished = one.done(Visited(name, "left", world.now.timestamp(), True, seen, 3.1 * MRAD))
+    finished = one.done(Visited(name, "left", world.now.timestamp(), True, 3.1 * MRAD))
     assert finished is not None
     assert finished.surprise
-    assert one.expected(world.now)[row] == pytest.approx(3.1 * calm)
+    assert one.expected(world.now)[row] == pytest.approx(3.1 * calm, rel=1e-4)
     assert name in one.compared().surprises
 
 
-def test_a_result_of_the_cycle_becomes_a_visit() -> None:
+def test_a_calibration_that_nobody_planned_still_teaches() -> None:
     world = Days(PLANT, scheduler(), MORNING)
-    seen = world.photographs(PLANT.names[0], "left", MORNING.timestamp() + np.arange(3.0))
-    good = CycleResult(PLANT.names[0], seen, (), 2e-3, 1e-4, {}, ("armature",), "calibrated: …")
-    now = MORNING.timestamp()
-    visit = Visited.of(good, "left", now)
-    assert (visit.calibrated, visit.measured, visit.sightings) == (True, 2e-3, seen)
-    assert Visited.of(good, "left", now, measured=3e-3).measured == 3e-3
-    bad = replace(good, text="unchanged: 2 sightings, 3 are needed")
-    assert not Visited.of(bad, "left", now).calibrated
-    # A visit that nobody planned still teaches.
-    assert world.scheduler.done(visit) is None
-    assert world.scheduler.expected(MORNING)[0] < 0.7 * scheduler().expected(MORNING)[0]
+    world.live(timedelta(minutes=10))
+    name, record = next(iter(world.records.items()))
+    row, fresh = PLANT.names.index(name), scheduler()
+    before = fresh.expected(MORNING)[row]
+    fresh.learn(record)
+    assert fresh.expected(MORNING)[row] < 0.7 * before
+    # A parameter that a calibration does not have stays as the prior says.
+    other, less = scheduler(), record.names[:-1]
+    other.learn(
+        replace(
+            record,
+            names=less,
+            values=record.values[:-1],
+            covariance=record.covariance[:-1, :-1],
+            prior=record.prior[:-1],
+        )
+    )
+    assert fresh.expected(MORNING)[row] < other.expected(MORNING)[row] < before
 
 
 # --- the plan, and the comparison -----------------------------------------------------
@@ -344,8 +350,8 @@ def test_a_plan_goes_on_from_what_is_under_way() -> None:
 def test_finished_visits_are_compared_with_their_prediction() -> None:
     told = Assignment("A", "left", 0.0, 100.0, 30e-3, 12e-3, 4e-3, 0.9, False, "")
     made = [
-        Finished(told, Visited("A", "left", 110.0, True, None, 3e-3)),
-        Finished(told, Visited("A", "left", 90.0, True, None, 5e-3)),
+        Finished(told, Visited("A", "left", 110.0, True, 3e-3)),
+        Finished(told, Visited("A", "left", 90.0, True, 5e-3)),
         Finished(told, Visited("B", "left", 130.0, False)),
     ]
     found = compare(made)

@@ -9,9 +9,8 @@ import pytest
 from heliotrope.field.layouts import malan_plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.plant.schedule.live import PlantSchedule, settings_for
-from heliotrope.plant.schedule.schedule import Scheduler, Settings
-from heliotrope.plant.visits.calibration_cycle import CycleSettings
+from heliotrope.plant.schedule import PlantSchedule, Scheduler, Settings, settings_for
+from heliotrope.plant.visits import CycleSettings
 from heliotrope.twin.live.live import LiveOptions, LivePlant
 
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
@@ -31,7 +30,9 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
         options = LiveOptions(rendered=False, threads=0)
         async with LivePlant(DESIGN, clock, options).running() as live:
             try:
-                schedule = live.operations.work._scheduler
+                calibrating = live.operations.automatic._calibrating
+                assert calibrating is not None
+                schedule = calibrating._scheduler
                 assert isinstance(schedule, PlantSchedule)
                 await _visits(live, schedule)
                 _what_came_of_it(live, schedule)
@@ -39,7 +40,7 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
                 _after_a_restart(live, schedule)
             finally:
                 # As an exit does: what is on its way is given up first.
-                await live.operations.work.halt()
+                await live.operations.automatic.halt()
                 await live.end()
 
     run_virtual(main, start=START)
@@ -78,23 +79,21 @@ def _what_is_to_come(live: LivePlant, schedule: PlantSchedule) -> None:
 
 
 def _after_a_restart(live: LivePlant, before: PlantSchedule) -> None:
-    """A new schedule knows what the cycle knows, and forgets what ended without a result."""
+    """A new schedule knows what the plant believes, and forgets what ended without a result."""
     names, now = live.plant.field.names, live.clock.utc()
-    cycle = before._cycle
     fresh = Scheduler(DESIGN, before.scheduler.settings, now=now, names=names)
-    again = PlantSchedule(live.plant, cycle, fresh)
+    again = PlantSchedule(live.plant, fresh)
     ready = np.full(12, fill_value=True)
-    book = live.operations.work.book
-    first = again.next("left", ready, book)
+    first = again.next("left", ready)
     assert first is not None
     np.testing.assert_allclose(fresh.expected(now), before.scheduler.expected(now), rtol=0.05)
     assert list(fresh.running) == [first.heliostat]
-    second = again.next("left", ready, book)
+    second = again.next("left", ready)
     assert second is not None
     assert list(fresh.running) == [second.heliostat]
-    nobody = again.next("right", np.zeros(12, dtype=np.bool_), book)
+    nobody = again.next("right", np.zeros(12, dtype=np.bool_))
     assert nobody is None
-    assert fresh.reason == "nobody stands ready"
+    assert fresh.reason == "no heliostat is ready"
 
 
 @pytest.mark.parametrize("hour", [0, 22])

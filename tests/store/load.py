@@ -17,12 +17,13 @@ from pathlib import Path
 import numpy as np
 import plant_load
 
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import sightings
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.audit import Record
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.records import Event, ParameterVersion, StoreError
+from heliotrope.store.records import Event, StoreError
 from heliotrope.store.telemetry import Look, Telemetry, TelemetrySettings
 
 NAMES = tuple(f"H{i}" for i in range(50))
@@ -55,11 +56,13 @@ async def _write(
         os.write(told, f"{line}\n".encode())
 
     tell("open")
+    counts = {name: one.version for name, one in keeper.latest_calibrations().items()}
     for k in range(100_000):
         numbers = keeper.record_sightings(NAMES, _sightings(seed, k))
         name = chance.choice(NAMES)
-        version = keeper.record_parameters(
-            ParameterVersion(
+        version = counts[name] = counts.get(name, 0) + 1
+        keeper.record_calibration(
+            HeliostatCalibration(
                 name,
                 float(k),
                 ("tilt_north",),
@@ -69,6 +72,7 @@ async def _write(
                 sightings=numbers,
                 residual_before=np.zeros((len(numbers), 2)),
                 residual_after=np.zeros((len(numbers), 2)),
+                version=version,
             )
         )
         keeper.record_event(Event(float(k), "load", f"{seed}-{k}"))

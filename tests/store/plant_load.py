@@ -12,7 +12,7 @@ from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
-from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
 from heliotrope.twin.live.live import LiveOptions, LivePlant
@@ -38,8 +38,7 @@ async def _run(place: Path, seed: int, tell: Callable[[str], object]) -> None:
             seed=1,
             rendered=False,
             threads=0,
-            plain=True,
-            work=WorkSettings(wanted=not by_hand, calibrate=not by_hand),
+            work=AutomaticSettings(wanted=not by_hand, calibrate=not by_hand),
         ),
         audit=KeptAudit(keeper, SystemClock(), clock.utc()),
         assigned=KeptPoints(keeper),
@@ -59,7 +58,7 @@ async def _learn(live: LivePlant, keeper: Keeper, seed: int, tell: Callable[[str
         keeper.record_event(Event(live.clock.utc().timestamp(), "load", f"{seed}-{k}"))
         await keeper.confirm()
         tell(f"event {seed}-{k}")
-        for name, version in keeper.latest_parameters().items():
+        for name, version in keeper.latest_calibrations().items():
             tell(f"version {name} {version.version}")
 
 

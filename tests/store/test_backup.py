@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from sqlalchemy import select, text
 
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import FormatError
 from heliotrope.store import backup as backups
@@ -23,7 +24,6 @@ from heliotrope.store.records import (
     AuditEntry,
     CampaignEntry,
     Event,
-    ParameterVersion,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -38,8 +38,8 @@ NAMES = ("A", "B", "C")
 def fill(keeper: Keeper, seen: Sightings) -> None:
     """Put something into every table."""
     numbers = keeper.record_sightings(NAMES, seen, target="west")
-    keeper.record_parameters(
-        ParameterVersion(
+    keeper.record_calibration(
+        HeliostatCalibration(
             "A",
             1.0,
             ("tilt_north",),
@@ -49,9 +49,10 @@ def fill(keeper: Keeper, seen: Sightings) -> None:
             sightings=numbers[:2],
             residual_before=np.ones((2, 2)),
             residual_after=np.zeros((2, 2)),
+            version=1,
         )
     )
-    keeper.record_visit(VisitEntry("A", "west", 1.0, 2.0, good=True))
+    keeper.record_visit(VisitEntry("A", "west", 1.0, 2.0, CalibrationOutcome.CALIBRATED))
     keeper.record_plan([PlannedVisit("B", "west", 3.0)])
     keeper.record_campaign(CampaignEntry("spring", 1.0))
     keeper.record_event(Event(1.0, "test", "hello", values={"x": float("nan")}))
@@ -280,9 +281,9 @@ class TestMigrations:
     ) -> None:
         Keeper(tmp_path).close()
         steps = []
-        monkeypatch.setattr(backups, "HEAD", "0002")
+        monkeypatch.setattr(backups, "HEAD", "9999")
         monkeypatch.setattr(Database, "migrate", lambda self: steps.append(self.locked))
         before, copy = backups.migrate(tmp_path)
-        assert (before, steps) == ("0001", [True])
-        assert copy == tmp_path / "store.before-0001.sqlite"
+        assert (before, steps) == (HEAD, [True])
+        assert copy == tmp_path / f"store.before-{HEAD}.sqlite"
         assert content(Database(copy)) == content(Database(tmp_path))

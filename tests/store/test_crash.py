@@ -124,7 +124,7 @@ class Promises:
             # All up to the last confirmed, and nothing twice.
             assert len(set(numbers)) == len(numbers)
             assert set(range(1, self.most + 1)) <= set(numbers.tolist())
-            latest = keeper.latest_parameters()
+            latest = keeper.latest_calibrations()
             assert all(latest[name].version >= v for name, v in self.versions.items())
             with keeper.database.reading() as connection:
                 records = {r.identity: r for r in audit.entries(connection, 10**6)}
@@ -193,7 +193,7 @@ def kill_plants(loads: Loads, place: Path, kills: int) -> dict[str, int]:
                 kept = audit.points(connection).get("STANDBY", {})
             assert accepted <= records
             assert events <= {e.text for e in keeper.events(10**6)}
-            latest = keeper.latest_parameters()
+            latest = keeper.latest_calibrations()
             assert all(latest[name].version >= v for name, v in versions.items())
             # What was told last, or one that came after it and was not told any more.
             assert points.keys() <= kept.keys()

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from heliotrope.calibration.fit.estimator import FitOutcome
+from heliotrope.calibration.record import HeliostatCalibration, Provenance
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store.export import export, folder_name
 from heliotrope.store.keeper import Keeper
-from heliotrope.store.records import ParameterVersion
 
 NAMES = ("A/1", "B", "C")
 
@@ -26,8 +27,8 @@ def exported(keeper: Keeper, seen: Sightings, tmp_path: Path) -> Path:
     numbers = keeper.record_sightings(NAMES, seen, kind="")
     mine = numbers[seen.heliostat == 0]
     for k in (1, 2):
-        keeper.record_parameters(
-            ParameterVersion(
+        keeper.record_calibration(
+            HeliostatCalibration(
                 "A/1",
                 1.8e9 + k,
                 ("tilt_north", "azimuth_bias"),
@@ -37,15 +38,18 @@ def exported(keeper: Keeper, seen: Sightings, tmp_path: Path) -> Path:
                 0.015,
                 3e-4,
                 1.2,
-                "converged",
+                FitOutcome.CONVERGED,
                 mine[: k + 1],
+                np.zeros(0, np.int64),
                 np.full((k + 1, 2), [3e-3, 4e-3]),
                 np.full((k + 1, 2), 1e-5 / k),
                 "two",
+                Provenance.CAMERA,
                 "anna",
                 "spring",
                 "a, note",
                 ("AXES",),
+                version=k,
             )
         )
     keeper.writer.confirmed().result(10.0)

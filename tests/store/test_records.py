@@ -10,7 +10,12 @@ import numpy as np
 import pytest
 
 from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import fit
+from heliotrope.calibration.fit.estimator import FitOutcome, fit
+from heliotrope.calibration.record import (
+    CalibrationOutcome,
+    HeliostatCalibration,
+    Provenance,
+)
 from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype
@@ -21,11 +26,9 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     Hold,
-    ParameterVersion,
     PlannedVisit,
     StoreError,
     VisitEntry,
-    version_of,
 )
 
 NAMES = ("A1", "Größe/2", "c'; DROP TABLE sighting")
@@ -45,11 +48,11 @@ def assert_same(found: Sightings, wanted: Sightings) -> None:
 
 def version(
     heliostat: str, numbers: np.ndarray, seed: int = 0, **given: object
-) -> ParameterVersion:
+) -> HeliostatCalibration:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(2, 2))
     count = len(numbers)
-    whole = ParameterVersion(
+    whole = HeliostatCalibration(
         heliostat,
         1.8e9 + seed,
         ("tilt_north", "tilt_east"),
@@ -59,15 +62,18 @@ def version(
         0.015,
         0.0003,
         1.1,
-        "converged",
+        FitOutcome.CONVERGED,
         numbers,
+        np.zeros(0, np.int64),
         rng.normal(size=(count, 2)),
         rng.normal(size=(count, 2)),
         "two",
+        Provenance.DRONE,
         "anna",
         "first",
         "note",
         ("POSITION", "AXES"),
+        version=1,
     )
     return replace(whole, **given)
 
@@ -121,42 +127,49 @@ class TestSightings:
 class TestParameters:
     def test_come_back_with_where_they_are_from(self, keeper: Keeper, seen: Sightings) -> None:
         numbers = keeper.record_sightings(NAMES, seen)
-        kept = version("A1", numbers[seen.heliostat == 0])
-        assert keeper.record_parameters(kept) == 1
-        assert keeper.record_parameters(version("A1", numbers[:0], 1, after=math.nan)) == 2
-        assert keeper.record_parameters(version("B", numbers[:2], 2)) == 1
+        kept = version("A1", numbers[seen.heliostat == 0], left_out=numbers[seen.heliostat == 1])
+        keeper.record_calibration(kept)
+        keeper.record_calibration(version("A1", numbers[:0], 1, after=math.nan, version=2))
+        keeper.record_calibration(version("B", numbers[:2], 2))
         confirm(keeper)
-        first, second = keeper.parameter_history("A1")
-        for field in fields(ParameterVersion):
-            wanted = 1 if field.name == "version" else getattr(kept, field.name)
+        first, second = keeper.calibration_history("A1")
+        for field in fields(HeliostatCalibration):
+            wanted = getattr(kept, field.name)
             np.testing.assert_array_equal(getattr(first, field.name), wanted, err_msg=field.name)
+        assert (first.outcome, first.provenance) == (FitOutcome.CONVERGED, Provenance.DRONE)
         assert (second.version, len(second.sightings)) == (2, 0)
         assert math.isnan(second.after)
-        assert keeper.parameter_history("nobody") == []
+        assert keeper.calibration_history("nobody") == []
 
     def test_the_latest_of_each(self, keeper: Keeper) -> None:
         none = np.zeros(0, np.int64)
         for seed, name in enumerate(("A", "B", "A", "A", "C")):
-            keeper.record_parameters(version(name, none, seed))
+            count = sum(n == name for n in ("A", "B", "A", "A", "C")[: seed + 1])
+            keeper.record_calibration(version(name, none, seed, version=count))
         confirm(keeper)
-        assert {n: v.version for n, v in keeper.latest_parameters().items()} == {
+        assert {n: v.version for n, v in keeper.latest_calibrations().items()} == {
             "A": 3,
             "B": 1,
             "C": 1,
         }
-        (latest,) = keeper.latest_parameters(["A"]).values()
+        (latest,) = keeper.latest_calibrations(["A"]).values()
         np.testing.assert_array_equal(latest.values, version("A", none, 3).values)
         many = [f"x{i}" for i in range(1000)] + ["B"]
-        assert list(keeper.latest_parameters(many)) == ["B"]
+        assert list(keeper.latest_calibrations(many)) == ["B"]
 
-    def test_are_numbered_on_over_a_restart(
+    def test_versions_rise_over_a_restart(
         self, place: str | Path, opened: Callable[..., Keeper]
     ) -> None:
         none = np.zeros(0, np.int64)
         first = opened(place)
-        first.record_parameters(version("A", none))
+        first.record_calibration(version("A", none))
         first.close()
-        assert opened(place).record_parameters(version("A", none)) == 2
+        again = opened(place)
+        with pytest.raises(InputError, match="calibration of A: version 1 is not above 1"):
+            again.record_calibration(version("A", none))
+        again.record_calibration(version("A", none, version=3))
+        confirm(again)
+        assert again.latest_calibrations()["A"].version == 3
 
     def test_must_fit_together(self) -> None:
         good = version("A", np.arange(3))
@@ -168,28 +181,30 @@ class TestParameters:
             replace(good, values=np.array([np.nan, 0.0]))
 
     def test_sightings_that_are_not_kept_are_told(self, keeper: Keeper) -> None:
-        keeper.record_parameters(version("A", np.array([77])))
+        keeper.record_calibration(version("A", np.array([77])))
         keeper.record_event(Event(1.0, "test", "goes on"))
         asyncio.run(keeper.confirm())
         assert "a record was refused" in keeper.refused
-        assert keeper.parameter_history("A") == []
+        assert keeper.calibration_history("A") == []
         assert [e.text for e in keeper.events()] == ["goes on"]
 
     def test_of_a_fit(self) -> None:
         nominal, seen = _small_case()
         fitted = fit(nominal, seen, ("tilt_north", "tilt_east"))
         numbers = np.arange(len(seen)) + 5
-        made = version_of("A", 9.0, fitted, nominal, seen, numbers, model="two", person="anna")
+        made = HeliostatCalibration.from_fit(
+            "A", 9.0, fitted, nominal, seen, numbers, model="two", person="anna"
+        )
         assert made.after < 1e-6 < made.before
         assert made.before == pytest.approx(2.0 * 0.004, rel=0.5)
-        assert made.outcome == "converged"
+        assert made.outcome is FitOutcome.CONVERGED
         np.testing.assert_allclose(
             np.hypot(*made.residual_before.T), beam_errors(nominal, seen).beam, rtol=1e-6
         )
         assert made.parameters["tilt_north"] == pytest.approx(0.004, abs=1e-6)
         np.testing.assert_allclose(made.sigma**2, np.diagonal(made.covariance))
-        with pytest.raises(InputError, match=r"2 numbers of \d+ sightings"):
-            version_of("A", 9.0, fitted, nominal, seen, numbers[:2], model="two")
+        with pytest.raises(InputError, match=r"2 numbers for \d+ sightings"):
+            HeliostatCalibration.from_fit("A", 9.0, fitted, nominal, seen, numbers[:2], model="two")
 
 
 def _small_case() -> tuple[Mechanism, Sightings]:
@@ -211,7 +226,7 @@ class TestSchedule:
             "west",
             10.0,
             20.0,
-            good=True,
+            CalibrationOutcome.CALIBRATED,
             text="calibrated",
             gain=0.3,
             sigma_before=0.01,
@@ -219,12 +234,13 @@ class TestSchedule:
             version=1,
             campaign="c",
         )
-        second = VisitEntry("B", "east", 11.0, 21.0, good=False, text="no spot")
+        second = VisitEntry("B", "east", 11.0, 21.0, CalibrationOutcome.NO_BEAM, text="no spot")
         for visit in (first, second):
             keeper.record_visit(visit)
         confirm(keeper)
         last, other = keeper.visits()
         assert (last.heliostat, last.number, last.good) == ("B", 2, False)
+        assert last.outcome is CalibrationOutcome.NO_BEAM
         assert math.isnan(last.gain)
         assert (other.gain, other.sigma_before, other.text) == (0.3, 0.01, "calibrated")
         assert [v.heliostat for v in keeper.visits(heliostat="A")] == ["A"]

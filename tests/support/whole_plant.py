@@ -30,7 +30,7 @@ from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.sun import Site
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.boards.board import Board

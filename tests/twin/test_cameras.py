@@ -13,7 +13,7 @@ from heliotrope.imaging.synthetic.rendering import Thrown, example_camera, examp
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.optics.mirror_image import gaussian_beam
-from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleSettings, Shot
+from heliotrope.plant.visits import CalibrationCycle, CycleSettings, Shot
 from heliotrope.twin.boards.outfit import RECEIVER
 from heliotrope.twin.cameras import ExactCamera, Mirror, RenderedCamera, Sight, mirrors_of
 from support.whole_plant import ENGINEER, WholePlant

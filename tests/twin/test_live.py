@@ -22,8 +22,8 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import LinkClosedError, Outcome
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.authority import Person, Role
-from heliotrope.plant.operations.operations import WorkSettings
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.cameras import Mirror, Sight
 from heliotrope.twin.live._boards import BoardField
@@ -41,7 +41,7 @@ from heliotrope.twin.live.loop import LATE, PacedLoop
 
 MRAD = 1e-3
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
-EXACT = LiveOptions(rendered=False, threads=0, plain=True)
+EXACT = LiveOptions(rendered=False, threads=0)
 
 
 def live(
@@ -239,10 +239,10 @@ class Strangers:
     """A camera on whose first photographs another's beam stands somewhere."""
 
     def __init__(self, camera: SeenExactly, count: int) -> None:
-        self._camera, self.left = camera, count
+        self._photograph, self.left = camera.photograph, count
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        shot = await self._camera.photograph(target, heliostat)
+        shot = await self._photograph(target, heliostat)
         if self.left == 0:
             return shot
         self.left -= 1
@@ -255,12 +255,12 @@ def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
     async def work(plant: LivePlant) -> None:
         assert isinstance(plant.cameras, SeenExactly)
         camera = Strangers(plant.cameras, count)
-        plant.operations.work._cycle._camera = camera  # type: ignore[union-attr]
+        plant.cameras.photograph = camera.photograph  # type: ignore[method-assign]
         await asyncio.sleep(150.0)
         assert camera.left == 0
         first = plant.operations.calibration().results[-1]
         assert first.text.startswith("calibrated"), first
-        assert "another beam's" in first.text
+        assert "another heliostat's beam" in first.text
         assert first.after < 0.5 * MRAD
 
     live(work, malan_plant(1))
@@ -318,7 +318,7 @@ def test_what_was_learnt_outlasts_the_program(tmp_path: Path) -> None:
             await first.end()
         assert known
         # The next program, and boards that know nothing.
-        idle = replace(EXACT, work=WorkSettings(calibrate=True))
+        idle = replace(EXACT, work=AutomaticSettings(calibrate=True))
         second = LivePlant(design, clock, idle, records=keeper)
         assert [hold.heliostat for hold in second.operations.holds()] == ["R001-002"]
         assert second.operations.calibration().done == len(known)

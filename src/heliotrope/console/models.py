@@ -62,7 +62,9 @@ def plain(value: Any) -> Any:
     """Return the JSON values of views: lists, dictionaries, numbers, text; NaN as None."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if value is None or (isinstance(value, str | bool | int) and not isinstance(value, Enum)):
+    if isinstance(value, Enum):
+        return value.name.lower()
+    if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())

@@ -25,16 +25,16 @@ from heliotrope.plant.audit import Audit
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.links_file import PlantLinks
-from heliotrope.plant.operations.book import CalibrationBook
-from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
-from heliotrope.plant.operations.work import LeastKnown, Scheduling, WorkSettings
-from heliotrope.plant.schedule.live import PlantSchedule, settings_for
-from heliotrope.plant.schedule.schedule import Scheduler
+from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
+from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.plant.visits.calibration_cycle import CycleSettings
-from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
 
@@ -68,8 +68,6 @@ class RealPlant:
         None: local controllers keep what they hold.
     work, plant
         Settings.
-    by_gain
-        Whether the schedule goes by expected gain.
     cycle
         Settings of the calibration.
 
@@ -95,9 +93,8 @@ class RealPlant:
         assigned: Assigned | None = None,
         cameras: RealCameras | None = None,
         machine: Machine | None = None,
-        work: WorkSettings | None = None,
+        work: AutomaticSettings | None = None,
         plant: PlantSettings | None = None,
-        by_gain: bool = False,
         cycle: CycleSettings = CYCLE,
     ) -> None:
         self.design, self.clock, self.audit = design, clock, audit
@@ -114,11 +111,13 @@ class RealPlant:
             assigned=assigned,
             on_alarm=self.logbook.take_alarm,
         )
-        settings = work or WorkSettings()
-        chosen = None if cameras is None else CentringCycle(self.plant, cameras, cycle)
+        settings = work or AutomaticSettings()
+        chosen = (
+            None if cameras is None else CalibrationCycle(self.plant, cameras, cycle, Centring())
+        )
         scheduler: Scheduling | None = None
         if chosen is not None and cameras is not None:
-            scheduler = _Watched(self._scheduler(chosen, settings, by_gain), cameras)
+            scheduler = _Watched(self._scheduler(chosen), cameras)
         seen = (
             () if cameras is None else [t for t in design.targets if t.name not in cameras.unseen]
         )
@@ -133,29 +132,24 @@ class RealPlant:
             extra=self._extra,
         )
         if machine is not None:
-            self._want(machine, chosen)
+            self._want(machine)
 
-    def _scheduler(self, cycle: CentringCycle, settings: WorkSettings, by_gain: bool) -> Scheduling:
-        if not by_gain:
-            return LeastKnown(self.plant, settings)
+    def _scheduler(self, cycle: CalibrationCycle) -> Scheduling:
         names = self.plant.field.names
         chosen = Scheduler(
             self.design, settings_for(cycle.settings), now=self.clock.utc(), names=names
         )
-        return PlantSchedule(self.plant, cycle, chosen)
+        return PlantSchedule(self.plant, chosen)
 
     def _extra(self) -> Mapping[str, Any]:
         refusal = self._links.refusal()
         return {"refused link": refusal} if refusal else {}
 
-    def _want(self, machine: Machine, cycle: CentringCycle | None) -> None:
+    def _want(self, machine: Machine) -> None:
         """Want of every local controller what the design and the last calibration say."""
         rest_on(self.plant.standbys, machine.standby)
         for name in self.plant.field.names:
-            group, row = self.design.find(name)
-            mechanism = group.calibrated[row]
-            if cycle is not None:
-                mechanism = cycle.mechanism(name)[1][0]
+            mechanism = self.plant.beliefs.present(name)[0]
             self.plant.wanted.set(name, items_of(mechanism, machine))
 
     # -- running ---------------------------------------------------------------------------
@@ -222,7 +216,7 @@ class RealPlant:
         It waits ``limit`` s at most, and for those only that are heard and can stow by an order;
         see `left` for the others.
         """
-        await self.operations.work.halt()
+        await self.operations.automatic.halt()
         self.plant.stow("plant's end")
         until = self.clock.monotonic() + limit
         while self.clock.monotonic() < until:
@@ -261,15 +255,13 @@ class _Watched:
     def __init__(self, schedule: Scheduling, cameras: RealCameras) -> None:
         self._schedule, self._cameras = schedule, cameras
 
-    def next(
-        self, target: str, ready: npt.NDArray[np.bool_], book: CalibrationBook
-    ) -> Planned | None:
+    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
         if not self._cameras.awake(target):
             return None
-        return self._schedule.next(target, ready, book)
+        return self._schedule.next(target, ready)
 
-    def plan(self, ready: npt.NDArray[np.bool_], book: CalibrationBook, limit: int) -> Any:
-        return self._schedule.plan(ready, book, limit)
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Any:
+        return self._schedule.plan(ready, limit)
 
     def done(self, entry: CalibrationEntry) -> None:
         self._schedule.done(entry)

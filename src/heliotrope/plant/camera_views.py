@@ -8,7 +8,7 @@ import numpy.typing as npt
 from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.photograph import Photograph
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.photographs import Shot
 
 #: Quality of the pictures for people, 0 to 100.
 _JPEG = 80

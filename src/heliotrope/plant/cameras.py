@@ -30,7 +30,7 @@ from heliotrope.imaging.targets.teaching import read_pictures
 from heliotrope.links.clock import Clock
 from heliotrope.plant.camera_views import Views, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Alarm, alarms
 
 #: A photograph is awaited for so long, and its frame looked for so often, s.

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.field.volumes import Volume
@@ -39,7 +40,7 @@ from heliotrope.links.messages import (
     Status,
     decode,
 )
-from heliotrope.mechanism.board_items import Wanted, checksums
+from heliotrope.mechanism.board_items import Wanted, checksums, items_of
 from heliotrope.plant._beam_watch import Lookout, Ways
 from heliotrope.plant._cluster_end import ClusterEnd
 from heliotrope.plant._joining import Job, Joiner, JoinQueue
@@ -50,6 +51,7 @@ from heliotrope.plant.aims import BeamCheck, default_aims
 from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
 from heliotrope.plant.audit import Audit, AuditError
 from heliotrope.plant.authority import Authority, Grant, Person, RefusedError, Role
+from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders, whole
@@ -100,7 +102,7 @@ class PlantController:
 
     Attributes
     ----------
-    design, field, authority, wanted, counters
+    design, field, authority, wanted, counters, beliefs
         See their classes.
     alarms
         The last ones, oldest first.
@@ -155,6 +157,8 @@ class PlantController:
         rows = conditions(self.settings.autonomy) if table is None else table
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
+        self.beliefs = Beliefs(design)
+        self.beliefs.subscribe(self._believe)
         looks = bool(self.beams.volumes)
         self._watch = PlantWatch(
             rows, tuple(held), self.settings.sensors, clock.monotonic(), looks=looks
@@ -596,6 +600,13 @@ class PlantController:
         self._orders.parameters(ticket, heliostat, items, token)
         self._pusher.follow(heliostat, ticket)
         return ticket
+
+    def _believe(self, record: HeliostatCalibration) -> None:
+        """Check beams by a new calibration, and want it of the local controller."""
+        mechanism = self.beliefs.present(record.heliostat)[0]
+        row = self.field.place(record.heliostat)
+        self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)
+        self.wanted.set(record.heliostat, items_of(mechanism))
 
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
         """Return the checksums of what a local controller has stored, by item.

@@ -11,6 +11,13 @@ from sqlalchemy import Connection, Executable, RowMapping, Table
 from sqlalchemy import Row as SqlRow
 from sqlalchemy.dialects import postgresql, sqlite
 
+from heliotrope.calibration.fit.estimator import FitOutcome
+from heliotrope.calibration.record import (
+    CalibrationOutcome,
+    HeliostatCalibration,
+    Identities,
+    Provenance,
+)
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.store import tables
@@ -19,9 +26,7 @@ from heliotrope.store.records import (
     AlarmEntry,
     CampaignEntry,
     Event,
-    Identities,
     KeptSightings,
-    ParameterVersion,
     PlannedVisit,
     VisitEntry,
 )
@@ -141,49 +146,55 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
 # -- parameters --------------------------------------------------------------------------
 
 
-def version_row(version: ParameterVersion) -> Row:
+def calibration_row(record: HeliostatCalibration) -> Row:
     """Return the row of the table ``parameter_version``."""
     return {
-        "heliostat": version.heliostat,
-        "version": version.version,
-        "at": version.at,
-        "model": version.model,
-        "names": list(version.names),
-        "value": version.values.tolist(),
-        "covariance": version.covariance.tolist(),
-        "prior": version.prior.tolist(),
-        "error_before": real(version.before),
-        "error_after": real(version.after),
-        "scale": real(version.scale),
-        "outcome": version.outcome,
-        "person": version.person,
-        "campaign": version.campaign,
-        "note": version.note,
-        "pushed": list(version.pushed),
-        "code": version.code,
+        "heliostat": record.heliostat,
+        "version": record.version,
+        "at": record.at,
+        "model": record.model,
+        "names": list(record.names),
+        "value": record.values.tolist(),
+        "covariance": record.covariance.tolist(),
+        "prior": record.prior.tolist(),
+        "error_before": real(record.before),
+        "error_after": real(record.after),
+        "scale": real(record.scale),
+        "outcome": record.outcome.name.lower(),
+        "provenance": record.provenance.value,
+        "person": record.person,
+        "campaign": record.campaign,
+        "note": record.note,
+        "pushed": list(record.pushed),
+        "code": record.code,
     }
 
 
-def used_rows(version: ParameterVersion) -> list[Row]:
-    """Return the rows of the table ``parameter_sighting``."""
-    misses = np.concatenate([version.residual_before, version.residual_after], axis=1)
+def used_rows(record: HeliostatCalibration) -> list[Row]:
+    """Return the rows of the table ``parameter_sighting``: sightings used, then those left out."""
+    nothing = np.full((len(record.left_out), 4), np.nan)
+    misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
+    whole = np.concatenate([misses, nothing])
+    numbers = (*record.sightings.tolist(), *record.left_out.tolist())
     return [
         {
-            "heliostat": version.heliostat,
-            "version": version.version,
+            "heliostat": record.heliostat,
+            "version": record.version,
             "place": place,
-            "sighting": int(sighting),
-            **{name: real(x) for name, x in zip(_MISSES, misses[place], strict=True)},
+            "sighting": number,
+            "used": place < len(record.sightings),
+            **{name: real(x) for name, x in zip(_MISSES, whole[place], strict=True)},
         }
-        for place, sighting in enumerate(version.sightings)
+        for place, number in enumerate(numbers)
     ]
 
 
-def parameter_version(row: RowMapping, used: Sequence[RowMapping] = ()) -> ParameterVersion:
-    """Return a version from its row, and those of the sightings that it was fitted to."""
+def calibration(row: RowMapping, behind: Sequence[RowMapping] = ()) -> HeliostatCalibration:
+    """Return a calibration from its row, and the rows of the sightings behind it."""
+    used = [u for u in behind if u["used"]]
     misses = np.array([[number(u[name]) for name in _MISSES] for u in used]).reshape(-1, 4)
     names = tuple(row["names"])
-    return ParameterVersion(
+    return HeliostatCalibration(
         row["heliostat"],
         row["at"],
         names,
@@ -193,11 +204,13 @@ def parameter_version(row: RowMapping, used: Sequence[RowMapping] = ()) -> Param
         number(row["error_before"]),
         number(row["error_after"]),
         number(row["scale"]),
-        row["outcome"],
+        FitOutcome[row["outcome"].upper()],
         np.array([u["sighting"] for u in used], np.int64),
+        np.array([u["sighting"] for u in behind if not u["used"]], np.int64),
         misses[:, :2],
         misses[:, 2:],
         row["model"],
+        Provenance(row["provenance"]),
         row["person"],
         row["campaign"],
         row["note"],
@@ -213,12 +226,15 @@ def parameter_version(row: RowMapping, used: Sequence[RowMapping] = ()) -> Param
 def visit_row(entry: VisitEntry, number: int) -> Row:
     """Return the row of the table ``visit``."""
     row = {column.name: getattr(entry, column.name) for column in tables.visit.columns}
-    return {**row, **{name: real(row[name]) for name in _VISIT_REALS}, "number": number}
+    reals = {name: real(row[name]) for name in _VISIT_REALS}
+    return {**row, **reals, "number": number, "outcome": entry.outcome.value}
 
 
 def visit(row: RowMapping) -> VisitEntry:
     """Return a visit from its row."""
-    return VisitEntry(**{**row, **{name: number(row[name]) for name in _VISIT_REALS}})
+    values = {name: value for name, value in row.items() if name != "good"}
+    reals = {name: number(row[name]) for name in _VISIT_REALS}
+    return VisitEntry(**{**values, **reals, "outcome": CalibrationOutcome(row["outcome"])})
 
 
 def plan_rows(plan: Sequence[PlannedVisit]) -> list[Row]:

@@ -15,6 +15,7 @@ from urllib.parse import quote
 import numpy as np
 from sqlalchemy import Connection, select
 
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sighting_table import KINDS, write_sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.files.cells import format_time
@@ -22,8 +23,8 @@ from heliotrope.files.text import write_text
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database
-from heliotrope.store.keeper import parameter_history
-from heliotrope.store.records import KeptSightings, ParameterVersion
+from heliotrope.store.keeper import calibration_history
+from heliotrope.store.records import KeptSightings
 
 
 def export(
@@ -65,7 +66,7 @@ def export(
         wanted = known if heliostats is None else list(dict.fromkeys(heliostats))
         for done, name in enumerate(wanted, 1):
             seen = _sightings(connection, name)
-            history = parameter_history(connection, name)
+            history = calibration_history(connection, name)
             _write_heliostat(place / folder_name(name), name, seen, history)
             index.append(_index_row(name, seen, history))
             if progress is not None:
@@ -94,7 +95,7 @@ def _sightings(connection: Connection, name: str) -> KeptSightings:
 
 
 def _write_heliostat(
-    place: Path, name: str, seen: KeptSightings, history: Sequence[ParameterVersion]
+    place: Path, name: str, seen: KeptSightings, history: Sequence[HeliostatCalibration]
 ) -> None:
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -130,7 +131,7 @@ _INDEX = (
 
 
 def _index_row(
-    name: str, seen: KeptSightings, history: Sequence[ParameterVersion]
+    name: str, seen: KeptSightings, history: Sequence[HeliostatCalibration]
 ) -> Sequence[Any]:
     last = history[-1] if history else None
     tail = ("", "", "") if last is None else (format_time(last.at), last.before, last.after)
@@ -144,7 +145,9 @@ _RESIDUALS = (
 )  # fmt: skip
 
 
-def _residuals(seen: KeptSightings, history: Sequence[ParameterVersion]) -> Iterable[Sequence[Any]]:
+def _residuals(
+    seen: KeptSightings, history: Sequence[HeliostatCalibration]
+) -> Iterable[Sequence[Any]]:
     row_of = {int(number): row for row, number in enumerate(seen.identities)}
     for version in history:
         before, after = version.residual_before, version.residual_after
@@ -171,12 +174,12 @@ _VERSIONS = (
 )  # fmt: skip
 
 
-def _version(v: ParameterVersion) -> Sequence[Any]:
+def _version(v: HeliostatCalibration) -> Sequence[Any]:
     return (
         v.version,
         format_time(v.at),
         v.model,
-        v.outcome,
+        v.outcome.text,
         len(v.sightings),
         v.before,
         v.after,
@@ -193,7 +196,7 @@ def _version(v: ParameterVersion) -> Sequence[Any]:
 _PARAMETERS = ("version", "at", "parameter", "value", "sigma", "prior_sigma")
 
 
-def _parameters(history: Sequence[ParameterVersion]) -> Iterable[Sequence[Any]]:
+def _parameters(history: Sequence[HeliostatCalibration]) -> Iterable[Sequence[Any]]:
     for v in history:
         for p, name in enumerate(v.names):
             yield (
@@ -209,7 +212,7 @@ def _parameters(history: Sequence[ParameterVersion]) -> Iterable[Sequence[Any]]:
 _COVARIANCE = ("version", "parameter_1", "parameter_2", "covariance", "correlation")
 
 
-def _covariance(history: Sequence[ParameterVersion]) -> Iterable[Sequence[Any]]:
+def _covariance(history: Sequence[HeliostatCalibration]) -> Iterable[Sequence[Any]]:
     for v in history:
         sigma = v.sigma
         for a, first in enumerate(v.names):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Connection, Table, and_, delete, func, select, update
 
+from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.store import _rows as rows
@@ -25,9 +26,7 @@ from heliotrope.store.records import (
     CampaignEntry,
     Event,
     Hold,
-    Identities,
     KeptSightings,
-    ParameterVersion,
     PlannedVisit,
     StoreError,
     VisitEntry,
@@ -163,20 +162,31 @@ class Keeper:
         self.writer.put(lambda c: rows.insert(c, tables.sighting, made))
         return numbers
 
-    def record_parameters(self, version: ParameterVersion) -> int:
-        """Keep a version of parameters; return its number among those of the heliostat."""
+    def record_calibration(self, record: HeliostatCalibration) -> None:
+        """Keep a calibration, whose version is above those kept of the heliostat.
+
+        Raises
+        ------
+        InputError
+            If its version is not above them.
+        StoreError
+            If too much waits already.
+        """
         with self._mine:
-            count = self._versions.get(version.heliostat, 0) + 1
-            row = {**rows.version_row(version), "version": count}
-            used = [{**u, "version": count} for u in rows.used_rows(version)]
+            last = self._versions.get(record.heliostat, 0)
+            if record.version <= last:
+                raise InputError(
+                    f"calibration of {record.heliostat}: version {record.version} is not above "
+                    f"{last}, the last one kept; number it anew"
+                )
+            row, used = rows.calibration_row(record), rows.used_rows(record)
 
             def work(connection: Connection) -> None:
                 rows.insert(connection, tables.parameter_version, [row])
                 rows.insert(connection, tables.parameter_sighting, used)
 
             self.writer.put(work)
-            self._versions[version.heliostat] = count
-        return count
+            self._versions[record.heliostat] = record.version
 
     def sightings(
         self,
@@ -204,9 +214,9 @@ class Keeper:
             found = [row for row in found if row.heliostat in wanted]
         return rows.kept_sightings(found)
 
-    def latest_parameters(
+    def latest_calibrations(
         self, heliostats: Sequence[str] | None = None
-    ) -> dict[str, ParameterVersion]:
+    ) -> dict[str, HeliostatCalibration]:
         """Return the last version of each, by heliostat, without sightings and residuals."""
         table = tables.parameter_version
         last = (
@@ -220,15 +230,15 @@ class Keeper:
             query = query.where(table.c.heliostat.in_(list(heliostats)))
         wanted = None if heliostats is None else set(heliostats)
         return {
-            row["heliostat"]: rows.parameter_version(row)
+            row["heliostat"]: rows.calibration(row)
             for row in self._select(query)
             if wanted is None or row["heliostat"] in wanted
         }
 
-    def parameter_history(self, heliostat: str) -> list[ParameterVersion]:
+    def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         """Return all versions of one heliostat, the oldest first, with their residuals."""
         with self.database.reading() as connection:
-            return parameter_history(connection, heliostat)
+            return calibration_history(connection, heliostat)
 
     # -- measurements and their plan -----------------------------------------------------
 
@@ -397,7 +407,7 @@ class Keeper:
         return self.writer.do(work, timeout)
 
 
-def parameter_history(connection: Connection, heliostat: str) -> list[ParameterVersion]:
+def calibration_history(connection: Connection, heliostat: str) -> list[HeliostatCalibration]:
     """Return all versions of one heliostat, the oldest first, with their residuals."""
     versions, used = tables.parameter_version, tables.parameter_sighting
     query = select(used).where(used.c.heliostat == heliostat).order_by(used.c.place)
@@ -406,7 +416,7 @@ def parameter_history(connection: Connection, heliostat: str) -> list[ParameterV
         by_version.setdefault(row["version"], []).append(row)
     query = select(versions).where(versions.c.heliostat == heliostat).order_by(versions.c.version)
     return [
-        rows.parameter_version(row, by_version.get(row["version"], ()))
+        rows.calibration(row, by_version.get(row["version"], ()))
         for row in connection.execute(query).mappings().all()
     ]
 

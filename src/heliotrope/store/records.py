@@ -14,19 +14,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-from heliotrope import __version__
-from heliotrope.calibration.evaluation import beam_errors
-from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
+from heliotrope.calibration.record import (
+    CalibrationOutcome,
+    HeliostatCalibration,
+    Identities,
+)
 from heliotrope.calibration.sightings import Sightings
-from heliotrope.errors import HeliotropeError, InputError
-from heliotrope.geometry import FloatArray
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.errors import HeliotropeError
 from heliotrope.safety import Severity
 
-Identities = npt.NDArray[np.int64]
 SEVERITIES = tuple(Severity)
 
 
@@ -64,162 +60,6 @@ class KeptSightings:
         """Return the sightings of one heliostat, renumbered to 0; none if it is not known."""
         row = self.names.index(heliostat) if heliostat in self.names else len(self.names)
         return self.sightings.of(row)
-
-
-@dataclass(frozen=True)
-class ParameterVersion:
-    """Parameters of one heliostat with where they come from.
-
-    Attributes
-    ----------
-    heliostat, at
-        Whose, and when they were found.
-    names, values
-        Of P parameters: deviations from the nominal mechanism, rad, m or 1, (P,).
-    covariance
-        Of the values, (P, P).
-    prior
-        Standard deviations of the priors, (P,).
-    before, after
-        Beam error over the sightings, as it was and fitted, rad RMS; NaN if not known.
-    scale
-        Noise found, in units of the sightings' sigma.
-    outcome
-        How the fit ended, in words.
-    sightings
-        Numbers of the sightings that it was fitted to, (M,).
-    residual_before, residual_after
-        Beam's error to the right of and above the destination as seen from the mirror, of each of
-        these sightings, under the nominal and the fitted mechanism, rad, (M, 2).
-    model
-        Name of the model.
-    person, campaign, note
-        By whom, in which campaign, further details.
-    pushed
-        Items that were written to the local controller and read back.
-    code
-        Version of the program.
-    version
-        1, 2, ... for each heliostat; 0 before it is kept.
-    """
-
-    heliostat: str
-    at: float
-    names: tuple[str, ...]
-    values: FloatArray
-    covariance: FloatArray
-    prior: FloatArray
-    before: float = float("nan")
-    after: float = float("nan")
-    scale: float = float("nan")
-    outcome: str = ""
-    sightings: Identities = field(default_factory=lambda: np.zeros(0, np.int64))
-    residual_before: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    residual_after: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    model: str = ""
-    person: str = ""
-    campaign: str = ""
-    note: str = ""
-    pushed: tuple[str, ...] = ()
-    code: str = __version__
-    version: int = 0
-
-    def __post_init__(self) -> None:
-        count, seen = len(self.names), len(self.sightings)
-        shapes = {
-            "values": (self.values, (count,)),
-            "covariance": (self.covariance, (count, count)),
-            "prior": (self.prior, (count,)),
-            "residual_before": (self.residual_before, (seen, 2)),
-            "residual_after": (self.residual_after, (seen, 2)),
-        }
-        for name, (array, shape) in shapes.items():
-            if np.shape(array) != shape:
-                raise InputError(
-                    f"parameters of {self.heliostat}: {name} of shape {np.shape(array)}; "
-                    f"{count} parameters and {seen} sightings need {shape}"
-                )
-        for name in ("values", "covariance", "prior"):
-            if not np.isfinite(getattr(self, name)).all():
-                raise InputError(
-                    f"parameters of {self.heliostat}: {name} is not finite; keep no failed fit"
-                )
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        """Values by name."""
-        return {name: float(v) for name, v in zip(self.names, self.values, strict=True)}
-
-    @property
-    def sigma(self) -> FloatArray:
-        """Standard deviations of the values, (P,)."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
-
-
-def version_of(
-    heliostat: str,
-    at: float,
-    fitted: FieldFit,
-    nominal: Mechanism,
-    seen: Sightings,
-    identities: npt.ArrayLike,
-    *,
-    model: str,
-    person: str = "",
-    campaign: str = "",
-    note: str = "",
-    pushed: Sequence[str] = (),
-) -> ParameterVersion:
-    """Return the version that a fit of one heliostat makes, with its residuals.
-
-    Parameters
-    ----------
-    heliostat, at
-        Whose, and when.
-    fitted
-        A fit of batch shape (1,).
-    nominal
-        The mechanism that the values deviate from, batch shape (1,).
-    seen, identities
-        The M sightings of the fit (heliostat row 0), and their numbers as
-        `Records.record_sightings` gave them, (M,).
-    model, person, campaign, note, pushed
-        As in `ParameterVersion`.
-
-    Raises
-    ------
-    InputError
-        If the numbers are not as many as the sightings, or the fit failed.
-    """
-    numbers = np.asarray(identities, np.int64).reshape(-1)
-    if len(numbers) != len(seen):
-        raise InputError(
-            f"parameters of {heliostat}: {len(numbers)} numbers of {len(seen)} sightings; keep "
-            "the sightings first"
-        )
-    first = beam_errors(nominal, seen)
-    last = beam_errors(nominal.with_parameters(fitted.parameters), seen)
-    rms = [float(np.sqrt(np.mean(e.beam**2))) if len(seen) else np.nan for e in (first, last)]
-    return ParameterVersion(
-        heliostat,
-        at,
-        tuple(fitted.names),
-        fitted.values[0],
-        fitted.covariance[0],
-        fitted.prior[0],
-        rms[0],
-        rms[1],
-        float(fitted.scale[0]),
-        FitOutcome(int(fitted.outcome[0])).text,
-        numbers,
-        first.offset,
-        last.offset,
-        model,
-        person,
-        campaign,
-        note,
-        tuple(pushed),
-    )
 
 
 @dataclass(frozen=True)
@@ -330,10 +170,10 @@ class VisitEntry:
     ----------
     heliostat, target, begun, finished
         Which, where, when.
-    good
-        Whether it brought sightings.
+    outcome
+        What became of it.
     text
-        What became of it, one line.
+        The same for people, one line.
     gain
         What the schedule had expected of it.
     sigma_before, sigma_expected, sigma_after
@@ -354,7 +194,7 @@ class VisitEntry:
     target: str
     begun: float
     finished: float
-    good: bool
+    outcome: CalibrationOutcome
     text: str = ""
     gain: float = float("nan")
     sigma_before: float = float("nan")
@@ -366,6 +206,11 @@ class VisitEntry:
     version: int = 0
     campaign: str = ""
     number: int = 0
+
+    @property
+    def good(self) -> bool:
+        """Whether the heliostat has new parameters."""
+        return self.outcome.calibrated
 
 
 @dataclass(frozen=True)
@@ -439,8 +284,8 @@ class Records(Protocol):
         """Keep sightings, whose rows point to ``names``; return their numbers, (M,)."""
         ...
 
-    def record_parameters(self, version: ParameterVersion) -> int:
-        """Keep a version of parameters; return its number among those of the heliostat."""
+    def record_calibration(self, record: HeliostatCalibration) -> None:
+        """Keep a calibration, whose version is above those kept of the heliostat."""
         ...
 
     def record_visit(self, visit: VisitEntry) -> None:
@@ -509,13 +354,13 @@ class Records(Protocol):
         """Return sightings of some heliostats (None: of all), those of one campaign if named."""
         ...
 
-    def latest_parameters(
+    def latest_calibrations(
         self, heliostats: Sequence[str] | None = None
-    ) -> dict[str, ParameterVersion]:
+    ) -> dict[str, HeliostatCalibration]:
         """Return the last version of each, by heliostat, without sightings and residuals."""
         ...
 
-    def parameter_history(self, heliostat: str) -> list[ParameterVersion]:
+    def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
         """Return all versions of one heliostat, the oldest first, with their residuals."""
         ...
 

@@ -87,9 +87,10 @@ parameter_version = Table(
     _text("note"),
     Column("pushed", JSON, nullable=False),
     _text("code"),
+    _text("provenance"),
 )
 
-#: Which sightings a version was fitted to, in their order, and what they missed by.
+#: The sightings behind a version: those used in the fit with their residuals, and those left out.
 parameter_sighting = Table(
     "parameter_sighting",
     metadata,
@@ -98,6 +99,7 @@ parameter_sighting = Table(
     Column("place", Integer, primary_key=True, autoincrement=False),
     Column("sighting", Number, ForeignKey(sighting.c.number), nullable=False),
     *(_real(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
+    Column("used", Boolean, nullable=False),
     ForeignKeyConstraint(
         ["heliostat", "version"], [parameter_version.c.heliostat, parameter_version.c.version]
     ),
@@ -139,6 +141,7 @@ visit = Table(
     Column("sightings", Integer, nullable=False),
     Column("version", Integer, nullable=False),
     _text("campaign"),
+    _text("outcome"),
     Index(None, "heliostat"),
 )
 

@@ -21,7 +21,7 @@ from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.optics.mirror_image import reflected_beam
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.twin.boards.board import Board
 
 #: Light further from the middle of a target than this many of its half diagonals is left out.

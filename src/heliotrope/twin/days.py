@@ -15,8 +15,8 @@ import numpy.typing as npt
 from heliotrope.calibration.evaluation import beam_errors
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.plan.planning import SightingLimits, aim_at
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.sightings import Sightings, camera_target, join, sightings
-from heliotrope.calibration.uncertainty import expected_error
 from heliotrope.field.example import roughly_installed
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, reflect
@@ -24,7 +24,7 @@ from heliotrope.lcu import states
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.tracking import track
 from heliotrope.optics.beam import CHI_SQUARE_90
-from heliotrope.plant.schedule.schedule import Assignment, Scheduler, Visited, Weather
+from heliotrope.plant.schedule import Assignment, Scheduler, Visited, Weather
 from heliotrope.sun import vector
 
 #: Before the end of a visit, its photographs are so far apart, s.
@@ -83,8 +83,8 @@ class Days:
         What the schedule is told; whose beams no photograph shows.
     truth
         The true mechanisms.
-    known, values, covariances
-        By heliostat: sightings, calibrated mechanism (1,), covariance of its parameters (P, P).
+    known, values, records
+        Sightings, calibrated mechanism (1,) and calibration, by heliostat.
     made
         Assignments in the order of their beginnings.
     reasons
@@ -101,7 +101,7 @@ class Days:
     blind: frozenset[str] = frozenset()
     known: dict[str, Sightings] = field(default_factory=dict)
     values: dict[str, Mechanism] = field(default_factory=dict)
-    covariances: dict[str, FloatArray] = field(default_factory=dict)
+    records: dict[str, HeliostatCalibration] = field(default_factory=dict)
     made: list[Assignment] = field(default_factory=list)
     reasons: set[str] = field(default_factory=set)
 
@@ -111,7 +111,6 @@ class Days:
         self.field = Standing.ready(len(self.plant))
         self.chance = np.random.default_rng(self.seed)
         self._ends: list[tuple[datetime, Assignment]] = []
-        self._learnt: tuple[str, ...] = ()
 
     def live(
         self,
@@ -203,11 +202,19 @@ class Days:
         before = [self.known[name]] if name in self.known else []
         self.known[name] = join([*before, seen])
         row = np.array([self.group.index(name)])
-        found = fit(self.group.mechanism[row], self.known[name], settings.model)
-        self.values[name] = self.group.mechanism[row].with_parameters(found.parameters)
-        self.covariances[name] = found.covariance[0]
-        self._learnt = tuple(found.parameters)
-        return Visited(name, told.target, told.until, True, self.known[name], measured)
+        nominal = self.group.mechanism[row]
+        record = HeliostatCalibration.from_fit(
+            name,
+            told.until,
+            fit(nominal, self.known[name], settings.model),
+            nominal,
+            self.known[name],
+            np.zeros(len(self.known[name]), np.int64),
+            model=settings.model if isinstance(settings.model, str) else "",
+        )
+        self.records[name], self.values[name] = record, record.mechanism(nominal)
+        self.scheduler.learn(record)
+        return Visited(name, told.target, told.until, True, measured)
 
     def look(self, times: FloatArray, names: tuple[str, ...] | None = None) -> Truth:
         """Compare with the truth what heliostats would do at the receiver.
@@ -243,10 +250,10 @@ class Days:
         row = np.full(count, self.group.index(name))
         seen = sightings(np.arange(count), counts, suns, np.broadcast_to(aim, (count, 3)))
         off = beam_errors(self.truth[row], seen).offset
-        if name not in self.covariances:
+        if name not in self.records:
             return off, np.full((count, 2, 2), np.nan)
-        found = expected_error(believed, self._learnt, self.covariances[name], suns, aim)
-        return off, found.covariance
+        nominal = self.group.mechanism[np.array([self.group.index(name)])]
+        return off, self.records[name].expected(nominal, suns, aim).covariance
 
 
 def _half(squares: FloatArray) -> FloatArray:

@@ -97,14 +97,6 @@ def run(
             rich_help_panel=_WORK,
         ),
     ] = None,
-    gain: Annotated[
-        bool,
-        typer.Option(
-            "--gain",
-            help="Measure by expected gain over the year, not pair by pair.",
-            rich_help_panel=_WORK,
-        ),
-    ] = False,
     minutes: Annotated[
         float | None,
         typer.Option(help="End after this time; default: at Ctrl-C.", rich_help_panel=_WORK),
@@ -204,7 +196,6 @@ def run(
             seed=seed,
             exact=exact,
             idle=bool(idle),
-            gain=gain,
             boards=prototype,
         )
         run_plant(design, choice, shown)
@@ -220,7 +211,7 @@ def run(
     from heliotrope.cli.run.real import RealChoice, run_real
 
     folder = field if field.is_dir() else field.parent
-    real = RealChoice(folder, clusters, idle is not False, gain, configure, check)
+    real = RealChoice(folder, clusters, idle is not False, configure, check)
     run_real(design, real, shown)
 
 

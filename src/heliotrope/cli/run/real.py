@@ -23,7 +23,7 @@ from heliotrope.links.clock import SystemClock
 from heliotrope.plant.assembly import RealPlant
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
-from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.settings import clusters_of
 
 if TYPE_CHECKING:
@@ -38,7 +38,6 @@ class RealChoice:
     folder: Path
     clusters: Path
     idle: bool
-    gain: bool
     configure: bool
     check: bool
 
@@ -124,10 +123,9 @@ async def _run(
             records=keeper,
             assigned=KeptPoints(keeper),
             machine=machine,
-            by_gain=choice.gain,
             cameras=_cameras(design, choice, shown, clock),
             # What a person gives to the automatic work is calibrated too.
-            work=WorkSettings(wanted=not choice.idle),
+            work=AutomaticSettings(wanted=not choice.idle),
         )
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)

@@ -19,7 +19,7 @@ from heliotrope.cli.run._shared import (
 from heliotrope.field.plant import Plant
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
-from heliotrope.plant.operations.operations import WorkSettings
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.live.live import LiveOptions, LivePlant
 from heliotrope.twin.live.loop import PacedLoop
 
@@ -33,7 +33,6 @@ class Choice:
     seed: int
     exact: bool
     idle: bool
-    gain: bool
     boards: bool
 
 
@@ -77,6 +76,5 @@ def _options(choice: Choice) -> LiveOptions:
         seed=choice.seed,
         rendered=not choice.exact,
         boards=choice.boards,
-        plain=not choice.gain,
-        work=WorkSettings(wanted=not choice.idle, calibrate=not choice.idle),
+        work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle),
     )

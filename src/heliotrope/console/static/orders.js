@@ -119,7 +119,7 @@ export function whoCommands(box) {
   const take = async () => {
     const head = store.head;
     if (store.mine) return act(() => api("DELETE", "authority"), "authority");
-    const other = head.holder && head.holder !== me.name && head.holder !== "automat";
+    const other = head.holder && head.holder !== me.name && head.holder !== "automatic control";
     if (!other) return act(() => api("POST", "authority"), "authority");
     const why = await ask(`${head.holder} has command. Break it?`, [{ name: "reason", label: "Reason" }], "Break and take");
     return why ? act(() => api("POST", "authority/seize", { reason: why.reason }), "authority") : null;

@@ -154,8 +154,8 @@ export function calibration(box) {
       table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
         ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
         truth ? ["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"] : ["", () => ""],
-        ["", (r) => h("span", { className: r.good ? "good" : "warn", title: r.text }, r.good ? "✓ learnt" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
-    chart(lines, [["median", "APPROACHING"], ["ninety", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_ninety", "SEARCHING", [5, 4]]]
+        ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓ learnt" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
+    chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
       .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
   };
   const end = refreshed(async () => { view = await api("GET", "calibration"); draw(); },

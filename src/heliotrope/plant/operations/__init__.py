@@ -1,1 +1,22 @@
-"""The plant at work: automatic control, and what people see and command of it."""
+"""A plant at work, as consoles, APIs and the command line use it.
+
+Begin with `Operations`: the one object that they talk to. Behind it stand automatic control
+(`automatic`, with `raising` and `calibrating`), the book of calibrations, the logbook of alarms,
+events and packets, and `views`, the plain values that people see.
+"""
+
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
+from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.operations import Operations, Photographer
+from heliotrope.plant.operations.zero import zero
+
+__all__ = [
+    "AutomaticControl",
+    "AutomaticSettings",
+    "Logbook",
+    "Operations",
+    "Photographer",
+    "Scheduling",
+    "zero",
+]

@@ -1,18 +1,18 @@
 """The plant at work: the one object that a console, an API and the command line talk to.
 
-It reads the plant (`PlantController`) into plain values, made at most once a second and shared by
-all who look; passes on commands of persons; and runs the work that goes on by itself: raising the
-field, calibrating it with every target's camera, keeping alarms and events. A single failure of
-that work is told as an event or an alarm, and the work goes on.
+It turns the plant (`PlantController`) into plain values, made at most once a second and shared by
+all clients; passes on people's commands; and runs automatic control, which raises the field and
+calibrates it with every target's camera. A single failure of automatic control is told as an event
+or an alarm, and it goes on.
 
-Commands of persons go through here so that the automatic work knows what people want: what a
-person has stowed, defocused or locked stays so until a person calls it back.
+People's commands go through here so that automatic control knows what they want: a heliostat that a
+person has stowed, defocused or locked stays so until a person gives it back.
 """
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy.typing as npt
 
@@ -21,12 +21,13 @@ from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.optics import FluxView, predict_flux
-from heliotrope.plant.authority import Grant, Person, RefusedError
+from heliotrope.plant.authority import Grant, Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
-from heliotrope.plant.operations.detail import detail, emergency_view
-from heliotrope.plant.operations.field import FrameMaker
-from heliotrope.plant.operations.log import Logbook
+from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
+from heliotrope.plant.operations.calibrating import Scheduling
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.viewing import Viewer
 from heliotrope.plant.operations.views import (
     AlarmRow,
     CalibrationView,
@@ -42,20 +43,25 @@ from heliotrope.plant.operations.views import (
     Summary,
     SunView,
 )
-from heliotrope.plant.operations.work import Automat, Photographer, Scheduling, WorkSettings
 from heliotrope.plant.tickets import Ticket
-from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
-__all__ = ["Logbook", "Operations", "WorkSettings"]
-
-#: Orders of persons after which the automatic work leaves heliostats alone, and those after
-#: which it has them again.
+#: Commands of people after which automatic control leaves heliostats alone, and those after which
+#: it has them again.
 _AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
 _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
-#: The predicted flux is made anew after so many seconds.
+#: The predicted flux is computed anew after this time, s.
 _FLUX_EVERY = 5.0
+
+
+class Photographer(Protocol):
+    """Has photographs of targets for people to look at."""
+
+    def view(self, target: str) -> CameraView:
+        """Return the last one."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -75,46 +81,51 @@ class Operations:
     logbook
         Alarms, events and packets.
     cycle
-        Calibrates; None: nothing is calibrated.
+        Calibrates one heliostat; None: nothing is calibrated.
     cameras
         Photographs of the targets for people, by name of the target.
     scheduler
-        Says which heliostat is next; None: the least known one that stands ready.
+        Chooses the next heliostat; None: nothing is calibrated.
     records
-        Keeps what happens over a restart; None: nothing is kept.
+        Where everything is kept over a restart; None: nowhere.
     truth
-        Tracking error of each heliostat that a twin knows, rad, (N,); None: nobody knows.
+        Gives the tracking errors that a twin knows, rad, (N,); None: nobody knows them.
     settings
-        Of the automatic work.
+        Settings of automatic control.
     extra
-        What the summary shows besides, such as the speed of a twin.
+        Gives more rows of the summary, such as the speed of a twin.
+
+    Attributes
+    ----------
+    plant, logbook, automatic
+        See their classes.
     """
 
     def __init__(
         self,
         plant: PlantController,
         logbook: Logbook,
-        cycle: CentringCycle | None = None,
+        cycle: CalibrationCycle | None = None,
         *,
         cameras: Mapping[str, Photographer] | None = None,
         scheduler: Scheduling | None = None,
         records: Records | None = None,
         truth: Callable[[], FloatArray] | None = None,
-        settings: WorkSettings | None = None,
+        settings: AutomaticSettings | None = None,
         extra: Callable[[], Mapping[str, Any]] | None = None,
     ) -> None:
         self.plant, self.logbook = plant, logbook
         self._cameras, self._extra = dict(cameras or {}), extra
-        self.work = Automat(
+        self.automatic = AutomaticControl(
             plant,
             logbook,
             cycle,
             scheduler=scheduler,
             records=records,
             truth=truth,
-            settings=settings or WorkSettings(),
+            settings=settings or AutomaticSettings(),
         )
-        self._frames = FrameMaker(plant, self.work)
+        self._viewer = Viewer(plant, self.automatic)
         self._flux: dict[str, _Cached] = {}
         self._closing = asyncio.Event()
 
@@ -124,14 +135,14 @@ class Operations:
         """Work until closed; the plant itself is run by the owner."""
         self.logbook.event("plant", "", f"{self.design.name}: operations begin")
         async with asyncio.TaskGroup() as group:
-            works = group.create_task(self.work.run())
+            work = group.create_task(self.automatic.run())
             await self._closing.wait()
-            self.work.stop()
-            works.cancel()
+            self.automatic.stop()
+            work.cancel()
         self.logbook.event("plant", "", f"{self.design.name}: operations end")
 
     async def close(self) -> None:
-        """End the work; beams stay where they are: stow before, if they shall not."""
+        """End automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
 
     # -- what it is ------------------------------------------------------------------------
@@ -154,12 +165,12 @@ class Operations:
     @property
     def positions(self) -> FloatArray:
         """Where the heliostats stand, ENU, m, (N, 3)."""
-        return self._frames.positions
+        return self._viewer.positions
 
     @property
     def sizes(self) -> FloatArray:
         """Width and height of the mirrors, m, (N, 2)."""
-        return self._frames.sizes
+        return self._viewer.sizes
 
     @property
     def targets(self) -> tuple[str, ...]:
@@ -173,17 +184,17 @@ class Operations:
 
     @property
     def aim_names(self) -> tuple[str, ...]:
-        """What `FieldFrame.on` counts: "", the receivers, the targets, "elsewhere"."""
-        return self._frames.aim_names
+        """The places that `FieldFrame.on` counts: "", the receivers, the targets, "elsewhere"."""
+        return self._viewer.aim_names
 
     # -- the field -------------------------------------------------------------------------
 
     def frame(self) -> FieldFrame:
         """Return the whole field; the same frame for a second."""
-        return self._frames.frame()
+        return self._viewer.frame()
 
     def summary(self) -> Summary:
-        """Return the plant in one look."""
+        """Return the state of the whole plant."""
         now, grant = self.plant.now(), self.plant.authority.grant
         field = self.plant.field
         alive = sum(now - at <= field.limit for at in field.status_at.values())
@@ -212,7 +223,7 @@ class Operations:
         UnknownNameError
             If there is none of that name.
         """
-        return detail(self.plant, self.work, self._frames, name)
+        return self._viewer.heliostat(name)
 
     def cluster_rows(self) -> tuple[ClusterRow, ...]:
         """Return the health of each cluster."""
@@ -240,7 +251,7 @@ class Operations:
         now, known = self.plant.now(), self._flux.get(receiver.name)
         if known is None or now - known.at >= _FLUX_EVERY:
             view = predict_flux(
-                receiver, *self._frames.beams(receiver.name), sun=self.plant.sun_vector()
+                receiver, *self._viewer.beams(receiver.name), sun=self.plant.sun_vector()
             )
             known = self._flux[receiver.name] = _Cached(now, view)
         return known.value
@@ -248,7 +259,7 @@ class Operations:
     # -- what happens ----------------------------------------------------------------------
 
     def alarms(self) -> tuple[AlarmRow, ...]:
-        """Return the alarms, those that are active or not acknowledged first, then the newest."""
+        """Return the alarms: active or unacknowledged ones first, then the newest."""
         return self.logbook.alarms()
 
     def events(self, limit: int = 200) -> tuple[EventRow, ...]:
@@ -256,17 +267,17 @@ class Operations:
         return self.logbook.events(limit)
 
     def packets(self, limit: int = 200, cluster: str = "") -> tuple[PacketRow, ...]:
-        """Return the last messages at the links, newest first; of one cluster if it is named.
+        """Return the last messages on the links, newest first; of one cluster if it is named.
 
-        Leases and statuses, which come each second, are only kept as the last of each cluster.
+        Of leases and statuses, which come each second, only the last of each cluster is kept.
         """
         return self.logbook.packets(limit, cluster)
 
     # -- calibration -----------------------------------------------------------------------
 
     def calibration(self) -> CalibrationView:
-        """Return how far calibration has come."""
-        return self.work.view()
+        """Return the progress of calibration."""
+        return self.automatic.view()
 
     def switch_calibration(self, person: Person, on: bool) -> None:
         """Switch the automatic calibration on or off.
@@ -277,7 +288,7 @@ class Operations:
             To a viewer.
         """
         _operator(person, "calibration")
-        self.work.switch(on)
+        self.automatic.switch(on)
         self._tell(person, f"calibration switched {'on' if on else 'off'}")
 
     def camera(self, target: str) -> CameraView:
@@ -293,12 +304,12 @@ class Operations:
         return self._cameras[target].view(target)
 
     def schedule(self, limit: int = 20) -> tuple[Planned, ...]:
-        """Return the plan of the next measurements."""
-        return self.work.plan(limit)
+        """Return the plan of the next visits."""
+        return self.automatic.plan(limit)
 
     def holds(self) -> tuple[Hold, ...]:
-        """Return the heliostats that are kept out of calibration."""
-        return tuple(self.work.holds.values())
+        """Return the heliostats kept out of calibration."""
+        return tuple(self.automatic.holds.values())
 
     def hold(self, person: Person, heliostats: Sequence[str], reason: str) -> None:
         """Keep heliostats out of calibration.
@@ -313,7 +324,7 @@ class Operations:
         _operator(person, "hold")
         if not reason.strip():
             raise RefusedError("hold: a reason is needed; give one")
-        self.work.hold(person.name, heliostats, reason)
+        self.automatic.hold(person.name, heliostats, reason)
         self._tell(person, f"{len(heliostats)} heliostats held: {reason}")
 
     def unhold(self, person: Person, heliostats: Sequence[str]) -> None:
@@ -327,13 +338,13 @@ class Operations:
             If there is no such heliostat.
         """
         _operator(person, "unhold")
-        self.work.unhold(person.name, heliostats)
+        self.automatic.unhold(person.name, heliostats)
         self._tell(person, f"{len(heliostats)} heliostats given back")
 
     # -- the authority ---------------------------------------------------------------------
 
     def take_authority(self, person: Person) -> Grant:
-        """Take the command authority; the automatic work gives way at once.
+        """Take the command authority; automatic control gives way at once.
 
         Raises
         ------
@@ -341,9 +352,9 @@ class Operations:
             If another person has it; to a viewer.
         """
         _operator(person, "authority")
-        self.work.give_way()
+        self.automatic.give_way()
         grant = self.plant.take_authority(person)
-        self._tell(person, "has the authority", "authority")
+        self._tell(person, "has the command authority", "authority")
         return grant
 
     def seize_authority(self, person: Person, reason: str) -> Grant:
@@ -355,9 +366,9 @@ class Operations:
             See `PlantController.seize_authority`.
         """
         _operator(person, "authority")
-        self.work.give_way()
+        self.automatic.give_way()
         grant = self.plant.seize_authority(person, reason)
-        self._tell(person, f"has broken the authority: {reason}", "authority")
+        self._tell(person, f"has seized the command authority: {reason}", "authority")
         return grant
 
     def keep_authority(self, person: Person, token: int) -> Grant:
@@ -371,7 +382,7 @@ class Operations:
         return self.plant.authority.keep(person, token)
 
     def release_authority(self, person: Person, token: int) -> None:
-        """Give the command authority back; the automatic work goes on.
+        """Give the command authority back; automatic control goes on.
 
         Raises
         ------
@@ -379,7 +390,7 @@ class Operations:
             If it is not theirs.
         """
         self.plant.release_authority(person, token)
-        self._tell(person, "has given the authority back", "authority")
+        self._tell(person, "has given the command authority back", "authority")
 
     # -- commands --------------------------------------------------------------------------
 
@@ -428,21 +439,21 @@ class Operations:
         return ticket
 
     def stow(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send heliostats (() for all) to stow; anybody may."""
+        """Send heliostats (() for all) to stow; everybody may."""
         ticket = self.plant.stow(person.name, heliostats)
         self._meant("STOW", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def defocus(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Take beams off the receiver; anybody may."""
+        """Take beams off the receiver; everybody may."""
         ticket = self.plant.defocus(person.name, heliostats)
         self._meant("DEFOCUS", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
+        """Order DEFOCUS or STOW of the whole field with proof; everybody may.
 
         Raises
         ------
@@ -456,7 +467,7 @@ class Operations:
 
     def emergency_view(self) -> EmergencyView:
         """Return the last emergency order with its proof."""
-        return emergency_view(self.plant)
+        return self._viewer.emergency()
 
     def withdraw(self, person: Person) -> None:
         """Take an emergency order back.
@@ -470,7 +481,7 @@ class Operations:
         self._tell(person, "emergency withdrawn", "command")
 
     def acknowledge(self, person: Person, condition: str, subject: str = "") -> None:
-        """Acknowledge an alarm, and the row of the safety table that it tells of.
+        """Acknowledge an alarm, and its row of the safety table.
 
         Raises
         ------
@@ -484,7 +495,7 @@ class Operations:
         self._tell(person, f"acknowledged {condition} {subject}".strip(), "command")
 
     def give_back(self, person: Person, heliostats: Sequence[str] = ()) -> None:
-        """Give heliostats (() for all) to the automatic work: it raises and calibrates them.
+        """Give heliostats (() for all) to automatic control, which raises and calibrates them.
 
         Raises
         ------
@@ -493,16 +504,16 @@ class Operations:
         """
         _operator(person, "give back")
         names = tuple(heliostats) or self.names
-        self.work.want(names, wanted=True)
-        self._tell(person, f"{len(names)} heliostats given to the automatic work", "command")
+        self.automatic.want(names, wanted=True)
+        self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
 
     # -- notes -----------------------------------------------------------------------------
 
     def _meant(self, name: str, heliostats: Sequence[str]) -> None:
         if name in _AWAY:
-            self.work.want(heliostats, wanted=False)
+            self.automatic.want(heliostats, wanted=False)
         elif name in _BACK:
-            self.work.want(heliostats, wanted=True)
+            self.automatic.want(heliostats, wanted=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
         some = ", ".join(ticket.heliostats[:3])
@@ -520,7 +531,5 @@ def _act(name: str) -> Act:
 
 
 def _operator(person: Person, what: str) -> None:
-    from heliotrope.plant.authority import Role
-
     if person.role < Role.OPERATOR:
         raise RefusedError(f"{what}: {person.name} is viewer; it needs operator")

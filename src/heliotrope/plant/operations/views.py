@@ -1,4 +1,4 @@
-"""What `Operations` shows of a plant at work: plain values, made anew, never changed."""
+"""The views that `Operations` gives of a plant at work: plain values that never change."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
 
-#: State of a row that is older than its limit: nothing else in it counts.
+#: State shown for a row older than its limit, whose other values do not count.
 STALE_STATE = 255
 
 
@@ -21,32 +22,32 @@ class FieldFrame:
     Attributes
     ----------
     number
-        Rises with each frame.
+        Increases with each frame.
     at
         POSIX s.
     state
-        Of `lcu.states`, `STALE_STATE` where it is not known, uint8, (N,).
+        States of `lcu.states`, `STALE_STATE` where unknown, uint8, (N,).
     fault, flags
-        Of `lcu.names`, uint8 and uint32, (N,).
+        Codes of `lcu.names`, uint8 and uint32, (N,).
     age
-        Of all values of the row, s, float32, (N,); infinite if never heard.
+        Age of all values of the row, s, float32, (N,); infinite if never heard.
     counts
-        Steps of the two axes, int32, (N, 2).
+        Step counts of the two axes, int32, (N, 2).
     error
-        Predicted standard deviation of the normal, two-dimensional, rad, float32, (N,); NaN where
-        a heliostat was never calibrated.
+        Predicted standard deviation of the normal, two-dimensional, rad, float32, (N,); NaN before
+        the first calibration.
     measured
-        Tracking error at the last photograph that counted, rad, float32, (N,); NaN before.
+        Tracking error in the photographs of the last visit, rad, float32, (N,); NaN before.
     calibrated_at
-        POSIX s, (N,); NaN before.
+        Time of the last calibration, POSIX s, (N,); NaN before.
     sightings
-        How many are known, int32, (N,).
+        Number of known sightings, int32, (N,).
     cluster
         Place in `Operations.clusters`, int16, (N,).
     on
-        Place in `Operations.aim_names` of what each was told to aim at, uint8, (N,); 0: nothing.
+        Place in `Operations.aim_names` of the aim of each, uint8, (N,); 0: none.
     held
-        Whether an operator keeps it out of calibration, bool, (N,).
+        Whether a person keeps it out of calibration, bool, (N,).
     truth_error
         Tracking error that a twin knows, rad, float32, (N,); None for a real plant.
     """
@@ -70,7 +71,7 @@ class FieldFrame:
 
 @dataclass(frozen=True)
 class SunView:
-    """The sun: unit vector (3,), azimuth and elevation in rad, and the time of it."""
+    """The sun at a time: unit vector (3,), azimuth and elevation, rad."""
 
     at: datetime
     direction: FloatArray
@@ -100,7 +101,7 @@ class DriveView:
 
 @dataclass(frozen=True)
 class SightingView:
-    """One sighting: POSIX s, target, beam error (rad) as it was when it was taken."""
+    """One sighting: POSIX s, target, beam error under the calibration of that time, rad."""
 
     at: float
     target: str
@@ -109,18 +110,18 @@ class SightingView:
 
 @dataclass(frozen=True)
 class Planned:
-    """One measurement to come.
+    """A planned visit.
 
     Attributes
     ----------
     heliostat, target
-        Who, and where.
+        Names.
     at
         Expected beginning, POSIX s.
     gain
-        Expected fall of the predicted error, rad; NaN if it is not judged.
+        Expected reduction of the tracking error over the year, rad; NaN if unknown.
     reason
-        In words.
+        The same for people.
     """
 
     heliostat: str
@@ -137,35 +138,37 @@ class HeliostatView:
     Attributes
     ----------
     name, cluster, row
-        Whose, and its place in all arrays.
+        Names, and the row in all arrays.
     position
         ENU, m, (3,).
     width, height
-        Of the mirror, m.
+        Size of the mirror, m.
     live, age, state, fault, flags
         As in `field_state.HeliostatState`.
     supply, temperature, boots
         V, °C, and restarts; NaN, NaN, 0 if not live.
     drives
-        The two; () if not live.
+        Its two drives; () if not live.
     aim, standby
-        ENU, m, (3,); NaN if none was given.
+        ENU, m, (3,); NaN if not assigned.
     on
-        Name of what it aims at, "" for nothing.
+        Receiver or target that it aims at, "" for none.
     parameters
-        By name.
+        Of its mechanism, by name.
+    calibration
+        The calibration believed now; None before the first.
     error
-        Predicted, rad; NaN if never calibrated.
+        Predicted tracking error, rad; NaN if never calibrated.
     truth_error
-        rad; NaN if nobody knows.
+        Tracking error that a twin knows, rad; NaN for a real plant.
     history
-        Its sightings, oldest first.
+        Its sightings since the start, oldest first.
     results
-        What its calibrations said, oldest first.
+        Results of its visits, oldest first.
     planned
-        The next measurement, if it is planned.
+        Its next visit, if one is planned.
     hold
-        Why an operator keeps it out of calibration, "" if nobody does.
+        Why a person keeps it out of calibration, "" if nobody does.
     """
 
     name: str
@@ -187,6 +190,7 @@ class HeliostatView:
     standby: FloatArray
     on: str
     parameters: Mapping[str, ParameterView]
+    calibration: HeliostatCalibration | None
     error: float
     truth_error: float
     history: tuple[SightingView, ...]
@@ -202,29 +206,29 @@ class ClusterRow:
     Attributes
     ----------
     name
-        Whose.
+        Of the cluster.
     alive
         Whether its status is younger than the limit.
     age
-        Of its status, s; infinite if none came.
+        Age of its status, s; infinite if none came.
     connected
         Whether its link is up.
     heliostats, live
-        How many it has, and how many were heard within the limit.
+        Its heliostats, and those heard within the limit.
     cycle
-        Last poll of its bus, s; NaN if unknown.
+        Duration of the last poll of its bus, s; NaN if unknown.
     answered
-        Share of its questions that its heliostats answered since it began; NaN if unknown.
+        Share of its polls that its heliostats have answered since it began; NaN if unknown.
     refused
-        Messages that it sent and that were none.
+        Messages from it that could not be read.
     time_quality, time_error
-        Of its clock; s.
+        Quality of its clock, and the error bound, s.
     lease_left
-        What is left of the plant's lease at its last status, s; NaN if unknown.
+        Remaining lease at its last status, s; NaN if unknown.
     acts
-        What its safety table holds.
+        Acts that its safety table demands.
     problem
-        Of its link, "" if there is none.
+        Problem of its link, "" if none.
     """
 
     name: str
@@ -245,20 +249,20 @@ class ClusterRow:
 
 @dataclass(frozen=True)
 class AlarmRow:
-    """One alarm: the last word on a condition of a subject.
+    """One alarm: the latest state of a condition of a subject.
 
     Attributes
     ----------
     at
-        When it came, POSIX s.
+        When it was raised, POSIX s.
     condition, subject, severity, text
-        As in `protocol.Alarm`.
+        As in `links.messages.Alarm`.
     active
-        Whether it holds still.
+        Whether it is still active.
     acknowledged_by
-        Who has acknowledged it, "" if nobody has.
+        Person who has acknowledged it, "" if nobody has.
     count
-        How often it came.
+        Number of times it was raised.
     """
 
     at: float
@@ -273,7 +277,7 @@ class AlarmRow:
 
 @dataclass(frozen=True)
 class EventRow:
-    """One event: POSIX s, kind (command, calibration, authority, plant), who, and a line."""
+    """One event: POSIX s, kind (command, calibration, authority, plant), person, and one line."""
 
     at: float
     kind: str
@@ -283,7 +287,7 @@ class EventRow:
 
 @dataclass(frozen=True)
 class PacketRow:
-    """One message at a link: POSIX s, cluster, "to" or "from" it, kind, bytes, and its sense."""
+    """One message on a link: POSIX s, cluster, "to" or "from" it, kind, bytes, and its text."""
 
     at: float
     cluster: str
@@ -295,7 +299,7 @@ class PacketRow:
 
 @dataclass(frozen=True)
 class Running:
-    """A measurement that goes on: who, where, stage in words, since when (POSIX s)."""
+    """A visit under way: heliostat, target, what is being done, and its beginning (POSIX s)."""
 
     heliostat: str
     target: str
@@ -305,39 +309,52 @@ class Running:
 
 @dataclass(frozen=True)
 class CalibrationEntry:
-    """The end of one measurement.
+    """The result of one visit.
 
     Attributes
     ----------
     at
         POSIX s.
     heliostat, target
-        Who, where.
-    good
-        Whether the heliostat has new parameters.
+        Names.
+    outcome
+        What became of it.
     before, after
-        Beam error over its sightings, rad RMS; NaN without a fit.
+        Beam error over all sightings of the heliostat, as believed before and fitted, rad RMS; NaN
+        without a fit.
+    measured
+        Beam error of the photographs of this visit, as believed before, rad RMS; NaN without.
     predicted
-        Standard deviation of the normal after it, rad; NaN without a fit.
+        Predicted standard deviation of the normal after it, rad; NaN if never calibrated.
     truth_before, truth_after
         Tracking error that a twin knows, rad; NaN for a real plant.
-    sightings
-        How many are known of it.
+    sightings, new
+        Sightings known of the heliostat, and how many of them this visit brought.
     text
-        In words.
+        The outcome for people.
+    version
+        Version of the new calibration; 0 without.
     """
 
     at: float
     heliostat: str
     target: str
-    good: bool
+    outcome: CalibrationOutcome
     before: float
     after: float
+    measured: float
     predicted: float
     truth_before: float
     truth_after: float
     sightings: int
+    new: int
     text: str
+    version: int = 0
+
+    @property
+    def good(self) -> bool:
+        """Whether the heliostat has a new calibration."""
+        return self.outcome.calibrated
 
 
 @dataclass(frozen=True)
@@ -349,37 +366,37 @@ class QualityPoint:
     at
         POSIX s.
     calibrated
-        How many.
-    median, ninety
-        Of their predicted error, rad, the median and what nine of ten are below.
-    truth_median, truth_ninety
-        The same of what a twin knows; NaN for a real plant.
+        Number of calibrated heliostats.
+    median, percentile_90
+        Median and 90th percentile of their predicted tracking error, rad.
+    truth_median, truth_percentile_90
+        The same of the error that a twin knows; NaN for a real plant.
     """
 
     at: float
     calibrated: int
     median: float
-    ninety: float
+    percentile_90: float
     truth_median: float
-    truth_ninety: float
+    truth_percentile_90: float
 
 
 @dataclass(frozen=True)
 class CalibrationView:
-    """How far calibration has come.
+    """Progress of calibration.
 
     Attributes
     ----------
     on
-        Whether it works; if not, ``reason`` says why.
+        Whether calibration is running; if not, ``reason`` says why.
     done, waiting, failed
-        Heliostats with parameters from sightings, those without, measurements without success.
+        Calibrated heliostats, the others, and visits without a new calibration.
     running
-        What goes on now.
+        Visits under way.
     results
-        The last ones, newest first.
+        Results of the last visits, newest first.
     quality
-        Over time, oldest first.
+        Quality over time, oldest first.
     """
 
     on: bool
@@ -401,15 +418,15 @@ class CameraView:
     target
         Name.
     version
-        Rises with each photograph; 0 before the first.
+        Increases with each photograph; 0 before the first.
     at
         POSIX s.
     jpeg
-        With what the software saw in it drawn in; b"" before the first.
+        The picture with what was read in it drawn in; b"" before the first.
     reading
-        In words, line by line.
+        What was read in it, line by line.
     centroid
-        Right of and above the target's centre, m, or None.
+        Of the beam, right of and above the target's centre, m; None if not seen.
     """
 
     target: str
@@ -422,7 +439,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class Hold:
-    """A heliostat that an operator keeps out of calibration: who did it, why, since (POSIX s)."""
+    """A heliostat kept out of calibration: by whom, why, and since when (POSIX s)."""
 
     heliostat: str
     who: str
@@ -437,17 +454,17 @@ class EmergencyView:
     Attributes
     ----------
     on
-        Whether it holds.
+        Whether it is active.
     act, who, reason
-        DEFOCUS or STOW; "" for all if there was none.
+        DEFOCUS or STOW, the person, the reason; "" if there was no order.
     seconds
-        Since the order, s.
+        Time since the order, s.
     heliostats, acknowledged, done
-        How many it went to, and how far they are.
+        Heliostats ordered, those that acknowledged it, and those proven to have carried it out.
     not_done
-        Names of the first of those that have not carried it out.
+        Names of the first heliostats not proven to have carried it out.
     text
-        In words.
+        The same for people.
     """
 
     on: bool
@@ -464,32 +481,32 @@ class EmergencyView:
 
 @dataclass(frozen=True)
 class Summary:
-    """The plant in one look, for the head of a page.
+    """The state of the plant, for the head of a page.
 
     Attributes
     ----------
     name
         Of the plant.
     at
-        Its time, UTC.
+        Time of the plant, UTC.
     heliostats, clusters
-        How many.
+        Number of each.
     states
-        How many heliostats are in each state, those not heard under "stale".
+        Number of heliostats in each state; those not heard under "stale".
     clusters_alive
-        How many clusters are heard.
+        Number of clusters heard.
     holder, role
-        Who has the command authority; "" if nobody has.
+        Person with the command authority; "" if nobody has it.
     waiting
-        Mirrors that wait to join the receiver.
+        Heliostats waiting to join the receiver.
     alarms
-        How many are active or not acknowledged.
+        Number of alarms active or unacknowledged.
     emergency
-        Whether one holds.
+        Whether an emergency is active.
     lag
-        How far the plant's time is behind, s: 0 unless the machine is too slow for its speed.
+        Delay of the plant's time, s: 0 unless the machine is too slow for a twin's speed.
     extra
-        Of the twin: its speed and the like.
+        More rows, such as the speed of a twin.
     """
 
     name: str

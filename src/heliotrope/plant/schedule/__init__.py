@@ -1,1 +1,32 @@
-"""The calibration schedule: which heliostat is measured next, on which target."""
+"""The schedule of calibration: which heliostat is photographed next, on which target.
+
+Begin with `Scheduler`: it answers from time, sun and states alone, so days are tried out in
+seconds. `PlantSchedule` runs it in a plant at work. `knowledge` holds how well each heliostat is
+known, `choice` finds the best visit of a moment.
+"""
+
+from heliotrope.plant.schedule.choice import Assignment
+from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
+from heliotrope.plant.schedule.scheduler import (
+    Comparison,
+    Finished,
+    Scheduler,
+    States,
+    Visited,
+    compare,
+)
+from heliotrope.plant.schedule.settings import Settings, Weather
+
+__all__ = [
+    "Assignment",
+    "Comparison",
+    "Finished",
+    "PlantSchedule",
+    "Scheduler",
+    "Settings",
+    "States",
+    "Visited",
+    "Weather",
+    "compare",
+    "settings_for",
+]

@@ -1,4 +1,8 @@
-"""The best of many heliostats: screened by bounds, judged exactly in the order of these."""
+"""The best visit of a moment: all heliostats screened by bounds, the best of them judged exactly.
+
+Screening looks only at angles, as if each mirror turned about its foot. The candidates are judged
+in the order of their bounds, including shading and blocking by neighbours.
+"""
 
 from collections.abc import Sequence
 from copy import copy
@@ -6,31 +10,167 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import erf
 
 from heliotrope.calibration.learn.drift import DAY
+from heliotrope.calibration.plan.planning import SightingLimits
+from heliotrope.field.camera import Camera
 from heliotrope.field.plant import Plant
-from heliotrope.geometry import FloatArray
-from heliotrope.plant.schedule.account import Assignment
-from heliotrope.plant.schedule.field import FieldKnowledge
-from heliotrope.plant.schedule.knowledge import Look
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray, angle_between, tangent_axes
+from heliotrope.optics.beam import SUN_RADIUS
+from heliotrope.plant.schedule.knowledge import FieldKnowledge, Look
 from heliotrope.plant.schedule.settings import Settings, Weather
-from heliotrope.plant.schedule.sight import Sight, hidden
 
-#: Heliostats that are judged exactly at a time; how often at most in a decision once one was found,
-#: and while none was.
+#: Heliostats judged exactly at a time; chunks of a decision at most once one was found, and while
+#: none was.
 CHUNK, CHUNKS, MOST_CHUNKS = 64, 2, 6
-#: Who cannot be seen now, or to no gain, is not looked at again for so long, s: the sun moves
-#: by a degree in four minutes.
+#: A heliostat that cannot be seen now, or to no gain, is judged again after this time, s: the sun
+#: moves by a degree in four minutes.
 AGAIN = 300.0
-#: A search for a beam looks at most at so many places.
+#: Places that a search for a beam looks at, at most.
 LOOKS = 25
+#: Slack of the screening, since a pivot is not at the foot of its heliostat, rad.
+SLACK = float(np.radians(4.0))
 
 Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
+class Assignment:
+    """A heliostat to be photographed on a target.
+
+    Attributes
+    ----------
+    heliostat, target
+        Names.
+    at, until
+        Beginning and expected end, POSIX s.
+    before, after
+        Expected beam error over the year before and after it, rad RMS (2-D).
+    predicted
+        Expected beam error at the photograph, including the camera's noise, rad RMS (2-D).
+    seen
+        Chance that the beam is wholly on the target at the first look.
+    overdue
+        Whether it was chosen for its age and not for its gain.
+    reason
+        The same for people.
+    """
+
+    heliostat: str
+    target: str
+    at: float
+    until: float
+    before: float
+    after: float
+    predicted: float
+    seen: float
+    overdue: bool
+    reason: str
+
+    @property
+    def gain(self) -> float:
+        """Expected reduction of the beam error over the year, rad."""
+        return self.before - self.after
+
+
+class Sight:
+    """Lines of sight from N heliostats to one target.
+
+    Parameters
+    ----------
+    target
+        The target.
+    position
+        Feet of the heliostats, ENU, m, (N, 3).
+    size
+        Width and height of the mirrors, m, (N, 2).
+    cameras
+        Cameras that look at the target.
+    """
+
+    def __init__(
+        self, target: Target, position: FloatArray, size: FloatArray, cameras: tuple[Camera, ...]
+    ) -> None:
+        self.target = target
+        way = target.center - position
+        self.distance = np.linalg.norm(way, axis=1)
+        self.way = way / self.distance[:, None]
+        self.obliquity = angle_between(-self.way, np.broadcast_to(target.normal, way.shape))
+        # The beam's own radius: half a mirror, and the sun's disc.
+        radius = 0.5 * size.max(axis=1) + SUN_RADIUS * self.distance
+        half = 0.5 * np.array([target.width, target.height])
+        self._room = np.maximum(half[None, :] - radius[:, None], 0.1 * half)
+        self._eyes = [c.position for c in cameras if c.position is not None]
+
+    def able(self, sun: FloatArray, limits: SightingLimits) -> Mask:
+        """Return which heliostats may be within the limits, with some slack, (N,)."""
+        half_way = 0.5 * angle_between(np.broadcast_to(sun, self.way.shape), self.way)
+        return np.asarray(
+            (half_way <= limits.max_incidence + SLACK)
+            & (self.obliquity <= limits.max_obliquity + SLACK)
+        )
+
+    def seen(self, square: FloatArray, rows: npt.NDArray[np.intp] | slice) -> FloatArray:
+        """Return the chance that a beam is wholly on the target at the first look, (K,).
+
+        Parameters
+        ----------
+        square
+            Expected squared beam error, rad², (K,).
+        rows
+            Heliostats, (K,).
+        """
+        sigma = np.sqrt(0.5 * square) * self.distance[rows]
+        across = sigma / np.maximum(np.cos(self.obliquity[rows]), 0.1)
+        room, root = self._room[rows], np.sqrt(2.0)
+        return np.asarray(erf(room[:, 0] / (root * across)) * erf(room[:, 1] / (root * sigma)))
+
+    def glare(self, sun: FloatArray) -> float:
+        """Return the smallest angle between the sun and a camera's line to the target, rad."""
+        ways = [self.target.center - eye for eye in self._eyes]
+        return min(
+            (float(angle_between(way / np.linalg.norm(way), sun)) for way in ways), default=np.pi
+        )
+
+
+def hidden(
+    offsets: FloatArray, normal: FloatArray, size: FloatArray, way: FloatArray
+) -> FloatArray:
+    """Return the share of mirrors that neighbours hide towards a direction, (K,).
+
+    Parameters
+    ----------
+    offsets
+        From each mirror to its neighbours, m, (K, J, 3).
+    normal
+        Normals of the mirrors, and of their neighbours, which are taken as parallel, (K, 3).
+    size
+        Width and height of the mirrors, m, (K, 2).
+    way
+        Unit vector to the sun or the target, (3,) or (K, 3).
+
+    Notes
+    -----
+    Parallel mirrors of one size are projected along the ray into the mirror's plane, where the
+    overlap of two rectangles is exact; overlaps of several neighbours are added, which is an upper
+    bound.
+    """
+    ray = np.broadcast_to(way, normal.shape)
+    steep = np.maximum(np.einsum("kc,kc->k", normal, ray), 0.05)
+    height = np.einsum("kjc,kc->kj", offsets, normal)
+    moved = offsets - (height / steep[:, None])[..., None] * ray[:, None, :]
+    axes = tangent_axes(normal)
+    plane = np.abs(np.einsum("kjc,kac->kja", moved, axes))
+    overlap = np.clip(1.0 - plane / size[:, None, :], 0.0, 1.0).prod(axis=-1)
+    # Only a neighbour in front of the mirror, towards the light, can hide it.
+    return np.asarray(np.minimum(np.where(height > 0.0, overlap, 0.0).sum(axis=1), 1.0))
+
+
+@dataclass(frozen=True)
 class Choice:
-    """The best that was found: who, its information, and what is told of it."""
+    """The best visit found: its value, the heliostat's row, its slope (2, P), the assignment."""
 
     value: float
     row: int
@@ -40,7 +180,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Moment:
-    """What a decision rests on."""
+    """The inputs of a decision: POSIX s, sun (3,), squares and ages (N,), counts (N, 2)."""
 
     now: float
     sun: FloatArray
@@ -55,18 +195,18 @@ class Judge:
     Parameters
     ----------
     design, settings
-        Of the schedule.
+        The plant, and the settings of the schedule.
     known
         How well each heliostat is known.
     names
-        Of the heliostats.
+        The heliostats.
 
     Attributes
     ----------
     sights
-        By target.
+        Lines of sight, by target.
     more
-        Whether the last decision found none but did not look at all: ask again.
+        Whether the last decision found none without judging every candidate: ask again.
     """
 
     def __init__(
@@ -86,7 +226,7 @@ class Judge:
         self._again = {name: np.full(len(known), -np.inf) for name in self.sights}
 
     def of(self, known: FieldKnowledge) -> "Judge":
-        """Return one that judges by other knowledge."""
+        """Return a judge with other knowledge."""
         other = copy(self)
         other._known = known  # noqa: SLF001 - its own kind
         again = {name: until.copy() for name, until in self._again.items()}
@@ -102,18 +242,18 @@ class Judge:
         counts: FloatArray | None = None,
         weather: Weather | None = None,
     ) -> tuple[Choice | None, str]:
-        """Return the best visit, and why it, or why there is none.
+        """Return the best visit, and why it is best or why there is none.
 
         Parameters
         ----------
         now, sun
-            Unix s, and the unit vector to the sun, (3,).
+            POSIX s, and the unit vector to the sun, (3,).
         ready
-            Who may be sent, (N,).
+            Which heliostats may be sent, (N,).
         targets
-            That are free.
+            Free targets.
         counts
-            Of the drives, (N, 2), if known.
+            Counts of the drives, (N, 2), if known.
         weather
             As far as it is measured.
         """
@@ -133,20 +273,20 @@ class Judge:
                 return best, best.assignment.reason
         wanting = int((late | worthy).sum())
         if self.more:
-            return None, f"none found yet; {wanting} want it, and not all were looked at"
+            return None, f"none found yet; {wanting} need a visit, and not all were judged"
         if wanting:
-            return None, f"{wanting} want it, but none of them can be seen now to any gain"
+            return None, f"{wanting} need a visit, but none of them can gain from one now"
         if not ready.any():
-            return None, "nobody stands ready"
-        return None, f"{int(ready.sum())} stand ready, and all are known well enough"
+            return None, "no heliostat is ready"
+        return None, f"{int(ready.sum())} are ready, and all are known well enough"
 
     def _best(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool
     ) -> Choice | None:
         """Return the best of the chosen heliostats on any of the targets.
 
-        Those that are overdue are ranked by age, the others by what a visit takes away from
-        their expected squared error in each second.
+        Overdue heliostats are ranked by age, the others by the reduction of their expected squared
+        error for each second of the visit.
         """
         row, place, bound = self._screen(moment, chosen, targets, overdue)
         order = np.argsort(-bound, kind="stable")
@@ -167,7 +307,7 @@ class Judge:
     def _screen(
         self, moment: Moment, chosen: Mask, targets: Sequence[str], overdue: bool
     ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], FloatArray]:
-        """Who may come into question: row, place of the target, and the most it can be worth."""
+        """Return candidates: their rows, their targets, and an upper bound of their value."""
         rows, places, bounds = [], [], []
         for t, name in enumerate(targets):
             sight = self.sights[name]
@@ -182,15 +322,15 @@ class Judge:
         return np.concatenate(rows), np.concatenate(places), np.concatenate(bounds)
 
     def _worth(self, gain: FloatArray, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Gain for each second, rad²/s."""
+        """Return the gain for each second, rad²/s."""
         return np.asarray(gain * self._chance(seen) / self._time(drive, seen))
 
     def _chance(self, seen: FloatArray) -> FloatArray:
-        """Chance that a visit sees the beam."""
+        """Return the chance that a visit sees the beam."""
         return seen if self._settings.look is None else np.ones_like(seen)
 
     def _time(self, drive: npt.ArrayLike, seen: FloatArray) -> FloatArray:
-        """Expected time of a visit, there and back, s."""
+        """Return the expected time of a visit, there and back, s."""
         settings = self._settings
         # The first look is one of the photographs.
         looks = np.minimum(1.0 / np.maximum(seen, 1e-9), LOOKS) - 1.0
@@ -200,7 +340,7 @@ class Judge:
     def _judge(
         self, moment: Moment, rows: npt.NDArray[np.intp], target: str, overdue: bool
     ) -> Choice | None:
-        """The best of some heliostats on one target."""
+        """Return the best of some heliostats on one target."""
         sight, settings = self.sights[target], self._settings
         best: Choice | None = None
         field = self._known
@@ -217,7 +357,7 @@ class Judge:
             seen = sight.seen(square, mine)
             value = self._worth(look.gain, look.drive, seen)
             if overdue:
-                # Of two targets the one that tells more.
+                # Prefer the target that tells more.
                 value = moment.age[mine] + look.gain / np.maximum(square, 1e-30)
             else:
                 free &= look.gain > settings.worth * square

@@ -1,53 +1,60 @@
-"""How well the heliostats of one group are known, and how that fades with time.
+"""How well the heliostats of a plant are known, and how that fades with time.
 
-The covariance of the parameters is that of priors and sightings; the zeros of the drives
-creep, so that it grows with the time since the last calibration. What an error of the parameters
-does to the beam over the year is a quadratic form, which changes slowly over the field: it is
-computed for some heliostats and taken from the nearest of them.
+The covariance of a heliostat's parameters is that of its calibration, or of the priors before the
+first. The zeros of the drives creep, so the covariance grows with the time since the calibration.
+The effect of parameter errors on the beam over the year is a quadratic form that changes slowly
+over the field: it is computed for a sample of heliostats; the others take it from the nearest.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from heliotrope.calibration.learn.drift import DAY, zeros
 from heliotrope.calibration.plan import gain as _gain
 from heliotrope.calibration.plan.planning import Aimed, SightingLimits, aim_at, sighting_jacobian
-from heliotrope.calibration.sightings import Sightings
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.calibration.uncertainty import error_form, precision, suns_of_year
+from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.mechanism.drives import SLOTS
+from heliotrope.plant.schedule.settings import Settings
 from heliotrope.sun import Site
 
-#: Heliostats whose form is computed; in between it changes by less than a per cent.
+#: Heliostats in the sample; between neighbours of the sample the form differs by less than 1 %.
 SAMPLES = 200
+#: Neighbours that can shade or block a mirror.
+NEIGHBOURS = 32
 
 Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a visit of K heliostats to a target would be, at one sun.
+    """What a visit of each of K heliostats to a target would bring, at one sun.
 
     Attributes
     ----------
     able
         Within stops and limits, (K,).
     normal
-        Of the mirrors, (K, 3).
+        Mirror normals, (K, 3).
     drive
-        Time to get there, s, (K,); 0 where speeds or counts are not known.
+        Time to get there, s, (K,); 0 where speeds or counts are unknown.
     slope
         Whitened derivative of all photographs of the visit together, (K, 2, P).
     gain
-        Fall of the expected squared beam error, rad², (K,).
+        Reduction of the expected squared beam error, rad², (K,).
     square
-        Expected squared beam error at the photograph, its noise included, rad², (K,).
+        Expected squared beam error at the photograph, including its noise, rad², (K,).
     """
 
     able: npt.NDArray[np.bool_]
@@ -59,29 +66,29 @@ class Look:
 
 
 class Knowledge:
-    """Of n heliostats of one kind.
+    """How well n heliostats of one group are known.
 
     Parameters
     ----------
     heliostats
-        Group of the design.
+        A group of the design.
     aim
         Where they aim in operation, ENU m, (3,).
     site, year
-        Whose suns count.
+        Place and calendar year of the suns that count.
     model
         Parameters: a name of the table, or names.
     priors
-        Standard deviations that replace the table's, by name.
+        Standard deviations that replace those of the table, by name.
     creep
-        Of the drives' zeros, rad in a day; it grows with the root of time.
+        Creep of the drives' zeros in a day, rad; it grows with the root of time.
 
     Attributes
     ----------
     names
-        P parameters.
+        The P parameters.
     since
-        Last calibration, unix s, (n,); NaN before the first.
+        Last calibration, POSIX s, (n,); NaN before the first.
     """
 
     def __init__(
@@ -118,7 +125,7 @@ class Knowledge:
         self._rate = np.einsum("npq,qp->n", self._form, self._noise)[self._like]
 
     def copy(self) -> "Knowledge":
-        """Return one that can be changed without changing this."""
+        """Return a copy to change independently."""
         other = object.__new__(Knowledge)
         other.__dict__ |= self.__dict__
         other.covariance, other.since = self.covariance.copy(), self.since.copy()
@@ -154,20 +161,20 @@ class Knowledge:
         sigma: float,
         counts: FloatArray | None = None,
     ) -> Look:
-        """Return what visits of heliostats at ``rows`` (K,) to a target would be.
+        """Return what visits of heliostats to a target would bring.
 
         Parameters
         ----------
         rows
-            Of the group.
+            Rows of the group, (K,).
         now, sun
-            Unix s and unit vector ENU, (3,).
+            POSIX s and unit vector ENU, (3,).
         target, limits
-            Where to, and what is allowed.
+            The target, and the allowed suns and angles.
         shots, sigma
             Photographs of a visit, and the standard deviation of the beam in each, rad.
         counts
-            Where the drives stand, (K, 2), if known.
+            Present counts of the drives, (K, 2), if known.
         """
         some = self.mechanism[rows]
         aimed = aim_at(some, sun, target, limits, counts)
@@ -181,27 +188,31 @@ class Knowledge:
             )
         covariance = self.faded(rows, now)
         seen = np.einsum("kip,kpq,kiq->k", slope, covariance, slope)
-        # The photographs of a visit are of nearly one sun: they only lessen the noise.
+        # The photographs of a visit see nearly the same sun: more of them only reduce the noise.
         slope = np.sqrt(shots) * slope
         gain = _gain.variance_gain(covariance, slope, self._form[self._like[rows]])
         drive = _drive_time(some.drives.table, aimed, counts)
         return Look(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
-        """Take it that a visit of that slope (2, P) has been made."""
+        """Assume that a visit with this slope (2, P) has been made."""
         rows = np.array([row], dtype=np.intp)
         self.covariance[row] = _gain.updated(self.faded(rows, now)[0], slope)
         self._set(rows, now)
 
-    def learn(self, row: int, seen: Sightings, now: float) -> None:
-        """Take all the sightings that a heliostat's parameters now rest on (its row is 0)."""
-        rows = np.array([row], dtype=np.intp)
-        information = precision(self.mechanism[rows], self.names, seen, priors=self._priors)
-        self.covariance[rows] = np.linalg.inv(information)
-        self._set(rows, now)
+    def learn(self, row: int, record: HeliostatCalibration) -> None:
+        """Take a new calibration; parameters that it does not have stay as the prior says."""
+        covariance = self._prior[row].copy()
+        shared = [name for name in self.names if name in record.names]
+        mine = [self.names.index(name) for name in shared]
+        theirs = [record.names.index(name) for name in shared]
+        covariance[mine, :] = covariance[:, mine] = 0.0
+        covariance[np.ix_(mine, mine)] = record.covariance[np.ix_(theirs, theirs)]
+        self.covariance[row] = covariance
+        self._set(np.array([row], dtype=np.intp), record.at)
 
     def doubt(self, row: int, factor: float) -> None:
-        """Take the variances to be ``factor`` times as large: it was found elsewhere."""
+        """Multiply the variances by a factor: the beam was found elsewhere."""
         self.covariance[row] *= factor
         self._set(np.array([row], dtype=np.intp), float(self.since[row]))
 
@@ -213,14 +224,141 @@ class Knowledge:
         self.since[rows] = now
 
 
-def _nearest(places: FloatArray, samples: FloatArray) -> Rows:
-    from scipy.spatial import cKDTree
+class FieldKnowledge:
+    """How well all N heliostats of a plant are known, group by group, in one order of rows.
 
+    Parameters
+    ----------
+    design
+        The plant.
+    settings
+        Settings of the schedule.
+    names
+        Order of the rows.
+    begin, year
+        Time from which the age of an uncalibrated heliostat counts, POSIX s; year of the suns.
+
+    Attributes
+    ----------
+    row
+        Row of each heliostat, by name.
+    position, size
+        Feet, and width and height of the mirrors, m, (N, 3) and (N, 2).
+    near
+        Rows of the nearest neighbours, (N, K).
+
+    Raises
+    ------
+    InputError
+        Names that are not those of the design.
+    """
+
+    def __init__(
+        self, design: Plant, settings: Settings, names: Sequence[str], begin: float, year: int
+    ) -> None:
+        if sorted(names) != sorted(design.names):
+            raise InputError(
+                f"schedule: {len(names)} names for {len(design)} heliostats; give each name of "
+                "the design once"
+            )
+        self.row = {name: i for i, name in enumerate(names)}
+        self._settings, self._begin, count = settings, begin, len(names)
+        aim = (design.receivers or design.targets)[0].center
+        groups = list(design.groups.values())
+        self._groups: list[Knowledge] = [
+            Knowledge(
+                group,
+                aim,
+                design.site,
+                year,
+                model=settings.model,
+                priors=settings.priors,
+                creep=settings.creep,
+            )
+            for group in groups
+        ]
+        # Rows of the heliostats of each group, and the way back.
+        self._rows = [np.array([self.row[n] for n in g.names], dtype=np.intp) for g in groups]
+        self.group, self._place = np.empty((2, count), dtype=np.intp)
+        self.position, self.size = np.empty((count, 3)), np.empty((count, 2))
+        for g, (group, rows) in enumerate(zip(groups, self._rows, strict=True)):
+            self.group[rows], self._place[rows] = g, np.arange(len(rows))
+            self.position[rows] = group.position
+            self.size[rows] = np.stack([group.width, group.height], axis=1)
+        self.near = neighbours(self.position)
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def copy(self) -> "FieldKnowledge":
+        """Return a copy to change independently."""
+        other = copy(self)
+        other._groups = [known.copy() for known in self._groups]  # noqa: SLF001 - its own kind
+        return other
+
+    def squares(self, now: float) -> FloatArray:
+        """Return the expected squared beam errors over the year at a time, rad², (N,)."""
+        found = np.empty(len(self))
+        for known, rows in zip(self._groups, self._rows, strict=True):
+            found[rows] = known.expected(now)
+        return found
+
+    def ages(self, now: float) -> FloatArray:
+        """Return the times since the last calibration, or since the beginning, s, (N,)."""
+        since = np.empty(len(self))
+        for known, rows in zip(self._groups, self._rows, strict=True):
+            since[rows] = known.since
+        return np.asarray(now - np.where(np.isnan(since), self._begin, since))
+
+    def look(
+        self,
+        rows: npt.NDArray[np.intp],
+        now: float,
+        sun: FloatArray,
+        target: Target,
+        counts: FloatArray | None,
+    ) -> Look:
+        """Return what visits of heliostats of one group would bring; see `Knowledge.look`."""
+        settings, known = self._settings, self._groups[int(self.group[rows[0]])]
+        return known.look(
+            self._place[rows],
+            now,
+            sun,
+            target,
+            settings.limits,
+            shots=settings.shots,
+            sigma=settings.sigma,
+            counts=counts,
+        )
+
+    def assume(self, row: int, slope: FloatArray, now: float) -> None:
+        """Assume that a visit with this slope (2, P) has been made."""
+        self._groups[self.group[row]].assume(int(self._place[row]), slope, now)
+
+    def learn(self, row: int, record: HeliostatCalibration) -> None:
+        """Take a new calibration of a heliostat."""
+        self._groups[self.group[row]].learn(int(self._place[row]), record)
+
+    def doubt(self, row: int, factor: float) -> None:
+        """Multiply the variances of a heliostat by a factor."""
+        self._groups[self.group[row]].doubt(int(self._place[row]), factor)
+
+
+def neighbours(position: FloatArray) -> npt.NDArray[np.intp]:
+    """Return the nearest neighbours of each heliostat, (N, K)."""
+    count = len(position)
+    if count < 2:
+        return np.empty((count, 0), dtype=np.intp)
+    _, found = cKDTree(position).query(position, k=min(NEIGHBOURS + 1, count))
+    return np.asarray(found, dtype=np.intp)[:, 1:]
+
+
+def _nearest(places: FloatArray, samples: FloatArray) -> Rows:
     return np.asarray(cKDTree(samples).query(places)[1], dtype=np.intp)
 
 
 def _drive_time(table: FloatArray, aimed: Aimed, counts: FloatArray | None) -> FloatArray:
-    """The slower axis from where the drives stand, s, (K,)."""
+    """Return the time that the slower axis needs to get there, s, (K,)."""
     if counts is None:
         return np.zeros(len(table))
     speed = table[..., SLOTS["speed"]]

@@ -1,1 +1,22 @@
-"""Visits of a heliostat to a target: the photographs, the search for its beam, the calibration."""
+"""Visits of a heliostat to a calibration target.
+
+Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
+a search for the beam: `Centring`), fits them, and lets the plant believe what is better. `Visit` is
+the way there and back; `Camera` is what a plant needs of a camera.
+"""
+
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+from heliotrope.plant.visits.photographs import Camera, Photographs, Shot
+from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.visit import Visit
+
+__all__ = [
+    "CalibrationCycle",
+    "Camera",
+    "Centring",
+    "CycleResult",
+    "CycleSettings",
+    "Photographs",
+    "Shot",
+    "Visit",
+]

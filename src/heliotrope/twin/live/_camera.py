@@ -19,7 +19,7 @@ from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.plant.camera_views import Views, picture_of, shot_of
 from heliotrope.plant.operations.views import CameraView
-from heliotrope.plant.visits.calibration_cycle import Shot
+from heliotrope.plant.visits.photographs import Shot
 from heliotrope.twin.cameras import PEAK, ExactCamera, Mirror, Optics, RenderedCamera, Sight
 
 

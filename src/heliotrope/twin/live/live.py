@@ -39,12 +39,14 @@ from heliotrope.mechanism.parameters import MODELS
 from heliotrope.plant.assigned import Assigned, rest_on
 from heliotrope.plant.audit import Audit, Record
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.operations.operations import Logbook, Operations, WorkSettings
-from heliotrope.plant.schedule.live import PlantSchedule, settings_for
-from heliotrope.plant.schedule.schedule import Scheduler
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
+from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings, clusters_of
-from heliotrope.plant.visits.calibration_cycle import CycleSettings
-from heliotrope.plant.visits.centring import CentringCycle
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.store.records import Records
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.cameras import NEAR, Optics, Sight
@@ -81,8 +83,6 @@ class LiveOptions:
         For photographs; 0 in virtual time.
     installed
         How mirrors stand, from the nominal mechanism; None: as roughly as Malan's.
-    plain
-        Whether the plain schedule says who is next, and not the one by expected gain.
     boards
         Whether each heliostat is a firmware-true board; for small plants.
     centroid
@@ -95,11 +95,10 @@ class LiveOptions:
     rendered: bool = True
     threads: int = 1
     installed: Callable[[Mechanism], Mechanism] | None = None
-    plain: bool = False
     boards: bool = False
     centroid: float = 1e-5
     cycle: CycleSettings | None = None
-    work: WorkSettings | None = None
+    work: AutomaticSettings | None = None
     plant: PlantSettings | None = None
 
     def __post_init__(self) -> None:
@@ -217,7 +216,7 @@ class LivePlant:
         self._points = np.empty((len(self.names), 3))
         self._points[self._rows] = np.stack([aims[name] for name in self.plant.field.names])
         self.cameras = self._new_cameras()
-        cycle = CentringCycle(self.plant, self.cameras, chosen.cycle or CYCLE)
+        cycle = CalibrationCycle(self.plant, self.cameras, chosen.cycle or CYCLE, Centring())
         self.operations = Operations(
             self.plant,
             self.logbook,
@@ -227,7 +226,7 @@ class LivePlant:
             records=records,
             truth=self.errors,
             extra=extra,
-            settings=chosen.work or WorkSettings(wanted=True),
+            settings=chosen.work or AutomaticSettings(wanted=True),
         )
 
     # -- putting it together ---------------------------------------------------------------
@@ -279,13 +278,13 @@ class LivePlant:
         sight = Sight(self.clock, self._mirrors, self.sun)
         return LiveCamera(sight, scenes, optics=optics, seed=seed, threads=self.options.threads)
 
-    def _scheduler(self, cycle: CentringCycle) -> PlantSchedule | None:
-        if not self.design.targets or self.options.plain:
+    def _scheduler(self, cycle: CalibrationCycle) -> PlantSchedule | None:
+        if not self.design.targets:
             return None
         settings = settings_for(cycle.settings)
         names = self.plant.field.names
         chosen = Scheduler(self.design, settings, now=self.clock.utc(), names=names)
-        return PlantSchedule(self.plant, cycle, chosen)
+        return PlantSchedule(self.plant, chosen)
 
     # -- the world -------------------------------------------------------------------------
 
@@ -364,7 +363,7 @@ class LivePlant:
 
     async def stowed(self, limit: float = 300.0) -> bool:
         """Stow the field and wait until it is; False if it is not within ``limit`` s."""
-        await self.operations.work.halt()
+        await self.operations.automatic.halt()
         self.plant.stow("live plant")
         until = self.clock.monotonic() + limit
         while self.clock.monotonic() < until:

@@ -1,16 +1,17 @@
 """The schedule of calibration: which heliostat is photographed next, on which target.
 
 A decision has two steps. All heliostats are screened by angles and by the most that a visit could
-bring: the whole of their expected squared beam error, over the time that a visit takes. In the
-order of this bound some at a time are judged exactly: stops, the way of the drives, who is shaded
-or blocked, and by how much the error would fall. It ends when no bound is above the best that
-was found. Heliostats that were not calibrated for longer than they may wait come first.
+bring: the whole of their expected squared beam error, over the time of a visit. In the order of
+this bound they are judged exactly, a chunk at a time: stops, the way of the drives, shading,
+blocking, and by how much the error would fall. The decision is made when no bound is above the best
+value found. Heliostats that have waited too long for a calibration come first.
 
 Nothing here reads a clock or moves a mirror: time, sun and states are arguments.
 """
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import islice
 from typing import Protocol
@@ -20,54 +21,144 @@ import numpy.typing as npt
 
 from heliotrope import sun as solar
 from heliotrope.calibration.learn.drift import DAY
-from heliotrope.calibration.sightings import Sightings
+from heliotrope.calibration.record import HeliostatCalibration
 from heliotrope.errors import InputError, TimeError, UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu import states as lcu_states
-from heliotrope.plant.schedule.account import (
-    SURPRISE,
-    Assignment,
-    Comparison,
-    Finished,
-    Visited,
-    compare,
-)
-from heliotrope.plant.schedule.choice import Judge, Mask
-from heliotrope.plant.schedule.field import FieldKnowledge
+from heliotrope.plant.schedule.choice import Assignment, Judge, Mask
+from heliotrope.plant.schedule.knowledge import FieldKnowledge
 from heliotrope.plant.schedule.settings import Settings, Weather
 
-__all__ = [
-    "Assignment",
-    "Comparison",
-    "Finished",
-    "Scheduler",
-    "Settings",
-    "States",
-    "Visited",
-    "Weather",
-    "compare",
-]
-
+#: A beam this many times as far off as expected says that its heliostat has changed.
+SURPRISE = 3.0
 #: States from which a heliostat can be sent to a target.
 READY = (lcu_states.IDLE, lcu_states.TRACKING)
-#: Finished visits that are remembered.
+#: Finished visits to remember.
 REMEMBERED = 20_000
-#: Steps of a plan while there is nothing to do, s.
+#: Step of a plan while there is nothing to do, s.
 _STEP = 600.0
 
 
+@dataclass(frozen=True)
+class Visited:
+    """What became of an assignment.
+
+    Attributes
+    ----------
+    heliostat, target
+        Names.
+    ended
+        POSIX s.
+    calibrated
+        Whether the heliostat has a new calibration.
+    measured
+        Beam error of the photographs of this visit under the calibration before it, rad RMS (2-D);
+        NaN if none could be used.
+    text
+        The same for people.
+    """
+
+    heliostat: str
+    target: str
+    ended: float
+    calibrated: bool
+    measured: float = float("nan")
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Finished:
+    """An assignment and what became of it."""
+
+    planned: Assignment
+    visited: Visited
+
+    @property
+    def surprise(self) -> bool:
+        """Whether the beam was far more off than expected."""
+        return bool(self.visited.measured > SURPRISE * self.planned.predicted)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Finished visits beside the prediction.
+
+    Attributes
+    ----------
+    visits, calibrated
+        Number of visits, and number of those that brought a new calibration.
+    measured, predicted
+        Beam error found at the photographs, and expected there, rad RMS (2-D), over visits with
+        both; NaN if there are none.
+    longer
+        Mean time of a visit, as a share of the expected time; NaN without visits.
+    surprises
+        Heliostats found more than `SURPRISE` times as far off as expected.
+    """
+
+    visits: int
+    calibrated: int
+    measured: float
+    predicted: float
+    longer: float
+    surprises: tuple[str, ...]
+
+    @property
+    def ratio(self) -> float:
+        """Measured over predicted error: near 1 if the prediction is right."""
+        return self.measured / self.predicted
+
+    @property
+    def text(self) -> str:
+        """One line."""
+        if not self.visits:
+            return "no visits"
+        head = f"{self.visits} visits, {self.calibrated} calibrated"
+        if not np.isfinite(self.ratio):
+            return f"{head}; no error could be compared"
+        return (
+            f"{head}; beam error found {1e3 * self.measured:.2f} mrad, expected "
+            f"{1e3 * self.predicted:.2f} mrad, ratio {self.ratio:.2f}; "
+            f"{len(self.surprises)} surprises"
+        )
+
+
+def compare(finished: Iterable[Finished]) -> Comparison:
+    """Compare finished visits with what was expected of them."""
+    made = list(finished)
+    both = [f for f in made if np.isfinite(f.visited.measured)]
+    nan = float("nan")
+
+    def rms(values: list[float]) -> float:
+        return float(np.sqrt(np.mean(np.square(values)))) if values else nan
+
+    spans = [
+        (f.visited.ended - f.planned.at) / (f.planned.until - f.planned.at)
+        for f in made
+        if f.planned.until > f.planned.at
+    ]
+    return Comparison(
+        visits=len(made),
+        calibrated=sum(f.visited.calibrated for f in made),
+        measured=rms([f.visited.measured for f in both]),
+        predicted=rms([f.planned.predicted for f in both]),
+        longer=float(np.mean(spans)) if spans else nan,
+        surprises=tuple(f.planned.heliostat for f in both if f.surprise),
+    )
+
+
 class States(Protocol):
-    """What is known of the field now, in the order of the scheduler's names."""
+    """The present state of the field, in the order of the scheduler's names."""
 
     @property
     def state(self) -> npt.NDArray[np.uint8]:
-        """Of `lcu.states`, or any other number where it is not known, (N,)."""
+        """States of `lcu.states`, any other number where unknown, (N,)."""
         ...
 
     @property
     def counts(self) -> npt.NDArray[np.int32]:
-        """Of the drives, (N, 2)."""
+        """Counts of the drives, (N, 2)."""
         ...
 
 
@@ -77,24 +168,24 @@ class Scheduler:
     Parameters
     ----------
     design
-        The plant; each of its targets counts.
+        The plant, with all its targets.
     settings
         See `Settings`.
     now
-        Its year's suns count; and the age of those that were never calibrated begins then.
+        The suns of its year count, and the age of uncalibrated heliostats begins then.
     names
         Order of the heliostats in `States`; default that of the design.
 
     Attributes
     ----------
     names
-        Of the heliostats.
+        The heliostats.
     reason
         Why the last decision was as it was, or why there was none.
     running
         Assignments under way, by heliostat.
     finished
-        The last visits with what was expected of them.
+        The last visits beside what was expected of them.
 
     Raises
     ------
@@ -125,9 +216,9 @@ class Scheduler:
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)
-        # What is expected of those under way, by heliostat.
+        # What the assignments under way are expected to tell, by heliostat.
         self._slopes: dict[str, FloatArray] = {}
-        self._failures = np.zeros(len(self.names), dtype=np.int64)
+        self._failures, self._learnt = np.zeros((2, len(self.names)), dtype=np.int64)
         self._retry = np.full(len(self.names), -np.inf)
 
     # -- what is known ---------------------------------------------------------------------
@@ -140,21 +231,23 @@ class Scheduler:
         """Return the time since the last calibration, or since the beginning, s, (N,)."""
         return self._known.ages(_unix(now_utc))
 
-    def learn(self, heliostat: str, seen: Sightings, at: datetime) -> None:
-        """Take all the sightings (heliostat row 0) that a heliostat's parameters rest on.
+    def learn(self, record: HeliostatCalibration) -> None:
+        """Take a new calibration.
 
         Raises
         ------
         UnknownNameError
             If there is no such heliostat.
         """
-        self._known.learn(self._find(heliostat), seen, _unix(at))
+        row = self._find(record.heliostat)
+        self._known.learn(row, record)
+        self._learnt[row] += 1
 
     def observe(self, heliostat: str, error: float, now_utc: datetime) -> bool:
-        """Take the beam error that somebody saw in operation, rad; return whether it surprises.
+        """Take a beam error seen in operation, rad; return whether it is a surprise.
 
-        If it is more than `SURPRISE` times what was expected the heliostat has changed, and is
-        taken to be as little known as the error says.
+        If it is more than `SURPRISE` times the expected error the heliostat has changed, and its
+        expected error becomes the one seen.
 
         Raises
         ------
@@ -186,18 +279,18 @@ class Scheduler:
     ) -> Assignment | None:
         """Return what to measure now, and note that it is under way; None: nothing, see `reason`.
 
-        Call `done` or `cancel` when it has ended.
+        Call `done` or `cancel` when it has ended; a new calibration is told by `learn` before.
 
         Parameters
         ----------
         now_utc, sun
             Time, and the unit vector to the sun, ENU, (3,).
         states
-            Of the field.
+            States of the field.
         free_targets
-            Names of the targets that no beam is on, each with a camera that is ready.
+            Targets without a beam, each with a camera that is ready.
         holds
-            Heliostats that are left alone.
+            Heliostats to leave alone.
         weather
             As far as it is measured.
 
@@ -244,7 +337,7 @@ class Scheduler:
     # -- what became of it -----------------------------------------------------------------
 
     def done(self, visited: Visited) -> Finished | None:
-        """Take what became of a visit; return it beside what was expected, if it was planned.
+        """Take the result of a visit; return it beside what was expected, if it was planned.
 
         Raises
         ------
@@ -255,12 +348,10 @@ class Scheduler:
         planned = self.running.pop(visited.heliostat, None)
         self._slopes.pop(visited.heliostat, None)
         finished = None if planned is None else Finished(planned, visited)
-        if visited.calibrated and visited.sightings is not None:
-            again = self._known.calibrated(row)
-            self._known.learn(row, visited.sightings, visited.ended)
+        if visited.calibrated:
             self._failures[row], self._retry[row] = 0, -np.inf
-            if finished is not None and finished.surprise and again:
-                # What was seen before it changed says less than the information believes.
+            if finished is not None and finished.surprise and self._learnt[row] > 1:
+                # The sightings from before the change say less than the covariance believes.
                 self._known.doubt(row, (visited.measured / finished.planned.predicted) ** 2)
         else:
             self._failures[row] += 1
@@ -271,12 +362,12 @@ class Scheduler:
         return finished
 
     def cancel(self, heliostat: str) -> None:
-        """Forget an assignment that was not begun, or that ended for no fault of the heliostat."""
+        """Forget an assignment that did not begin, or failed through no fault of the heliostat."""
         self.running.pop(heliostat, None)
         self._slopes.pop(heliostat, None)
 
     def compared(self, since: datetime | None = None) -> Comparison:
-        """Return the finished visits, from a time on, beside their prediction."""
+        """Compare the finished visits, from a time on, with their prediction."""
         begin = -np.inf if since is None else _unix(since)
         return compare(f for f in self.finished if f.visited.ended >= begin)
 
@@ -290,16 +381,16 @@ class Scheduler:
         holds: Collection[str] = (),
         most: int = 20,
     ) -> list[Assignment]:
-        """Return the next measurements, if the sky stays clear and each brings what is expected.
+        """Return the next visits, if the sky stays clear and each brings what is expected.
 
         Parameters
         ----------
         now_utc, horizon
-            From when, and how long.
+            Beginning and length of the plan.
         states, holds
-            As for `next`; None: all stand ready.
+            As for `next`; None: all heliostats are ready.
         most
-            So many at most: each takes as long as a decision.
+            Longest plan, visits: each takes as long as a decision.
         """
         coming = self.upcoming(now_utc, horizon, states, holds)
         return list(islice((told for told in coming if told is not None), most))
@@ -311,7 +402,7 @@ class Scheduler:
         states: States | None = None,
         holds: Collection[str] = (),
     ) -> Iterator[Assignment | None]:
-        """Yield what `plan` returns one by one, None between: each step is one decision at most."""
+        """Yield the visits of `plan`, None between: each step is one decision at most."""
         now = _unix(now_utc)
         end, known = now + horizon.total_seconds(), self._known.copy()
         judge = self._judge.of(known)
@@ -340,7 +431,7 @@ class Scheduler:
                 yield None
 
     def _later(self, now: float) -> float:
-        """When to look again if there is nothing to do: after a while, or when the sun is up."""
+        """Return when to look again: after a while, or when the sun is up."""
         times = now + _STEP * np.arange(1, 145)
         up = solar.position(times, self.design.site).elevation >= self.settings.limits.min_elevation
         return float(times[np.argmax(up)]) if up.any() else float(times[-1])

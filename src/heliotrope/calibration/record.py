@@ -1,0 +1,261 @@
+"""What is believed of one heliostat: the record that a calibration makes, once.
+
+The learner makes a `HeliostatCalibration` from a fit. Everybody else (automatic control, schedule,
+beam checks, local controllers, store, pages) holds a reference to that same record; nobody fits or
+inverts again. `CalibrationOutcome` says what became of an attempt, whether or not it made a record.
+"""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Self
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope import __version__
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit, FitOutcome
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.calibration.uncertainty import expected_error
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.optics.beam import ExpectedError
+
+Identities = npt.NDArray[np.int64]
+
+
+class Provenance(StrEnum):
+    """Where the sightings behind a calibration come from."""
+
+    CAMERA = "camera"
+    DRONE = "drone"
+    TABLE = "table"
+
+
+class CalibrationOutcome(StrEnum):
+    """What became of an attempt to calibrate one heliostat."""
+
+    CALIBRATED = "calibrated"
+    NO_BEAM = "no_beam"
+    NO_PHOTOGRAPH = "no_photograph"
+    TOO_FEW_SIGHTINGS = "too_few_sightings"
+    FIT_FAILED = "fit_failed"
+    IMPLAUSIBLE = "implausible"
+    POOR_FIT = "poor_fit"
+    NO_BETTER = "no_better"
+    REFUSED = "refused"
+    ERROR = "error"
+    #: Unchanged for a reason that was not kept.
+    UNCHANGED = "unchanged"
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the heliostat has new parameters."""
+        return self is CalibrationOutcome.CALIBRATED
+
+
+def _no_identities() -> Identities:
+    return np.zeros(0, np.int64)
+
+
+def _no_residuals() -> FloatArray:
+    return np.zeros((0, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class HeliostatCalibration:
+    """The calibration of one heliostat: P parameters from M sightings. Arrays are read-only.
+
+    Attributes
+    ----------
+    heliostat
+        Name.
+    at
+        Time of the fit, POSIX s.
+    names, values
+        Parameters, and their deviations from the nominal mechanism, rad, m or 1, (P,).
+    covariance
+        Of the values, with the noise scaled to the residuals, (P, P).
+    prior
+        Standard deviations of the priors that the covariance stands on, (P,).
+    before, after
+        Beam error over the sightings under the nominal and the calibrated mechanism, rad RMS;
+        NaN if unknown.
+    scale
+        Noise found, in units of the sightings' sigma.
+    outcome
+        How the fit ended.
+    sightings, left_out
+        Numbers of the sightings used, (M,), and of those left out of the fit, as given by the
+        store; 0 for a sighting that no store keeps.
+    residual_before, residual_after
+        Beam error of each sighting used, to the right of and above the destination as seen from
+        the mirror, under the nominal and the calibrated mechanism, rad, (M, 2).
+    model
+        Name of the model.
+    provenance
+        Source of the sightings.
+    person, campaign, note
+        Who calibrated it, in which campaign, and remarks.
+    pushed
+        Items written to the local controller and read back.
+    code
+        Version of the program.
+    version
+        1, 2, ... for each heliostat; 0 before it is numbered.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not match, or parameters that are not finite.
+    """
+
+    heliostat: str
+    at: float
+    names: tuple[str, ...]
+    values: FloatArray
+    covariance: FloatArray
+    prior: FloatArray
+    before: float = float("nan")
+    after: float = float("nan")
+    scale: float = float("nan")
+    outcome: FitOutcome = FitOutcome.CONVERGED
+    sightings: Identities = field(default_factory=_no_identities)
+    left_out: Identities = field(default_factory=_no_identities)
+    residual_before: FloatArray = field(default_factory=_no_residuals)
+    residual_after: FloatArray = field(default_factory=_no_residuals)
+    model: str = ""
+    provenance: Provenance = Provenance.CAMERA
+    person: str = ""
+    campaign: str = ""
+    note: str = ""
+    pushed: tuple[str, ...] = ()
+    code: str = __version__
+    version: int = 0
+
+    def __post_init__(self) -> None:
+        count, used = len(self.names), np.shape(self.sightings)[0]
+        shapes = {
+            "values": (count,),
+            "covariance": (count, count),
+            "prior": (count,),
+            "sightings": (used,),
+            "left_out": (np.size(self.left_out),),
+            "residual_before": (used, 2),
+            "residual_after": (used, 2),
+        }
+        for name, shape in shapes.items():
+            array = np.array(getattr(self, name))
+            if array.shape != shape:
+                raise InputError(
+                    f"calibration of {self.heliostat}: {name} of shape {array.shape}; {count} "
+                    f"parameters and {used} sightings need {shape}"
+                )
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        for name in ("values", "covariance", "prior"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(
+                    f"calibration of {self.heliostat}: {name} is not finite; keep no failed fit"
+                )
+
+    @classmethod
+    def from_fit(
+        cls,
+        heliostat: str,
+        at: float,
+        fitted: FieldFit,
+        nominal: Mechanism,
+        seen: Sightings,
+        identities: npt.ArrayLike,
+        *,
+        model: str,
+        used: npt.ArrayLike | None = None,
+        provenance: Provenance = Provenance.CAMERA,
+        person: str = "",
+        campaign: str = "",
+        note: str = "",
+        pushed: tuple[str, ...] = (),
+        version: int = 0,
+    ) -> Self:
+        """Return the record of a fit of one heliostat.
+
+        Parameters
+        ----------
+        heliostat, at
+            Name, and time of the fit, POSIX s.
+        fitted
+            A fit of batch shape (1,).
+        nominal
+            The mechanism that the values deviate from, batch shape (1,).
+        seen, identities
+            The sightings given to the fit (heliostat row 0), and their numbers, (M,).
+        used
+            Mask of the sightings that the fit used, (M,); default all.
+        model, provenance, person, campaign, note, pushed, version
+            See the attributes.
+
+        Raises
+        ------
+        InputError
+            If numbers and sightings differ in count, or the fit failed.
+        """
+        numbers = np.asarray(identities, np.int64).reshape(-1)
+        if len(numbers) != len(seen):
+            raise InputError(
+                f"calibration of {heliostat}: {len(numbers)} numbers for {len(seen)} sightings; "
+                "number the sightings first"
+            )
+        mask = np.ones(len(seen), np.bool_) if used is None else np.asarray(used, np.bool_)
+        taken = seen.take(np.flatnonzero(mask))
+        first = beam_errors(nominal, taken)
+        last = beam_errors(nominal.with_parameters(fitted.parameters), taken)
+        return cls(
+            heliostat,
+            at,
+            tuple(fitted.names),
+            fitted.values[0],
+            fitted.covariance[0],
+            fitted.prior[0],
+            root_mean_square(first.beam),
+            root_mean_square(last.beam),
+            float(fitted.scale[0]),
+            FitOutcome(int(fitted.outcome[0])),
+            numbers[mask],
+            numbers[~mask],
+            first.offset,
+            last.offset,
+            model,
+            provenance,
+            person,
+            campaign,
+            note,
+            pushed,
+            version=version,
+        )
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values by name."""
+        return {name: float(v) for name, v in zip(self.names, self.values, strict=True)}
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Standard deviations of the values, (P,)."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance)))
+
+    def mechanism(self, nominal: Mechanism) -> Mechanism:
+        """Return the calibrated mechanism, in the batch shape of the nominal one."""
+        return nominal.with_parameters(self.parameters)
+
+    def expected(
+        self, nominal: Mechanism, sun: npt.ArrayLike, aim: npt.ArrayLike, noise: float = 0.0
+    ) -> ExpectedError:
+        """Return the expected beam error for suns and aims; see `uncertainty.expected_error`."""
+        return expected_error(self.mechanism(nominal), self.names, self.covariance, sun, aim, noise)
+
+
+def root_mean_square(values: FloatArray) -> float:
+    """Return the root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

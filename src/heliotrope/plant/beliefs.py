@@ -1,0 +1,162 @@
+"""What the plant believes of its mirrors: the one owner of calibrations and of their sightings.
+
+A new `HeliostatCalibration` is taken here once; everybody who acts on it has subscribed: beam
+checks and wanted parameters (the controller), automatic control, schedule, store and pages. A
+calibration recalled from the store comes the same way.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.record import HeliostatCalibration, Identities
+from heliotrope.calibration.sightings import Sightings, join
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+
+#: Keeps sightings of a heliostat on a target; returns their numbers, (M,), 0 where not kept.
+Numbering = Callable[[str, str, Sightings], Identities]
+Subscriber = Callable[[HeliostatCalibration], None]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The M sightings known of one heliostat, in the order of time.
+
+    Attributes
+    ----------
+    sightings
+        With heliostat row 0.
+    identities
+        Numbers given by the store; 0 for a sighting that is not kept, (M,).
+    targets
+        Names, M.
+    missed
+        Beam error under the mechanism believed when it was taken, rad, (M,); NaN if recalled.
+    """
+
+    sightings: Sightings
+    identities: Identities
+    targets: tuple[str, ...]
+    missed: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.sightings)
+
+
+class Beliefs:
+    """Nominal mechanism, sightings and current calibration of each heliostat.
+
+    Parameters
+    ----------
+    design
+        The plant.
+    """
+
+    def __init__(self, design: Plant) -> None:
+        self._design = design
+        self._records: dict[str, HeliostatCalibration] = {}
+        self._seen: dict[str, Seen] = {}
+        self._subscribers: list[Subscriber] = []
+        self._number: Numbering = _unkept
+
+    def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
+        """Call back with each new calibration, and (``held``) at once with those believed now."""
+        self._subscribers.append(subscriber)
+        for record in self._records.values() if held else ():
+            subscriber(record)
+
+    def number_with(self, numbering: Numbering) -> None:
+        """Let a store keep and number the sightings that are noted."""
+        self._number = numbering
+
+    # -- looking -------------------------------------------------------------------------------
+
+    def nominal(self, heliostat: str) -> Mechanism:
+        """Return the mechanism of the design, batch shape (1,)."""
+        group, row = self._design.find(heliostat)
+        return group.mechanism[np.array([row])]
+
+    def present(self, heliostat: str) -> Mechanism:
+        """Return the mechanism that is believed now, batch shape (1,).
+
+        Before the first calibration it is that of the plant file, with its parameters.
+        """
+        record = self._records.get(heliostat)
+        if record is not None:
+            return record.mechanism(self.nominal(heliostat))
+        group, row = self._design.find(heliostat)
+        values = {name: float(v[row]) for name, v in group.parameters.items()}
+        return self.nominal(heliostat).with_parameters(values)
+
+    def record(self, heliostat: str) -> HeliostatCalibration | None:
+        """Return the current calibration; None before the first."""
+        return self._records.get(heliostat)
+
+    def seen(self, heliostat: str) -> Seen | None:
+        """Return the known sightings; None if there are none."""
+        return self._seen.get(heliostat)
+
+    def __len__(self) -> int:
+        return len(self._records)
+
+    def __iter__(self) -> Iterator[HeliostatCalibration]:
+        """Iterate over the current calibrations."""
+        return iter(self._records.values())
+
+    # -- taking --------------------------------------------------------------------------------
+
+    def note(self, heliostat: str, target: str, new: Sightings) -> Seen:
+        """Add sightings of a heliostat (row 0) on a target; return all that are known now.
+
+        Sightings that the store could not keep before are offered to it again.
+        """
+        missed = beam_errors(self.present(heliostat), new).beam
+        added = Seen(new, np.zeros(len(new), np.int64), (target,) * len(new), missed)
+        known = _joined(self._seen.get(heliostat), added)
+        identities = known.identities.copy()
+        for name in dict.fromkeys(known.targets):
+            there = np.array([each == name for each in known.targets], dtype=np.bool_)
+            rows = np.flatnonzero((identities == 0) & there)
+            if len(rows):
+                identities[rows] = self._number(heliostat, name, known.sightings.take(rows))
+        self._seen[heliostat] = Seen(known.sightings, identities, known.targets, known.missed)
+        return self._seen[heliostat]
+
+    def take(self, record: HeliostatCalibration) -> None:
+        """Believe a calibration from now on, and tell all subscribers."""
+        self._records[record.heliostat] = record
+        for subscriber in self._subscribers:
+            subscriber(record)
+
+    def recall(
+        self,
+        record: HeliostatCalibration,
+        sightings: Sightings,
+        identities: Identities,
+        targets: Sequence[str],
+    ) -> None:
+        """Take up a calibration and its sightings as they were kept before a restart."""
+        if len(sightings):
+            unknown = np.full(len(sightings), np.nan)
+            self._seen[record.heliostat] = Seen(sightings, identities, tuple(targets), unknown)
+        self.take(record)
+
+
+def _joined(known: Seen | None, added: Seen) -> Seen:
+    if known is None:
+        return added
+    return Seen(
+        join([known.sightings, added.sightings]),
+        np.concatenate([known.identities, added.identities]),
+        (*known.targets, *added.targets),
+        np.concatenate([known.missed, added.missed]),
+    )
+
+
+def _unkept(heliostat: str, target: str, sightings: Sightings) -> Identities:
+    del heliostat, target
+    return np.zeros(len(sightings), np.int64)

@@ -1,0 +1,349 @@
+"""Automatic control: the field raised, calibrated target by target, and stowed before the night.
+
+It commands as a person of its own. It takes the command authority while nobody else has it, and
+gives way at once. It moves only heliostats that are *wanted*: what a person stows, defocuses or
+locks is not, nor is anything after an emergency, until a person gives it back.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import InputError
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.links.clock import sleep_until
+from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, TrueErrors
+from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.raising import Raising
+from heliotrope.plant.operations.views import CalibrationView, Hold, Planned
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
+from heliotrope.safety import alarms
+from heliotrope.store.records import Records
+
+#: The person in whose name it commands.
+AUTOMATIC = Person("automatic control", Role.ENGINEER)
+_UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
+_READY = (states.IDLE, states.TRACKING)
+#: The sun is looked at this often, s.
+_SUN_EVERY = 30.0
+#: After a person has given the command authority back, this long passes before it is taken, s.
+_COURTESY = 5.0
+#: The errors of the field are predicted this often, s.
+_LOOK_EVERY = 10.0
+
+
+@dataclass(frozen=True)
+class AutomaticSettings:
+    """Settings of automatic control.
+
+    Attributes
+    ----------
+    wanted
+        Whether all heliostats are wanted from the start; else those that `give_back` names.
+    calibrate
+        Whether calibration is on at the start.
+    rate
+        Heliostats that leave stow, and that go to the receiver, in a second.
+    beat
+        Time between looks at the field, s.
+    lowest
+        Elevation of the sun below which the field is stowed, rad.
+    patience
+        Time before the same command is given again, s.
+    margin
+        Standard deviations by which beams never calibrated must miss the targets.
+    events
+        Age at which events, and alarms that are over and acknowledged, are removed, days.
+    """
+
+    wanted: bool = False
+    calibrate: bool = True
+    rate: float = 10.0
+    beat: float = 2.0
+    lowest: float = math.radians(8.0)
+    patience: float = 60.0
+    margin: float = 3.0
+    events: float = 400.0
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.rate <= 100.0 and 0.0 < self.beat <= 60.0 and self.margin >= 0.0):
+            raise InputError(
+                f"automatic control: {self.rate} heliostats a second, a beat of {self.beat} s, a "
+                f"margin of {self.margin}; give above 0 to 100, above 0 to 60 s, 0 or more"
+            )
+        if not self.events > 0.0:
+            raise InputError(
+                f"automatic control: events are kept for {self.events} days; give above 0"
+            )
+
+
+class AutomaticControl:
+    """Automatic control of a plant; see `Operations` for the parameters.
+
+    Attributes
+    ----------
+    book
+        How well each heliostat is calibrated.
+    truth
+        Errors that a twin knows.
+    holds
+        Heliostats that people keep out of calibration, by name.
+    installed
+        Tracking error that the priors allow an uncalibrated heliostat, rad.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        logbook: Logbook,
+        cycle: CalibrationCycle | None,
+        *,
+        scheduler: Scheduling | None,
+        records: Records | None,
+        truth: Callable[[], FloatArray] | None,
+        settings: AutomaticSettings,
+    ) -> None:
+        self._plant, self._log, self._settings = plant, logbook, settings
+        self.truth = TrueErrors(plant, truth)
+        self.book = CalibrationBook(plant, "malan8" if cycle is None else cycle.settings.model)
+        self.installed = self.book.installed()
+        self._keeping = Keeping(plant.field.names, plant.beliefs, records)
+        self.holds: dict[str, Hold] = self._keeping.holds(self._utc())
+        self._raising = Raising(
+            plant,
+            logbook,
+            AUTOMATIC,
+            most=max(1, round(settings.rate * settings.beat)),
+            patience=settings.patience,
+            clearance=settings.margin * self.installed,
+            wanted=settings.wanted,
+        )
+        self._calibrating: Calibrating | None = None
+        if cycle is not None and scheduler is not None:
+            self._calibrating = Calibrating(
+                plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth
+            )
+        self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
+        self._token, self._sun_at, self._troubled = 0, -math.inf, False
+        self._stopped = False
+        if cycle is not None:
+            self._keeping.recall()
+
+    # -- what people say -------------------------------------------------------------------
+
+    @property
+    def model(self) -> tuple[str, ...]:
+        """Parameters that are fitted."""
+        return self.book.model
+
+    def switch(self, on: bool) -> None:
+        """Switch calibration on or off."""
+        self._on = on
+
+    def want(self, heliostats: Sequence[str], *, wanted: bool) -> None:
+        """Give heliostats to automatic control, or take them out of it."""
+        self._raising.want(heliostats, wanted=wanted)
+
+    def hold(self, who: str, heliostats: Sequence[str], reason: str) -> None:
+        """Keep heliostats out of calibration."""
+        now = self._utc()
+        for name in heliostats:
+            self._plant.field.place(name)
+        for name in heliostats:
+            self.holds[name] = Hold(name, who, reason, now)
+        self._keeping.hold(heliostats, reason, who, now)
+
+    def unhold(self, who: str, heliostats: Sequence[str]) -> None:
+        """Give heliostats back to calibration."""
+        for name in heliostats:
+            self._plant.field.place(name)
+            self.holds.pop(name, None)
+        self._keeping.unhold(heliostats, who, self._utc())
+
+    def stop(self) -> None:
+        """Begin nothing more; to be called before `run` is cancelled."""
+        self._stopped = True
+
+    async def halt(self, limit: float = 5.0) -> None:
+        """Give everything up, and wait for visits under way to end, ``limit`` s at most."""
+        self._raising.wanted[:] = self._on = False
+        self.give_way()
+        until = self._plant.now() + limit
+        while self._visiting() and self._plant.now() < until:
+            await self._sleep(0.5)
+
+    def give_way(self) -> None:
+        """Give the command authority to a person; visits under way are given up."""
+        self._gave_way_at = self._plant.now()
+        if self._has_authority():
+            self._plant.release_authority(AUTOMATIC, self._token)
+
+    # -- what is shown ---------------------------------------------------------------------
+
+    def held_rows(self) -> npt.NDArray[np.bool_]:
+        """Return which heliostats are held, (N,)."""
+        held = np.zeros(len(self._plant.field), dtype=np.bool_)
+        held[[self._plant.field.place(name) for name in self.holds]] = True
+        return held
+
+    def view(self) -> CalibrationView:
+        """Return the progress of calibration."""
+        reason = self._why_not()
+        running = {} if self._calibrating is None else self._calibrating.running
+        return CalibrationView(
+            not reason,
+            reason,
+            self.book.calibrated,
+            len(self._plant.field) - self.book.calibrated,
+            self.book.failed,
+            tuple(running.values()),
+            tuple(list(self.book.results)[:-51:-1]),
+            tuple(self.book.quality),
+        )
+
+    def plan(self, limit: int) -> tuple[Planned, ...]:
+        """Return the coming visits."""
+        return () if self._calibrating is None else self._calibrating.plan(self._ready(), limit)
+
+    # -- running ---------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Work until cancelled."""
+        async with asyncio.TaskGroup() as group:
+            for part in (self._govern, self._raise, self._look):
+                name = part.__name__.strip("_")
+                group.create_task(self._again(name, part, self._settings.beat))
+            if self._calibrating is not None:
+                for target in self._plant.design.targets:
+                    visits = self._visits(self._calibrating, target.name)
+                    group.create_task(self._again(f"target {target.name}", visits, 1.0))
+
+    async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
+        """Do a part of the work again and again; a failure is told, and ends nothing."""
+        failed = False
+        # A cancelled visit brings its beam home, and may end with another error then.
+        while not self._stopped:
+            try:
+                await part()
+                if failed:
+                    self._log.take_alarm(alarms.WORK.ended(name))
+                failed = False
+            except RefusedError as error:
+                self._log.event("calibration", AUTOMATIC.name, str(error))
+            except Exception as error:  # noqa: BLE001 - the work survives whatever fails in a part
+                failed, text = True, f"{type(error).__name__}: {error}"
+                self._log.take_alarm(alarms.WORK.raised(name, error=text))
+                await self._sleep(5.0)
+            await self._sleep(pause)
+
+    async def _sleep(self, seconds: float) -> None:
+        await sleep_until(self._plant.clock, self._plant.now() + seconds)
+
+    def _utc(self) -> float:
+        return self._plant.clock.utc().timestamp()
+
+    # -- authority and day -----------------------------------------------------------------
+
+    def _has_authority(self) -> bool:
+        grant = self._plant.authority.grant
+        return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
+
+    def _why_not(self) -> str:
+        """Return why nothing is calibrated now, "" if it is."""
+        if self._calibrating is None:
+            return "there is no camera"
+        if not self._on:
+            return "it is switched off"
+        return self._why_idle()
+
+    def _why_idle(self) -> str:
+        """Return why nothing is moved now, "" if it may be."""
+        if self._plant.emergency_on:
+            return "an emergency is active"
+        if not self._day:
+            return "the sun is too low"
+        if not self._has_authority():
+            grant = self._plant.authority.grant
+            return f"{grant.holder.name} has the command authority" if grant else "it is starting"
+        return ""
+
+    async def _govern(self) -> None:
+        """Hold the authority while nobody else wants it; give up in an emergency; see the night."""
+        plant, wanted = self._plant, self._raising.wanted
+        if plant.emergency_on:
+            wanted[:] = False
+        grant, since = plant.authority.grant, plant.now() - self._gave_way_at
+        if self._has_authority():
+            plant.authority.keep(AUTOMATIC, self._token)
+        elif grant is None and since > _COURTESY and (wanted.any() or self._on):
+            self._token = plant.take_authority(AUTOMATIC).token
+        self._night()
+
+    def _night(self) -> None:
+        """Stow the wanted heliostats before the sun is low."""
+        now = self._plant.now()
+        if now - self._sun_at < _SUN_EVERY:
+            return
+        self._sun_at = now
+        elevation = math.asin(float(np.clip(self._plant.sun_vector()[2], -1.0, 1.0)))
+        lowest = self._settings.lowest
+        if self._day and elevation < lowest:
+            self._day = False
+            up = self._plant.field.among(_UP, now) & self._raising.wanted
+            if up.any():
+                names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
+                self._plant.stow(AUTOMATIC.name, names)
+            text = f"the sun is low: {int(up.sum())} heliostats go to stow"
+            self._log.event("plant", AUTOMATIC.name, text)
+        elif not self._day and elevation > lowest + math.radians(1.0):
+            self._day = True
+            self._log.event("plant", AUTOMATIC.name, "the sun is high enough")
+
+    # -- parts of the work -----------------------------------------------------------------
+
+    async def _raise(self) -> None:
+        if not self._why_idle():
+            await self._raising.step(self._token, self._visiting)
+
+    def _visiting(self) -> frozenset[str]:
+        if self._calibrating is None:
+            return frozenset()
+        return frozenset(run.heliostat for run in self._calibrating.running.values())
+
+    def _ready(self) -> npt.NDArray[np.bool_]:
+        """Return which heliostats may be calibrated now, (N,)."""
+        ready = self._plant.field.among(_READY, self._plant.now()) & self._raising.wanted
+        ready &= ~self.held_rows()
+        ready[[self._plant.field.place(name) for name in self._visiting()]] = False
+        return ready
+
+    def _visits(self, calibrating: Calibrating, target: str) -> Callable[[], Awaitable[None]]:
+        async def visit() -> None:
+            if self._why_not():
+                return
+            name = await calibrating.visit(target, self._ready(), AUTOMATIC, self._token)
+            if name:
+                self._raising.release(name)
+
+        return visit
+
+    async def _look(self) -> None:
+        """Predict errors anew, note the quality of the field, and tell whether records are kept."""
+        self.book.refresh()
+        self.book.point(self._utc(), self.truth.all())
+        self._keeping.forget(self._utc(), self._settings.events)
+        problem = self._keeping.problem
+        if problem or self._troubled:
+            kind = alarms.RECORDS
+            self._log.take_alarm(kind.raised(problem=problem) if problem else kind.ended())
+        self._troubled = bool(problem)
+        await self._sleep(_LOOK_EVERY)

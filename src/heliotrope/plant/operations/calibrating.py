@@ -1,0 +1,168 @@
+"""Calibrating the field: one visit after another to each target, as the schedule says."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.errors import HeliotropeError
+from heliotrope.geometry import FloatArray
+from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.calibration_book import CalibrationBook
+from heliotrope.plant.operations.keeping import Keeping
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
+from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
+
+#: The true errors are computed anew this often, s.
+_TRUTH_EVERY = 5.0
+
+
+class Scheduling(Protocol):
+    """Says which heliostat is calibrated next."""
+
+    def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
+        """Return the next of the ready heliostats (N,) for a free target, None if none is due."""
+        ...
+
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
+        """Return the coming visits."""
+        ...
+
+    def done(self, entry: CalibrationEntry) -> None:
+        """Take the result of a visit."""
+        ...
+
+
+class TrueErrors:
+    """Tracking errors that a twin knows, computed every five seconds.
+
+    Parameters
+    ----------
+    plant
+        Its clock counts.
+    truth
+        Gives them, rad, (N,); None: nobody knows them.
+    """
+
+    def __init__(self, plant: PlantController, truth: Callable[[], FloatArray] | None) -> None:
+        self._plant, self._truth = plant, truth
+        self._known: tuple[float, FloatArray] | None = None
+
+    def all(self) -> FloatArray | None:
+        """Return the errors of all heliostats, rad, (N,); None if nobody knows them."""
+        if self._truth is None:
+            return None
+        now = self._plant.now()
+        if self._known is None or now - self._known[0] >= _TRUTH_EVERY:
+            self._known = now, self._truth()
+        return self._known[1]
+
+    def now(self, row: int) -> float:
+        """Return the present error of one heliostat, rad; NaN if nobody knows it."""
+        self._known = None
+        found = self.all()
+        return math.nan if found is None else float(found[row])
+
+
+class Calibrating:
+    """Makes the visits, and tells what came of them.
+
+    Parameters
+    ----------
+    plant, log
+        The controller, and where results are told.
+    cycle
+        Makes one visit.
+    scheduler
+        Chooses the heliostats.
+    book, keeping
+        Take the results.
+    truth
+        Errors that a twin knows.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        log: Logbook,
+        cycle: CalibrationCycle,
+        scheduler: Scheduling,
+        book: CalibrationBook,
+        keeping: Keeping,
+        truth: TrueErrors,
+    ) -> None:
+        self._plant, self._log, self._cycle, self._scheduler = plant, log, cycle, scheduler
+        self._book, self._keeping, self._truth = book, keeping, truth
+        self._running: dict[str, Running] = {}
+
+    @property
+    def running(self) -> Mapping[str, Running]:
+        """Visits under way, by target."""
+        return MappingProxyType(self._running)
+
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> tuple[Planned, ...]:
+        """Return the coming visits of the ready heliostats, (N,)."""
+        return tuple(self._scheduler.plan(ready, limit))
+
+    async def visit(
+        self, target: str, ready: npt.NDArray[np.bool_], person: Person, token: int
+    ) -> str:
+        """Calibrate the next of the ready heliostats (N,); return its name, "" if none is due."""
+        chosen = self._scheduler.next(target, ready)
+        if chosen is None:
+            return ""
+        name, begun = chosen.heliostat, self._now()
+
+        def tell(stage: str) -> None:
+            self._running[target] = Running(name, target, stage, begun)
+
+        tell("on the way")
+        row = self._plant.field.place(name)
+        truth, sigma = self._truth.now(row), float(self._book.error[row])
+        try:
+            result = await self._cycle.run(person, token, name, target, tell)
+        except RefusedError as error:
+            result = CycleResult(name, CalibrationOutcome.REFUSED, str(error))
+        except HeliotropeError as error:
+            text = f"{type(error).__name__}: {error}"
+            result = CycleResult(name, CalibrationOutcome.ERROR, text)
+        finally:
+            self._running.pop(target, None)
+        self._conclude(target, result, truth, begun, sigma)
+        return name
+
+    def _now(self) -> float:
+        return self._plant.clock.utc().timestamp()
+
+    def _conclude(
+        self, target: str, result: CycleResult, truth: float, begun: float, sigma: float
+    ) -> None:
+        row, good = self._plant.field.place(result.heliostat), result.outcome.calibrated
+        seen = self._plant.beliefs.seen(result.heliostat)
+        record = result.record
+        entry = CalibrationEntry(
+            self._now(),
+            result.heliostat,
+            target,
+            result.outcome,
+            result.before,
+            result.after,
+            result.measured,
+            float(self._book.error[row]),
+            truth,
+            self._truth.now(row) if good else math.nan,
+            0 if seen is None else len(seen),
+            result.new,
+            "; ".join((result.text, *result.rejected[:2])),
+            0 if record is None else record.version,
+        )
+        self._book.conclude(entry)
+        self._scheduler.done(entry)
+        self._log.event("calibration", entry.heliostat, f"at {target}: {entry.text}")
+        self._keeping.keep(entry, begun, sigma)

@@ -1,0 +1,161 @@
+"""How well every heliostat is calibrated, for people: predicted and measured errors over time."""
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.record import HeliostatCalibration
+from heliotrope.calibration.uncertainty import expected_error, precision
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism import parameters as parameter_table
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
+
+#: Points of the quality over time, and results, to hold.
+_POINTS, _RESULTS = 4000, 2000
+#: Heliostats whose priors tell the error of an uncalibrated one.
+_SAMPLE = 100
+
+
+class CalibrationBook:
+    """Calibration of N heliostats, from the calibrations that the plant believes.
+
+    Parameters
+    ----------
+    plant
+        The controller; the book follows its `beliefs`.
+    model
+        Parameters that are fitted: a name of the table, or names.
+
+    Attributes
+    ----------
+    error
+        Predicted standard deviation of the normal (two-dimensional) at the aim, rad, (N,).
+    measured, calibrated_at, sightings
+        See `FieldFrame`.
+    model
+        Names of the parameters.
+    results, quality
+        The last ones, oldest first.
+    failed
+        Number of visits without a new calibration.
+    """
+
+    def __init__(self, plant: PlantController, model: str | tuple[str, ...]) -> None:
+        count = len(plant.field)
+        self._plant = plant
+        group, _ = plant.design.find(plant.field.names[0])
+        known = group.mechanism.parameters
+        self.model = parameter_table.model(model, known) if isinstance(model, str) else model
+        self.error = np.full(count, np.nan)
+        self.measured = np.full(count, np.nan)
+        self.calibrated_at = np.full(count, np.nan)
+        self.sightings = np.zeros(count, dtype=np.int32)
+        self.results: deque[CalibrationEntry] = deque(maxlen=_RESULTS)
+        self.quality: deque[QualityPoint] = deque(maxlen=_POINTS)
+        self.failed = 0
+        plant.beliefs.subscribe(self._believe)
+
+    @property
+    def calibrated(self) -> int:
+        """Number of heliostats with a calibration."""
+        return len(self._plant.beliefs)
+
+    def _believe(self, record: HeliostatCalibration) -> None:
+        row = self._plant.field.place(record.heliostat)
+        seen = self._plant.beliefs.seen(record.heliostat)
+        self.calibrated_at[row] = record.at
+        self.sightings[row] = 0 if seen is None else len(seen)
+        self._predict([record])
+
+    def conclude(self, entry: CalibrationEntry) -> None:
+        """Take the result of a visit."""
+        row = self._plant.field.place(entry.heliostat)
+        self.sightings[row] = entry.sightings
+        if np.isfinite(entry.measured):
+            # The normal is off by half as much as the beam.
+            self.measured[row] = 0.5 * entry.measured
+        self.failed += not entry.good
+        self.results.append(entry)
+
+    def refresh(self) -> None:
+        """Predict the errors of all calibrated heliostats for the present sun and aims."""
+        self._predict(list(self._plant.beliefs))
+
+    def _predict(self, records: list[HeliostatCalibration]) -> None:
+        light = self._plant.sun_vector()
+        if not light[2] > 0.0:
+            return
+        # Heliostats of one group with the same parameters are computed together.
+        parts: dict[tuple[int, tuple[str, ...]], list[HeliostatCalibration]] = {}
+        for record in records:
+            group = self._plant.design.find(record.heliostat)[0]
+            parts.setdefault((id(group), record.names), []).append(record)
+        for (_, names), members in parts.items():
+            group = self._plant.design.find(members[0].heliostat)[0]
+            places = np.array([group.index(r.heliostat) for r in members], dtype=np.intp)
+            values = np.stack([record.values for record in members])
+            rows = np.array([self._plant.field.place(r.heliostat) for r in members], dtype=np.intp)
+            covariance = np.stack([record.covariance for record in members])
+            parameters = dict(zip(names, values.T, strict=True))
+            mechanism = group.mechanism[places].with_parameters(parameters)
+            found = expected_error(mechanism, names, covariance, light, self._aims(rows))
+            self.error[rows] = 0.5 * found.rms
+
+    def _aims(self, rows: npt.NDArray[np.intp]) -> FloatArray:
+        names = [self._plant.field.names[row] for row in rows]
+        given = self._plant.default_aims(names)
+        return np.stack([given[name] for name in names])
+
+    def installed(self) -> float:
+        """Return the tracking error that the priors allow an uncalibrated heliostat, rad."""
+        field = self._plant.field
+        rows = np.unique(np.linspace(0, len(field) - 1, _SAMPLE).astype(np.intp))
+        light = self._plant.sun_vector()
+        light = light if light[2] > 0.0 else np.array([0.0, 0.0, 1.0])
+        spread = []
+        for row, aim in zip(rows, self._aims(rows), strict=True):
+            nominal = self._plant.beliefs.nominal(field.names[row])
+            prior = np.linalg.inv(precision(nominal, self.model))[0]
+            found = expected_error(nominal, self.model, prior, light, aim)
+            spread.append(0.5 * float(found.rms[0]))
+        good = np.array(spread)[np.isfinite(spread)]
+        return float(np.sqrt(np.mean(good**2))) if len(good) else 0.0
+
+    # -- looking ---------------------------------------------------------------------------
+
+    def history(self, name: str) -> tuple[SightingView, ...]:
+        """Return the sightings of a heliostat since the start, oldest first."""
+        seen = self._plant.beliefs.seen(name)
+        if seen is None:
+            return ()
+        columns = zip(seen.sightings.time, seen.targets, seen.missed, strict=True)
+        return tuple(
+            SightingView(float(at), target, float(missed))
+            for at, target, missed in columns
+            if np.isfinite(missed)
+        )
+
+    def results_of(self, name: str) -> tuple[CalibrationEntry, ...]:
+        """Return the results of a heliostat's visits, oldest first."""
+        return tuple(entry for entry in self.results if entry.heliostat == name)
+
+    def point(self, at: float, truth: FloatArray | None) -> None:
+        """Add a point to the quality over time."""
+        rows = np.isfinite(self.calibrated_at)
+        if not rows.any():
+            return
+        nan = float("nan")
+        known, true = self.error[rows], None if truth is None else truth[rows]
+        median, ninety = _shares(known)
+        of_truth = (nan, nan) if true is None else _shares(true)
+        self.quality.append(QualityPoint(at, int(rows.sum()), median, ninety, *of_truth))
+
+
+def _shares(values: FloatArray) -> tuple[float, float]:
+    """Return median and 90th percentile of the finite values."""
+    good = values[np.isfinite(values)]
+    if not len(good):
+        return float("nan"), float("nan")
+    return float(np.median(good)), float(np.quantile(good, 0.9))

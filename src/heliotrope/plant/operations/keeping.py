@@ -1,0 +1,157 @@
+"""What automatic control keeps over a restart: sightings, calibrations, visits and holds."""
+
+import functools
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from heliotrope.calibration.record import HeliostatCalibration, Identities
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.plant.beliefs import Beliefs
+from heliotrope.plant.operations.views import CalibrationEntry, Hold
+from heliotrope.store.records import Records, StoreError, VisitEntry
+
+#: Old events are removed this often, s.
+_DAY = 86_400.0
+
+
+@runtime_checkable
+class Forgetting(Protocol):
+    """Records that can remove what is old."""
+
+    def forget_events(self, before: float) -> None:
+        """Remove events before a time, and alarms that were over and acknowledged by then."""
+        ...
+
+
+class Keeping:
+    """Keeps what the plant learns, and recalls it; without records it does nothing.
+
+    It keeps and numbers sightings, and each new calibration, for the plant's beliefs.
+
+    Parameters
+    ----------
+    names
+        Heliostats of the plant.
+    beliefs
+        Beliefs of the plant.
+    records
+        Where everything is kept; None: nowhere.
+
+    Attributes
+    ----------
+    lost
+        The last failure to keep something, "" if the last attempt succeeded.
+    """
+
+    def __init__(self, names: Sequence[str], beliefs: Beliefs, records: Records | None) -> None:
+        self._names, self._beliefs, self._records = names, beliefs, records
+        self.lost = ""
+        self._forgot_at = -np.inf
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be kept now, "" if it can."""
+        return self.lost or (self._records.problem if self._records is not None else "")
+
+    def recall(self) -> None:
+        """Let the plant believe the calibrations kept before, and keep new ones from now on."""
+        records = self._records
+        if records is None:
+            return
+        kept = records.sightings(self._names)
+        for name, record in records.latest_calibrations(self._names).items():
+            rows = np.zeros(0, np.intp)
+            if name in kept.names:
+                rows = np.flatnonzero(kept.sightings.heliostat == kept.names.index(name))
+            targets = [kept.targets[row] for row in rows]
+            self._beliefs.recall(record, kept.of(name), kept.identities[rows], targets)
+        self._beliefs.number_with(self._number)
+        self._beliefs.subscribe(functools.partial(self._keep, records), held=False)
+
+    def _number(self, name: str, target: str, new: Sightings) -> Identities:
+        """Keep sightings; return their numbers, 0 where they could not be kept."""
+        assert self._records is not None
+        try:
+            return self._records.record_sightings((name,), new, target=target)
+        except StoreError as error:
+            self.lost = str(error)
+            return np.zeros(len(new), np.int64)
+
+    def _keep(self, records: Records, record: HeliostatCalibration) -> None:
+        if (record.sightings == 0).any():
+            return  # its sightings could not be kept, which `lost` tells
+        try:
+            records.record_calibration(record)
+        except StoreError as error:
+            self.lost = str(error)
+
+    def keep(self, entry: CalibrationEntry, begun: float, sigma: float) -> None:
+        """Keep the result of a visit.
+
+        Parameters
+        ----------
+        entry
+            The result.
+        begun
+            Beginning of the visit, POSIX s.
+        sigma
+            Predicted error of the normal before it, rad.
+        """
+        if self._records is None:
+            return
+        visit = VisitEntry(
+            entry.heliostat,
+            entry.target,
+            begun,
+            entry.at,
+            entry.outcome,
+            entry.text,
+            sigma_before=sigma,
+            sigma_after=entry.predicted,
+            error_before=entry.before,
+            error_after=entry.after,
+            sightings=entry.new,
+            version=entry.version,
+        )
+        try:
+            self._records.record_visit(visit)
+            seen = self._beliefs.seen(entry.heliostat)
+            if seen is None or (seen.identities > 0).all():
+                self.lost = ""
+        except StoreError as error:
+            self.lost = str(error)
+
+    # -- holds and events ------------------------------------------------------------------
+
+    def holds(self, now: float) -> dict[str, Hold]:
+        """Return the holds kept before; ``now`` in POSIX s."""
+        if self._records is None:
+            return {}
+        return {
+            name: Hold(name, hold.person, hold.reason, hold.since)
+            for name, hold in self._records.holds(now).items()
+            if name in self._names
+        }
+
+    def hold(self, heliostats: Sequence[str], reason: str, who: str, at: float) -> None:
+        """Keep holds."""
+        if self._records is not None:
+            self._records.hold(heliostats, reason, who, at)
+
+    def unhold(self, heliostats: Sequence[str], who: str, at: float) -> None:
+        """Keep the end of holds."""
+        if self._records is not None:
+            self._records.unhold(heliostats, who, at)
+
+    def forget(self, now: float, days: float) -> None:
+        """Remove events older than some days, once a day; ``now`` in POSIX s."""
+        kept: object = self._records
+        if now - self._forgot_at < _DAY or not isinstance(kept, Forgetting):
+            return
+        self._forgot_at = now
+        try:
+            kept.forget_events(now - days * _DAY)
+        except StoreError as error:
+            self.lost = str(error)

@@ -1,0 +1,180 @@
+"""Raising the field: wanted heliostats go from stow to standby and to the receiver."""
+
+import functools
+import math
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.lcu import states
+from heliotrope.plant._beam_watch import BeamError
+from heliotrope.plant.authority import Person
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.tickets import Ticket
+from heliotrope.safety import alarms
+
+#: A heliostat whose beam has no clear way is tried again after this time, s.
+_BLOCKED = 300.0
+
+Rows = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+
+
+class Raising:
+    """Brings wanted heliostats to the receiver, a few at a time.
+
+    An uncalibrated beam goes to the receiver only if it would miss every target by a wide margin.
+
+    Parameters
+    ----------
+    plant, log
+        The controller, and where blocked beams are told.
+    person
+        Commands in its name.
+    most
+        Heliostats that leave stow, or go to the receiver, at a time.
+    patience
+        Time before the same command is given again, s.
+    clearance
+        Tracking error that an uncalibrated beam must not miss targets by less than, rad.
+    wanted
+        Whether all heliostats are wanted from the start.
+
+    Attributes
+    ----------
+    wanted
+        Which heliostats automatic control may move, (N,).
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        log: Logbook,
+        person: Person,
+        *,
+        most: int,
+        patience: float,
+        clearance: float,
+        wanted: bool,
+    ) -> None:
+        self._plant, self._log, self._person = plant, log, person
+        self._most, self._patience = most, patience
+        count = len(plant.field)
+        self.wanted: Mask = np.full(count, wanted, dtype=np.bool_)
+        self._busy_until = np.full(count, -math.inf)
+        self._told_in = np.full(count, -1, dtype=np.int16)
+        self._blocked: set[str] = set()
+        self._joins: list[Ticket] = []  # some of their heliostats still wait for their turn
+        self._aims = plant.default_aims() if plant.design.receivers else {}
+        self._clear = self._clear_of_targets(clearance)
+
+    def want(self, heliostats: Sequence[str], *, wanted: bool) -> None:
+        """Give heliostats to automatic control, or take them out of it."""
+        rows = [self._plant.field.place(name) for name in heliostats]
+        self.wanted[rows] = wanted
+        self._busy_until[rows] = -math.inf
+
+    def release(self, heliostat: str) -> None:
+        """Let a heliostat be commanded again at once: its visit to a target has ended."""
+        self._busy_until[self._plant.field.place(heliostat)] = -math.inf
+
+    def _clear_of_targets(self, clearance: float) -> Mask:
+        """Return which beams miss all targets on their way to the receiver uncalibrated, (N,)."""
+        plant, aims = self._plant, self._aims
+        if not aims:
+            return np.zeros(len(plant.field), dtype=np.bool_)
+        points = np.stack([aims[name] for name in plant.field.names])
+        slant = np.linalg.norm(points - plant.beams.armature.origin_1, axis=-1)
+        room = np.full(len(points), math.inf)
+        for target in plant.design.targets:
+            middle = np.asarray(target.corners).mean(axis=0)
+            reach = 0.5 * math.hypot(target.width, target.height)
+            room = np.minimum(room, np.linalg.norm(points - middle, axis=-1) - reach)
+        # The beam is off by twice as much as the normal; that error is two-dimensional.
+        return np.asarray(math.sqrt(2.0) * clearance * slant < room)
+
+    async def step(self, token: int, visiting: Callable[[], frozenset[str]]) -> None:
+        """Command what may be commanded now.
+
+        Parameters
+        ----------
+        token
+            Of the command authority.
+        visiting
+            Gives the heliostats that visit targets now.
+        """
+        plant, now = self._plant, self._plant.now()
+        self._look_at_blocked()
+        busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
+        free = self.wanted & ~busy
+        free[[plant.field.place(name) for name in visiting()]] = False
+        for state, name in ((states.STOWED, "APPROACH"), (states.DEFOCUSED, "IDLE")):
+            rows = np.flatnonzero(free & plant.field.among((state,), now))[: self._most]
+            if len(rows):
+                give = functools.partial(plant.command, self._person, token, name)
+                self._give(rows, state, give)
+        calibrated = np.array([plant.beliefs.record(n) is not None for n in plant.field.names])
+        able = free & (self._clear | calibrated) & plant.field.among((states.IDLE,), now)
+        rows = np.flatnonzero(able)[: self._most]
+        if len(rows) and self._aims and plant.waiting < self._most:
+            await self._join(rows, token, visiting)
+
+    async def _join(self, rows: Rows, token: int, visiting: Callable[[], frozenset[str]]) -> None:
+        """Give heliostats their aims on the receiver, and send them there."""
+        plant, aims = self._plant, self._aims
+        given = self._give(
+            rows,
+            states.IDLE,
+            lambda names: plant.aim(self._person, token, {n: aims[n] for n in names}),
+        )
+        if given is None:
+            return
+        names, ticket = given
+        await ticket.end(10.0)
+        # A visit may have begun meanwhile: its aim must not be undone.
+        away = visiting() | ticket.refusals.keys()
+        done = tuple(name for name in names if name not in away)
+        if done:
+            self._joins.append(plant.command(self._person, token, "TRACK", done))
+
+    def _give(
+        self, rows: Rows, state: int, give: Callable[[tuple[str, ...]], Ticket]
+    ) -> tuple[tuple[str, ...], Ticket] | None:
+        """Give a command to the heliostats whose beams have a clear way; the others wait."""
+        names = tuple(self._plant.field.names[row] for row in rows)
+        while names:
+            try:
+                ticket = give(names)
+            except BeamError as error:
+                refusals = error.refusals
+            else:
+                told = [self._plant.field.place(name) for name in names]
+                # Not again before something has come of it.
+                self._busy_until[told] = self._plant.now() + self._patience
+                self._told_in[told] = state
+                self._block(ticket.blocked, state)
+                return names, ticket
+            self._block(refusals, state)
+            names = tuple(name for name in names if name not in refusals)
+        return None
+
+    def _block(self, refusals: Mapping[str, str], state: int) -> None:
+        """Leave heliostats where they are until the sun has moved on."""
+        for name, text in refusals.items():
+            row = self._plant.field.place(name)
+            self._busy_until[row], self._told_in[row] = self._plant.now() + _BLOCKED, state
+            self._blocked.add(name)
+            self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
+
+    def _look_at_blocked(self) -> None:
+        """Tell which beams were blocked when their turn came, and which alarms are over."""
+        for ticket in [ticket for ticket in self._joins if ticket.finished]:
+            self._joins.remove(ticket)
+            self._block(ticket.blocked, states.IDLE)
+        for name in sorted(self._blocked):
+            row = self._plant.field.place(name)
+            if self._plant.field.rows["state"][row] != self._told_in[row]:
+                self._blocked.remove(name)
+                self._log.take_alarm(alarms.BEAM_BLOCKED.ended(name))

@@ -1,0 +1,257 @@
+"""The photographs of a visit: plainly where the beam is, or with a search and a centred beam.
+
+A mirror that was never calibrated may miss by more than the target is wide. If the first photograph
+shows no light, the aim moves along a square spiral in the target's plane until light appears, and
+then by as much as the beam is off the middle. Only light on the target counts, and only light that
+moves as the aim moves: other beams cross targets while a field is raised.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.visit import Visit
+
+#: Where the photographs after the first are taken: right and up, in turn.
+CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
+#: Photographs beyond those wanted: one or the other may be cut at the edge of the target.
+_SPARE = 2
+#: An aim this close to the one before is not sent, m.
+_SAME = 0.05
+
+#: Told what is being done, in words.
+Tell = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a photograph of a target shows of one beam.
+
+    Attributes
+    ----------
+    point
+        Centroid, ENU, m, (3,).
+    at
+        Middle of the exposure, s of the plant's monotonic clock.
+    covariance
+        Of the point, m²: a variance or (3, 3).
+    reasons
+        Why it cannot be used; () if it can.
+    """
+
+    point: FloatArray
+    at: float
+    covariance: npt.ArrayLike = 0.0
+    reasons: tuple[str, ...] = ()
+
+
+class Camera(Protocol):
+    """Takes photographs of targets and reads them."""
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return what is seen now of a heliostat's beam."""
+        ...
+
+
+@dataclass
+class Photographs:
+    """The photographs of one visit.
+
+    Attributes
+    ----------
+    used
+        Each with the step counts of the two axes, (2,), at its exposure.
+    rejected
+        Why others were not used, in words.
+    found
+        Whether the beam was seen at all.
+    """
+
+    used: list[tuple[Shot, FloatArray]] = field(default_factory=list)
+    rejected: list[str] = field(default_factory=list)
+    found: bool = True
+
+
+class Photographing(Protocol):
+    """A way to take the photographs of a visit."""
+
+    async def take(self, visit: Visit, tell: Tell) -> Photographs:
+        """Photograph the beam of a heliostat that has arrived at its target."""
+        ...
+
+
+class Plain:
+    """Photographs the beam where it is, without search or centring."""
+
+    def __init__(self, camera: Camera, settings: CycleSettings) -> None:
+        self._camera, self._settings = camera, settings
+
+    async def take(self, visit: Visit, tell: Tell) -> Photographs:
+        """Take the photographs; see `Photographing`."""
+        plant, taken = visit.plant, Photographs()
+        for k in range(self._settings.shots):
+            tell(f"photograph {k + 1}")
+            due = plant.now() + self._settings.interval
+            shot = await _photograph(self._camera, visit)
+            if shot.reasons:
+                taken.rejected.append(f"photograph {k + 1}: {'; '.join(shot.reasons)}")
+            else:
+                taken.used.append((shot, await visit.counts_at(shot.at)))
+            while plant.now() < due and k + 1 < self._settings.shots:
+                await visit.look()
+        return taken
+
+
+class Centred:
+    """Searches for the beam, centres it, and photographs it at several places of the target."""
+
+    def __init__(self, camera: Camera, settings: CycleSettings, centring: Centring) -> None:
+        self._camera, self._settings, self._centring = camera, settings, centring
+
+    async def take(self, visit: Visit, tell: Tell) -> Photographs:
+        """Take the photographs; see `Photographing`."""
+        taken, before = Photographs(), np.asarray(visit.target.center)
+        for _ in range(self._centring.looks):
+            light = await self._find(visit, before, tell)
+            if light is None:
+                tries = self._centring.most + 1
+                taken.rejected.append(
+                    f"no beam was seen on {visit.target.name} in {tries} photographs"
+                )
+                taken.found = False
+                return taken
+            await self._series(visit, light, taken, tell)
+            if taken.used:
+                break
+            before = light.aim
+        return taken
+
+    async def _find(self, visit: Visit, before: FloatArray, tell: Tell) -> "_Light | None":
+        """Search for the beam and bring it near the middle; None if it is nowhere.
+
+        ``before`` is the present aim.
+        """
+        target, centring = visit.target, self._centring
+        pitch = centring.pitch * min(target.width, target.height)
+        for k, place in enumerate([(0, 0), *spiral(centring.most)]):
+            aim = np.asarray(target.center + pitch * (np.array(place) @ target.axes))
+            tell(f"search {k}" if k else "first look")
+            await self._go(visit, aim, before)
+            before = aim
+            light = seen(target, await _photograph(self._camera, visit))
+            if light is not None:
+                return await self._centre(visit, aim, light, tell)
+        return None
+
+    async def _centre(
+        self, visit: Visit, aim: FloatArray, place: FloatArray, tell: Tell
+    ) -> "_Light":
+        """Move the aim by as much as the beam is off the middle."""
+        target = visit.target
+        if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
+            return _Light(aim, aim, place)
+        tell("to the middle")
+        moved = np.asarray(aim - place @ target.axes)
+        await visit.aim(moved)
+        await visit.arrived(self._settings.arrival)
+        return _Light(moved, aim, place)
+
+    async def _series(self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell) -> None:
+        """Take the photographs of the beam that was found; end at once if it is another's."""
+        plant, settings = visit.plant, self._settings
+        aim, room = light.aim, self._room(visit)
+        for k in range(settings.shots + _SPARE):
+            tell(f"photograph {k + 1}")
+            due = plant.now() + settings.interval
+            shot = await _photograph(self._camera, visit)
+            astray = self._astray(visit.target, shot, aim, light)
+            good = not astray and not shot.reasons
+            if good:
+                taken.used.append((shot, await visit.counts_at(shot.at)))
+            else:
+                taken.rejected.append(f"photograph {k + 1}: {astray or '; '.join(shot.reasons)}")
+            if len(taken.used) >= settings.shots or (astray and not taken.used):
+                return
+            # A photograph that failed off the middle may succeed in the middle.
+            corner = np.array(CORNERS[k % len(CORNERS)]) * (room if good else 0.0)
+            goal = np.asarray(light.aim + corner @ visit.target.axes)
+            await self._go(visit, goal, aim)
+            aim = goal
+            while plant.now() < due:
+                await visit.look()
+
+    def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
+        """Return why light is not the beam found first, "" if it is: a beam moves as its aim."""
+        place = seen(target, shot)
+        if place is None:
+            return "" if shot.reasons else "no light on the target"
+        expected = light.place + target.axes @ (aim - light.first)
+        away = float(np.linalg.norm(place - expected))
+        if away <= self._centring.astray * min(target.width, target.height):
+            return ""
+        return f"light {away:.1f} m from where the aim went: another heliostat's beam"
+
+    def _room(self, visit: Visit) -> float:
+        """Return how far a beam may be off the middle on both sides, m."""
+        target, plant, row = visit.target, visit.plant, visit.row
+        group, place = plant.design.find(visit.heliostat)
+        mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
+        slant = float(np.linalg.norm(plant.beams.armature.origin_1[row] - target.center))
+        free = 0.5 * min(target.width, target.height) - mirror - self._centring.slope * slant
+        return self._centring.spread * max(0.0, free)
+
+    async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:
+        if np.linalg.norm(aim - before) > _SAME:
+            await visit.aim(aim)
+            await visit.arrived(self._settings.arrival)
+
+
+@dataclass(frozen=True)
+class _Light:
+    """Light first seen at ``place`` (m, (2,)) under aim ``first``; ``aim`` centres it."""
+
+    aim: FloatArray
+    first: FloatArray
+    place: FloatArray
+
+
+async def _photograph(camera: Camera, visit: Visit) -> Shot:
+    shot = await camera.photograph(visit.target, visit.heliostat)
+    if visit.state != states.TRACKING:
+        raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")
+    return shot
+
+
+def seen(target: Target, shot: Shot) -> FloatArray | None:
+    """Return where a shot shows light, right of and above the aim point, m, (2,); None: nowhere."""
+    if not np.isfinite(shot.point).all():
+        return None
+    place = target.plane_coordinates(shot.point)
+    corners = target.plane_coordinates(target.corners)
+    if (place < corners.min(axis=0)).any() or (place > corners.max(axis=0)).any():
+        return None
+    return np.asarray(place)
+
+
+def spiral(count: int) -> Iterator[tuple[int, int]]:
+    """Yield the first places of a square spiral about (0, 0), which is left out."""
+    x = y = 0
+    step, turn, left = 1, 0, 1
+    ways = ((1, 0), (0, 1), (-1, 0), (0, -1))
+    for _ in range(count):
+        x, y = x + ways[turn % 4][0], y + ways[turn % 4][1]
+        yield x, y
+        left -= 1
+        if left == 0:
+            turn += 1
+            step += turn % 2 == 0
+            left = step

@@ -1,0 +1,94 @@
+"""Settings of a visit: its photographs, the search for a beam, and what a fit must fulfil."""
+
+from dataclasses import dataclass
+
+from heliotrope.errors import InputError
+
+
+@dataclass(frozen=True)
+class CycleSettings:
+    """Settings of a calibration cycle.
+
+    Attributes
+    ----------
+    shots, interval
+        Photographs of one visit, and the time between them, s.
+    arrival
+        Longest time to reach an aim, s.
+    model
+        Parameters to fit; see `calibration.fit.estimator.fit`.
+    least
+        Sightings that a fit needs, all visits together.
+    sigma
+        Standard deviation of a beam beside that of its centroid, rad.
+    most
+        Largest credible deviation of a parameter, in standard deviations of its prior.
+    gain
+        Largest accepted error after the fit, as a share of the error before (RMS over all
+        sightings).
+    left
+        Largest accepted beam error after the fit, rad RMS: a robust fit settles on nonsense too.
+    """
+
+    shots: int = 3
+    interval: float = 20.0
+    arrival: float = 300.0
+    model: str | tuple[str, ...] = "malan8"
+    least: int = 3
+    sigma: float = 5e-4
+    most: float = 6.0
+    gain: float = 1.0
+    left: float = 3e-3
+
+    def __post_init__(self) -> None:
+        if self.shots < 1 or self.least < 1 or not self.interval >= 0.0:
+            raise InputError(
+                f"calibration cycle: {self.shots} shots {self.interval} s apart, at least "
+                f"{self.least} sightings; give 1 or more, 0 s or more, 1 or more"
+            )
+
+    @property
+    def model_name(self) -> str:
+        """The model as one word."""
+        return self.model if isinstance(self.model, str) else "+".join(self.model)
+
+
+@dataclass(frozen=True)
+class Centring:
+    """How a beam that misses its target is found and centred.
+
+    Attributes
+    ----------
+    pitch
+        Distance between neighbouring aims of the search, as a share of the target's shorter side.
+    most
+        Aims to try beside the middle.
+    near
+        A beam this close to the middle is not moved, as a share of the shorter side.
+    spread
+        How far off the middle later photographs are taken, as a share of the room that the beam
+        leaves on the target: the further apart sightings are, the more they tell. 0: all in the
+        middle.
+    slope
+        Half the divergence of a beam, rad, beside the size of its mirror.
+    astray
+        Light this far from where the aim has moved it belongs to another heliostat, as a share of
+        the shorter side.
+    looks
+        How often to search again if the first light belonged to another heliostat.
+    """
+
+    pitch: float = 0.7
+    most: int = 24
+    near: float = 0.15
+    spread: float = 0.8
+    slope: float = 8e-3
+    astray: float = 0.06
+    looks: int = 3
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.pitch <= 2.0 and self.most >= 0 and 0.0 < self.near <= 0.5):
+            raise InputError(
+                f"centring: pitch {self.pitch}, {self.most} aims, near {self.near}; give above 0 "
+                "to 2, 0 or more, and above 0 to 0.5"
+            )
