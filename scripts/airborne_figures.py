@@ -20,7 +20,7 @@ import numpy as np
 
 from heliotrope.airborne.evaluate.orientation import measure
 from heliotrope.airborne.evaluate.pictures import heliostat_drawing
-from heliotrope.airborne.simulate.trial import Conditions, four_facets, scene
+from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, trial_mirror
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial" / "airborne.md"
@@ -70,7 +70,7 @@ def four() -> str:
     mirror = four_facets()
     turns = np.zeros((4, 2))
     turns[3, 1] = 1.5e-3
-    flown = scene(mirror.canted(turns), Conditions(columns=11, rows=9), 3)
+    flown = trial_mirror(mirror.canted(turns), TrialConditions(columns=11, rows=9), 3)
     found = measure(flown.reflections, mirror, flown.told_rotation, flown.told_vertex)
     return heliostat_drawing("Four facets", found, mirror)
 

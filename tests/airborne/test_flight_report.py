@@ -31,7 +31,7 @@ from heliotrope.airborne.evaluate.tables import (
     orientation_rows,
     systematic_parts,
 )
-from heliotrope.airborne.simulate.trial import Conditions, four_facets, scene
+from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, trial_mirror
 from heliotrope.errors import FormatError, InputError
 
 SHAPE = four_facets()
@@ -43,7 +43,7 @@ BUDGET = Budget(0.010, 0.030, 0.005, 0.002)
 def field() -> tuple[Orientations, np.ndarray]:
     found, places = [], []
     for k in range(2):
-        s = scene(SHAPE, Conditions(columns=7, rows=6), 20 + k)
+        s = trial_mirror(SHAPE, TrialConditions(columns=7, rows=6), 20 + k)
         own = replace(s.reflections, heliostat=s.reflections.heliostat + k)
         # Two spots that were taken for another's.
         own = replace(own, x=own.x + np.where(np.arange(len(own)) < 2 * k, 0.7, 0.0))
@@ -214,7 +214,7 @@ def test_nothing_measured_is_still_a_report(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".csv", ".parquet"])
 def test_reflections_are_read_as_they_were_written(suffix: str, tmp_path: Path) -> None:
-    s = scene(SHAPE, Conditions(columns=3, rows=3), 1)
+    s = trial_mirror(SHAPE, TrialConditions(columns=3, rows=3), 1)
     file = tmp_path / f"table{suffix}"
     write_reflections(file, s.reflections, ("H",))
     kept, left_out = read_reflections(file, ("G", "H"))
@@ -226,7 +226,9 @@ def test_reflections_are_read_as_they_were_written(suffix: str, tmp_path: Path) 
 
 def test_bad_rows_are_named_and_left_out(tmp_path: Path) -> None:
     file = tmp_path / "table.csv"
-    write_reflections(file, scene(SHAPE, Conditions(columns=3, rows=3), 1).reflections, ("H",))
+    write_reflections(
+        file, trial_mirror(SHAPE, TrialConditions(columns=3, rows=3), 1).reflections, ("H",)
+    )
     lines = file.read_text().splitlines()
     cells = [line.split(",") for line in lines[1:6]]
     cells[0][1] = "X"

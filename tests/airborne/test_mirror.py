@@ -227,7 +227,7 @@ def test_random_surfaces_are_surfaces() -> None:
     [
         (np.zeros((3, 4, 4, 2)), "a map of 3 facets, but the mirror has 4"),
         (np.full((4, 4, 4, 2), 0.4), "400 mrad is above 100 mrad"),
-        (np.full((4, 4, 4, 2), np.nan), "facet 0: 100 % of its map are missing"),
+        (np.full((4, 4, 4, 2), np.nan), "facet 0: 100 % of its map is missing"),
         (np.zeros((4, 4, 2)), "they must be"),
     ],
 )
@@ -248,9 +248,9 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
     )
     for name, text in (
         ("other.npz", "no array 'slope' in it, only height"),
-        ("no.npz", "not a file that NumPy wrote"),
+        ("no.npz", "not an .npz file written by NumPy"),
         ("part.csv", "1 rows for 4 × 91 × 91 cells"),
-        ("half.csv", "are no whole numbers"),
+        ("half.csv", "are not whole numbers"),
         ("missing.npz", "there is no such file"),
     ):
         with pytest.raises(FormatError, match=text):

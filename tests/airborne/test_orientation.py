@@ -17,7 +17,14 @@ from heliotrope.airborne.evaluate.orientation import (
 from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.evaluate.sightings import to_sightings
 from heliotrope.airborne.mirror import MirrorShape, measured_normal, orientation, reflection_points
-from heliotrope.airborne.simulate.trial import Conditions, Trials, four_facets, scene, table, trials
+from heliotrope.airborne.simulate.trial import (
+    TrialConditions,
+    Trials,
+    four_facets,
+    table,
+    trial_mirror,
+    trials,
+)
 from heliotrope.calibration import sightings as kinds
 from heliotrope.calibration.fit.estimator import fit
 from heliotrope.calibration.fit.residuals import linearise
@@ -25,7 +32,9 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import MRAD, direction, normalize, reflect, tangent_axes
 from heliotrope.mechanism.kinds import azimuth_elevation
 
-EXACT = Conditions(slope=0.0, rtk=0.0, reflection=0.0, pointing=8e-3, budget=Budget(0, 0, 0, 0))
+EXACT = TrialConditions(
+    slope=0.0, rtk=0.0, reflection=0.0, pointing=8e-3, budget=Budget(0, 0, 0, 0)
+)
 SHAPE = four_facets()
 
 
@@ -36,7 +45,7 @@ def rms(values: np.ndarray) -> float:
 @pytest.mark.parametrize("mean", ["plain", "area"])
 @pytest.mark.parametrize("slope", [0.0, 0.8e-3])
 def test_the_truth_is_found_where_nothing_is_wrong(mean: str, slope: float) -> None:
-    s = scene(SHAPE, replace(EXACT, slope=slope), 4)
+    s = trial_mirror(SHAPE, replace(EXACT, slope=slope), 4)
     found = measure(
         s.reflections, s.shape, s.told_rotation, s.told_vertex, mean=mean, budget=EXACT.budget
     )
@@ -52,7 +61,7 @@ def test_the_truth_is_found_where_nothing_is_wrong(mean: str, slope: float) -> N
 
 
 def test_two_rounds_are_enough() -> None:
-    s = scene(SHAPE, EXACT, 4)
+    s = trial_mirror(SHAPE, EXACT, 4)
     error = []
     for rounds in (0, 1, 2):
         found = measure(
@@ -65,7 +74,7 @@ def test_two_rounds_are_enough() -> None:
 
 def test_the_vertex_turns_about_the_pivot() -> None:
     """A vertex 0.4 m in front of its pivot moves by 0.4 m times the turn."""
-    s = scene(SHAPE, EXACT, 4)
+    s = trial_mirror(SHAPE, EXACT, 4)
     pivot = np.array([0.0, 0.0, -0.4])
     told_vertex = s.vertex + (s.rotation - s.told_rotation) @ pivot
     found = measure(s.reflections, SHAPE, s.told_rotation, told_vertex, pivot=pivot)
@@ -84,7 +93,7 @@ def test_rotations_about_the_mirrors_own_axes() -> None:
 
 
 def test_gross_errors_are_left_out() -> None:
-    s = scene(SHAPE, replace(EXACT, reflection=0.01), 3)
+    s = trial_mirror(SHAPE, replace(EXACT, reflection=0.01), 3)
     x = s.reflections.x.copy()
     x[[5, 11]] += [1.1, 0.9]
     wrong = replace(s.reflections, x=np.clip(x, -1.6, 2.5))
@@ -97,7 +106,7 @@ def test_gross_errors_are_left_out() -> None:
 def test_a_canted_facet_is_named() -> None:
     turns = np.zeros((4, 2))
     turns[2] = [2.5 * MRAD, -2.0 * MRAD]
-    s = scene(SHAPE.canted(turns), replace(EXACT, reflection=0.01, hover=0.05), 3)
+    s = trial_mirror(SHAPE.canted(turns), replace(EXACT, reflection=0.01, hover=0.05), 3)
     found = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex)
     told = [w for w in found.warnings if "canted off by" in w]
     assert len(told) == 1
@@ -107,10 +116,10 @@ def test_a_canted_facet_is_named() -> None:
 
 
 def test_uneven_sampling_is_named() -> None:
-    s = scene(SHAPE, replace(EXACT, reflection=0.01), 3)
+    s = trial_mirror(SHAPE, replace(EXACT, reflection=0.01), 3)
     part = s.reflections.take(s.reflections.x > 0.0)
     told = measure(part, SHAPE, s.told_rotation, s.told_vertex).warnings
-    assert any(w.startswith("unsymmetric sampling: the points' centre stands +0.") for w in told)
+    assert any(w.startswith("unsymmetric sampling: the centre of the points is +0.") for w in told)
     assert sum("it may be canted off, dirty or shaded" in w for w in told) == 2
     few = measure(s.reflections.take([3]), SHAPE, s.told_rotation, s.told_vertex)
     assert few.warnings[0].startswith("only 1 reflections")
@@ -118,7 +127,7 @@ def test_uneven_sampling_is_named() -> None:
 
 
 def test_differences_that_are_not_normal_are_named() -> None:
-    s = scene(SHAPE, EXACT, 3)
+    s = trial_mirror(SHAPE, EXACT, 3)
     rng = np.random.default_rng(0)
     shift = 0.02 * rng.choice([-1.0, 1.0], len(s.reflections))
     odd = replace(s.reflections, x=s.reflections.x + shift)
@@ -127,7 +136,7 @@ def test_differences_that_are_not_normal_are_named() -> None:
 
 
 def test_a_field_goes_on_where_one_heliostat_fails() -> None:
-    s = scene(SHAPE, EXACT, 3)
+    s = trial_mirror(SHAPE, EXACT, 3)
     one = s.reflections
     strange = replace(one, heliostat=one.heliostat + 2, facet=one.facet + 4)
     both = join([one, strange])
@@ -146,7 +155,7 @@ def test_a_field_goes_on_where_one_heliostat_fails() -> None:
 
 
 def test_what_cannot_be_measured_is_refused() -> None:
-    s = scene(SHAPE, EXACT, 3)
+    s = trial_mirror(SHAPE, EXACT, 3)
     pose = (SHAPE, s.told_rotation, s.told_vertex)
     with pytest.raises(InputError, match="no reflections"):
         measure(s.reflections.take([]), *pose)
@@ -181,7 +190,7 @@ def test_the_papers_systematic_budget() -> None:
     budget = Budget(0.010, 0.030, 0.0, 0.0)
     assert budget.systematic(150.0) == pytest.approx(0.21 * MRAD, abs=0.005 * MRAD)
     assert np.hypot(budget.systematic(150.0), 0.20 * MRAD) == pytest.approx(0.29e-3, abs=0.005e-3)
-    s = scene(SHAPE, EXACT, 1)
+    s = trial_mirror(SHAPE, EXACT, 1)
     found = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex, budget=budget)
     np.testing.assert_allclose(found.systematic, budget.systematic(150.0), rtol=1e-3)
     assert Noise(0.008, 0.0).of_a_point(0.015, 150.0) == pytest.approx(np.hypot(15, 8) / 150 * MRAD)
@@ -191,7 +200,7 @@ def test_the_papers_systematic_budget() -> None:
         Noise(slope=float("nan"))
 
 
-WIDE = Conditions(columns=13, rows=10, reflection=0.020)
+WIDE = TrialConditions(columns=13, rows=10, reflection=0.020)
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +211,7 @@ def many_points() -> Trials:
 @pytest.mark.parametrize("pattern", ["narrow", "wide"])
 def test_the_papers_figures(pattern: str, many_points: Trials) -> None:
     """σ_mean 0.07-0.19 mrad with the ideal surface; true error beside it; honest totals."""
-    narrow = Conditions(columns=7, rows=6, reflection=0.010)
+    narrow = TrialConditions(columns=7, rows=6, reflection=0.010)
     t = many_points if pattern == "wide" else trials(narrow, 14)
     assert 30 < t.count.mean() < 110
     assert 0.07 < 1e3 * rms(t.sigma_mean) < 0.19
@@ -215,7 +224,7 @@ def test_the_papers_figures(pattern: str, many_points: Trials) -> None:
 
 
 def test_a_measured_surface_gives_hundredths() -> None:
-    c = Conditions(columns=7, rows=6, reflection=0.020)
+    c = TrialConditions(columns=7, rows=6, reflection=0.020)
     t = trials(c, 12, map_known=True)
     assert 0.01 < 1e3 * rms(t.sigma_mean) < 0.04
     assert rms(t.error) < 0.04 * MRAD
@@ -231,7 +240,7 @@ def test_the_table_of_the_papers_conditions() -> None:
     assert len(lines) == 10
     assert lines[1].split()[:2] == ["ideal", "plain"]
     with pytest.raises(InputError, match="must be above 0"):
-        Conditions(distance=0.0)
+        TrialConditions(distance=0.0)
 
 
 # Into the model ------------------------------------------------------------------------------
@@ -324,7 +333,7 @@ def test_both_together_predict_better_than_either_alone() -> None:
         rng = np.random.default_rng(seed)
         values = {k: v * rng.choice([-1.0, 1.0]) * rng.uniform(0.5, 1.5) for k, v in TRUTH.items()}
         true = mechanism.with_parameters(values)
-        slopes = scene(SHAPE, Conditions(), 50 + seed).shape
+        slopes = trial_mirror(SHAPE, TrialConditions(), 50 + seed).shape
         poses = np.stack([rng.uniform(2.2, 4.4, 15), rng.uniform(0.4, 1.3, 15)], axis=-1)
         flights = kinds.join(
             [
@@ -379,14 +388,14 @@ def test_wrong_sightings_are_refused() -> None:
         to_sightings(nothing, np.zeros((1, 2)))
     with pytest.raises(InputError, match="per='photo'"):
         to_sightings(nothing, np.zeros((1, 2)), per="photo")  # type: ignore[arg-type]
-    s = scene(SHAPE, EXACT, 3)
+    s = trial_mirror(SHAPE, EXACT, 3)
     o = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex)
     with pytest.raises(InputError, match="counts of 2 heliostats for 1 names"):
         to_sightings(Orientations(("A",), (o,), {}), np.zeros((2, 2)))
 
 
 def test_differences_have_their_sign_from_the_expected_normal_to_the_measured() -> None:
-    s = scene(SHAPE, EXACT, 3)
+    s = trial_mirror(SHAPE, EXACT, 3)
     away = turned(s.rotation, [-1 * MRAD, 2 * MRAD])
     omega = differences(s.reflections, SHAPE, away, s.vertex)
     # To first order: the points move with the mirror, but not the measured normals.
@@ -394,7 +403,7 @@ def test_differences_have_their_sign_from_the_expected_normal_to_the_measured() 
 
 
 def test_reflections_is_a_table() -> None:
-    s: Reflections = scene(SHAPE, EXACT, 3).reflections
+    s: Reflections = trial_mirror(SHAPE, EXACT, 3).reflections
     assert len(s.take([])) == 0
     assert len(s.of(0)) == len(s)
     assert len(s.of(1)) == 0

@@ -133,8 +133,8 @@ def test_bad_photographs_get_one_line_each(tmp_path) -> None:
     assert [p.name for p in found] == ["g0.jpg", "g1.jpg"]
     text = "\n".join(problems)
     assert "plain.jpg: its XMP lacks GpsLatitude, GpsLongitude" in text
-    assert "broken.jpg: this is no readable image" in text
-    assert "float.jpg: RtkFlag 34 is no fixed solution" in text
+    assert "broken.jpg: not a readable image" in text
+    assert "float.jpg: RtkFlag 34 is not a fixed solution" in text
     assert "xml.jpg: its XMP is damaged" in text
     assert "other.jpg: 40 × 40 px, but most photographs have 80 × 60 px" in text
     assert len(problems) == 5
@@ -154,7 +154,7 @@ def test_folder_without_photographs(tmp_path) -> None:
         ("name,yaw_deg\na,1\n", "needs the columns"),
         (
             "name,east_m,north_m,up_m,yaw_deg,pitch_deg,roll_deg\na.jpg,1,x,3,0,0,0\n",
-            "column north_m: 'x' is no number",
+            "column north_m: 'x' is not a number",
         ),
     ],
 )

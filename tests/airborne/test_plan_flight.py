@@ -175,7 +175,7 @@ def test_refusals(plant: Plant) -> None:
 
     with pytest.raises(InputError, match="leave no time for a photograph in 30 s"):
         made(craft=Craft(endurance=30.0))
-    with pytest.raises(InputError, match=r"home at 0.0 m east, 0.0 m north: it lies in a keep-out"):
+    with pytest.raises(InputError, match=r"home at 0.0 m east, 0.0 m north: it is in a keep-out"):
         made(home=np.zeros(3))
     with pytest.raises(InputError, match="model malan8 has 8 unknowns"):
         made(choosing=Choosing(points=8))
@@ -198,7 +198,7 @@ def test_no_way_out(flown: FlightPlan) -> None:
         for k, (a, b) in enumerate(zip(ring, ring[1:] + ring[:1], strict=True))
     ]
     air = Airspace(tuple(walls))
-    with pytest.raises(InputError, match="calibration point 1: there is no free way to it"):
+    with pytest.raises(InputError, match="calibration point 1: there is no free route to it"):
         flight.fly(flown.stations, range(len(flown.clusters)), air, home, Craft(), flown.labels)
 
 
@@ -207,7 +207,7 @@ def test_a_drone_that_is_always_in_the_way(flown: FlightPlan) -> None:
     line = timeline([sortie], flown.stations, CRAFT, sortie.drone)
     middle = line.place[len(line.place) // 2]
     other = flight.Timeline(np.array([0.0]), middle[None])
-    with pytest.raises(InputError, match="number 1 comes within 15 m of another"):
+    with pytest.raises(InputError, match="drone 1 comes within 15 m of another"):
         flight._delay(sortie, flown.stations, CRAFT, [other])
     # One that leaves after a while is waited for.
     gone = flight.Timeline(

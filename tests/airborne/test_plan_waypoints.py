@@ -330,7 +330,7 @@ def test_document_says_when_mirrors_move(plan: FlightPlan) -> None:
     ("name", "read", "text"),
     [
         ("a.csv", read_litchi, "the header is not Litchi's"),
-        ("a.kmz", read_wpml, "no KMZ with wpmz/template.kml"),
+        ("a.kmz", read_wpml, "not a KMZ with wpmz/template.kml"),
         ("a.plan", read_qgc, "no JSON"),
     ],
 )
@@ -346,16 +346,16 @@ def test_broken_files(flown: Mission, tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     lines = litchi(flown).splitlines()
     path.write_text("\n".join([lines[0], lines[1] + ",3"]))
-    with pytest.raises(FormatError, match="line 2: 47 cells; there should be 46"):
+    with pytest.raises(FormatError, match="line 2: 47 cells instead of 46"):
         read_litchi(path)
     path.write_text("\n".join([lines[0], re.sub(r"^[^,]*", "north", lines[1])]))
-    with pytest.raises(FormatError, match="a cell is no number"):
+    with pytest.raises(FormatError, match="a cell is not a number"):
         read_litchi(path)
     kmz = tmp_path / "a.kmz"
     with zipfile.ZipFile(kmz, "w") as archive:
         archive.writestr("wpmz/template.kml", "<kml>")
         archive.writestr("wpmz/waylines.wpml", "<kml>")
-    with pytest.raises(FormatError, match="no XML"):
+    with pytest.raises(FormatError, match="not XML"):
         read_wpml(kmz)
     plan = tmp_path / "a.plan"
     root = json.loads(qgc(flown))
@@ -384,5 +384,5 @@ def test_refusals(plan: FlightPlan, flown: Mission, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="format 'kml': give some of dji, qgc, litchi"):
         write_plan(plan, tmp_path, formats=("kml",))
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be made"):
+    with pytest.raises(InputError, match="cannot be created"):
         write_plan(plan, tmp_path / "file" / "inside")

@@ -1,1 +1,37 @@
-"""Calibration from the air: a drone with a lamp beside its camera (HelioPoint)."""
+"""Calibration from the air: a drone with a lamp beside its camera (HelioPoint).
+
+A mirror that shows the lamp to the camera points at the drone. The package plans such flights,
+evaluates their photographs, and simulates both.
+
+- :mod:`heliotrope.airborne.plan`: clusters, calibration points, hover patterns, airspace, sorties
+  and waypoint files. Begin with ``plan_flight``.
+- :mod:`heliotrope.airborne.evaluate`: photographs to orientations, report and sightings. Begin with
+  ``evaluate_flight``.
+- :mod:`heliotrope.airborne.simulate`: flights with their truth, with or without images.
+
+Here are the things that all three share: mirrors and how they stand, photographs and the camera
+that took them.
+"""
+
+from heliotrope.airborne.mirror import MirrorShape, ideal, measured_normal, rectangle, tiled
+from heliotrope.airborne.photo import LedCamera, Photo, read_camera, read_photos, write_camera
+from heliotrope.airborne.slopes import read_slopes, write_slopes
+from heliotrope.airborne.standing import Standing, read_commands, write_commands
+
+__all__ = [
+    "LedCamera",
+    "MirrorShape",
+    "Photo",
+    "Standing",
+    "ideal",
+    "measured_normal",
+    "read_camera",
+    "read_commands",
+    "read_photos",
+    "read_slopes",
+    "rectangle",
+    "tiled",
+    "write_camera",
+    "write_commands",
+    "write_slopes",
+]

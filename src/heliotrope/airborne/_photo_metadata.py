@@ -1,4 +1,4 @@
-"""EXIF and XMP as the drones of DJI write them into their photographs: read, and made."""
+"""EXIF and XMP as DJI drones write them into their photographs, read and written."""
 
 import math
 from dataclasses import dataclass, field
@@ -18,20 +18,20 @@ _EXIF_IFD, _TAKEN, _OFFSET, _SUBSECOND = 0x8769, 0x9003, 0x9011, 0x9291
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a photograph says of itself; NaN where it says nothing.
+    """What a photograph's header states; NaN where it states nothing.
 
     Attributes
     ----------
     size
         Width and height, pixels.
     time
-        UTC, if the file states the zone.
+        UTC, if the file states the time zone.
     latitude_deg, longitude_deg, altitude
         Of the projection centre; the altitude in m.
     yaw_deg, pitch_deg, roll_deg
         Of the gimbal.
     sigma
-        Standard deviations east, north, up that the RTK receiver states, m, (3,).
+        Standard deviations east, north, up stated by the RTK receiver, m, (3,).
     rtk_flag
         50 for a fixed solution; None if the file has none.
     """
@@ -54,12 +54,12 @@ class Metadata:
 
 
 def read_metadata(path: str | Path) -> Metadata:
-    """Return what a JPEG says of itself; its pixels are not decoded.
+    """Return what a JPEG's header states; the pixels are not decoded.
 
     Raises
     ------
     FormatError
-        If it is no image, or its XMP is damaged.
+        If it is not an image, or its XMP is damaged.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -69,10 +69,10 @@ def read_metadata(path: str | Path) -> Metadata:
             size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
             tags = dict(exif.get_ifd(_EXIF_IFD))
     except FileNotFoundError:
-        raise FormatError(file, "there is no such file; give a photograph") from None
+        raise FormatError(file, "no such file; give a photograph") from None
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
         text = str(error).split(":")[-1].strip() or "damaged"
-        raise FormatError(file, f"this is no readable image ({text}); copy it again") from None
+        raise FormatError(file, f"not a readable image ({text}); copy it again") from None
     values = _xmp(file, packet) if packet else {}
 
     def number(*names: str) -> float:
@@ -88,7 +88,7 @@ def read_metadata(path: str | Path) -> Metadata:
         size=(int(size[0]), int(size[1])),
         time=_time(values, tags),
         latitude_deg=number("GpsLatitude"),
-        # Firmware of some drones spells it with a missing letter.
+        # The firmware of some drones misspells it.
         longitude_deg=number("GpsLongitude", "GpsLongtitude"),
         altitude=number("AbsoluteAltitude"),
         yaw_deg=number("GimbalYawDegree"),
@@ -100,7 +100,7 @@ def read_metadata(path: str | Path) -> Metadata:
 
 
 def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
-    """Return DJI's values and the creation date, by name; as attributes or as elements."""
+    """Return DJI's values and the creation date by name, from attributes or elements."""
     from lxml import etree
 
     data = packet.encode() if isinstance(packet, str) else packet
@@ -121,7 +121,7 @@ def _xmp(file: Path, packet: bytes | str) -> dict[str, str]:
 
 
 def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
-    """Return the time of exposure in UTC, the most exact statement first."""
+    """Return the time of exposure in UTC, from the most exact statement."""
     taken = str(tags.get(_TAKEN, "")).replace(":", "-", 2)
     part = str(tags.get(_SUBSECOND, "")).strip()
     taken += f".{part}" if taken and part.isdigit() else ""
@@ -140,7 +140,7 @@ def _time(values: dict[str, str], tags: dict[int, object]) -> datetime | None:
 
 
 def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
-    """Return the EXIF block and the XMP packet that say what ``found`` says."""
+    """Return the EXIF block and the XMP packet that state ``found``."""
     from PIL import Image
 
     exif = Image.Exif()
@@ -175,5 +175,5 @@ def exif_and_xmp(found: Metadata) -> tuple[bytes, bytes]:
     return exif.tobytes(), packet.encode()
 
 
-#: Written where nothing else is known: a fixed solution.
+#: Written by default: a fixed solution.
 RTK_FLAG = 50

@@ -1,23 +1,23 @@
 r"""A mirror's surface in concentrator coordinates, and where it reflects a lamp to a camera.
 
-Concentrator coordinates: origin at the mirror's vertex, x to the right and y up along the
-mirror as seen from in front of it, z along its normal, m. The *rotation* of a mirror turns
+Concentrator coordinates (HelioPoint's CCS): origin at the mirror's vertex, x to the right and y up
+along the mirror as seen from the front, z along its normal, m. The *rotation* of a mirror turns
 them into ENU.
 
-A facet is a rectangle with its own axes u (right) and v (up). Its surface stands
+A facet is a rectangle with its own axes u (right) and v (up). Its surface lies
 
 .. math:: w(u, v) = (u^2 + v^2) / 4 f
 
-above its plane, and a slope map adds what was measured: the deviations
-:math:`∂z/∂u, ∂z/∂v` of the slope. The heights that belong to them are left out: over half a
-metre 1 mrad is 0.5 mm, which turns a ray to a drone at 100 m by 5 µrad.
+above its plane, and a slope map adds measured deviations :math:`∂z/∂u, ∂z/∂v` of the slope. The
+corresponding heights are neglected: over half a metre 1 mrad is 0.5 mm, which turns a ray to a
+drone at 100 m by 5 µrad.
 
-A reflection stands where the surface's normal bisects the ways to lamp and camera, so where
+A reflection lies where the surface's normal bisects the directions to lamp and camera, so where
 
 .. math:: g = (p + b_u / b_w, \; q + b_v / b_w) = 0
 
 with the slopes p, q and the bisector b in the facet's axes. In a cell of the slope map g is
-bilinear but for the curvature of the ways; its (at most two) roots start Newton's method.
+bilinear but for the change of the directions; its (at most two) roots start Newton's method.
 """
 
 from collections.abc import Iterator
@@ -37,9 +37,9 @@ IntArray = npt.NDArray[np.intp]
 
 # Cells along an edge of a facet without slope map.
 _CELLS = 4
-# Nodes that are looked at together: tens of megabytes.
+# Nodes processed together: tens of megabytes.
 _BLOCK = 400_000
-# Of a cell's spread of g, by which g may differ from its bilinear form.
+# How much g may differ from its bilinear form, as a share of its range in the cell.
 _MARGIN = 0.05
 _ITERATIONS = 30
 
@@ -57,10 +57,10 @@ class MirrorShape:
     focal
         Focal lengths of the facets, m, (F,); inf if flat.
     slope
-        Deviations ∂z/∂u and ∂z/∂v of each facet's slope from that surface along its own right
-        and upward edges, rad, (F, H, W, 2), or None. Row 0 lies at the lower edge, column 0 at
-        the left one; values stand in the middle of the H × W cells and are interpolated
-        bilinearly. A positive ∂z/∂u leans the normal to the left.
+        Deviations ∂z/∂u and ∂z/∂v from the slopes of that surface along each facet's own right
+        and upward edges, rad, (F, H, W, 2), or None. Row 0 is at the lower edge, column 0 at the
+        left one; values are at the middles of the H × W cells, with bilinear interpolation. A
+        positive ∂z/∂u leans the normal to the left.
     """
 
     center: FloatArray
@@ -77,7 +77,7 @@ class MirrorShape:
             raise InputError(f"mirror: facets of shape {shape}; give centres and edges (F, 3)")
         focal = np.array(np.broadcast_to(as_float(self.focal), shape[:1]))
         if not (focal != 0.0).all():
-            raise InputError("mirror: a focal length is 0 m or no number; give inf for flat")
+            raise InputError("mirror: a focal length is 0 m or not a number; give inf for flat")
         object.__setattr__(self, "focal", focal)
         area = np.linalg.norm(np.cross(self.half_width, self.half_height), axis=-1)
         if not (area > 0.0).all():
@@ -100,7 +100,7 @@ class MirrorShape:
 
     @cached_property
     def axes(self) -> FloatArray:
-        """Rows are each facet's unit axes right, up and out of it, (F, 3, 3)."""
+        """Each facet's unit axes right, up and outwards, as rows, (F, 3, 3)."""
         right = normalize(self.half_width)
         out = normalize(np.cross(self.half_width, self.half_height))
         return np.stack([right, np.cross(out, right), out], axis=1)
@@ -113,7 +113,7 @@ class MirrorShape:
 
     @cached_property
     def corners(self) -> FloatArray:
-        """Of each facet: lower left, lower right, upper right, upper left, m, (F, 4, 3)."""
+        """Corners of each facet: lower left, lower right, upper right, upper left, m, (F, 4, 3)."""
         signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
         return self.on_facet(
             np.repeat(np.arange(len(self)), 4), (signs * self.half_size[:, None]).reshape(-1, 2)
@@ -128,12 +128,12 @@ class MirrorShape:
         return replace(self, slope=as_float(slope))
 
     def canted(self, turns: npt.ArrayLike) -> "MirrorShape":
-        """Return the mirror with each facet turned about its own right and upward axes.
+        """Return the mirror with each facet rotated about its own right and upward axes.
 
         Parameters
         ----------
         turns
-            rad, (F, 2) or what broadcasts to it.
+            rad, (F, 2) or broadcastable to it.
         """
         angles = np.broadcast_to(as_float(turns), (len(self), 2))
         turn = rotation(self.axes[:, 0], angles[:, 0]) @ rotation(self.axes[:, 1], angles[:, 1])
@@ -144,7 +144,7 @@ class MirrorShape:
         )
 
     def on_facet(self, facet: npt.ArrayLike, uv: npt.ArrayLike) -> FloatArray:
-        """Return the surface's points at (K, 2) m along the axes of ``facet`` (K,): (K, 3)."""
+        """Return the surface points at (K, 2) m along the axes of ``facet`` (K,): (K, 3)."""
         k, own = np.asarray(facet, dtype=np.intp), as_float(uv)
         high = np.sum(own**2, axis=-1) / (4.0 * self.focal[k])
         return as_float(
@@ -153,12 +153,12 @@ class MirrorShape:
         )
 
     def along_facet(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
-        """Return where (K, 2) m of the concentrator lie along the axes of ``facet`` (K,), m."""
+        """Return concentrator positions (K, 2) m along the axes of ``facet`` (K,), m, (K, 2)."""
         k, wanted = np.asarray(facet, dtype=np.intp), as_float(xy)
         inverse = np.linalg.inv(np.swapaxes(self.axes[k][:, :2, :2], -1, -2))
         uv = np.zeros((len(k), 2))
         for _ in range(8):
-            # The height changes x and y by its part along a canted facet's normal only.
+            # The height changes x and y only along the normal of a canted facet.
             gap = wanted - self.on_facet(k, uv)[:, :2]
             uv = uv + (inverse @ gap[..., None])[..., 0]
             if np.abs(gap).max(initial=0.0) < 1e-12:
@@ -166,7 +166,7 @@ class MirrorShape:
         return uv
 
     def facet_at(self, xy: npt.ArrayLike) -> IntArray:
-        """Return the facet that holds each point (K, 2) m of the concentrator, or -1."""
+        """Return the facet at each concentrator position (K, 2) m, or -1."""
         points = as_float(xy).reshape(-1, 2)
         found = np.full(len(points), -1, dtype=np.intp)
         for k in range(len(self)):
@@ -175,7 +175,7 @@ class MirrorShape:
         return found
 
     def point_at(self, facet: npt.ArrayLike, xy: npt.ArrayLike) -> FloatArray:
-        """Return the surface's points (K, 3) above (K, 2) m of the concentrator."""
+        """Return the surface points (K, 3) at concentrator positions (K, 2) m."""
         return self.on_facet(facet, self.along_facet(facet, xy))
 
     def normal_at(
@@ -190,7 +190,7 @@ class MirrorShape:
         xy
             m in concentrator coordinates, (K, 2).
         slopes
-            Whether with the slope map, if there is one.
+            Whether to include the slope map, if there is one.
         """
         k = np.asarray(facet, dtype=np.intp)
         uv = self.along_facet(k, xy)
@@ -207,14 +207,14 @@ class MirrorShape:
 
     @cached_property
     def nodes(self) -> FloatArray:
-        """Slope deviations at the corners of cells, rad, (F, I, J, 2); to the edge they go on."""
+        """Slope deviations at the corners of cells, rad, (F, I, J, 2), constant at the edges."""
         if self.slope is None:
             return np.zeros((len(self), _CELLS + 1, _CELLS + 1, 2))
         return np.pad(self.slope, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
 
     @cached_property
     def lines(self) -> tuple[FloatArray, FloatArray]:
-        """Where the corners of the cells lie, as shares of the half width and half height."""
+        """Positions of the cells' corners, as shares of the half width and half height."""
         rows, columns = self.nodes.shape[1:3]
         if self.slope is None:
             return np.linspace(-1.0, 1.0, columns), np.linspace(-1.0, 1.0, rows)
@@ -250,7 +250,7 @@ class MirrorShape:
 
 @dataclass(frozen=True)
 class Patch:
-    """K cells: place and size, m, (K, 2), and a bilinear function's values at their corners."""
+    """K cells: origin and size, m, (K, 2), and a bilinear function's values at their corners."""
 
     low: FloatArray
     size: FloatArray
@@ -260,7 +260,7 @@ class Patch:
     corner_11: FloatArray
 
     def at(self, st: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the function at (K, 2) shares of the cells and its derivatives by metres."""
+        """Return the function at (K, 2) shares of the cells, and its derivatives by metres."""
         s, t = st[:, :1], st[:, 1:]
         by_s = self.corner_10 - self.corner_00
         by_t = self.corner_01 - self.corner_00
@@ -283,7 +283,7 @@ class ReflectionPoints:
     xy
         Concentrator coordinates, m, (K, 2).
     point
-        The same in ENU, m, (K, 3).
+        ENU, m, (K, 3).
     """
 
     position: IntArray
@@ -296,7 +296,7 @@ class ReflectionPoints:
 
 
 def ideal(heliostats: Heliostats, row: int, focal: npt.ArrayLike = np.inf) -> MirrorShape:
-    """Return the mirror of heliostat ``row`` as it was designed.
+    """Return the mirror of heliostat ``row`` as designed.
 
     Parameters
     ----------
@@ -369,7 +369,7 @@ def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray
         Of the drives, (..., D).
     """
     frame = mirror_frame(mechanism.normal)
-    # What a mechanism does to its normal it does to any direction that is fixed to the mirror.
+    # A mechanism turns any direction fixed to the mirror as it turns the normal.
     right = replace(mechanism, normal=frame[..., 0]).pose(counts)
     pose = mechanism.pose(counts)
     up = np.cross(pose.normal, right.normal)
@@ -377,12 +377,12 @@ def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray
 
 
 def measured_normal(point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike) -> FloatArray:
-    """Return the normals at points (..., 3) at which a lamp's reflection reached a camera.
+    """Return the normals at points (..., 3) that reflect a lamp to a camera.
 
     Raises
     ------
     InputError
-        If lamp and camera lie on opposite sides of a point, or on it.
+        If lamp and camera are on opposite sides of a point, or at it.
     """
     m = as_vectors(point, "point")
     return bisector(
@@ -400,9 +400,9 @@ def reflection_points(
 ) -> ReflectionPoints:
     """Return all points of a mirror that show the lamp to the camera, for P positions.
 
-    A facet shows it nowhere, once or several times. The points are exact to 1e-9 m. Where a
-    whole patch lights up, at the centre of its curvature, it has no single point and is left
-    out. Other mirrors and facets that may stand in the way are not looked at.
+    A facet may show it nowhere, once or several times. The points are exact to 1e-9 m. Where a
+    whole patch lights up, at its centre of curvature, there is no single point, and it is left
+    out. Obstruction by other mirrors and facets is not considered.
 
     Parameters
     ----------
@@ -413,7 +413,7 @@ def reflection_points(
     vertex
         ENU metres, (3,).
     camera, led
-        ENU metres, (P, 3) or what broadcasts together.
+        ENU metres, (P, 3) or broadcastable together.
 
     Raises
     ------
@@ -442,11 +442,11 @@ def _blocks(shape: MirrorShape, positions: int) -> Iterator[tuple[int, int]]:
 def _within(
     shape: MirrorShape, camera: FloatArray, led: FloatArray, start: int, stop: int
 ) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return position, facet and place along the facet of reflections in a block."""
+    """Return position row, facet, and coordinates along the facet of reflections in a block."""
     position, facet, cell, values = _candidates(shape, camera[start:stop], led[start:stop])
     position += start
     starts = _bilinear_roots(values)
-    # Two starts for each cell.
+    # Two starting points for each cell.
     position, facet = np.repeat(position, 2), np.repeat(facet, 2)
     patch = shape.patch(facet, np.repeat(cell, 2, axis=0))
     st = starts.reshape(-1, 2)
@@ -471,7 +471,7 @@ def _candidates(
     which = np.repeat(np.arange(facets), rows * columns)
     points = shape.on_facet(which, uv.reshape(-1, 2))
     slope = (uv / (2.0 * shape.focal[:, None, None, None]) + nodes).reshape(-1, 2)
-    # Components stand apart: sums over a last axis of 3 are slow.
+    # Components are kept apart: sums over a last axis of 3 are slow.
     total = [np.zeros((len(camera), len(points))) for _ in range(3)]
     for end in (camera, led):
         way = [end[:, k, None] - points[:, k] for k in range(3)]
@@ -480,7 +480,7 @@ def _candidates(
             total[k] += way[k] * scale
     axes = shape.axes[which]
     u, v, w = (sum(total[i] * axes[:, k, i] for i in range(3)) for k in range(3))
-    # Behind the facet nothing is seen: NaN compares false below.
+    # Nothing is seen from behind the facet: NaN compares false below.
     ahead = np.where(w > 0.0, w, np.nan)
     maybe = np.ones((len(camera), facets, rows - 1, columns - 1), dtype=np.bool_)
     corners = []
@@ -498,10 +498,10 @@ def _candidates(
 
 
 def _bilinear_roots(corners: FloatArray) -> FloatArray:
-    """Return both (s, t) at which a + b s + c t + d s t is nearest 0, (K, 2, 2), about the cell.
+    """Return both (s, t) at which a + b s + c t + d s t is closest to 0, (K, 2, 2), about the cell.
 
-    Eliminating s leaves (c × d) t² + (a × d + c × b) t + a × b = 0, with × the plane's
-    cross product; where roots are complex their common real part is given.
+    Eliminating s leaves (c × d) t² + (a × d + c × b) t + a × b = 0, with × the cross product in
+    the plane. Of complex roots the common real part is returned.
     """
     a = corners[:, 0]
     b, c = corners[:, 1] - a, corners[:, 2] - a
@@ -512,7 +512,7 @@ def _bilinear_roots(corners: FloatArray) -> FloatArray:
 
     two, one, zero = cross(c, d), cross(a, d) + cross(c, b), cross(a, b)
     root = np.sqrt(np.maximum(one**2 - 4.0 * two * zero, 0.0))
-    # The stable pair: q / two and zero / q.
+    # The numerically stable pair: q / two and zero / q.
     q = -0.5 * (one + np.where(one < 0.0, -root, root))
     with np.errstate(divide="ignore", invalid="ignore"):
         t = np.stack([zero / q, q / two], axis=-1)
@@ -552,7 +552,7 @@ def _newton(
         step = np.where(usable[:, None], step, 0.0)
         good = usable & (np.abs(step) < 1e-10).all(axis=-1)
         share = step / patch.size
-        # Beyond the next cell the function is another one.
+        # Beyond the next cell the function is a different one.
         share /= np.maximum(1.0, np.abs(share).max(axis=-1, keepdims=True, initial=0.0))
         st = st + share
         if good.all():
@@ -590,7 +590,7 @@ def _law(
 
 
 def _distinct(position: IntArray, facet: IntArray, uv: FloatArray) -> IntArray:
-    """Return rows without those that stand within 1e-7 m of another, in order of position."""
+    """Return rows in order of position, without those within 1e-7 m of another."""
     order = np.lexsort((uv[:, 1], uv[:, 0], facet, position))
     kept: list[int] = []
     for row in order:

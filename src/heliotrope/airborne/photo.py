@@ -1,7 +1,7 @@
-"""Photographs from the air: which camera, from where, looking where.
+"""Photographs from the air: camera, position and attitude.
 
-The camera model is that of :mod:`heliotrope.field.camera`, in the same convention: camera axes
-x right, y down, z forward, and rotations from camera axes to ENU.
+The camera model and its conventions are those of :mod:`heliotrope.field.camera`: camera axes x
+right, y down, z forward, and rotations from camera axes to ENU.
 """
 
 import csv
@@ -29,13 +29,13 @@ from heliotrope.geometry import (
     rotation,
 )
 
-#: What :func:`read_photos` takes for a photograph.
+#: Suffixes of photographs.
 SUFFIXES = (".jpg", ".jpeg")
-#: Of a position that states no deviation of its own: a fixed RTK solution, m.
+#: Standard deviation of a fixed RTK solution that states none, m.
 RTK_SIGMA = 0.01
 #: Points farther out than this multiple of the frame's corners are not seen.
 REACH = 1.3
-#: Value of RtkFlag for a fixed solution; what is below is known to decimetres or metres.
+#: RtkFlag of a fixed solution; lower values mean decimetres or metres.
 RTK_FIXED = 50
 
 
@@ -52,7 +52,7 @@ class LedCamera:
     distortion
         k1, k2, p1, p2, k3, (5,).
     led_offset
-        From the projection centre to the lamp, m, in camera axes, (3,).
+        From the projection centre to the lamp, m, in camera axes, (3,). HelioPoint's d_cam-led.
     """
 
     size: tuple[int, int]
@@ -64,7 +64,7 @@ class LedCamera:
         size, matrix, distortion = checked_pinhole("camera", self, smallest=16)
         offset = as_vectors(self.led_offset, "camera: led_offset")
         if offset.shape != (3,) or np.linalg.norm(offset) > 5.0:
-            raise InputError(f"camera: led_offset {offset} m; give right, down, ahead within 5 m")
+            raise InputError(f"camera: led_offset {offset} m; give right, down, forward within 5 m")
         object.__setattr__(self, "size", size)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "distortion", distortion)
@@ -78,14 +78,14 @@ class LedCamera:
 
 @dataclass(frozen=True)
 class Photo:
-    """One photograph and what the drone says of it.
+    """One photograph as recorded by the drone.
 
     Attributes
     ----------
     name
         Of the file.
     time
-        UTC; None if nothing states it with its zone.
+        UTC; None if no time with its zone is stated.
     position
         Of the projection centre, ENU metres, (3,).
     rotation
@@ -115,7 +115,7 @@ class Photo:
         object.__setattr__(self, "sigma_position", sigma)
 
     def led_position(self, camera: LedCamera) -> FloatArray:
-        """Return where the lamp is, ENU metres, (3,)."""
+        """Return the position of the lamp, ENU metres, (3,)."""
         return as_float(self.position + self.rotation @ camera.led_offset)
 
     def pixels(self, camera: LedCamera, points: npt.ArrayLike) -> FloatArray:
@@ -132,22 +132,22 @@ class Photo:
 
 
 def rotation_of_gimbal(yaw: float, pitch: float, roll: float) -> FloatArray:
-    """Return the rotation from camera axes to ENU, (3, 3), of a gimbal's angles in rad.
+    """Return the rotation from camera axes to ENU, (3, 3), for gimbal angles in rad.
 
-    Angles are those of DJI: turned about the axes of a body x ahead, y right, z down, in the
-    order yaw, pitch, roll from north-east-down. Yaw is clockwise from north, pitch is 0 at
-    the horizon and −π/2 straight down, roll lowers the right side.
+    Angles as defined by DJI: rotations about the axes of a body x forward, y right, z down, in the
+    order yaw, pitch, roll, from north-east-down. Yaw is clockwise from north, pitch is 0 at the
+    horizon and −π/2 straight down, roll lowers the right side.
     """
     ned = rotation([0.0, 0.0, 1.0], yaw) @ rotation([0.0, 1.0, 0.0], pitch)
     ned = ned @ rotation([1.0, 0.0, 0.0], roll)
-    # Camera x right, y down, z ahead are the body's y, z, x; ENU are NED's y, x, −z.
+    # Camera x right, y down, z forward are the body's y, z, x; ENU are NED's y, x, −z.
     return as_float(ned[[1, 0, 2]][:, [1, 2, 0]] * np.array([[1.0], [1.0], [-1.0]]))
 
 
 def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return yaw in [−π, π], pitch and roll, rad, that :func:`rotation_of_gimbal` turns back.
+    """Return yaw in [−π, π], pitch and roll, rad: the inverse of :func:`rotation_of_gimbal`.
 
-    Straight down yaw and roll are one: all of it is given to the yaw.
+    Straight down, yaw and roll are one angle, which is returned as yaw.
     """
     enu = as_float(turned)
     ned = (enu * np.array([[1.0], [1.0], [-1.0]]))[[1, 0, 2]][:, [2, 0, 1]]
@@ -162,7 +162,7 @@ def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
 
 
 def read_camera(path: str | Path) -> LedCamera:
-    """Return the camera of a TOML file as :func:`write_camera` writes it.
+    """Return the camera of a TOML file written by :func:`write_camera`.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def read_camera(path: str | Path) -> LedCamera:
 
 
 def write_camera(path: str | Path, camera: LedCamera) -> None:
-    """Write a camera as a TOML file; offsets of the lamp are right, down and ahead of it."""
+    """Write a camera as a TOML file; the lamp's offset is right, down and forward of the camera."""
     m = camera.matrix
     rows = {
         "size_px": list(camera.size),
@@ -222,7 +222,7 @@ def read_photos(
     """Return the photographs of a folder in the order of their names, and what is wrong.
 
     Position, gimbal angles and time come from ``photos.csv`` in the folder if there is one,
-    else from the EXIF and XMP that DJI writes.
+    otherwise from the EXIF and XMP that DJI writes.
 
     Parameters
     ----------
@@ -230,28 +230,28 @@ def read_photos(
         Of JPEG files, as :data:`SUFFIXES`.
     plant_origin
         Latitude and longitude (degrees) and height (m) of ENU's origin. Heights of photographs
-        are taken as of the same kind (both above the ellipsoid, or both above the geoid).
+        must be of the same kind (both above the ellipsoid, or both above the geoid).
 
     Returns
     -------
-    Photographs, and one line for each that cannot be used: positions or angles missing, no
-    fixed RTK solution, a size unlike that of most of the others (mixed cameras).
+    Photographs, and a line for each that cannot be used: position or angles missing, no fixed RTK
+    solution, or a size unlike that of most others (mixed cameras).
 
     Raises
     ------
     InputError
         If there is no such folder, or no photograph in it.
     FormatError
-        If ``photos.csv`` is no such table.
+        If ``photos.csv`` is not such a table.
     """
     place = Path(folder)
     if not place.is_dir():
-        raise InputError(f"{place}: there is no such folder; give one with photographs")
+        raise InputError(f"{place}: no such folder; give one with photographs")
     files = sorted(f for f in place.iterdir() if f.suffix.lower() in SUFFIXES)
     table = place / "photos.csv"
     rows = _read_table(table) if table.exists() else {}
     if not files and not rows:
-        raise InputError(f"{place}: there is no photograph ({', '.join(SUFFIXES)}) in it")
+        raise InputError(f"{place}: there are no photographs ({', '.join(SUFFIXES)}) in it")
     photos: list[Photo] = []
     problems: list[str] = []
     sizes: dict[str, tuple[int, int]] = {}
@@ -282,7 +282,7 @@ def _of_one_camera(
             width, height = sizes[photo.name]
             problems.append(
                 f"{place / photo.name}: {width} × {height} px, but most photographs have "
-                f"{usual[0]} × {usual[1]} px; evaluate each camera's in a folder of its own"
+                f"{usual[0]} × {usual[1]} px; give each camera a folder of its own"
             )
         photos = [p for p in photos if sizes[p.name] == usual]
     return tuple(photos), tuple(problems)
@@ -310,7 +310,7 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
     if found.rtk_flag is not None and found.rtk_flag != RTK_FIXED:
         raise FormatError(
             file,
-            f"RtkFlag {found.rtk_flag} is no fixed solution ({RTK_FIXED}): its position is "
+            f"RtkFlag {found.rtk_flag} is not a fixed solution ({RTK_FIXED}): its position is "
             "known to decimetres at best; leave it out, or correct it and write photos.csv",
         )
     position = geodetic_to_enu(found.latitude_deg, found.longitude_deg, found.altitude, origin)
@@ -334,7 +334,7 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
         raise FormatError(
             path,
             "needs the columns name, yaw_deg, pitch_deg, roll_deg and east_m, north_m, up_m "
-            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m may be given",
+            "(or latitude_deg, longitude_deg, altitude_m); time and sigma_m are optional",
         )
     return {row["name"].strip(): row for row in reader}
 
@@ -348,7 +348,9 @@ def _of_row(
         except (TypeError, ValueError):
             value = math.nan
         if not math.isfinite(value):
-            raise FormatError(table, f"{row[key]!r} is no number", f"{row['name']}, column {key}")
+            raise FormatError(
+                table, f"{row[key]!r} is not a number", f"{row['name']}, column {key}"
+            )
         return value
 
     yaw, pitch, roll = (math.radians(number(f"{k}_deg")) for k in ("yaw", "pitch", "roll"))

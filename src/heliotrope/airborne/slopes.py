@@ -1,8 +1,8 @@
 """Slope maps of mirrors: measured ones in files, random ones for simulation.
 
-A map is what deflectometry gives (QDec-H and its like): for each facet a grid of the slope's
-deviations from the ideal surface, (F, H, W, 2); see :class:`heliotrope.airborne.mirror.MirrorShape`
-for its signs.
+A map comes from deflectometry (QDec-H and the like): for each facet a grid of the slope's
+deviations from the ideal surface, (F, H, W, 2); its signs are those of
+:class:`heliotrope.airborne.mirror.MirrorShape`.
 """
 
 import zipfile
@@ -17,9 +17,9 @@ from heliotrope.files.text import check_file, write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")
-#: A larger deviation is in another unit, rad.
+#: A larger deviation must be in another unit, rad.
 LARGEST = 0.1
-# Of a facet's map that may be missing, and is filled from the nearest cell that is there.
+# Largest share of a facet's map that may be missing; it is filled from the nearest cell.
 _MOST_HOLES = 0.5
 
 
@@ -29,16 +29,16 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
     Parameters
     ----------
     path
-        ``.npz`` with one array ``slope`` in rad, or ``.csv`` with the columns facet, row,
-        column (all from 0; row 0 at the lower edge), slope_u_mrad and slope_v_mrad.
+        ``.npz`` with one array ``slope`` in rad, or ``.csv`` with the columns facet, row, column
+        (all from 0; row 0 at the lower edge), slope_u_mrad and slope_v_mrad.
     facets
-        How many the mirror has.
+        Number of facets of the mirror.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, is for another number of facets, has values above
-        100 mrad, or lacks more than half of a facet.
+        If the file cannot be read, is for another number of facets, has values above 100 mrad, or
+        lacks more than half of a facet.
     """
     file = check_file(path, "a slope map (.npz or .csv)", binary=True)
     suffix = file.suffix.casefold()
@@ -64,14 +64,14 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
         if missing > _MOST_HOLES:
             raise FormatError(
                 file,
-                f"facet {k}: {100 * missing:.0f} % of its map are missing, more than "
+                f"facet {k}: {100 * missing:.0f} % of its map is missing, more than "
                 f"{100 * _MOST_HOLES:.0f} %; measure it again or leave the map out",
             )
     return _filled(slope)
 
 
 def write_slopes(path: str | Path, slope: FloatArray) -> None:
-    """Write a slope map as :func:`read_slopes` reads it: whole or not at all."""
+    """Write a slope map as :func:`read_slopes` reads it, completely or not at all."""
     file = Path(path)
     suffix = file.suffix.casefold()
     if suffix == ".npz":
@@ -99,9 +99,9 @@ def smooth_slopes(
 ) -> FloatArray:
     """Return random slope deviations of a mirror, (F, cells, cells, 2), rad.
 
-    Each facet's surface is a smooth random one, so that both slopes belong to one surface. The
-    mean over each facet is 0, which leaves its canting and the mirror's orientation as they
-    are; the root mean square over the mirror is ``rms`` for each of the two components.
+    Each facet's surface is smooth and random, so that both slopes belong to one surface. The mean
+    over each facet is 0, which preserves its canting and the mirror's orientation; the root mean
+    square over the mirror is ``rms`` for each of the two components.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def smooth_slopes(
     rms
         Of ∂z/∂u and of ∂z/∂v over the mirror, rad.
     length
-        Over which slopes stay alike, m: that of a Gaussian filter of the heights.
+        Correlation length of the slopes, m: that of a Gaussian filter of the heights.
     cells
         Along each edge of a facet.
 
@@ -131,7 +131,7 @@ def smooth_slopes(
     slope = np.zeros((len(shape), cells, cells, 2))
     for k, (half_width, half_height) in enumerate(shape.half_size):
         step = np.array([2.0 * half_height, 2.0 * half_width]) / cells
-        # A border as wide as the filter keeps the edges as rough as the middle.
+        # A border as wide as the filter makes the edges as rough as the middle.
         border = [int(np.ceil(3.0 * length / s)) for s in step]
         size = [cells + 2 * b for b in border]
         high = gaussian_filter(generator.standard_normal(size), length / step, mode="wrap")
@@ -152,7 +152,7 @@ def _read_npz(file: Path) -> FloatArray:
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         if isinstance(error, FormatError):
             raise
-        raise FormatError(file, "not a file that NumPy wrote as .npz; write one again") from None
+        raise FormatError(file, "not an .npz file written by NumPy; write it again") from None
 
 
 def _read_csv(file: Path) -> FloatArray:
@@ -165,7 +165,7 @@ def _read_csv(file: Path) -> FloatArray:
         i = int(np.flatnonzero(wrong)[0])
         raise FormatError(
             file,
-            f"facet, row, column {index[i].tolist()} are no whole numbers from 0 to 9999",
+            f"facet, row, column {index[i].tolist()} are not whole numbers from 0 to 9999",
             rows.places[i],
         )
     if not len(index):

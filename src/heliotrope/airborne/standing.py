@@ -1,7 +1,7 @@
-"""How mirrors stand: vertex and rotation of each at its drive positions, and where its edges are.
+"""How mirrors stand: vertex, rotation and outline of each at its drive positions.
 
-Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up
-along the mirror, z the normal.
+Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up along
+the mirror, z the normal.
 """
 
 import csv
@@ -22,7 +22,7 @@ from heliotrope.geometry import FloatArray, as_float
 
 @dataclass(frozen=True)
 class Standing:
-    """N mirrors as they stand, or are believed to.
+    """N mirrors as they stand, or are believed to stand.
 
     Attributes
     ----------
@@ -33,8 +33,8 @@ class Standing:
     rotation
         Concentrator to ENU, (N, 3, 3).
     outline
-        Corners of the mirror in concentrator coordinates, m: upper left, upper right, lower
-        right, lower left as seen from the front, (N, 4, 3).
+        Corners in concentrator coordinates, m: upper left, upper right, lower right, lower left
+        as seen from the front, (N, 4, 3).
     """
 
     names: tuple[str, ...]
@@ -77,7 +77,7 @@ def join_standing(parts: Sequence[Standing]) -> Standing:
         If there are none.
     """
     if not parts:
-        raise InputError("no mirror is commanded; name those that the photographs show")
+        raise InputError("no mirror is commanded; list those that the photographs show")
     return Standing(
         tuple(name for p in parts for name in p.names),
         np.concatenate([p.vertex for p in parts]),
@@ -89,7 +89,7 @@ def join_standing(parts: Sequence[Standing]) -> Standing:
 def outline(heliostats: Heliostats) -> FloatArray:
     """Return the corners of mirrors in concentrator coordinates, (N, 4, 3).
 
-    Of facets the outermost corners, with their heights; else a flat rectangle.
+    The outermost corners of the facets, with their heights, or of a flat rectangle.
     """
     signs = np.array([(-1.0, 1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)])
     facets = heliostats.facets
@@ -117,8 +117,8 @@ def read_commands(
     Parameters
     ----------
     path
-        CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); those
-        of a flight plan have ``cluster``, ``point`` and ``reachable`` besides.
+        CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); that of a
+        flight plan also has ``cluster``, ``point`` and ``reachable``.
     names
         Of the plant's heliostats.
     cluster, point
@@ -127,7 +127,7 @@ def read_commands(
     Raises
     ------
     FormatError
-        If a column is missing, a value is no number or a heliostat stands in it twice.
+        If a column is missing, a value is not a number, or a heliostat is listed twice.
     UnknownNameError
         If a heliostat is not in the plant: the wrong field.
     """
@@ -148,8 +148,8 @@ def read_commands(
         if index[name] in found:
             raise FormatError(
                 path,
-                f"heliostat {name} stands in it twice; photographs show one pose: give the "
-                "cluster and the point that they are of",
+                f"heliostat {name} is listed twice, but photographs show one pose; give "
+                "the cluster and the point of the photographs",
                 f"line {line}",
             )
         found[index[name]] = _counts(path, line, name, [row[c] for c in counts])
@@ -165,12 +165,12 @@ def _counts(path: str | Path, line: int, name: str, texts: Sequence[str]) -> lis
     except (TypeError, ValueError):
         values = [np.nan]
     if not np.isfinite(values).all():
-        raise FormatError(path, f"counts of {name} are no numbers", f"line {line}")
+        raise FormatError(path, f"counts of {name} are not numbers", f"line {line}")
     return values
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:
-    """Write drive counts (N, D) of heliostats so that :func:`read_commands` reads them."""
+    """Write drive counts (N, D) of heliostats as :func:`read_commands` reads them."""
     table = as_float(counts)
     header = ["heliostat", *(f"count_{k + 1}" for k in range(table.shape[1]))]
     lines = [",".join(header)]

@@ -1,22 +1,22 @@
-r"""How well an orientation is known: what the many points average, and what they share.
+r"""The error budget of an orientation: what averages over many points, and what they share.
 
-A point m whose ways to lamp and camera are off turns its measured normal. With s and t the unit
-vectors from the mirror to the two, v their bisector, and δ the displacement of the mirror
+An error of a point's lines of sight to lamp and camera turns its measured normal. With s and t the
+unit vectors from the mirror to the two, v their bisector, and δ the displacement of the mirror
 relative to the drone,
 
 .. math:: δv = -\frac{I - v v^T}{|s + t|}
           \left(\frac{I - s s^T}{d_s} + \frac{I - t t^T}{d_t}\right) δ
 
-which with the lamp beside the camera is δ across the line of sight over the distance. What is
-off alike for all points of a mirror turns its orientation by as much, however many there are:
+which with the lamp beside the camera is δ across the line of sight over the distance. An error
+common to all points of a mirror turns its orientation by as much, however many there are:
 
 - the surveyed position of the heliostat,
-- its kinematics: where the vertex stands in this pose, as against where the model has it,
-- the absolute position of the RTK base, unless the heliostats themselves gave it,
-- the lamp's place beside the camera, which moves one of the two ways only.
+- its kinematics: the vertex in this pose compared with the model's,
+- the absolute position of the RTK base, unless the heliostats themselves revealed it,
+- the offset of the lamp from the camera, which moves one of the two lines only.
 
-What differs from point to point goes down with their number: where the reflection was seen on
-the mirror, each photograph's own RTK error, and the slope deviations if no map is known.
+Errors that differ from point to point average out: the detected position of the reflection on the
+mirror, each photograph's own RTK error, and the slope deviations if no map is known.
 """
 
 from dataclasses import dataclass, fields
@@ -30,19 +30,19 @@ from heliotrope.geometry import FloatArray, as_float, as_vectors
 
 @dataclass(frozen=True)
 class Budget:
-    """Standard deviations per axis of what a flight does not average, m.
+    """Standard deviations per axis of a flight's common errors, m.
 
     Attributes
     ----------
     position
-        Of the heliostat's surveyed position.
+        Surveyed position of the heliostat.
     kinematics
-        Of the vertex in a pose, about where the position and the nominal mechanism put it.
+        Vertex in a pose, relative to the position and the nominal mechanism.
     rtk
-        Of the common offset of all positions of the drone; what is left of it if the offset
-        was estimated from the heliostats.
+        Common offset of all drone positions; its remainder if it was estimated from the
+        heliostats.
     lamp
-        Of the lamp's place beside the camera.
+        Offset of the lamp from the camera.
     """
 
     position: float = 0.010
@@ -57,18 +57,18 @@ class Budget:
                 raise InputError(f"budget: {f.name} {value} m must be 0 or more")
 
     def parts(self, distance: npt.ArrayLike) -> dict[str, FloatArray]:
-        """Return what each turns an orientation by at distances (...), rad per axis, (...)."""
+        """Return the rotation by each cause at distances (...), rad per axis, (...)."""
         d = as_float(distance)
         return {
             "position": self.position / d,
             "kinematics": self.kinematics / d,
             "rtk": self.rtk / d,
-            # Half of the light's way is the lamp's.
+            # The lamp is at one of the two ends.
             "lamp": 0.5 * self.lamp / d,
         }
 
     def systematic(self, distance: npt.ArrayLike) -> FloatArray:
-        """Return their sum in squares, rad per axis, (...)."""
+        """Return the root sum square of the parts, rad per axis, (...)."""
         return as_float(np.sqrt(sum(p**2 for p in self.parts(distance).values())))
 
     def covariance(
@@ -79,7 +79,7 @@ class Budget:
         axes: npt.ArrayLike,
         place: npt.ArrayLike | None = None,
     ) -> FloatArray:
-        """Return the covariance along two axes of what N points of a mirror share, (2, 2), rad².
+        """Return the covariance along two axes of the error that N points share, (2, 2), rad².
 
         Parameters
         ----------
@@ -88,8 +88,8 @@ class Budget:
         axes
             Two unit axes across the mirror's normal, (2, 3).
         place
-            Covariance of the mirror's place as seen from the drone, m², (3, 3), if a bundle
-            adjustment found it: it stands for ``position``, ``kinematics`` and ``rtk``.
+            Covariance of the mirror's position relative to the drone, m², (3, 3), if a bundle
+            adjustment found it. It replaces ``position``, ``kinematics`` and ``rtk``.
         """
         both, lamp = lever(point, camera, led, axes)
         known = (self.position**2 + self.kinematics**2 + self.rtk**2) * np.eye(3)
@@ -100,14 +100,14 @@ class Budget:
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations per axis of what differs from point to point.
+    """Standard deviations per axis of errors that differ from point to point.
 
     Attributes
     ----------
     rtk
-        Of one photograph's position, m.
+        Position of one photograph, m.
     slope
-        Of the slope deviations that no map tells, rad.
+        Slope deviations without a map, rad.
     """
 
     rtk: float = 0.008
@@ -127,9 +127,9 @@ class Noise:
         Parameters
         ----------
         sigma
-            Of the reflection's place on the mirror, m, (...). A place that is off by δ turns
-            the measured normal by δ over the distance and the expected one by δ / 2f: on a
-            focusing mirror they cancel in part.
+            Of the reflection's position on the mirror, m, (...). An error δ of it turns the
+            measured normal by δ over the distance and the expected one by δ / 2f: on a focusing
+            mirror the two partly cancel.
         distance, focal
             From mirror to drone, and of the facets, m, (...).
         """
@@ -141,7 +141,7 @@ class Noise:
 def lever(
     point: npt.ArrayLike, camera: npt.ArrayLike, led: npt.ArrayLike, axes: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how measured normals turn by moving lamp and camera together, and the lamp alone.
+    """Return how measured normals turn when lamp and camera move together, and when the lamp moves.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def lever(
 
     Returns
     -------
-    Derivatives along the axes by ENU metres, each (N, 2, 3). Moving the mirror is moving both
+    Derivatives along the axes by ENU metres, (N, 2, 3) each. Moving the mirror equals moving both
     the other way.
     """
     m, across = as_vectors(point, "point"), as_float(axes)

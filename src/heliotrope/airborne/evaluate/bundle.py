@@ -1,26 +1,26 @@
-r"""Where the photographs of a flight were taken and how, from all of them together.
+r"""Exterior orientation of a flight's photographs, from all of them together.
 
-The corners of the mirrors are marks whose places are nearly known. Unknown are, for each
-photograph, a rotation φ of the camera and the error t of its RTK position; the offset b that all
-positions share; for each mirror in each pose the error δ of its vertex, a rotation ψ, and by how
-much its outline looks wider and higher than it is, g; and for each heliostat that was flown in
-several poses the error d of its surveyed position. A corner c of a mirror (vertex v, rotation M)
-is seen from the told position p at
+The corners of the mirrors are marks at nearly known positions. The unknowns are, for each
+photograph, a rotation φ of the camera and the error t of its RTK position; the offset b common to
+all positions; for each mirror in each pose the error δ of its vertex, a rotation ψ, and the error g
+of its apparent width and height, relative; and for each heliostat flown in several poses the error
+d of its surveyed position. A corner c of a mirror (vertex v, rotation M) is seen from the recorded
+position p at
 
 .. math:: X = (R e^{[φ]})^T (v + d + δ + M e^{[ψ]} (c + g c) - (p - b + t))
 
-in camera axes, at (X/Z, Y/Z) without distortion. Without g a shadow beside the edges of all
-mirrors, which shifts them by a tenth of a pixel, would move the camera by a decimetre: mirrors
-that look smaller would be taken to be farther away.
+in camera axes, at (X/Z, Y/Z) without distortion. Without g, a shadow beside the edges of all
+mirrors, which shifts them by a tenth of a pixel, would move the camera by a decimetre: mirrors that
+look smaller would be taken to be farther away.
 
-From one place the camera's attitude takes the shift of all mirrors for its own: what the survey
-errors leave of b is several times their mean. From several sides they are told apart, so the
-flights over the same heliostats go into one adjustment.
+From one place, the camera's attitude absorbs a shift of all mirrors: survey errors leave an error
+in b of several times their mean. From several sides the two are told apart, so flights over
+the same heliostats go into one adjustment.
 
-All unknowns have priors: RTK's own deviation, the survey's, the commands'; that of φ is
-wide. The normal equations (Gauss-Newton, with weights that fall for residuals beyond 2.5
-standard deviations, after Huber) are sparse and are solved as such by SuperLU, which also gives
-the covariances; a least-squares driver without the normal matrix would not.
+All unknowns have priors: RTK's own deviation, the survey's, the commands'; that of φ is wide. The
+normal equations (Gauss-Newton, with Huber's weights beyond 2.5 standard deviations) are sparse and
+are solved as such by SuperLU, which also gives the covariances; a least-squares driver without the
+normal matrix would not.
 
 Derivatives, with [X]_× for the matrix of the cross product:
 :math:`∂X/∂φ = [X]_×`, :math:`∂X/∂t = -R^T = -∂X/∂b`, :math:`∂X/∂δ = ∂X/∂d = R^T`,
@@ -45,11 +45,11 @@ if TYPE_CHECKING:
 #: Residuals beyond this many standard deviations weigh less.
 HUBER = 2.5
 _MOST_ROUNDS = 25
-#: Of so many photographs the deviations of the positions are worked out.
+#: With more photographs than this, the standard deviations of their positions are not computed.
 MOST_POSITIONS = 400
-#: Steps below this (m, rad) change nothing that matters.
+#: Steps below this no longer matter, m and rad.
 _STILL = 2e-6
-#: No prior of a place is taken as narrower than this, m.
+#: Narrowest prior of a position, m.
 _FIRM = 1e-6
 #: Unknowns of a mirror: δ, ψ, g.
 _OF_MIRROR = 8
@@ -62,11 +62,11 @@ class Corners:
     Attributes
     ----------
     photo, mirror, corner
-        Which, (K,).
+        Indices, (K,).
     place
         X/Z and Y/Z in camera axes, without distortion, (K, 2).
     sigma
-        Standard deviation of each, (K,).
+        Standard deviation of each coordinate, (K,).
     """
 
     photo: npt.NDArray[np.intp]
@@ -81,20 +81,20 @@ class Corners:
 
 @dataclass(frozen=True)
 class Priors:
-    """Standard deviations of what is nearly known.
+    """Standard deviations of what is known beforehand.
 
     Attributes
     ----------
     offset
-        Of RTK's common offset, m.
+        RTK's common offset, m.
     position
-        Of a heliostat's surveyed position, each axis, m: the same in all poses.
+        Surveyed position of a heliostat, each axis, m; the same in all poses.
     kinematics
-        Of a mirror's vertex in one pose about that, m.
+        Vertex of a mirror in one pose, relative to that, m.
     turn
-        Of a mirror's rotation about each of its axes, rad.
+        Rotation of a mirror about each of its axes, rad.
     growth
-        Of how much wider or higher an outline looks, relative.
+        Relative error of an outline's apparent width and height.
     """
 
     offset: float = 1.0
@@ -106,18 +106,18 @@ class Priors:
 
 @dataclass(frozen=True)
 class State:
-    """All that is to be found, and what it starts from.
+    """The unknowns, and the values they start from.
 
     Attributes
     ----------
     told
-        Positions as told, ENU m, (P, 3).
+        Recorded positions, ENU m, (P, 3).
     rotation
         Camera axes to ENU, (P, 3, 3).
     error
         t of each position, m, (P, 3).
     offset
-        b, told less true, m, (3,).
+        b, recorded less true, m, (3,).
     stand
         The mirrors as they stand.
     survey
@@ -133,20 +133,20 @@ class State:
 
     @property
     def position(self) -> FloatArray:
-        """Where the photographs were taken, ENU m, (P, 3)."""
+        """True positions of the photographs, ENU m, (P, 3)."""
         return self.told - self.offset + self.error
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where which unknowns stand: φ and t of each photograph, b, δ, ψ and g of each mirror, d.
+    """Order of the unknowns: φ and t of each photograph, b, δ, ψ and g of each mirror, d.
 
     Attributes
     ----------
     photos, mirrors, heliostats
-        How many; no heliostats if each was flown in one pose.
+        Counts; no heliostats if each was flown in one pose.
     owner
-        Row of the heliostat of each mirror, (N,).
+        Row of each mirror's heliostat, (N,).
     """
 
     photos: int
@@ -181,29 +181,29 @@ class _Layout:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """The outcome of a bundle adjustment.
+    """The result of a bundle adjustment.
 
     Attributes
     ----------
     state
-        What was found.
+        Adjusted unknowns.
     offset_covariance
         Of b, m², (3, 3).
     position_sigma
         Standard deviations of the positions, m, (P, 3); NaN beyond :data:`MOST_POSITIONS`.
     place_covariance
-        Of where each mirror stands as seen from the mean position of the photographs that show
-        it, m², (N, 3, 3): what all its reflections share.
+        Of each mirror's position relative to the mean position of the photographs that show it,
+        m², (N, 3, 3): shared by all its reflections.
     residual
-        Of the corners in standard deviations, (K, 2).
+        Of the corners, in standard deviations, (K, 2).
     deviation
-        Their RMS without outliers; 1 if the deviations that were given are true.
+        Their RMS without outliers; 1 if the given standard deviations are right.
     outlier
         Corners beyond four standard deviations, (K,).
     rounds
-        Until nothing moved any more.
+        Number of iterations.
     converged
-        Whether that came within the limit.
+        Whether the last step was negligible.
     """
 
     state: State
@@ -220,11 +220,11 @@ class Adjusted:
 def residuals(
     state: State, corners: Corners, *, derivative: bool = True
 ) -> tuple[FloatArray, tuple[FloatArray, ...]]:
-    """Return seen less expected places (K, 2), and the derivatives of the expected ones.
+    """Return seen less expected coordinates (K, 2), and the derivatives of the expected ones.
 
     Returns
     -------
-    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, each (K, 2, 3), and ∂g, (K, 2, 2); nothing
+    Residuals, and ∂place/∂φ, ∂t, ∂b, ∂δ, ∂ψ, (K, 2, 3) each, and ∂g, (K, 2, 2); no derivatives
     unless asked for.
     """
     R = state.rotation[corners.photo]
@@ -257,22 +257,22 @@ def adjust(
     *,
     owner: npt.ArrayLike | None = None,
 ) -> Adjusted:
-    """Return the exterior orientation of all photographs, and the mirrors' places.
+    """Return the exterior orientation of all photographs, and the mirrors' positions.
 
     Parameters
     ----------
     told, sigma
-        Positions and their standard deviations without the common part, ENU m, (P, 3).
+        Recorded positions and their standard deviations without the common part, ENU m, (P, 3).
     rotations
-        To start from, right to a few mrad, (P, 3, 3).
+        Starting attitudes, right to a few mrad, (P, 3, 3).
     stand
         Mirrors as surveyed and commanded, once for each pose.
     corners
-        What was seen.
+        Corners seen.
     priors
         By default those of :class:`Priors`.
     owner
-        Row of the heliostat that each mirror is of, (N,); by default each is one of its own.
+        Row of each mirror's heliostat, (N,); by default each mirror has its own.
 
     Raises
     ------
@@ -297,7 +297,7 @@ def adjust(
     for rounds in range(1, _MOST_ROUNDS + 1):
         gap, parts = residuals(state, corners)
         scaled = np.linalg.norm(gap, axis=-1) / corners.sigma
-        # The first round may stand far off for want of a good start: nothing is an outlier yet.
+        # In the first round a poor start may make all residuals large: no outliers yet.
         limit = HUBER if rounds > 1 else max(HUBER, 3.0 * float(np.median(scaled)))
         scale = np.sqrt(np.minimum(1.0, limit / np.maximum(scaled, 1e-9))) / corners.sigma
         prior, pull = _priors(layout, state, spreads, known, moved)
@@ -356,7 +356,7 @@ def _place_covariances(layout: _Layout, corners: Corners, solver: "SuperLU") -> 
 def _priors(
     layout: _Layout, state: State, spreads: FloatArray, known: Priors, moved: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weights of all unknowns' priors, and how they pull."""
+    """Return the weights of all priors, and their pull on the unknowns."""
     prior, pull = np.zeros(layout.size), np.zeros(layout.size)
     photo = slice(0, layout.offset)
     own, drawn = (a[photo].reshape(-1, 6) for a in (prior, pull))
@@ -402,7 +402,7 @@ def _normal_equations(
 def jacobian_matrix(
     corners: Corners, parts: tuple[FloatArray, ...], layout: _Layout
 ) -> "csc_array":
-    """Return the sparse derivative (2K, U) of all places by all U unknowns, per unit."""
+    """Return the sparse derivative of all coordinates by all U unknowns, (2K, U)."""
     from scipy.sparse import csc_array
 
     count = len(corners)
@@ -444,7 +444,7 @@ def _step(
         stand=replace(
             start,
             vertex=start.vertex + total[:, :3] + survey[layout.owner],
-            # Small: the prior of ψ refers to where it started.
+            # ψ is small, and its prior refers to the start.
             rotation=start.rotation @ _turns(total[:, 3:6]),
             outline=start.outline * (1.0 + np.pad(total[:, None, 6:], ((0, 0), (0, 0), (0, 1)))),
         ),
@@ -458,7 +458,7 @@ def _turns(small: FloatArray) -> FloatArray:
 def _covariance(
     solver: "SuperLU", size: int, parts: Sequence[tuple[int, FloatArray]]
 ) -> FloatArray:
-    """Return the covariance of a sum of three unknowns each, times matrices, (3, 3)."""
+    """Return the covariance of a sum of three-vectors of unknowns times matrices, (3, 3)."""
     unit = np.zeros((size, 3))
     for at, factor in parts:
         unit[at : at + 3] += factor.T

@@ -1,7 +1,7 @@
-"""What one photograph shows: mirrors as bright patches, their outlines, the lamp's spots.
+"""Detection in one photograph: mirrors as bright patches, their outlines, the lamp's spots.
 
-Readings are turned into light by the inverse of sRGB's curve before anything is measured:
-edges and spots would be displaced otherwise.
+Readings are converted to light by the inverse of sRGB's curve before anything is measured;
+otherwise edges and spots would be displaced.
 """
 
 from dataclasses import dataclass
@@ -18,22 +18,22 @@ Picture = npt.NDArray[np.uint8]
 Rows = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
-#: Readings from here on are clipped.
+#: Readings of this and more are clipped.
 CLIPPED = 253
-#: Quantiles of brightness that are taken for a mirror's.
+#: Quantiles of brightness taken as that of a mirror.
 _FILLED = (0.995, 0.9995, 0.97)
-#: Of an edge, where it is looked at, and how many points are measured on it.
+#: Share of an edge left out at each end, profiles across it, and points measured on it.
 _ENDS, _PROFILES, _GROUPS = 0.1, 32, 8
-#: A spot stands out by this many standard deviations of the mirror's noise, and by this
-#: share of the full scale.
+#: A spot exceeds its mirror by this many standard deviations of the noise, and by this share
+#: of full scale.
 _SPOT_SIGMAS, _SPOT_LEAST = 7.0, 0.02
-#: Half the side of the window in which a spot is measured, and the spread of its weight, px.
+#: Half the side of the window in which a spot is measured, and the width of its weight, px.
 _WINDOW, _WEIGHT = 5, 1.8
 
 
 @dataclass(frozen=True)
 class Patches:
-    """K bright patches that may be mirrors: centre (K, 2) and area (K,), px."""
+    """K bright patches that may be mirrors: centres (K, 2) and areas (K,), px."""
 
     center: FloatArray
     area: FloatArray
@@ -44,18 +44,18 @@ class Patches:
 
 @dataclass(frozen=True)
 class Outlines:
-    """Edges of M mirrors.
+    """Outlines of M mirrors.
 
     Attributes
     ----------
     corners
-        Pixels, in the order of the outline that was looked for, (M, 4, 2).
+        Pixels, in the order of the expected outline, (M, 4, 2).
     sigma
         Standard deviation of a corner in each direction, px, (M,).
     contrast
-        Of the weakest edge, full scales, (M,).
+        Of the weakest edge, share of full scale, (M,).
     found
-        Whether all four edges were, (M,).
+        Whether all four edges were found, (M,).
     """
 
     corners: FloatArray
@@ -75,9 +75,9 @@ class Spots:
     pixel
         Centre, (S, 2).
     sigma
-        Its standard deviation in each direction, px, (S,).
+        Standard deviation of the centre in each direction, px, (S,).
     flux
-        Light above the mirror's, full scales times pixels, (S,).
+        Light above the mirror's, full scale times pixels, (S,).
     clipped
         Number of clipped pixels, (S,).
     """
@@ -93,12 +93,12 @@ class Spots:
 
 
 def decode(path: str | Path) -> Picture:
-    """Return a photograph, blue-green-red, (H, W, 3), as the sensor's rows and columns lie.
+    """Return a photograph, blue-green-red, (H, W, 3), in the sensor's rows and columns.
 
     Raises
     ------
     FormatError
-        If there is none, or it broke off or is damaged.
+        If there is no file, or it is truncated or damaged.
     """
     import cv2
 
@@ -127,12 +127,12 @@ def _linear() -> npt.NDArray[np.float32]:
 
 
 def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
-    """Return patches of about ``expected`` px of area that differ from what is around them.
+    """Return patches of about ``expected`` px² that differ from their surroundings.
 
-    Mirrors show the sky: they are brighter than the ground, or at least bluer. How much of the
-    frame they fill is not known. So there are several answers, the likeliest first: brighter
-    ones for mirrors that fill more than 0.5 %, 0.05 % and 3 % of it, then bluer ones. Darker
-    ones are shadows, which lie like the mirrors, and so are not looked for.
+    Mirrors show the sky: they are brighter than the ground, or at least bluer. What share of the
+    frame they fill is unknown, so there are several answers, the most likely first: brighter
+    patches for mirrors that fill more than 0.5 %, 0.05 % and 3 %, then bluer ones. Darker patches
+    are shadows, which are arranged like the mirrors, and so are not searched for.
     """
     import cv2
 
@@ -146,7 +146,7 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
     found = []
     for feature in (grey, blue):
         above = np.clip(feature - cv2.blur(feature, (side, side)), 0.0, None)
-        # The lamp is brighter than any mirror, and small.
+        # A quantile rather than the maximum: the lamp is brighter than any mirror, but small.
         for top in np.quantile(above, _FILLED):
             levels = np.clip(above * (255.0 / max(float(top), 1e-6)), 0.0, 255.0)
             _, mask = cv2.threshold(
@@ -154,7 +154,7 @@ def find_patches(picture: Picture, expected: float) -> tuple[Patches, ...]:
             )
             closed = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
             patches = _whole_patches(np.asarray(closed, np.uint8), expected * scale**2)
-            # The centre of a small picture's pixel lies in the middle of those it stands for.
+            # The centre of a reduced pixel is the middle of the pixels it stands for.
             center = (patches.center + 0.5) / scale - 0.5
             found.append(Patches(center, patches.area / scale**2))
     return tuple(found)
@@ -180,7 +180,7 @@ def _whole_patches(mask: npt.NDArray[np.uint8], expected: float) -> Patches:
 
 
 def sample(picture: Picture, places: FloatArray) -> FloatArray:
-    """Return the light at places (..., 2), bilinear, (..., 3); the border goes on outside."""
+    """Return the light at pixels (..., 2), bilinear, (..., 3); outside, that of the border."""
     height, width = picture.shape[:2]
     x = np.clip(places[..., 0], 0.0, width - 1.001).ravel()
     y = np.clip(places[..., 1], 0.0, height - 1.001).ravel()
@@ -198,18 +198,18 @@ def find_outlines(
 ) -> Outlines:
     """Return the outlines of mirrors near the expected ones.
 
-    Across each edge profiles are read, projected on the colour in which both sides differ most,
-    and averaged in eight groups; the edge of each lies at the centroid of its slope. A straight
-    line goes through them by weights that leave out what lies off it (a neighbour, a shadow).
+    Profiles across each edge are projected on the colour in which both sides differ most and
+    averaged in eight groups; the edge of each group is the centroid of its slope. A straight line
+    through them is fitted with weights that reject what is off it, such as a neighbour or a shadow.
 
     Parameters
     ----------
     picture
         Blue-green-red.
     expected
-        Corners in turn, px, (M, 4, 2).
+        Corners in order, px, (M, 4, 2).
     reach
-        Farthest distance of an edge from the expected one, px.
+        Largest distance of an edge from the expected one, px.
     profiles
         Across each edge, a multiple of eight; fewer are quicker.
     """
@@ -222,7 +222,7 @@ def find_outlines(
     length = np.linalg.norm(along, axis=-1, keepdims=True)
     unit = along / np.maximum(length, 1e-9)
     outward = np.stack([unit[..., 1], -unit[..., 0]], axis=-1)
-    # Corners may run either way round: outward is away from the middle.
+    # Corners may run either way: outward is away from the middle.
     middle = expected.mean(axis=1, keepdims=True)
     side = np.sum((0.5 * (start + end) - middle) * outward, axis=-1, keepdims=True)
     outward = outward * np.sign(side)
@@ -240,7 +240,7 @@ def find_outlines(
     points = points + offset[..., None] * outward[:, :, None]
     lines, spread, enough = _lines(points, known, outward)
     corners = _crossings(lines)
-    # The corner's error: that of both lines at their ends, about twice that in the middle.
+    # At its ends, the error of a line is about twice that in its middle.
     sigma = np.sqrt(np.sum(spread**2, axis=1) / 4.0) * 2.0
     found: Mask = np.asarray(enough.all(axis=1) & np.isfinite(corners).all(axis=(1, 2)))
     return Outlines(np.where(found[:, None, None], corners, np.nan), sigma, contrast, found)
@@ -249,7 +249,7 @@ def find_outlines(
 def _edges(
     colour: FloatArray, steps: FloatArray, reach: float
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return offsets (M, 4, groups) of the edges, the least contrast (M,), what is known."""
+    """Return offsets (M, 4, groups) of the edges, the least contrast (M,), and which are valid."""
     inner, outer = steps < -reach, steps > reach
     levels = colour[..., inner, :].mean(axis=(2, 3)), colour[..., outer, :].mean(axis=(2, 3))
     apart = levels[0] - levels[1]
@@ -268,7 +268,7 @@ def _edges(
     weight = np.where(near, np.clip(slope - 0.1 * highest, 0.0, None), 0.0)
     total = weight.sum(axis=-1)
     offset = np.sum(weight * at, axis=-1) / np.maximum(total, 1e-12)
-    # A real edge has most of the contrast.
+    # A true edge has most of the contrast.
     jump = np.sum(np.where(near, slope, 0.0), axis=-1)
     known = (jump > 0.5 * contrast[..., None]) & (total > 0.0)
     return offset, contrast.min(axis=1) / np.sqrt(3.0), known
@@ -277,7 +277,7 @@ def _edges(
 def _lines(
     points: FloatArray, known: Mask, outward: FloatArray
 ) -> tuple[FloatArray, FloatArray, Mask]:
-    """Return lines a x + b y = c, (M, 4, 3), the deviation of each in its middle, enough points."""
+    """Return lines a x + b y = c, (M, 4, 3), their error, and which have enough points."""
     weight = known.astype(np.float64)
     enough = weight.sum(axis=-1) >= 4
     weight = np.where(enough[..., None], weight, 1.0)
@@ -304,7 +304,7 @@ def _lines(
 
 
 def _crossings(lines: FloatArray) -> FloatArray:
-    """Return where each edge's line crosses that of the edge before it, (M, 4, 2)."""
+    """Return the intersection of each edge's line with that of the edge before it, (M, 4, 2)."""
     before = np.roll(lines, 1, axis=1)
     det = before[..., 0] * lines[..., 1] - before[..., 1] * lines[..., 0]
     det = np.where(np.abs(det) < 0.05, np.nan, det)
@@ -319,7 +319,7 @@ def _crossings(lines: FloatArray) -> FloatArray:
 def find_spots(
     picture: Picture, corners: FloatArray, most: int = 12
 ) -> tuple[Spots, tuple[str, ...]]:
-    """Return the lamp's spots on mirrors, and why a mirror gives none ("" where it may).
+    """Return the lamp's spots on mirrors, and why a mirror gives none ("" if it may).
 
     Parameters
     ----------
@@ -328,7 +328,7 @@ def find_spots(
     corners
         Of the mirrors, px, (M, 4, 2).
     most
-        More spots than this on one mirror are no lamp's: it is left out as "cluttered".
+        A mirror with more spots than this is left out as "cluttered": they are not the lamp's.
     """
     found: list[tuple[int, FloatArray, float, float, int]] = []
     reasons = []
@@ -350,7 +350,7 @@ def find_spots(
 def _spots_of(
     picture: Picture, outline: FloatArray
 ) -> tuple[list[tuple[FloatArray, float, float, int]], str]:
-    """Return centre, sigma, flux and clipped pixels of the spots on one mirror."""
+    """Return centre, sigma, flux and clipped pixels of a mirror's spots, or why there are none."""
     import cv2
 
     height, width = picture.shape[:2]
@@ -362,7 +362,7 @@ def _spots_of(
     inside = np.zeros(raw.shape[:2], np.uint8)
     cv2.fillConvexPoly(inside, np.round((outline - low) * 16).astype(np.int32), 1, shift=4)
     inside = np.asarray(cv2.erode(inside, np.ones((3, 3), np.uint8)), np.uint8)
-    # Of three colours sums are quicker than NumPy's reductions.
+    # For three colours, operators are quicker than NumPy's reductions.
     bright = np.minimum(np.minimum(raw[..., 0], raw[..., 1]), raw[..., 2]) >= CLIPPED
     area = int(inside.sum())
     if area < 30:
@@ -389,7 +389,7 @@ def _spots_of(
 
 
 def _mean(light: FloatArray, share: npt.NDArray[np.float32], sigma: float) -> FloatArray:
-    """Return the Gaussian mean of what lies inside the mirror."""
+    """Return the Gaussian mean of the light inside the mirror."""
     import cv2
 
     weight = cv2.GaussianBlur(share, (0, 0), sigma)
@@ -408,8 +408,8 @@ def _centroid(
 ) -> tuple[FloatArray, float, float, int] | None:
     """Return centre (x, y), sigma, flux and clipped pixels of the spot at row i, column j.
 
-    The centre is the mean of light above the mirror's under a Gaussian weight that moves with
-    it; of a clipped spot the plain mean of what is above half of the peak.
+    The centre is the mean of the light above the mirror's, under a Gaussian weight that moves with
+    it; for a clipped spot, the plain mean of the light above half of the peak.
     """
     rows = np.arange(max(i - _WINDOW, 0), min(i + _WINDOW + 1, light.shape[0]))
     columns = np.arange(max(j - _WINDOW, 0), min(j + _WINDOW + 1, light.shape[1]))
@@ -420,8 +420,8 @@ def _centroid(
     if int(ring.sum()) < 6:
         return None
     above = np.where(held, part - np.median(part[ring]), 0.0)
-    # Beside a crossing of gaps between facets the mean around is low, but nothing is brighter
-    # than the brighter part of the mirror around.
+    # Where gaps between facets cross, the surrounding mean is low; a true spot is also brighter
+    # than the bright part of its surroundings.
     if float(part[far < 1.2].mean() - np.quantile(part[ring], 0.8)) < 0.8 * raised:
         return None
     clipped = int(np.sum(bright[np.ix_(rows, columns)] & (far <= _WINDOW)))
@@ -450,6 +450,6 @@ def _centroid(
     flux = float(above[far <= 3.5].sum())
     if flux <= 0.0:
         return None
-    # Noise of a centroid: that of a pixel times its lever, over the light.
+    # Noise of a centroid: pixel noise times its lever, over the light.
     sigma = float(np.hypot(noise * 1.2 * np.sqrt(20.0) * 1.5 / flux, 0.03 + 0.02 * (clipped > 3)))
     return center, sigma, flux, clipped

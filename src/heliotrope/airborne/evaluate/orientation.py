@@ -1,15 +1,17 @@
 r"""The orientation of mirrors from reflections of the drone's lamp.
 
-Each reflection measures one normal: the bisector of the ways to lamp and camera. The mirror's
-shape says which normal is expected at that point. The small rotation ω, about the
+Each reflection measures one normal: the bisector of the directions to lamp and camera. The
+mirror's shape gives the normal expected at that point. The small rotation ω, about the
 concentrator's own x and y axes, that turns the expected normal n into the measured one v is
 
 .. math:: ω = \frac{n × v}{|n × v|} \arcsin |n × v|
 
-and the orientation is moved by the mean of all ω, over the points or over the mirror's area. As
-the points on the mirror move with the orientation, that is done twice; then outliers are left
-out (Rosner's test of each component), and the last mean is the result. What is left of ω at
-each point, the *difference*, carries all that is told of accuracy and of the facets.
+The orientation is corrected by the mean of all ω, over the points or over the mirror's area. As
+the points move on the mirror with the orientation, that is done twice; then outliers are rejected
+(Rosner's test of each component), and the last mean is the result. The remaining ω at each point,
+its *angular difference*, carries all information on accuracy and on the facets.
+
+Two rounds, the test and a last mean are HelioPoint's procedure; the mean over the area is ours.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -32,32 +34,33 @@ from heliotrope.airborne.mirror import MirrorShape, measured_normal
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, rotation
 
-#: Which mean over the points is the mirror's: as they are, or weighted for the whole area.
+#: Mean over the points: equal weights, or weights that represent the whole area.
 Mean = Literal["plain", "area"]
 
-#: Rounds of mean and update before outliers are looked for.
+#: Rounds of mean and correction before the test for outliers.
 ROUNDS = 2
-#: Fewer points than this give no standard deviation that is worth its name.
+#: Fewer points than this give no meaningful standard deviation.
 FEWEST = 5
-# The centre of the points from the mirror's, in half widths, above which a warning is given.
+# Distance of the points' centre from the mirror's that raises a warning, in half widths.
 _OFF_CENTRE = 0.25
-# A facet whose mean stands this many standard errors and this far (rad) off the others.
+# A facet is canted off if its mean differs this many standard errors, and this much (rad).
 _CANTED_SIGMA, _CANTED = 4.0, 0.5e-3
-# p of the test of normality below which the differences are called not normal.
+# p below which the differences are reported as not normal. HelioPoint uses 0.05, which one good
+# mirror in ten would fail in one of its two components.
 _NORMAL = 1e-3
 
 
 @dataclass(frozen=True)
 class FacetMean:
-    """What the points on one facet say.
+    """The points on one facet.
 
     Attributes
     ----------
     facet, count
-        Its number, and how many points it has: without outliers, unless they are the most.
+        Its number, and how many points it has: without outliers, unless most of them are.
     mean
-        Of the differences, rotX and rotY, rad, (2,): its canting error, as seen from the
-        mean of all; NaN without points.
+        Of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
+        all; NaN without points.
     sigma
         Plain standard error of the mean, rad, (2,).
     """
@@ -81,26 +84,26 @@ class Orientation:
     vertex
         ENU metres, (3,).
     correction
-        rotX and rotY, rad: how the mirror stands turned, about its own axes, from where it
-        was expected, (2,).
+        rotX and rotY, rad: rotation from the expected orientation about the mirror's own axes,
+        (2,).
     reflections
-        The n rows this is from, outliers included.
+        The n reflections, outliers included.
     point
-        Where each stands, ENU metres, (n, 3).
+        Their positions, ENU metres, (n, 3).
     outlier
         (n,).
     weight
-        Of each point in the mean, their sum 1; 0 for outliers, (n,).
+        Of each point in the mean, adding up to 1; 0 for outliers, (n,).
     difference
-        Of each point from the result, rotX and rotY, rad, (n, 2).
+        Angular difference of each point from the result, rotX and rotY, rad, (n, 2).
     sigma
         Standard deviation of the differences without outliers, rad, (2,).
     sigma_plain
         σ_mean as σ/√n, rad, (2,).
     sigma_mean
-        σ_mean with the fixed field of slopes counted as what it is, rad, (2,).
+        σ_mean with the slope deviations treated as the fixed field they are, rad, (2,).
     systematic
-        What all points share, rad, (2,).
+        Error common to all points, rad, (2,).
     normality
         p of Shapiro and Wilk's test, (2,).
     facets
@@ -108,7 +111,7 @@ class Orientation:
     distance
         Mean, from mirror to camera, m.
     mean
-        Which mean was taken.
+        The mean that was used.
     warnings
         One line each.
     """
@@ -134,7 +137,7 @@ class Orientation:
 
     @property
     def count(self) -> int:
-        """Number of points that were used."""
+        """Number of points without outliers."""
         return int((~self.outlier).sum())
 
     @property
@@ -154,7 +157,7 @@ class Orientation:
 
     @property
     def sigma_total(self) -> FloatArray:
-        """σ_tot of rotX and rotY: the mean's and the systematic one together, rad, (2,)."""
+        """σ_tot of rotX and rotY: σ_mean and the systematic part combined, rad, (2,)."""
         return np.hypot(self.sigma_mean, self.systematic)
 
 
@@ -167,9 +170,9 @@ class Orientations:
     names
         Of all N heliostats.
     found
-        Of those that could be measured, in their order.
+        Orientations that could be measured, in the order of the heliostats.
     left_out
-        For each other one that was to be measured its name and the reason.
+        For each other heliostat that was to be measured, its name and the reason.
     """
 
     names: tuple[str, ...]
@@ -177,7 +180,7 @@ class Orientations:
     left_out: Mapping[str, str]
 
     def of(self, name: str) -> Orientation | None:
-        """Return the orientation of heliostat ``name``, None if it has none."""
+        """Return the orientation of heliostat ``name``, None if it was not measured."""
         return next((o for o in self.found if self.names[o.heliostat] == name), None)
 
 
@@ -198,9 +201,9 @@ def differences(
     shape
         Of its mirror.
     rotation, vertex
-        Its orientation, (3, 3), and place, ENU metres, (3,).
+        Its orientation, (3, 3), and vertex, ENU metres, (3,).
     slopes
-        Whether the normals are expected with the slope map, if there is one.
+        Whether expected normals include the slope map, if there is one.
     """
     R, v = as_float(rotation), as_float(vertex)
     point = v + shape.point_at(reflections.facet, reflections.xy) @ R.T
@@ -213,7 +216,7 @@ def differences(
 
 
 def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
-    """Return an orientation (3, 3) turned by rotX and rotY (2,), rad, about its own axes."""
+    """Return an orientation (3, 3) rotated by rotX and rotY (2,), rad, about its own axes."""
     x, y = as_float(rot)
     axis = np.array([x, y, 0.0])
     return as_float(R) @ rotation(axis, float(np.hypot(x, y)))
@@ -222,7 +225,7 @@ def turned(R: npt.ArrayLike, rot: npt.ArrayLike) -> FloatArray:
 def rotation_between(R: npt.ArrayLike, other: npt.ArrayLike) -> FloatArray:
     """Return rotX, rotY and rotZ, rad, (3,), that turn orientation ``R`` into ``other``.
 
-    They are the components, along R's own axes, of the one rotation between both.
+    They are the components of a single rotation, along R's own axes.
     """
     from scipy.spatial.transform import Rotation
 
@@ -252,26 +255,28 @@ def measure(
     shape
         Of its mirror.
     rotation, vertex
-        Orientation (3, 3) and place, ENU metres, (3,), that are expected.
+        Expected orientation (3, 3) and vertex, ENU metres, (3,).
     pivot
-        About which the mirror turns, m in concentrator coordinates from the vertex, (3,).
+        Point about which the mirror turns, from the vertex in concentrator coordinates, m, (3,).
     slopes
-        Whether the slope map is used, if the mirror has one.
+        Whether to use the slope map, if the mirror has one.
     budget
-        Of what all points share; the default one if None.
+        Errors common to all points; the default budget if None.
     place
-        Covariance of the mirror's place as seen from the drone, m², (3, 3), see
+        Covariance of the mirror's position relative to the drone, m², (3, 3), see
         :meth:`~heliotrope.airborne.evaluate.budget.Budget.covariance`.
     mean
-        "area", weighted for the whole mirror, or "plain", all points alike, as in the paper.
-        Without slope map that is worse: points crowd where the surface looks alike.
+        "area", weighted to represent the whole mirror, or "plain", equal weights, as in
+        HelioPoint. Without a slope map the plain mean is worse: points crowd where the surface
+        is flat.
     alpha, rounds
-        Of the test for outliers, and of mean and update before it.
+        Of the test for outliers, and of the corrections before it.
 
     Raises
     ------
     InputError
-        If there are no reflections, or not of one heliostat with these facets.
+        If there are no reflections, or they are of several heliostats or of facets that the
+        mirror does not have.
     """
     own = _checked(reflections, shape)
     start, foot, lever = as_float(rotation), as_float(vertex), as_float(pivot)
@@ -285,7 +290,7 @@ def measure(
         return turned(R, _mean(omega, own, shape, keep, mean))
 
     for _ in range(rounds):
-        # Any mean brings the points to their places.
+        # Any mean brings the points to their positions.
         R = update(R, "plain")
     omega = differences(own, shape, R, where(R), slopes=slopes)
     keep = ~(rosner(omega[:, 0], alpha=alpha) | rosner(omega[:, 1], alpha=alpha))
@@ -321,15 +326,15 @@ def measure_field(
     rotation, vertex
         Expected, (N, 3, 3) and (N, 3).
     wanted
-        Rows that were to be measured; all if None.
+        Rows to be measured; all if None.
     slopes, budget, mean
         As :func:`measure`.
     places
-        Covariances of their places as seen from the drone, m², (N, 3, 3).
+        Covariances of their positions relative to the drone, m², (N, 3, 3).
 
     Notes
     -----
-    A heliostat that cannot be measured is named with the reason; the others go on.
+    A heliostat that cannot be measured is listed with the reason; the others continue.
     """
     turns, feet = as_float(rotation), as_float(vertex)
     seen = None if places is None else as_float(places)
@@ -360,9 +365,9 @@ def measure_field(
 
 def _checked(reflections: Reflections, shape: MirrorShape) -> Reflections:
     if not len(reflections):
-        raise InputError("orientation: no reflections; a heliostat needs at least one")
+        raise InputError("orientation: no reflections; at least one is needed")
     if (reflections.heliostat != reflections.heliostat[0]).any():
-        raise InputError("orientation: reflections of several heliostats; take those of one")
+        raise InputError("orientation: reflections of several heliostats; give those of one")
     highest = int(reflections.facet.max())
     if highest >= len(shape):
         raise InputError(
@@ -442,7 +447,7 @@ def _facet_means(
     for k in range(len(shape)):
         on = facet == k
         used = on & keep
-        # A facet that is canted off has nothing but outliers: they are its truth.
+        # On a canted facet most points are outliers of the mirror, but right for the facet.
         mine = found[used if 2 * used.sum() >= on.sum() else on]
         mean = mine.mean(axis=0) if len(mine) else np.full(2, np.nan)
         means.append(FacetMean(k, len(mine), mean, plain_sigma(mine)))
@@ -452,7 +457,7 @@ def _facet_means(
 def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
     lines = []
     if o.count < FEWEST:
-        lines.append(f"only {o.count} reflections; fly more points, {FEWEST} at the least")
+        lines.append(f"only {o.count} reflections; fly more points, at least {FEWEST}")
     area = np.prod(shape.half_size, axis=-1)
     share = area / area.sum()
     corners = shape.corners[..., :2].reshape(-1, 2)
@@ -466,9 +471,9 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
             )
         )
         lines.append(
-            f"unsymmetric sampling: the points' centre stands {off[0]:+.2f} half widths to the "
-            f"right and {off[1]:+.2f} half heights above the mirror's; a linear change of the "
-            f"differences would make that {effect}"
+            f"unsymmetric sampling: the centre of the points is {off[0]:+.2f} half widths to the "
+            f"right of and {off[1]:+.2f} half heights above that of the mirror; if the "
+            f"differences change linearly across it, the error is {effect}"
         )
     total = sum(f.count for f in o.facets)
     for f in o.facets:
@@ -490,18 +495,18 @@ def _warnings(o: Orientation, shape: MirrorShape, xy: FloatArray) -> list[str]:
 
 
 def _tilt_by_gradient(o: Orientation, xy: FloatArray, offset: FloatArray) -> FloatArray:
-    """Return what a plane through the differences has at ``offset`` from its centre, (2,)."""
+    """Return a plane through the differences at ``offset`` from their centre, (2,)."""
     centred = xy - xy.mean(axis=0)
     plane, *_ = np.linalg.lstsq(centred, o.difference[~o.outlier], rcond=None)
     return as_float(offset @ plane)
 
 
 def _off_the_others(o: Orientation, f: FacetMean) -> FloatArray | None:
-    """Return a facet's mean less the median of the others', if it is beyond chance."""
+    """Return a facet's mean less the median of the others' if it is beyond chance."""
     others = [g for g in o.facets if g.facet != f.facet and g.count >= 3]
     if f.count < 3 or not others:
         return None
-    # The median, so that the one that is off is named and not all the others.
+    # The median, so that the odd facet is reported and not all the others.
     away = f.mean - np.median([g.mean for g in others], axis=0)
     error = np.sqrt(f.sigma**2 + np.mean([g.sigma**2 for g in others], axis=0))
     if ((np.abs(away) > _CANTED_SIGMA * error) & (np.abs(away) > _CANTED)).any():

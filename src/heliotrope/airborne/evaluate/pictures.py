@@ -1,4 +1,4 @@
-"""Pictures of a flight's orientations: one heliostat's points and differences, and the field."""
+"""Pictures of a flight: the points and differences of one heliostat, and a map of the field."""
 
 from typing import TYPE_CHECKING
 
@@ -19,21 +19,21 @@ _NAMES = ("rotX", "rotY")
 _COLOURS = (AFTER, TESTED)
 _BAR = "#bbccdd"
 _ENDS = np.array([-1.0, 1.0])
-# Of a heliostat's picture, px.
+# Size of a heliostat's picture, px.
 _SIZE = (1180.0, 500.0)
-# Length that the RMS of the differences is drawn with, in widths of the mirror.
+# Drawn length of the RMS difference, in widths of the mirror.
 _ARROW = 0.06
-# Texts of facets that have room side by side.
+# Most labels of facets side by side.
 _MOST_LABELS = 6
-#: More heliostats than these get no arrows, and no names, in the map.
+#: Most heliostats with arrows, and most with names, in the map.
 MOST_ARROWS, MOST_NAMES = 300, 40
 
 
 def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
     """Return the picture of one heliostat, as SVG.
 
-    Sampling points on the mirror with an arrow each (where the normal leans to, from the one
-    expected), the differences about both axes with their distribution, by facet, and in the
+    Sampling points on the mirror, each with an arrow along which its normal leans from the
+    expected one, and the differences about both axes: their distribution, by facet, and in the
     order of the photographs.
     """
     panels = [_points(o, shape), _distribution(o, 0), _distribution(o, 1), _facets(o), _order(o)]
@@ -42,7 +42,7 @@ def heliostat_drawing(name: str, o: Orientation, shape: MirrorShape) -> str:
 
 
 def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Figure":
-    """Return the field: where mirrors stand turned to, and how well that is known.
+    """Return a map of the field: deviations of the mirrors, and how well they are known.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
             dots = ax.scatter(places[rows, 0], places[rows, 1], c=shown, s=size, cmap="cividis")
             figure.colorbar(dots, ax=ax, label=label)
         ax.set_aspect("equal", adjustable="datalim")
-        # Arrows and names reach beyond the outermost heliostats.
+        # Room for arrows and names beyond the outermost heliostats.
         ax.margins(0.15)
         ax.set_xlabel("east, m")
         ax.set_ylabel("north, m")
@@ -87,13 +87,13 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
 
 
 def rms(values: FloatArray) -> float:
-    """Return the root of the mean square of finite values; NaN if there are none."""
+    """Return the root mean square of the finite values; NaN if there are none."""
     known = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
 
 
 def _leans(ax: "Axes", found: Orientations, places: FloatArray) -> None:
-    """Draw where normals lean to, from where they were expected, as seen from above."""
+    """Draw the direction in which normals lean from the expected ones, as seen from above."""
     lean = 1e3 * np.array([_lean(o) for o in found.found])
     size = max(rms(np.linalg.norm(lean[:, :2], axis=-1)), 1e-6)
     span = max(float(np.ptp(places[:, :2], axis=0).max()), 10.0)
@@ -118,7 +118,7 @@ def _lean(o: Orientation) -> FloatArray:
 
 
 def _tips(o: Orientation, rows: npt.NDArray[np.bool_]) -> list[str]:
-    """Return what is known of each reflection."""
+    """Return the tooltip of each reflection."""
     seen, d = o.reflections, 1e3 * o.difference
     return [
         f"photograph {seen.photo[i]}, facet {seen.facet[i]}: rotX {d[i, 0]:+.2f}, "
@@ -139,7 +139,7 @@ def _points(o: Orientation, shape: MirrorShape) -> Panel:
         390.0,
         x,
         y,
-        "points, and where normals lean to",
+        "sampling points, and the lean of the normals",
         "x, m (right, seen from the front)",
         "y, m",
     ).equal()
@@ -199,7 +199,7 @@ def _facets(o: Orientation) -> Panel:
         1e3 * np.array([getattr(f, what) for f in o.facets]) for what in ("mean", "sigma")
     )
     reach = np.where(np.isfinite(errors), errors, 0.0)
-    # As many texts as have room.
+    # As many labels as there is room for.
     every = 1 + (len(o.facets) - 1) // _MOST_LABELS
     labels = tuple("" if f.facet % every else f"{f.facet}: {f.count}" for f in o.facets)
     panel = Panel(

@@ -1,13 +1,13 @@
-r"""Orientations that a drone measured, as sightings for the calibration.
+r"""Orientations measured by a drone, as sightings for the calibration.
 
-A sighting's rays meet at the mirror's vertex; a reflection stands anywhere on the mirror, on a
-facet that is canted. Both ways are therefore moved to the vertex and turned by the rotation
-that takes the normal measured at the point to the normal that the whole mirror has if this
-point is right; the distances stay. Bisector and lever are then those of the reflection.
+The rays of a sighting meet at the mirror's vertex; a reflection lies anywhere on the mirror, on a
+facet that is canted. Both rays are therefore moved to the vertex and turned by the rotation from
+the normal measured at the point to the normal that the whole mirror has if this point is right.
+The distances stay the same, and bisector and lever are those of the reflection.
 
-Slope deviations that no map tells turn a mirror as the drone sees it alike in all poses. The
-centroid of a mirror's image on a target shows the mean over the whole mirror instead. In a fit
-of both that turn is an unknown of its own (:func:`fit_together`).
+Unmapped slope deviations turn a mirror, as seen by the drone, alike in all poses. The centroid of
+a mirror's image on a target represents the mean over the whole mirror instead. In a fit of both,
+that turn is an additional unknown (:func:`fit_together`).
 """
 
 from collections.abc import Mapping
@@ -26,18 +26,18 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, normalize, rotation
 from heliotrope.mechanism.chain import Mechanism
 
-#: What makes one sighting.
+#: One sighting for each reflection, or for each orientation.
 Per = Literal["reflection", "orientation"]
 
-# Standard deviation of a difference where there are too few points to tell it, rad.
+# Standard deviation of a difference with too few points to estimate it, rad.
 _UNTOLD = 1e-3
-# Rounds of fit and turn: two do, as the turn is linear but for its square.
+# Rounds of fit and turn: two suffice, as the turn is linear to second order.
 _ROUNDS = 10
-# A turn that moves by less than this from one round to the next has settled, rad.
+# The turn has converged when it changes by less than this, rad.
 _SETTLED = 1e-7
-# What several poses scatter is told from this many degrees of freedom on.
+# Degrees of freedom from which the scatter of the poses is estimated.
 _ENOUGH = 8
-# And it is no less than this part of what they say of themselves.
+# Least scatter, as a share of the stated standard deviation.
 _LEAST = 0.1
 
 
@@ -60,23 +60,21 @@ def to_sightings(
     time
         Unix seconds, () or (N,).
     per
-        "reflection" makes one of each reflection that is no outlier, "orientation" one of
+        "reflection" makes a sighting of each reflection that is not an outlier, "orientation" of
         each orientation.
     systematic
-        Whether σ holds what all points of a mirror share. Leave it out if the fit estimates
-        the positions, which are the larger part of it.
+        Whether σ includes the error common to all points of a mirror. Leave it out if the fit
+        estimates the positions, which are the larger part of it.
 
-    Returns
-    -------
-    With a σ such that all sightings of an orientation together weigh what σ_tot (or σ_mean)
-    says, however many they are; those of single reflections as the mean over the mirror weighs
-    them. So both ways give a fit the same; single ones let it find outliers of its own.
+    Returns ------- Sightings whose σ gives all sightings of an orientation together the weight of
+    σ_tot (or σ_mean), however many they are; single reflections share it as in the mean over the
+    mirror. Both ways give the same fit, and single reflections let it find its own outliers.
 
     Raises
     ------
     InputError
-        If no orientation was found, the counts are not those of N heliostats, or ``per`` is
-        another word.
+        If there is no orientation, the counts are not those of N heliostats, or ``per`` is
+        neither word.
     """
     if per not in ("reflection", "orientation"):
         raise InputError(f"to_sightings: per={per!r}; give 'reflection' or 'orientation'")
@@ -106,14 +104,14 @@ def _sigma(o: Orientation, systematic: bool) -> float:
 
 
 def _of_mean(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
-    # A lamp in the camera, on the normal: the ray turns by twice the normal's error.
+    # With the lamp in the camera, on the normal, the ray turns by twice the error of the normal.
     place = o.vertex + o.distance * o.normal
     sigma = 2.0 * _sigma(o, systematic)
     return drone([o.heliostat], counts[None], place, place, time=time, sigma=sigma)
 
 
 def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool) -> Sightings:
-    # A weight below a tenth of the usual (it may be negative, behind others) is no sighting.
+    # Kriging weights of points behind others may be negative: a tenth of the mean is the least.
     share = np.maximum(o.weight, 0.1 / max(o.count, 1))
     kept = np.flatnonzero(~o.outlier)
     share = share[kept] / share[kept].sum()
@@ -142,20 +140,20 @@ def _of_points(o: Orientation, counts: FloatArray, time: float, systematic: bool
 
 @dataclass(frozen=True)
 class Together:
-    """A fit of drone sightings with others.
+    """A joint fit of drone sightings and others.
 
     Attributes
     ----------
     calibration
-        Of N heliostats. Its covariance counts that the turn is not known.
+        Of N heliostats. Its covariance accounts for the unknown turn.
     turn
-        By which the drone sees a mirror turned in all poses, about the concentrator's x and y
+        By which the drone sees a mirror rotated in all poses, about the concentrator's x and y
         axes, rad, (N, 2).
     turn_covariance
         rad², (N, 2, 2).
     noise
-        What the poses scatter beside the turn, in units of the drone sightings' sigma, (N,);
-        1 where there are too few poses to tell.
+        Scatter of the poses beside the turn, in units of the drone sightings' sigma, (N,); 1
+        with too few poses to estimate it.
     """
 
     calibration: FieldFit
@@ -172,21 +170,21 @@ def fit_together(
     *,
     priors: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Together:
-    """Return the fit of drone sightings together with others, if slopes are not known.
+    """Return a joint fit of drone sightings and others, for mirrors without slope maps.
 
-    A turn of each mirror that all its poses share is an unknown besides the parameters. Its
-    prior is as wide as the drone sightings say of themselves (half of their sigma, which is the
-    beam's), and what remains of them is what they scatter about a fit of their own. Losses are
-    squares: leave outliers out before.
+    A turn of each mirror common to all its poses is an additional unknown. Its prior is as wide as
+    the stated standard deviation of the drone sightings (half of their sigma, which is the
+    beam's), and their remaining error is their scatter about a fit of their own. Losses are
+    squares: remove outliers before.
 
     Parameters
     ----------
     mechanism
         Nominal mechanisms, batch shape (N,).
     others
-        Camera-target sightings: a centroid shows the mean over the whole mirror.
+        Camera-target sightings: a centroid represents the mean over the whole mirror.
     flights
-        One of each orientation (``per="orientation"``), without the systematic part.
+        One for each orientation (``per="orientation"``), without the systematic part.
     model, priors
         As :func:`heliotrope.calibration.fit.estimator.fit`.
 
@@ -198,8 +196,8 @@ def fit_together(
     Notes
     -----
     Simulated (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors):
-    normals elsewhere are predicted to 0.77 mrad from the first alone, 0.16 from the second,
-    0.16 from both in :func:`~heliotrope.calibration.fit.estimator.fit`, and 0.08 from this.
+    normals elsewhere are predicted to 0.77 mrad from the first alone, 0.16 from the second, 0.16
+    from both in :func:`~heliotrope.calibration.fit.estimator.fit`, and 0.08 from this function.
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)
@@ -228,7 +226,7 @@ def _shared_spread(flights: Sightings, count: int) -> FloatArray:
 
 
 def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
-    """Return what poses scatter about their own fit, in units of their sigma, (N,)."""
+    """Return the scatter of poses about their own fit, in units of their sigma, (N,)."""
     count = len(alone.values)
     free = 2 * np.bincount(flights.heliostat, minlength=count) - len(alone.names)
     square = np.bincount(flights.heliostat, weights=alone.lengths**2, minlength=count)
@@ -237,7 +235,7 @@ def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
 
 
 def _turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
-    """Return drone sightings without the turn: their rays turned about the vertices."""
+    """Return drone sightings without the turn: their rays rotated about the vertices."""
     R, vertex = orientation(mechanism[flights.heliostat], flights.counts)
     axis = -np.einsum("mij,mj->mi", R[..., :2], turn[flights.heliostat])
     back = rotation(axis, np.linalg.norm(axis, axis=-1))
@@ -256,7 +254,7 @@ def _joint_step(
     turn: FloatArray,
     spread: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss and Newton's step of the turns (N, 2), and the covariance of all unknowns."""
+    """Return the Gauss-Newton step of the turns (N, 2), and the covariance of all unknowns."""
     fitted = mechanism.with_parameters(told.parameters)[seen.heliostat]
     lines = linearise(fitted, seen, told.names)
     by_turn = _by_turn(fitted, seen)
@@ -273,10 +271,10 @@ def _joint_step(
 
 
 def _by_turn(mechanism: Mechanism, seen: Sightings) -> FloatArray:
-    """Return derivatives of whitened residuals by the turn that is taken out, (M, 2, 2)."""
+    """Return derivatives of whitened residuals by the turn that is removed, (M, 2, 2)."""
     R, vertex = orientation(mechanism, seen.counts)
     axes, whiten = whitening(seen, vertex)
     source, way = ray_directions(seen, vertex)
-    # The bisector v turns back by ω × v, and it stands with a minus in the residual.
+    # The bisector v turns back by ω × v, and enters the residual with a minus sign.
     moved = np.cross(np.swapaxes(R, -1, -2)[:, :2], normalize(source + way)[:, None])
     return as_float(np.einsum("mab,mbk,mik->mai", whiten, axes, moved))

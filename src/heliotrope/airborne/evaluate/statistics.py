@@ -1,18 +1,18 @@
-r"""Outliers, normality, and how well a mean over points of a mirror is known.
+r"""Outliers, normality, and the accuracy of a mean over points of a mirror.
 
-The plain figure, σ/√n, takes the differences at n points as n independent draws. They are
-not: the slope deviations of a mirror are one fixed, smooth field, and points that are spread
-over it average it better than chance would. What the mean over points misses of the mean over
-the mirror V is, with the covariance C of the field,
+The plain figure, σ/√n, treats the differences at n points as independent draws. They are not: the
+slope deviations of a mirror are one fixed, smooth field, and points spread over it average it
+better than chance would. The error of the mean over points, relative to the mean over the
+mirror V, is, with the covariance C of the field,
 
 .. math:: σ_E^2 = \bar C(x, x) - 2 \bar C(x, V) + \bar C(V, V) + τ^2 / n
 
 (the extension variance: Matheron 1963, Economic Geology 58, 1246; Chilès & Delfiner 2012,
 *Geostatistics*, section 2.6) with τ the noise of one point. The field is taken as Gaussian with
-Matérn's covariance of smoothness 3/2, the same on all facets and independent between them, so
-that canting errors are part of it. Variance, correlation length and noise come from the
-differences themselves by restricted maximum likelihood, averaged over all lengths and noise
-ratios by their likelihood, since one mirror says little about either.
+Matérn's covariance of smoothness 3/2, the same on all facets and independent between them, so that
+canting errors are part of it. Variance, correlation length and noise are estimated from the
+differences by restricted maximum likelihood, averaged over all lengths and noise ratios by their
+likelihood, since one mirror says little about either.
 """
 
 from dataclasses import dataclass
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 #: Probability of a false alarm of Rosner's test.
 ALPHA = 0.05
-#: No more than this share of the values can be outliers.
+#: Largest share of outliers.
 SHARE = 0.2
-# Correlation lengths that are tried, as shares of a facet's diagonal, and ratios τ²/s².
+# Trial correlation lengths, as shares of a facet's diagonal, and trial ratios τ²/s².
 _LENGTHS = np.geomspace(0.04, 1.2, 8)
 _RATIOS = np.geomspace(1e-3, 1e2, 11)
-# Points along an edge of a facet that stand for its area. Two grids without common points, so
-# that the mean of C over pairs is not raised by pairs of a point with itself.
+# Points along an edge of a facet that represent its area. Two grids without common points, so
+# that pairs of a point with itself do not raise the mean of C over pairs.
 _AREA = (9, 8)
 
 
@@ -49,7 +49,7 @@ def rosner(
     Parameters
     ----------
     values
-        (n,), from a normal distribution but for the outliers.
+        (n,), normally distributed but for the outliers.
     alpha
         Probability of calling any of n good values an outlier.
     share
@@ -58,20 +58,20 @@ def rosner(
     Raises
     ------
     InputError
-        If alpha or share does not lie between 0 and 1.
+        If alpha or share is not between 0 and 1.
 
     Notes
     -----
     Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are the values' own;
-    :func:`heliotrope.calibration.learn.outliers.generalised_esd` is the test where the covariance
-    is known.
+    :func:`heliotrope.calibration.learn.outliers.generalised_esd` is the test for a known
+    covariance.
     """
     for name, value in (("alpha", alpha), ("share", share)):
         if not 0.0 < value < 1.0:
             raise InputError(f"{name} {value}: it must lie between 0 and 1")
     data = as_float(values)
     mask = np.zeros(len(data), dtype=np.bool_)
-    # Rosner's critical values hold from n = 15 on well, and need two values that stay.
+    # Rosner's critical values are accurate from n = 15, and need two values that remain.
     most = min(int(np.ceil(share * len(data))), len(data) - 3)
     if most < 1:
         return mask
@@ -85,9 +85,9 @@ def rosner(
 def studentized_deviates(
     values: npt.ArrayLike, most: int, alpha: float = ALPHA
 ) -> tuple[npt.NDArray[np.intp], FloatArray, FloatArray]:
-    """Return rows, extreme Studentized deviates R and critical values λ, each (most,).
+    """Return rows, extreme Studentized deviates R and critical values λ, (most,) each.
 
-    Rosner 1983, (2.1) and (2.5): what is farthest from the mean is taken away ``most`` times.
+    Rosner 1983, (2.1) and (2.5): the value farthest from the mean is removed ``most`` times.
     """
     from scipy.stats import t as student
 
@@ -100,7 +100,7 @@ def studentized_deviates(
         spread = float(part.std(ddof=1))
         away = np.abs(part - part.mean())
         k = int(np.argmax(away))
-        # Values that are all alike have no extreme one.
+        # Equal values have no extreme one.
         extreme[i] = away[k] / spread if spread > 0.0 else 0.0
         which[i] = left[k]
         left = np.delete(left, k)
@@ -137,14 +137,14 @@ class SpreadMean:
     sigma
         Standard deviation of the points' plain mean about the mean over the mirror, (c,).
     weights
-        With which the points give the mean over the mirror with the least variance (ordinary
-        block kriging); their sum is 1, (n,).
+        Of the points in the best estimate of the mean over the mirror (ordinary block kriging),
+        adding up to 1, (n,).
     sigma_weighted
         Standard deviation of that weighted mean, (c,).
     length
         Correlation length, m: mean over the likelihood.
     noise
-        Share of the variance that belongs to no field: τ² / (s² + τ²).
+        Share of the variance that is noise rather than field: τ² / (s² + τ²).
     """
 
     sigma: FloatArray
@@ -157,7 +157,7 @@ class SpreadMean:
 def spread_mean(
     values: npt.ArrayLike, shape: MirrorShape, facet: npt.ArrayLike, uv: npt.ArrayLike
 ) -> SpreadMean:
-    """Return what n points say about the mean over the mirror.
+    """Return the mean over the mirror as n points show it.
 
     Parameters
     ----------
@@ -166,11 +166,11 @@ def spread_mean(
     shape
         Of the mirror.
     facet, uv
-        Of each point, (n,), and where it stands along the facet's axes, m, (n, 2).
+        Of each point, (n,), and its position along the facet's axes, m, (n, 2).
 
     Returns
     -------
-    For fewer than 8 points the plain figures: they say nothing about a field.
+    For fewer than 8 points the plain figures, as they cannot show a field.
     """
     data, k, place = as_float(values), np.asarray(facet, dtype=np.intp), as_float(uv)
     n = len(data)
@@ -184,7 +184,7 @@ def spread_mean(
 
 @lru_cache(maxsize=1)
 def _one_thread() -> "ThreadpoolController":
-    """Matrices of a mirror's points are small: threads would wait longer than they work."""
+    """Return a limit of threads: a mirror's matrices are too small to share the work."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -230,7 +230,7 @@ def matern(distance: npt.ArrayLike) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Areas:
-    """Distances between points and area and within the area, by facet."""
+    """Distances from points to the area of their facet."""
 
     shape: MirrorShape
     facet: npt.NDArray[np.intp]
@@ -242,7 +242,7 @@ class _Areas:
         return cls(shape, facet, np.linalg.norm(uv[:, None] - grid, axis=-1))
 
     def at(self, length: float) -> tuple[FloatArray, float]:
-        """Return mean correlation of each point with the mirror, (n,), and of the mirror."""
+        """Return the mean correlation of each point with the mirror, (n,), and within it."""
         area = np.prod(self.shape.half_size, axis=-1)
         share = area / area.sum()
         to_mirror = share[self.facet] * matern(self.to_area / length).mean(axis=-1)
@@ -306,7 +306,7 @@ class _Fit:
         unit = inverse @ ones**2
         mean = (inverse * ones) @ values / unit[:, None]
         gap = values[None] - ones[None, :, None] * mean[:, None, :]
-        # s² of each component, as REML has it at this length and ratio.
+        # REML estimate of s² of each component at this length and ratio.
         variance = np.einsum("rn,rnc->rc", inverse, gap**2) / (n - 1)
         score = -0.5 * (
             (n - 1) * np.log(np.maximum(variance, 1e-300))

@@ -1,8 +1,8 @@
-"""Clusters: heliostats that one hover pattern serves at once.
+"""Clusters: heliostats that are measured from one hover pattern.
 
-Clusters have equal areas of ground and are as round as that allows: they are the cells
-of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions of given
-areas its cells have the smallest sum of squared distances from their centres).
+Clusters have equal areas of ground and are as round as that allows, as HelioPoint asks for: they
+are the cells of a power diagram (Aurenhammer, Hoffmann & Aronov 1998: among all partitions into
+given areas its cells have the smallest sum of squared distances from their centres).
 """
 
 from dataclasses import dataclass
@@ -14,13 +14,14 @@ from scipy.spatial import cKDTree
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 
-#: Squares of ground in a mean heliostat's share when areas are counted.
+#: Areas are counted in squares, this many for the ground of a mean heliostat. (GEOS's Voronoi cells
+#: fail with a TopologyException on radial fields of 10,000 heliostats.)
 _SQUARES = 16
-#: Ground further from every heliostat than this, in typical spacings, is not field.
+#: Ground farther than this from every heliostat, in typical spacings, is not part of the field.
 _EDGE = 0.8
-#: Rounds in which cells become round, and at most.
+#: Rounds until the cells are round, and most rounds.
 _SETTLED, _ROUNDS = 60, 200
-#: Areas are equal when none differs from their mean by more than this share.
+#: Areas are equal if none differs from their mean by more than this share.
 _EVEN = 0.02
 
 
@@ -31,16 +32,16 @@ class Clusters:
     Attributes
     ----------
     of
-        Row of each heliostat's cluster, 0 … K − 1, (N,).
+        Cluster of each heliostat, 0 … K − 1, (N,).
     center
-        Mean of the positions, ENU metres, (K, 3).
+        Mean position, ENU metres, (K, 3).
     area
         Ground that the heliostats stand on, m², (K,).
     radius
         Largest horizontal distance of a heliostat from the centre, m, (K,).
     roundness
-        Mean squared distance from the centre that a disc of that area has, over that of
-        the heliostats, (K,): 1 for a disc, 0.95 for a square, 0.6 for an oblong of 1:3.
+        Mean squared distance from the centre of a disc of the same area, over that of the
+        heliostats, (K,): 1 for a disc, 0.95 for a square, 0.6 for an oblong of 1:3.
     """
 
     of: npt.NDArray[np.intp]
@@ -58,17 +59,15 @@ class Clusters:
 
 
 def ground_areas(position: npt.ArrayLike) -> FloatArray:
-    """Return the ground that is nearest to each heliostat, m², (N,).
+    """Return the area of ground nearest to each heliostat, m², (N,).
 
     Parameters
     ----------
     position
         ENU metres, (N, 3).
 
-    Notes
-    -----
-    The Voronoi cell, without ground that is further than 0.8 typical spacings from every
-    heliostat; counted in squares, so exact to a few per cent of a cell.
+    Notes ----- The Voronoi cell, without ground that is farther than 0.8 typical spacings from
+    every heliostat; counted in squares, so accurate to a few per cent of a cell.
     """
     flat = _flat(position)
     if len(flat) == 1:
@@ -77,12 +76,12 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     near = np.asarray(tree.query(flat, k=min(5, len(flat)))[0])[:, 1:]
     spacing = float(np.median(near.mean(axis=1)))
     if spacing <= 0.0:
-        raise InputError("clusters: most heliostats stand at one and the same place")
+        raise InputError("clusters: most heliostats have one and the same position")
     side = spacing / np.sqrt(_SQUARES)
     low, high = flat.min(axis=0) - spacing, flat.max(axis=0) + spacing
     counts = np.ceil((high - low) / side).astype(np.int64)
     while counts.prod() > max(100_000, 4 * _SQUARES * len(flat)):
-        # Stray heliostats far away need no finer squares.
+        # Outlying heliostats far away need no finer squares.
         side *= 2.0
         counts = np.ceil((high - low) / side).astype(np.int64)
     east, north = (low[k] + side * (np.arange(counts[k]) + 0.5) for k in (0, 1))
@@ -90,24 +89,24 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     nearest = tree.query(squares, distance_upper_bound=_EDGE * spacing)
     distance, owner = (np.asarray(part) for part in nearest)
     found = np.bincount(owner[np.isfinite(distance)], minlength=len(flat))
-    # Two at one place share a cell; none may weigh nothing.
+    # Heliostats at one position share a cell, but none may have no weight.
     return np.asarray(np.maximum(found, 1) * side**2)
 
 
 def clusters(
     position: npt.ArrayLike, *, size: float = 100.0, max_radius: float = np.inf
 ) -> Clusters:
-    """Return roundish clusters of equal area.
+    """Return round clusters of equal area.
 
     Parameters
     ----------
     position
         Of the heliostats, ENU metres, (N, 3).
     size
-        Diameter of a disc of a cluster's area, m.
+        Diameter of a disc with the area of a cluster, m.
     max_radius
-        No heliostat is further from the centre of its cluster, m; clusters become
-        smaller than ``size`` where it asks for it.
+        Largest distance of a heliostat from the centre of its cluster, m; clusters become
+        smaller than ``size`` where that requires it.
 
     Raises
     ------
@@ -130,14 +129,14 @@ def clusters(
 
 
 def tour(center: npt.ArrayLike, start: npt.ArrayLike) -> npt.NDArray[np.intp]:
-    """Return a short order in which to visit places, from ``start`` (nearest first, then 2-opt).
+    """Return a short order in which to visit places from ``start`` (nearest first, then 2-opt).
 
     Parameters
     ----------
     center
         (K, M) coordinates.
     start
-        Where the way begins, (M,); it need not end there.
+        Start of the tour, (M,); it need not end there.
     """
     points = np.asarray(center, dtype=np.float64)
     gap = np.linalg.norm(points[:, None] - points[None], axis=-1)
@@ -171,7 +170,7 @@ def _flat(position: npt.ArrayLike) -> FloatArray:
 
 
 def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np.intp]:
-    """Cell of each heliostat in a power diagram of ``count`` cells of equal area."""
+    """Return the cell of each heliostat in a power diagram of ``count`` equal areas."""
     if count == 1:
         return np.zeros(len(flat), dtype=np.intp)
     order = _along_curve(flat)
@@ -184,7 +183,7 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
     for k in range(_ROUNDS):
         inside = np.bincount(of, weights=area, minlength=count)
         unequal = float(np.abs(inside / wanted - 1.0).max())
-        # The curve's pieces are equal from the first, but long: time to become round.
+        # The pieces of the curve are equal from the start, but long: let them become round.
         if k >= _SETTLED and unequal < worst and inside.min() > 0.0:
             best, worst = of, unequal
             if worst < _EVEN:
@@ -194,19 +193,19 @@ def _partition(flat: FloatArray, area: FloatArray, count: int) -> npt.NDArray[np
             [np.bincount(of, weights=area * flat[:, d], minlength=count) / held for d in (0, 1)],
             axis=-1,
         )
-        # A cell without heliostats begins again beside the fullest one.
+        # A cell without heliostats restarts beside the fullest one.
         center[inside <= 0.0] = center[int(np.argmax(inside))] + 1e-3
-        # A weight is a squared radius: where area lacks, so much of it is added.
+        # A weight is a squared radius: it grows with the missing area.
         weight += 0.5 * (wanted - inside) / np.pi
         weight -= weight.mean()
-        # Squared distance less weight, without what all cells have in common.
+        # Squared distance less weight, without the terms that all cells share.
         power = (center**2).sum(axis=-1) - weight - 2.0 * flat @ center.T
         of = np.argmin(power, axis=1).astype(np.intp)
     return best
 
 
 def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
-    """Order along Hilbert's curve, which keeps neighbours together."""
+    """Return the order along Hilbert's curve, which keeps neighbours together."""
     low = flat.min(axis=0)
     extent = max(float((flat.max(axis=0) - low).max()), 1e-9)
     bits = 16
@@ -223,7 +222,7 @@ def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
 
 
 def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) -> Clusters:
-    # Numbered without gaps, whatever cells stayed empty.
+    # Number without gaps, in case a cell stayed empty.
     of = np.unique(of, return_inverse=True)[1].astype(np.intp)
     number = np.bincount(of)
     center = np.stack([np.bincount(of, weights=place[:, d]) / number for d in range(3)], axis=-1)
@@ -232,6 +231,6 @@ def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) ->
     radius = np.zeros(len(number))
     np.maximum.at(radius, of, away)
     spread = np.bincount(of, weights=area * away**2) / whole
-    # A lone heliostat's ground spreads about it, though its place does not.
+    # Include the spread of each heliostat's own ground, so that a lone one has some.
     spread += np.bincount(of, weights=area**2) / whole / (2.0 * np.pi)
     return Clusters(of, center, whole, radius, whole / (2.0 * np.pi) / spread)

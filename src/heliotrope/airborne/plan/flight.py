@@ -1,8 +1,8 @@
-"""Flights: in which order stations are flown, from which take-off, and how long it takes.
+"""Flights: the order in which stations are flown, from which take-off, and how long it takes.
 
-A station is one cluster in one pose: a hover pattern. While a drone flies the stations of
-some clusters, the mirrors of the others move to their next pose; so clusters are flown
-in groups, each pose of the whole group before the next.
+A station is one cluster in one pose: a hover pattern. While a drone flies the stations of some
+clusters, the mirrors of the others move to their next pose. So clusters are flown in groups: the
+whole group in one pose, then in the next.
 """
 
 from collections.abc import Sequence
@@ -17,32 +17,32 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, azimuth_elevation
 from heliotrope.sun import Site, position
 
-#: Largest group of clusters that is tried.
+#: Largest group of clusters tried.
 _GROUPS = 8
-#: Drones in the air stay so far apart, m.
+#: Least distance between drones in the air, m.
 APART = 15.0
-#: Take-offs wait for other drones so long at most, s.
+#: Longest wait of a take-off for other drones, s.
 _LATEST = 7200.0
-#: Mirrors rest so long before the first photograph, s.
+#: Time for mirrors to settle before the first photograph, s.
 REST = 5.0
 
 
 @dataclass(frozen=True)
 class Craft:
-    """What the drones can do.
+    """Performance of the drones.
 
     Attributes
     ----------
     count
-        Drones that fly at the same time.
+        Drones flying at the same time.
     speed
         Between stations, m/s, up to 15.
     acceleration
         m/s².
     photo
-        To come to rest at a hover point and take a photograph, s.
+        Time to come to rest at a hover point and take a photograph, s.
     endurance
-        From take-off to landing on one battery, its reserve not counted, s.
+        From take-off to landing on one battery, without its reserve, s.
     change
         From landing to the next take-off, s.
     """
@@ -67,13 +67,13 @@ class Craft:
             raise InputError(f"battery change {self.change:g} s must not be below 0")
 
     def time(self, length: float) -> float:
-        """Return how long a leg takes from rest to rest, s."""
+        """Return the duration of a leg from rest to rest, s."""
         if length >= self.speed**2 / self.acceleration:
             return length / self.speed + self.speed / self.acceleration
         return 2.0 * float(np.sqrt(length / self.acceleration))
 
     def way(self, points: FloatArray) -> float:
-        """Return how long a way through points (M, 3) takes, stopping at each, s."""
+        """Return the duration of a route through points (M, 3), stopping at each, s."""
         return sum(self.time(float(d)) for d in np.linalg.norm(np.diff(points, axis=0), axis=-1))
 
 
@@ -88,7 +88,7 @@ class Station:
     pattern
         The hover points.
     travel
-        Time that the mirrors need from their pose before, s; 0 for the first.
+        Time that the mirrors need from the previous pose, s; 0 for the first.
     """
 
     cluster: int
@@ -109,20 +109,20 @@ class Station:
 
 @dataclass(frozen=True)
 class Visit:
-    """Hover points of a station that are flown in one go.
+    """Hover points of a station flown in one go.
 
     Attributes
     ----------
     station
         Row of the station.
     first, last
-        Rows of its hover points, ``last`` not included.
+        Rows of its hover points, ``last`` excluded.
     approach
-        Points between the place before and the first hover point, ENU metres, (M, 3).
+        Points between the previous place and the first hover point, ENU metres, (M, 3).
     begin, end
-        Of photographing, s since the campaign began.
+        Of photographing, s since the start of the campaign.
     wait
-        In the air before, for mirrors that are still moving, s.
+        Time hovering beforehand, for mirrors that are still moving, s.
     """
 
     station: int
@@ -141,11 +141,11 @@ class Sortie:
     Attributes
     ----------
     drone, number
-        0 …; the number counts the drone's sorties.
+        From 0; the number counts the sorties of the drone.
     start, end
-        Take-off and landing, s since the campaign began.
+        Take-off and landing, s since the start of the campaign.
     home
-        Where it takes off and lands, ENU metres, (3,).
+        Place of take-off and landing, ENU metres, (3,).
     visits
         In order.
     back
@@ -162,25 +162,25 @@ class Sortie:
 
     @property
     def photos(self) -> int:
-        """Photographs taken."""
+        """Number of photographs."""
         return sum(v.last - v.first for v in self.visits)
 
 
 @dataclass(frozen=True)
 class _Ways:
-    """Ways between stations and homes, found once."""
+    """Routes between stations and homes, each found once."""
 
     airspace: Airspace
     stations: Sequence[Station]
     labels: Sequence[str]
     known: dict[tuple[int, int, int], FloatArray]
-    #: Times home by drone and station.
+    #: Durations of the way home, by drone and station.
     backs: dict[tuple[int, int], float]
 
     def between(
         self, a: FloatArray, b: FloatArray, whence: int, whither: int, home: FloatArray, drone: int
     ) -> FloatArray:
-        """Points between a place of one station and one of another; row -1 is the home."""
+        """Return the route between places of two stations; row -1 is the home."""
         legs = self.airspace.free_legs
         if legs(a[None], b[None])[0]:
             return np.empty((0, 3))
@@ -188,7 +188,7 @@ class _Ways:
         if key not in self.known:
             ends = [home if r < 0 else self.stations[r].pattern.center for r in (whence, whither)]
             self.known[key] = self._found(ends[0], ends[1], max(whence, whither))
-        # The way from middle to middle serves if it can be joined and left from here.
+        # The route between the centres will do if it can be joined and left from here.
         way = self.known[key]
         if len(way) and legs(np.stack([a, way[-1]]), np.stack([way[0], b])).all():
             return way
@@ -200,8 +200,8 @@ class _Ways:
             station = self.stations[whose]
             raise InputError(
                 f"{self.labels[station.cluster]}, calibration point {station.point + 1}: there is "
-                "no free way to it and back; widen the fence, raise the greatest height or move "
-                "the home point"
+                "no free route to it and back; widen the fence, raise the upper height limit or "
+                "move the home point"
             )
         return way
 
@@ -219,25 +219,23 @@ def fly(
     Parameters
     ----------
     stations
-        Of all clusters; those of one cluster stand in the order of its points.
+        Of all clusters; those of one cluster in the order of its points.
     order
         Clusters in the order of a short tour.
     airspace, craft
-        What is allowed and possible.
+        Limits and performance.
     home
         Where drones take off, ENU metres, (count, 3).
     labels
         Names of the clusters, for errors.
 
-    Notes
-    -----
-    Each drone gets a connected part of the tour with an equal share of the photographs,
-    and the size of groups, of 1 to 8 clusters, with which it is home first.
+    Notes ----- Each drone gets a connected part of the tour with an equal share of the
+    photographs, and the size of groups, of 1 to 8 clusters, that brings it home first.
 
     Raises
     ------
     InputError
-        If a station cannot be reached, or not on one battery.
+        If a station cannot be reached at all, or not on one battery.
     """
     place: dict[int, list[int]] = {int(c): [] for c in order}
     for row, station in enumerate(stations):
@@ -255,7 +253,7 @@ def fly(
             rows = grouped(mine, place, size)
             tried = _one(drone, rows, stations, home[drone], craft, ways)
             if best and tried[-1].end > 0.995 * best[-1].end:
-                # Mirrors move unnoticed already; larger groups only fly further.
+                # The mirrors cause no wait any more; larger groups only fly farther.
                 break
             best, rest = tried, rows
         if flown:
@@ -266,13 +264,13 @@ def fly(
 
 
 def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> list[int]:
-    """Return rows of stations, all clusters of a group in one pose before the next pose."""
+    """Return rows of stations: all clusters of a group in one pose before the next pose."""
     rows: list[int] = []
     groups = max(1, len(clusters) // size)
     for group in np.array_split(np.array(clusters), groups):
         members = [int(c) for c in group]
         for k in range(max(len(place[c]) for c in members)):
-            # There and back, so that the way to the next pose is short.
+            # Back and forth, so that the way to the next pose is short.
             way = members if k % 2 == 0 else members[::-1]
             rows.extend(place[c][k] for c in way if k < len(place[c]))
     return rows
@@ -287,7 +285,7 @@ def _one(
     ways: _Ways,
     others: "Sequence[Timeline]" = (),
 ) -> list[Sortie]:
-    """Sorties of one drone that flies ``rows`` in order and keeps away from others."""
+    """Return the sorties of one drone that flies ``rows`` in order and avoids others."""
     work = _Work(drone, stations, home, craft, ways, others, {}, [], [])
     for row in rows:
         work.station(row)
@@ -297,7 +295,7 @@ def _one(
 
 @dataclass
 class _Work:
-    """Where one drone is in its work."""
+    """State of one drone's work."""
 
     drone: int
     stations: Sequence[Station]
@@ -315,7 +313,7 @@ class _Work:
     row: int = -1
 
     def station(self, row: int) -> None:
-        """Fly one station, with landings in between where the battery asks for them."""
+        """Fly one station, with landings in between where the battery requires them."""
         station = self.stations[row]
         camera = station.pattern.camera
         step = self.craft.photo + self.craft.time(station.pattern.spacing)
@@ -327,7 +325,7 @@ class _Work:
             approach = self._way(here, camera[first], -1 if at_home else self.row, row)
             travel = self.craft.way(np.vstack([here, approach, camera[first]]))
             if at_home:
-                # Who waits does so on the ground.
+                # Wait on the ground rather than in the air.
                 self.start = self.now = max(self.now, ready - travel)
             begin = max(self.now + travel, ready)
             left = self.start + self.craft.endurance - begin - self.back(row)
@@ -352,7 +350,7 @@ class _Work:
         return self.ways.between(a, b, whence, whither, self.home, self.drone)
 
     def back(self, row: int) -> float:
-        """Longest way home from a station, s."""
+        """Return the longest way home from a station, s."""
         known = self.ways.backs
         if (self.drone, row) not in known:
             known[self.drone, row] = self._back(row)
@@ -388,12 +386,12 @@ class _Work:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Where a drone is when.
+    """Position of a drone over time.
 
     Attributes
     ----------
     time
-        s since the campaign began, rising, (W,).
+        s since the start of the campaign, rising, (W,).
     place
         ENU metres, (W, 3).
     """
@@ -402,14 +400,14 @@ class Timeline:
     place: FloatArray
 
     def at(self, clock: FloatArray) -> FloatArray:
-        """Return its places at times (M,), ENU metres, (M, 3)."""
+        """Return its positions at times (M,), ENU metres, (M, 3)."""
         return np.stack([np.interp(clock, self.time, self.place[:, k]) for k in range(3)], -1)
 
 
 def _delay(
     sortie: Sortie, stations: Sequence[Station], craft: Craft, others: Sequence[Timeline]
 ) -> float:
-    """How much later a sortie must begin to stay away from other drones, s."""
+    """Return the delay with which a sortie stays clear of other drones, s."""
     line = timeline([sortie], stations, craft, sortie.drone)
     clock = np.arange(sortie.start, sortie.end, 1.0)
     mine = line.at(clock)
@@ -420,7 +418,7 @@ def _delay(
         ):
             return float(late)
     raise InputError(
-        f"drones: number {sortie.drone + 1} comes within {APART:g} m of another whenever it takes "
+        f"drones: drone {sortie.drone + 1} comes within {APART:g} m of another whenever it takes "
         "off; fly with fewer drones"
     )
 
@@ -428,7 +426,7 @@ def _delay(
 def timeline(
     sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft, drone: int
 ) -> Timeline:
-    """Return the way of one drone through all its sorties."""
+    """Return the path of one drone through all its sorties."""
     time, place = [0.0], []
     mine = [s for s in sorties if s.drone == drone]
     place.append(mine[0].home)
@@ -457,7 +455,7 @@ def timeline(
 
 
 def separation(sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft) -> float:
-    """Return how close two drones come, m, looked at every second; infinite for one drone."""
+    """Return the least distance of two drones, m, checked every second; infinite for one drone."""
     drones = sorted({s.drone for s in sorties})
     if len(drones) < 2:
         return float(np.inf)
@@ -473,7 +471,7 @@ def separation(sorties: Sequence[Sortie], stations: Sequence[Station], craft: Cr
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """How long photographs of beams on a target take.
+    """Duration of the same campaign with camera and target.
 
     Attributes
     ----------
@@ -482,7 +480,7 @@ class CameraTarget:
     days, months
         Calendar time.
     sunny
-        Hours a day in which it can be done, h.
+        Usable hours a day, h.
     """
 
     hours: float
@@ -506,28 +504,28 @@ def camera_target(
     Parameters
     ----------
     site
-        Place and air.
+        Location and air.
     photographs
         Heliostats times calibration points.
     minutes
         From one photograph to the next on a target, min.
     targets
-        With a camera each.
+        Each with a camera.
     clear
-        Share of the hours of sun that are clear enough.
+        Share of the sunny hours that are clear enough.
     year, min_elevation
-        In which, and the lowest sun that serves, rad.
+        Year, and lowest usable sun, rad.
 
     Raises
     ------
     InputError
-        If a number is not above 0, or the sun is never so high.
+        If a number is not above 0, or the sun is never this high.
     """
     for name, value in (("minutes", minutes), ("targets", targets), ("clear share", clear)):
         if not (np.isfinite(value) and value > 0.0):
             raise InputError(f"{name} {value:g}: give a number above 0")
     begin = np.datetime64(f"{year}-01-01").astype("datetime64[s]").astype(np.float64)
-    # Every 29 minutes of a year: all hours of all days come alike.
+    # Every 29 minutes of a year, which samples all hours of the day equally.
     moments = begin + np.arange(0.0, 365.0 * 86400.0, 29.0 * 60.0)
     up = position(moments, site).elevation >= min_elevation
     sunny = 24.0 * float(up.mean()) * min(clear, 1.0)
@@ -545,7 +543,7 @@ def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     counts
-        Of K poses of n mirrors, (K, n, D).
+        Of n mirrors in K poses, (K, n, D).
     speed
         Of the drives, counts/s, (n, D).
     """
@@ -554,6 +552,6 @@ def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
 
 
 def homes(home: FloatArray, count: int, apart: float = 20.0) -> FloatArray:
-    """Return one place to take off for each drone, in a row from west to east, (count, 3)."""
+    """Return a take-off place for each drone, in a row from west to east, (count, 3)."""
     shift = apart * (np.arange(count) - 0.5 * (count - 1))
     return np.asarray(home + shift[:, None] * np.array([1.0, 0.0, 0.0]))

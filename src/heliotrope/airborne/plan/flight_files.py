@@ -1,4 +1,4 @@
-"""The files of a flight plan: waypoints of each sortie, commands of the mirrors, all as JSON."""
+"""The files of a flight plan: waypoints of each sortie, commands of the mirrors, and JSON."""
 
 import csv
 import io
@@ -20,7 +20,7 @@ from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, enu_to_geodetic
 from heliotrope.sun import Site
 
-#: Folder, suffix and what writes it, by the name of a format.
+#: Formats of waypoint files; each has a folder of its name.
 FORMATS = ("dji", "qgc", "litchi")
 _SUFFIX = {"dji": ".kmz", "qgc": ".plan", "litchi": ".csv"}
 Progress = Callable[[int, int], None]
@@ -32,12 +32,10 @@ def sortie_name(sortie: Sortie) -> str:
 
 
 def mission(plan: FlightPlan, sortie: Sortie, name: str) -> Mission:
-    """Return a sortie as waypoint files hold it.
+    """Return a sortie in the form of waypoint files.
 
-    Notes
-    -----
-    The drone looks from each place along the axis of its station; it rests a part of
-    ``craft.photo`` before each photograph, and for mirrors that are still moving.
+    Notes ----- The drone looks along the axis of its station from every point. It rests for
+    ``craft.photo`` before each photograph, and waits for mirrors that are still moving.
     """
     place, yaw, pitch, stay, photo = (list[Any]() for _ in range(5))
 
@@ -81,13 +79,13 @@ def _origin(site: Site) -> tuple[float, float, float]:
 
 
 def _return_height(airspace: Airspace, sortie: Sortie) -> float:
-    """Above all keep-outs if that is allowed, else as high as is."""
+    """Return a height above all keep-outs, or the greatest one allowed, m above take-off."""
     tops = [k.top + airspace.margin for k in airspace.keep_outs if np.isfinite(k.top)]
     return float(min(airspace.max_height, max([airspace.min_height, *tops]) - sortie.home[2]))
 
 
 def fence(plan: FlightPlan) -> Fence:
-    """Return what QGroundControl is told of the airspace, with its margins."""
+    """Return the airspace for QGroundControl, with its margins."""
     airspace, origin = plan.wishes.airspace, _origin(plan.plant.site)
 
     def geodetic(corners: FloatArray) -> FloatArray:
@@ -119,20 +117,20 @@ def write_plan(
     Parameters
     ----------
     plan
-        What to write.
+        The plan.
     folder
-        Is made if it is not there.
+        Is made if need be.
     formats
         Of :data:`FORMATS`.
     aircraft
-        Of DJI's files, see :data:`~heliotrope.airborne.plan.waypoints.AIRCRAFT`.
+        For DJI's files, see :data:`~heliotrope.airborne.plan.waypoints.AIRCRAFT`.
     progress
         Called with (done, all) sorties.
 
     Raises
     ------
     InputError
-        If a format or the aircraft is not known, or the folder cannot be written to.
+        If a format or the aircraft is unknown, or the folder cannot be written to.
     """
     for name in formats:
         if name not in FORMATS:
@@ -143,7 +141,7 @@ def write_plan(
             (into / name).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
-            f"{into}: cannot be made ({error.strerror}); give another folder"
+            f"{into}: cannot be created ({error.strerror}); give another folder"
         ) from None
     around, written = fence(plan), []
     for done, sortie in enumerate(plan.sorties):
@@ -167,7 +165,7 @@ def write_plan(
 
 
 def commands(plan: FlightPlan) -> str:
-    """Return a table with one row a heliostat and calibration point: where its drives stand."""
+    """Return a table of drive positions with one row for each heliostat and calibration point."""
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(
@@ -204,7 +202,7 @@ def commands(plan: FlightPlan) -> str:
 
 
 def document(plan: FlightPlan) -> dict[str, Any]:
-    """Return the plan as plan.json holds it: ENU metres, degrees, seconds in the names."""
+    """Return the plan as plan.json holds it; names carry the units."""
     wishes, air = plan.wishes, plan.wishes.airspace
     timing = {v.station: [np.inf, 0.0] for s in plan.sorties for v in s.visits}
     for sortie in plan.sorties:
@@ -305,7 +303,7 @@ def _sortie(plan: FlightPlan, sortie: Sortie) -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
-    """What JSON can hold: None for what is infinite."""
+    """Return a value that JSON can hold: None instead of infinity."""
     if isinstance(value, dict):
         return {k: _finite(v) for k, v in value.items()}
     if isinstance(value, list):
@@ -314,22 +312,22 @@ def _finite(value: Any) -> Any:
 
 
 def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArray | None]:
-    """Return an airspace from a JSON file, and the home point if it names one.
+    """Return an airspace from a JSON file, and the home point if it gives one.
 
     Parameters
     ----------
     path
-        An object that may have ``min_height_m``, ``max_height_m``, ``margin_m``, ``home``
-        ([east, north, up]), ``fence`` ([[east, north], …]) and ``keep_out``: a list of
-        objects with ``name`` and either ``polygon`` ([[east, north], …]) or ``centre``
-        ([east, north]) and ``radius_m``, and perhaps ``bottom_m`` and ``top_m``.
+        An object that may have ``min_height_m``, ``max_height_m``, ``margin_m``, ``home`` ([east,
+        north, up]), ``fence`` ([[east, north], …]) and ``keep_out``: a list of objects with
+        ``name`` and either ``polygon`` ([[east, north], …]) or ``centre`` ([east, north]) and
+        ``radius_m``, and optionally ``bottom_m`` and ``top_m``.
     base
-        Whose keep-outs stay, and whose limits hold where the file names none.
+        Airspace whose keep-outs are kept, and whose limits apply where the file gives none.
 
     Raises
     ------
     FormatError, InputError
-        If it cannot be used.
+        If the file cannot be used.
     """
     root = read_json(path, "an airspace in JSON")
     known = {"min_height_m", "max_height_m", "margin_m", "home", "fence", "keep_out"}

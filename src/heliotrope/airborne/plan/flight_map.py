@@ -1,4 +1,4 @@
-"""The map of a flight plan: clusters, stations, the drones' ways and what they avoid."""
+"""The map of a flight plan: clusters, stations, routes of the drones, and keep-outs."""
 
 from typing import TYPE_CHECKING
 
@@ -12,20 +12,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Okabe and Ito's colours, told apart by the colour-blind too.
+#: Okabe and Ito's colours, distinct for the colour-blind too.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-#: Quiet colours that tell neighbouring clusters apart.
+#: Muted colours that distinguish neighbouring clusters.
 _SHADES = ("#7f9cc4", "#c49a6c", "#8fae7a", "#b58aa5", "#6fa3a3", "#a3a3a3", "#c2b04f")
 
 
 def flight_map(plan: FlightPlan) -> "Figure":
-    """Return the field from above, and the directions from which it is seen.
+    """Return the field from above, and the directions from which it is measured.
 
-    Notes
-    -----
-    Left: heliostats in the shade of their cluster, its name, one dot a station, the way of
-    each drone's first sorties, homes, keep-outs and fence. Right: directions to the drone
-    of all stations, azimuth around and elevation inwards.
+    Notes ----- Left: heliostats in the colour of their cluster, its name, a dot for each station,
+    the routes of each drone's first sorties, homes, keep-outs and fence. Right: directions to the
+    drone of all stations, azimuth around and elevation inwards.
     """
     from matplotlib.figure import Figure
 
@@ -63,7 +61,7 @@ def _field(ax: "Axes", plan: FlightPlan) -> None:
 
 
 def _ways(ax: "Axes", plan: FlightPlan) -> None:
-    """The first sorties of each drone; all of them would hide the field."""
+    """Draw the first sorties of each drone; all of them would hide the field."""
     for drone, home in enumerate(plan.homes):
         colour = _COLOURS[drone % len(_COLOURS)]
         some = [s for s in plan.sorties if s.drone == drone][:2]

@@ -1,4 +1,4 @@
-"""The plan of a campaign: clusters, poses, hover patterns, flights and what they take."""
+"""The plan of a campaign: clusters, poses, hover patterns, flights and their duration."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -22,36 +22,36 @@ from heliotrope.mechanism.drives import SLOTS
 from heliotrope.mechanism.parameters import MODELS
 from heliotrope.mechanism.parameters import model as model_names
 
-#: A home point lies so far south of the field, m.
+#: Distance of the default home point from the southern edge of the field, m.
 _OUTSIDE = 20.0
 Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """What a campaign is to be.
+    """Settings of a campaign.
 
     Attributes
     ----------
     size
         Diameter of a cluster, m.
     spread
-        Largest angle between an optical axis and the cluster's mean one, rad: it limits
-        the radius of clusters to distance · tan(spread).
+        Largest angle between an optical axis and its cluster's mean axis, rad: it limits the
+        radius of clusters to distance · tan(spread).
     view
-        Angle that the camera sees across its shorter side, rad: a cluster fits into a
+        Angle of view of the camera across its shorter side, rad: a cluster fits into a
         photograph.
     model
-        Whose unknowns are to be found; "auto" takes jacks or malan8.
+        Error model whose unknowns are to be found; "auto" takes jacks or malan8.
     sampling, choosing, craft, airspace
         Patterns, calibration points, drones, and where they may fly.
     home
-        Where they take off, ENU metres, (3,); None takes a point south of the field.
+        Place of take-off, ENU metres, (3,); None for a point south of the field.
     hours_a_day
-        In which is flown, h.
+        Flying hours a day, h.
     photo_minutes, clear
-        Of camera and target for comparison: from photograph to photograph, min, and the
-        share of the hours of sun that are clear.
+        Of camera and target, for comparison: time between photographs, min, and the share of
+        the sunny hours that are clear.
     """
 
     size: float = 100.0
@@ -83,7 +83,7 @@ class FlightPlan:
     Attributes
     ----------
     plant, wishes, mirrors
-        What it is for.
+        The field and the settings.
     clusters
         K of them.
     labels
@@ -95,11 +95,11 @@ class FlightPlan:
     sorties
         Of all drones.
     homes
-        Where each drone takes off, ENU metres, (drones, 3).
+        Take-off place of each drone, ENU metres, (drones, 3).
     separation
         Least distance of two drones in the air, m.
     camera_target
-        What the same number of poses takes with camera and target.
+        Duration of the same number of poses with camera and target.
     """
 
     plant: Plant
@@ -116,7 +116,7 @@ class FlightPlan:
 
     @property
     def photos(self) -> int:
-        """Photographs of the campaign."""
+        """Number of photographs."""
         return sum(s.photos for s in self.sorties)
 
     @property
@@ -126,12 +126,12 @@ class FlightPlan:
 
     @property
     def airborne(self) -> float:
-        """Time in the air of all drones together, s."""
+        """Flying time of all drones together, s."""
         return sum(s.end - s.start for s in self.sorties)
 
     @property
     def poses(self) -> int:
-        """Orientations to be measured: heliostats times calibration points within their stops."""
+        """Orientations to measure: heliostats times their reachable calibration points."""
         return sum(int(k.facing.able.sum()) for k in self.look)
 
     def summary(self) -> dict[str, Any]:
@@ -182,15 +182,15 @@ def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) 
     plant
         With its calibrated mechanisms, if any.
     wishes
-        See there; the ground of its airspace is that of the plant if it has none.
+        Settings; if its airspace has no ground, that of the plant is used.
     progress
         Called with (done, all) clusters.
 
     Raises
     ------
     InputError
-        If the model has as many unknowns as points or more, or heights, keep-outs, stops
-        or the battery leave no flight.
+        If the model has as many unknowns as points or more, or heights, keep-outs, stops or the
+        battery allow no flight.
     """
     all_mirrors = mirrors(plant)
     airspace = wishes.airspace
@@ -246,7 +246,7 @@ def _look(
     wishes: Wishes,
     label: str,
 ) -> LookPoints:
-    """Calibration points of one cluster, chosen for the heliostat in its middle."""
+    """Return the calibration points of one cluster, chosen for the heliostat in its middle."""
     away = np.linalg.norm(plant.position[rows] - center, axis=-1)
     group, row = plant.find(all_mirrors.names[int(rows[np.argmin(away)])])
     middle = group.calibrated[np.array([row])]
@@ -258,7 +258,9 @@ def _look(
     else:
         surfaces = [r.center for r in plant.receivers] + [t.center for t in plant.targets]
         if not surfaces:
-            raise InputError("the plant has no receiver and no target; beams must go somewhere")
+            raise InputError(
+                "the plant has no receiver and no target to aim at; add one to the plant file"
+            )
         aim = surfaces[0]
     return look_points(
         all_mirrors,
@@ -310,7 +312,7 @@ def _stations(
 
 
 def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: Airspace) -> None:
-    """Refuse patterns that leave the air that may be flown in."""
+    """Refuse patterns that leave the permitted airspace."""
     sizes = np.array([len(s.pattern) for s in stations])
     free = airspace.free(np.concatenate([s.pattern.camera for s in stations]))
     whose = np.repeat(np.arange(len(stations)), sizes)
@@ -319,13 +321,14 @@ def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: 
         raise InputError(
             f"{labels[station.cluster]}, calibration point {station.point + 1}: its pattern of "
             f"{station.pattern.columns} by {station.pattern.rows} points, "
-            f"{station.pattern.spacing:g} m apart, leaves the heights, the fence or comes too near "
-            "to a keep-out; lower the pointing error, or the elevations, or widen the airspace"
+            f"{station.pattern.spacing:g} m apart, leaves the height limits or the fence, or comes "
+            "too near to a keep-out; lower the pointing error or the elevations, or widen the "
+            "airspace"
         )
 
 
 def _home(plant: Plant, wishes: Wishes) -> FloatArray:
-    """Where drones take off: as given, else south of the middle of the field."""
+    """Return the place of take-off: as given, or south of the middle of the field."""
     if wishes.home is not None:
         start = np.asarray(wishes.home, dtype=np.float64)
     else:
@@ -335,7 +338,7 @@ def _home(plant: Plant, wishes: Wishes) -> FloatArray:
     up = start + np.array([0.0, 0.0, wishes.airspace.min_height])
     if not wishes.airspace.free_legs(start[None], up[None])[0]:
         raise InputError(
-            f"home at {start[0]:.1f} m east, {start[1]:.1f} m north: it lies in a keep-out or "
+            f"home at {start[0]:.1f} m east, {start[1]:.1f} m north: it is in a keep-out or "
             "outside the fence; give another with --home"
         )
     return start

@@ -1,20 +1,20 @@
-r"""Hover patterns: where the drone must be so that all of every mirror is sampled.
+r"""Hover patterns: drone positions from which all of every mirror is sampled.
 
-Lamp and camera hang side by side, so a mirror shows the lamp where its normal points at
-the drone. A place of the mirror at height x above its vertex (either direction of the
-mirror's plane), whose normal leans by the slope s(x) against the optical axis, meets a
-plane across the axis at distance D in
+Lamp and camera are side by side, so a mirror shows the lamp where its normal points at the drone.
+A point of the mirror at height x above its vertex (either direction of the mirror's plane), whose
+normal leans by the slope s(x) from the optical axis, meets a plane across the axis at distance D
+in
 
 .. math:: q(x) = x + D \, s(x) + D \, e
 
-for a mirror that points wrong by e. All of a mirror is seen by a drone that covers the
-range of x + D s(x), widened by D e on all sides. A facet of focal length f has
-s = -x / 2f within it, so that a step g of the drone moves the reflection by
+for a mirror with a pointing error e. All of the mirror is seen by a drone that covers the range of
+x + D s(x), widened by D e on all sides. A facet of focal length f has s = -x / 2f within it, so
+that a step g of the drone moves the reflection by
 
 .. math:: g / |1 - D / 2f|
 
-and n samples on a facet of w by h want :math:`g = \sqrt{w h / n} \, |1 - D / 2f|`. A
-wrong normal thus moves the reflection on a flat facet by D e: 0.75 m at 150 m and 5 mrad.
+and n samples on a facet of w by h require :math:`g = \sqrt{w h / n} \, |1 - D / 2f|`. A pointing
+error thus moves the reflection on a flat facet by D e: 0.75 m at 150 m and 5 mrad.
 """
 
 from dataclasses import dataclass
@@ -29,9 +29,9 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import track
 
-#: Rounds of the fixed point on the vertex; each gains a factor of distance over offset.
+#: Rounds of the fixed-point iteration on the vertex; each gains a factor of distance over offset.
 _ROUNDS = 4
-#: Where a step of the drone moves a reflection by 20 steps or more, it has no place.
+#: Where a step of the drone moves a reflection by 20 steps or more, its position is undefined.
 _BLURRED = 0.05
 
 
@@ -44,16 +44,16 @@ class Sampling:
     distance
         From the middle of a cluster to its hover plane, m.
     pointing
-        Error of normals that the pattern covers, rad: of freshly installed heliostats a
-        few times their standard deviation, later less.
+        Pointing error that the pattern covers, rad: for newly installed heliostats a few times
+        their standard deviation, later less.
     samples
         On each facet.
     focal
         Focal length of the facets, m; infinite for flat ones.
     led_offset
-        Lamp from the camera, in the camera's axes (right, down, ahead), m, (3,).
+        Lamp from the camera, in the camera's axes (right, down, forward), m, (3,).
     least_spacing
-        Points of the pattern are no closer, m; Litchi refuses less than 0.6 m.
+        Least distance between points of the pattern, m; Litchi refuses less than 0.6 m.
     """
 
     distance: float = 150.0
@@ -70,18 +70,18 @@ class Sampling:
                 raise InputError(f"{name} {value:g}{unit}: give a number above 0")
         if not 0.0 <= self.pointing <= 0.1:
             raise InputError(
-                f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; align mirrors "
-                "that point worse roughly first"
+                f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; roughly align "
+                "mirrors that are worse beforehand"
             )
         if not abs(self.focal) > 0.0:
             raise InputError("focal length 0 m: give another, or infinity for flat facets")
         if np.shape(self.led_offset) != (3,) or not np.isfinite(self.led_offset).all():
-            raise InputError("led_offset: give three numbers, right, down and ahead, in metres")
+            raise InputError("led_offset: give three numbers, right, down and forward, in metres")
 
 
 @dataclass(frozen=True)
 class Mirrors:
-    """What hover patterns depend on, of all N heliostats of a plant.
+    """Properties of all N heliostats of a plant that hover patterns depend on.
 
     Attributes
     ----------
@@ -90,10 +90,10 @@ class Mirrors:
     armature, drives
         Calibrated, batch shapes (N,) and (N, 2).
     corners
-        Facets' corners in the mirror's plane (x to the right as seen from in front, y
-        up), m, (N, F, 4, 2); facets that a heliostat lacks are NaN.
+        Facets' corners in the mirror's plane (x to the right as seen from the front, y up), m,
+        (N, F, 4, 2); NaN for facets that a heliostat lacks.
     slopes
-        Of the facets' normals against the mirror's, rad, (N, F, 2).
+        Of the facets' normals from the mirror's, rad, (N, F, 2).
     facet_area
         Of the smallest facet, m², (N,).
     """
@@ -110,15 +110,15 @@ class Mirrors:
 
 
 def mirrors(plant: Plant) -> Mirrors:
-    """Return the mirrors of a plant, group after group.
+    """Return the mirrors of a plant, group by group.
 
     Raises
     ------
     InputError
-        If the plant has no heliostats, or a mechanism has not two drives.
+        If the plant has no heliostats, or a mechanism does not have two drives.
     """
     if not len(plant):
-        raise InputError("the plant has no heliostats; there is nothing to fly for")
+        raise InputError("the plant has no heliostats; there is nothing to measure")
     for name, group in plant.groups.items():
         if len(group.mechanism.driven) != 2:
             raise InputError(
@@ -161,7 +161,7 @@ def mirrors(plant: Plant) -> Mirrors:
 
 @dataclass(frozen=True)
 class Facing:
-    """Mirrors that look at a point; batch shape (...).
+    """Mirrors facing a point; batch shape (...).
 
     Attributes
     ----------
@@ -170,7 +170,7 @@ class Facing:
     normal, vertex
         ENU, (..., 3).
     able
-        Within the stops, (...).
+        Whether within the stops, (...).
     """
 
     counts: FloatArray
@@ -182,7 +182,7 @@ class Facing:
 def face(
     armature: Armature, drives: Drive, point: npt.ArrayLike, current: FloatArray | None = None
 ) -> Facing:
-    """Return the poses in which optical axes go through points.
+    """Return the poses in which optical axes pass through points.
 
     Parameters
     ----------
@@ -191,14 +191,12 @@ def face(
     point
         ENU metres, (..., 1, 3) or (..., N, 3).
     current
-        Counts where the drives stand, to choose the nearer branch.
+        Present counts of the drives, to choose the nearer branch.
 
-    Notes
-    -----
-    Lamp and eye are at the same point, so the law asks for the normal n ∥ p − m. The
-    vertex m moves with the pose; the direction to p is taken from the vertex before, and
-    the error of that shrinks with (offset / distance) in each of four rounds: at 100 m
-    and 0.5 m of offset to below a nanometre.
+    Notes ----- Lamp and camera are at the same point, so the law asks for the normal n ∥ p − m.
+    The vertex m moves with the pose. The direction to p is taken from the previous vertex, and its
+    error shrinks by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m,
+    to less than a nanometre.
     """
     goal = as_float(point)
     start = armature.origin_1
@@ -224,15 +222,15 @@ class Pattern:
     center
         Its middle, ENU metres, (3,).
     direction
-        Unit vector from the field to the drone, normal of the plane, (3,).
+        Unit vector from the field to the drone, normal to the plane, (3,).
     columns, rows
         Points across and upwards.
     spacing
         Between neighbours, m.
     samples
-        Expected on each facet; less than asked for where the least spacing forbids more.
+        Expected on each facet; fewer than asked for if the least spacing does not allow more.
     camera
-        The camera's places, row by row there and back, ENU metres, (H, 3).
+        Positions of the camera, row by row back and forth, ENU metres, (H, 3).
     """
 
     center: FloatArray
@@ -255,23 +253,21 @@ def reach(
     direction: FloatArray,
     sampling: Sampling,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the lower and upper bound of drone places that mirrors ask for.
+    """Return the lower and upper bound of the drone positions that mirrors require.
 
     Parameters
     ----------
     corners, slopes
         Of n mirrors, (n, F, 4, 2) and (n, F, 2).
     vertex
-        Of the mirrors, ENU metres, (n, 3); their axes go through ``point``.
+        Of the mirrors, ENU metres, (n, 3); their axes pass through ``point``.
     point, direction
         A point of the hover plane, and its normal, (3,).
     sampling
         Focal length and pointing error.
 
-    Returns
-    -------
-    Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
-    ``direction``), from ``point``, m, (2,) each. The mirrors' x is taken as horizontal.
+    Returns ------- Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
+    ``direction``), from ``point``, m, (2,) each. The mirrors' x axis is taken as horizontal.
     """
     away = point - vertex
     slant = np.linalg.norm(away, axis=-1)
@@ -279,7 +275,7 @@ def reach(
     axes = tangent_axes(normal)
     right, up = -axes[:, 0, None, None], axes[:, 1, None, None]
     middle = corners.mean(axis=2, keepdims=True)
-    # Within a curved facet the slope falls with the distance from its middle.
+    # Within a curved facet the slope decreases with the distance from its middle.
     slope = slopes[:, :, None] - (corners - middle) / (2.0 * sampling.focal)
     place = vertex[:, None, None] + corners[..., :1] * right + corners[..., 1:] * up
     ray = normal[:, None, None] + slope[..., :1] * right + slope[..., 1:] * up
@@ -293,14 +289,14 @@ def reach(
 
 
 def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tuple[float, float]:
-    """Return the spacing of a pattern, m, and the samples that it gives to the worst facet.
+    """Return the spacing of a pattern, m, and the samples that it gives on the worst facet.
 
     Parameters
     ----------
     facet_area, slant
         Smallest facet, m², and distance to the drone, m, of n mirrors, (n,).
     sampling
-        What is wanted.
+        Sampling asked for.
 
     Raises
     ------
@@ -314,7 +310,7 @@ def spacing(facet_area: FloatArray, slant: FloatArray, sampling: Sampling) -> tu
             f"{float(slant[scale.argmin()]):.0f} m: close to twice the focal length a facet lights "
             "up as a whole; change the distance"
         )
-    # What a step of the drone is on the mirror, in steps that give one sample.
+    # Drone spacing that gives the number of samples asked for.
     wanted = float((np.sqrt(facet_area / sampling.samples) * scale).min())
     step = max(wanted, sampling.least_spacing)
     return step, sampling.samples * (wanted / step) ** 2
@@ -334,13 +330,13 @@ def pattern(
     Parameters
     ----------
     facing_vertex
-        Of the mirrors as they look at ``point``, ENU metres, (n, 3).
+        Vertices of the mirrors facing ``point``, ENU metres, (n, 3).
     corners, slopes, facet_area
         As :class:`Mirrors`, of the n mirrors.
     point, direction
-        Where the mirrors look at, and the normal of the plane, (3,).
+        Point that the mirrors face, and the normal of the plane, (3,).
     sampling
-        What is wanted.
+        Sampling asked for.
     """
     p, d = as_float(point), as_float(direction)
     low, high = reach(corners, slopes, facing_vertex, p, d, sampling)
@@ -352,8 +348,8 @@ def pattern(
     upwards = step * (np.arange(rows) - 0.5 * (rows - 1))
     grid = np.stack(np.meshgrid(across, upwards), axis=-1)
     grid[1::2] = grid[1::2, ::-1].copy()
-    # The mirror's normal points half-way between lamp and camera. Who looks back along d
-    # has the plane's first axis to the left.
+    # The mirror's normal points half-way between lamp and camera. Seen along −d, the plane's first
+    # axis points to the left.
     right, down, ahead = sampling.led_offset
     lamp = -right * plane[0] - down * plane[1] - ahead * d
     camera = middle + grid.reshape(-1, 2) @ plane - 0.5 * lamp

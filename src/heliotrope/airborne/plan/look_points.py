@@ -1,7 +1,8 @@
-"""Calibration points of a flight: from which directions clusters of mirrors are seen.
+"""Calibration points of a flight: the directions from which clusters of mirrors are measured.
 
-A direction is one pose of each mirror of the cluster. Directions are chosen as sightings
-are planned for a target: those that together tell most about the mechanism.
+A direction is one pose of each mirror of the cluster. Directions are chosen as sightings on a
+target are planned: those that together tell most about the mechanism. HelioPoint takes the
+calibration points from the operator of the plant; this choice is ours.
 """
 
 from collections.abc import Mapping
@@ -28,9 +29,9 @@ from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 
-#: Candidates stand about so far apart, rad.
+#: Approximate angle between candidates, rad.
 _STEP = float(np.radians(12.0))
-#: Mirrors of a cluster that candidates are tried on.
+#: Mirrors of a cluster on which candidates are tried.
 _SOME = 24
 
 
@@ -45,13 +46,13 @@ class Choosing:
     criterion
         "d": most information; "v": smallest beam error over the year.
     sigma
-        Of a measured normal in each of two directions, rad.
+        Standard deviation of a measured normal in each of two directions, rad.
     min_elevation, max_elevation
-        Of the drone as seen from the cluster, rad. Low ones are seen past other mirrors.
+        Of the drone as seen from the cluster, rad. At low ones mirrors hide each other.
     share
-        Of a cluster's mirrors that must be able to look there.
+        Of a cluster's mirrors that must be able to face the drone.
     priors
-        Standard deviations instead of the parameter table's, by name.
+        Standard deviations to use instead of the parameter table's, by name.
     """
 
     points: int = 20
@@ -76,7 +77,7 @@ class Choosing:
             raise InputError(f"share {self.share}: give a number above 0, up to 1")
 
     def check(self, names: tuple[str, ...], model: str) -> None:
-        """Refuse fewer points than a model's unknowns and one more."""
+        """Refuse points that do not outnumber a model's unknowns."""
         if self.points <= len(names):
             raise InputError(
                 f"{self.points} calibration points: the model {model} has {len(names)} unknowns; "
@@ -93,11 +94,11 @@ class LookPoints:
     direction
         Unit vectors from the cluster's middle to the drone, (K, 3).
     point
-        That all mirrors look at, ENU metres, (K, 3).
+        Faced by all mirrors, ENU metres, (K, 3).
     facing
         Poses, batch shape (K, n).
     plan
-        The choice for the mirror in the middle, with the errors to expect.
+        The choice for the mirror in the middle, with the expected errors.
     """
 
     direction: FloatArray
@@ -110,13 +111,13 @@ class LookPoints:
 
 
 def directions(choosing: Choosing) -> FloatArray:
-    """Return unit vectors about 12° apart between the least and the greatest elevation, (M, 3)."""
+    """Return unit vectors about 12° apart, within the elevation limits, (M, 3)."""
     low, high = choosing.min_elevation, choosing.max_elevation
     rings = max(2, int(np.ceil((high - low) / _STEP)) + 1)
     found = []
     for k, elevation in enumerate(np.linspace(low, high, rings)):
         count = max(1, int(np.ceil(2.0 * np.pi * np.cos(elevation) / _STEP)))
-        # Rings are turned against each other, or columns would stand above columns.
+        # Rings are staggered, so that columns do not line up.
         azimuth = 2.0 * np.pi * (np.arange(count) + 0.5 * (k % 2)) / count
         found.append(direction(azimuth, np.full(count, elevation)))
     return np.concatenate(found)
@@ -139,17 +140,17 @@ def look_points(
     Parameters
     ----------
     mirrors, rows
-        Of the plant, and which of them are the cluster, (n,).
+        Of the plant, and the rows of the cluster, (n,).
     middle
         Mechanism for which the points are chosen, batch shape (1,).
     aim
-        Where it sends the sun in operation, (3,).
+        Its aim point in operation, (3,).
     names
         P parameters of its model.
     suns
-        Of the year, (K, 3), see `suns_of_year`.
+        Of the year, (K, 3), see :func:`~heliotrope.calibration.information.suns_of_year`.
     airspace, sampling, choosing
-        What is allowed and wanted.
+        Limits and settings.
     label
         The cluster's name, for errors.
 
@@ -166,10 +167,10 @@ def look_points(
     if not free.any():
         raise InputError(
             f"{label}: heights, fence or keep-outs leave no place at {sampling.distance:g} m; "
-            "lower the distance or the elevations, or raise the greatest height"
+            "lower the distance or the elevations, or raise the upper height limit"
         )
     towards, points = towards[free], points[free]
-    # Neighbours can look where their neighbours can: some of the mirrors stand for all.
+    # Neighbours can face almost the same directions: some of the mirrors represent all.
     some = np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.intp))
     facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
     able = facing.able.mean(axis=1) >= choosing.share
@@ -185,10 +186,10 @@ def look_points(
     form = error_form(middle, aim, suns, names)[0]
     chosen = plan_sightings(found, choosing.points, information, form, criterion=choosing.criterion)
     index = chosen.chosen.time.astype(np.intp)
-    # A short way through the directions is a short way for mirrors and drone.
+    # A short tour of the directions is short for mirrors and drone.
     south = np.array([0.0, -1.0, 0.0])
     index = index[tour(there[index], south)]
-    # Each from the pose before, so that mirrors stay on their branch.
+    # Start from the previous pose, so that mirrors stay on their branch.
     counts, normal, vertex, ok = [], [], [], []
     current = None
     for point in there_points[index]:
@@ -210,12 +211,12 @@ def _free(
     rows: npt.NDArray[np.intp],
     sampling: Sampling,
 ) -> npt.NDArray[np.bool_]:
-    """Around which points there is room for a pattern."""
+    """Return the points that have room for a pattern around them."""
     corners, distance = mirrors.corners[rows], sampling.distance
     middle = corners.mean(axis=2, keepdims=True)
     slope = mirrors.slopes[rows][:, :, None] - (corners - middle) / (2.0 * sampling.focal)
     wide = float(np.nanmax(np.linalg.norm(corners + distance * slope, axis=-1)))
-    # Patterns grow a little where axes are oblique to their plane.
+    # Patterns are a little larger where axes are oblique to their plane.
     half = 1.2 * (wide + distance * sampling.pointing) + sampling.least_spacing
     plane = half * tangent_axes(towards)
     found = airspace.free(points)
@@ -231,11 +232,11 @@ def _candidates(
     names: tuple[str, ...],
     sigma: float,
 ) -> CandidateSightings:
-    """Sightings of the drone by one mirror; their "time" is the row of the direction."""
+    """Return sightings of the drone by one mirror; their "time" is the row of the direction."""
     facing = face(middle.armature, middle.drives, points[:, None])
     rows = np.flatnonzero(facing.able[:, 0])
     counts = facing.counts[rows, 0]
-    # A normal that turns by σ turns the ray by 2 σ.
+    # A normal that is off by σ turns the ray by 2 σ.
     zero = np.zeros(len(rows), dtype=np.intp)
     if len(rows):
         seen = drone(zero, counts, points[rows], points[rows], sigma=2.0 * sigma)

@@ -1,4 +1,4 @@
-"""The stations of a flight plan's ``plan.json``: who is flown over from where, in which pose."""
+"""The stations of a flight plan (``plan.json``): heliostats, pose, photographs' positions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ class PlannedStation:
     Attributes
     ----------
     name
-        Cluster and calibration point, as ``C1-3``: the folder of its photographs.
+        Cluster and calibration point, such as ``C1-3``: the folder of its photographs.
     heliostats
-        Rows in the list of names that was given, (N,), without those that cannot look there.
+        Rows in the given list of names, (N,), without those that cannot face the drone there.
     counts
         Of their drives, (N, D).
     pattern
-        Where photographs are taken, in order, ENU metres, (P, 3).
+        Positions of the photographs, in order, ENU metres, (P, 3).
     middle
         Of the cluster, ENU metres, (3,).
     """
@@ -43,21 +43,21 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     Parameters
     ----------
     path
-        ``plan.json`` as ``heliotrope drone plan`` writes it.
+        ``plan.json`` written by ``heliotrope drone plan``.
     names
-        Of the heliostats that are flown over.
+        Of the heliostats to be measured.
 
     Raises
     ------
     FormatError
-        If it is no such plan.
+        If it is not such a plan.
     UnknownNameError
         If it names other heliostats.
     """
     root = read_json(path, "a flight plan (plan.json)")
     told = root["format"].text()
     if told != "heliotrope flight plan 1":
-        raise root["format"].fail(f"{told!r} is not known; give a 'heliotrope flight plan 1'")
+        raise root["format"].fail(f"{told!r} is not known; give 'heliotrope flight plan 1'")
     index = {name: i for i, name in enumerate(names)}
     clusters: dict[str, tuple[npt.NDArray[np.intp], FloatArray]] = {}
     for node in root["clusters"].elements():
@@ -78,7 +78,7 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
 
 
 def _patterns(root: Node) -> dict[int, FloatArray]:
-    """Return the photographs' places of each station; several sorties may share it."""
+    """Return the photographs' positions of each station; several sorties may share it."""
     parts: dict[int, list[tuple[float, FloatArray]]] = {}
     for sortie in root["sorties"].elements():
         for visit in sortie["visits"].elements():
@@ -96,7 +96,7 @@ def _station(
 ) -> PlannedStation:
     cluster = node["cluster"].text()
     if cluster not in clusters:
-        raise node["cluster"].fail(f"{cluster!r} is no cluster of the plan")
+        raise node["cluster"].fail(f"{cluster!r} is not a cluster of the plan")
     rows, middle = clusters[cluster]
     counts = as_float([[v.number() for v in row.elements()] for row in node["counts"].elements()])
     if len(counts) != len(rows):

@@ -1,9 +1,9 @@
 """Waypoint files: Litchi CSV, DJI WPML in KMZ, QGroundControl plan; written and read back.
 
-Formats as published: Litchi Hub's CSV in metres; DJI's Waypoint Markup Language 1.0.2
-(Cloud API documentation: template.kml and waylines.wpml in a folder ``wpmz``);
-QGroundControl's plan file (developer guide, mission items of MAVLink's common set).
-Heights are relative to the place of take-off in all three.
+Formats as published: Litchi Hub's CSV in metres; DJI's Waypoint Markup Language 1.0.2 (Cloud API
+documentation: template.kml and waylines.wpml in a folder ``wpmz``); QGroundControl's plan file
+(developer guide, mission items of MAVLink's common set). In all three, heights are relative to the
+place of take-off.
 """
 
 import csv
@@ -24,14 +24,14 @@ from heliotrope.files.json import read_json
 from heliotrope.files.text import check_file, read_text
 from heliotrope.geometry import FloatArray
 
-#: Drone, its variant, payload and the photographs it keeps, as WPML numbers and names them.
+#: WPML codes of drone, variant and payload, and the photographs to keep.
 AIRCRAFT = {
     "M3E": (77, 0, 66, "visible"), "M3T": (77, 1, 67, "visible"), "M3M": (77, 2, 68, "visible"),
     "M30": (67, 0, 52, "wide"), "M30T": (67, 1, 53, "wide"),
     "M300-H20": (60, 0, 42, "wide"), "M300-H20T": (60, 0, 43, "wide"),
     "M350-H20": (89, 0, 42, "wide"), "M350-H20T": (89, 0, 43, "wide"),
 }  # fmt: skip
-#: Litchi: least distance of waypoints, m; longest stay, ms; actions of a waypoint.
+#: Litchi: least distance between waypoints, m; longest stay, ms; actions at a waypoint.
 _LITCHI_APART, _LITCHI_STAY, _LITCHI_ACTIONS = 0.6, 32_000, 15
 _WPMZ = "http://www.dji.com/wpmz/1.0.2"
 _KML = "http://www.opengis.net/kml/2.2"
@@ -46,7 +46,7 @@ _LITCHI_HEADER = [
 
 @dataclass(frozen=True)
 class Mission:
-    """One flight as waypoint files hold it; W waypoints.
+    """One flight in the form of waypoint files; W waypoints.
 
     Attributes
     ----------
@@ -61,9 +61,9 @@ class Mission:
     pitch_deg
         Of the gimbal, −90 is straight down, (W,).
     stay
-        At rest there before a photograph, s, (W,); 0 where there is none.
+        Rest before a photograph, s, (W,); 0 where there is none.
     photo
-        Whether one is taken, (W,).
+        Whether a photograph is taken, (W,).
     speed
         m/s.
     home
@@ -86,7 +86,7 @@ class Mission:
 
     def __post_init__(self) -> None:
         if not len(self.latitude_deg):
-            raise InputError(f"flight {self.name}: it has no waypoint")
+            raise InputError(f"flight {self.name}: it has no waypoint; give one or more")
         if (np.abs(self.height) > 500.0).any():
             worst = float(self.height[int(np.argmax(np.abs(self.height)))])
             raise InputError(
@@ -99,7 +99,7 @@ class Mission:
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle that QGroundControl keeps a drone out of: degrees and metres."""
+    """A circle to stay out of, for QGroundControl: degrees and metres."""
 
     latitude_deg: float
     longitude_deg: float
@@ -108,7 +108,7 @@ class Circle:
 
 @dataclass(frozen=True)
 class Fence:
-    """What QGroundControl is told of the airspace.
+    """The airspace for QGroundControl.
 
     Attributes
     ----------
@@ -129,12 +129,12 @@ class Fence:
 
 
 def litchi(mission: Mission) -> str:
-    """Return the CSV of Litchi Hub, in metres, one row a waypoint.
+    """Return the CSV of Litchi Hub, in metres, with one row for each waypoint.
 
     Raises
     ------
     InputError
-        If waypoints are closer than Litchi allows.
+        If waypoints are closer together than Litchi allows.
     """
     _check_litchi(mission)
     text = io.StringIO(newline="")
@@ -175,7 +175,7 @@ def litchi(mission: Mission) -> str:
 
 def _check_litchi(mission: Mission) -> None:
     lat, lon = np.radians(mission.latitude_deg), np.radians(mission.longitude_deg)
-    # A sphere will do for the distance of neighbours.
+    # A sphere is accurate enough for the distance of neighbours.
     step = 6.37e6 * np.hypot(np.diff(lat), np.cos(lat[:-1]) * np.diff(lon))
     gap = np.hypot(step, np.diff(mission.height))
     if len(gap) and gap.min() < 0.99 * _LITCHI_APART:
@@ -187,12 +187,12 @@ def _check_litchi(mission: Mission) -> None:
 
 
 def read_litchi(path: str | Path) -> Mission:
-    """Return the flight of a Litchi CSV; what the file does not hold is 0.
+    """Return the flight of a Litchi CSV; values that the file does not hold are 0.
 
     Raises
     ------
     FormatError
-        If it is none.
+        If it is not such a file.
     """
     text = read_text(path, "a Litchi CSV")
     rows = list(csv.reader(io.StringIO(text, newline="")))
@@ -201,12 +201,12 @@ def read_litchi(path: str | Path) -> Mission:
     for number, row in enumerate(rows[1:], start=2):
         if len(row) != len(_LITCHI_HEADER):
             raise FormatError(
-                path, f"{len(row)} cells; there should be {len(_LITCHI_HEADER)}", f"line {number}"
+                path, f"{len(row)} cells instead of {len(_LITCHI_HEADER)}", f"line {number}"
             )
     try:
         table = np.array([[float(cell) for cell in row] for row in rows[1:]])
     except ValueError as error:
-        raise FormatError(path, f"a cell is no number ({error})") from None
+        raise FormatError(path, f"a cell is not a number ({error})") from None
     table = table.reshape(-1, len(_LITCHI_HEADER))
     kind, value = table[:, 8:38:2], table[:, 9:38:2]
     if not len(table) or (np.abs(table[:, 0]) > 90.0).any() or (np.abs(table[:, 1]) > 180.0).any():
@@ -242,7 +242,7 @@ def wpml(mission: Mission, aircraft: str = "M3E") -> bytes:
     Raises
     ------
     UnknownNameError
-        If the aircraft is not known.
+        If the aircraft is unknown.
     """
     if aircraft not in AIRCRAFT:
         raise UnknownNameError("aircraft", aircraft, AIRCRAFT)
@@ -253,7 +253,7 @@ def wpml(mission: Mission, aircraft: str = "M3E") -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=3) as archive:
         for name, text in (("template.kml", template), ("waylines.wpml", waylines)):
-            # A fixed time, so that the same plan gives the same file.
+            # A fixed time, so that equal plans give equal files.
             entry = zipfile.ZipInfo(f"wpmz/{name}", (2020, 1, 1, 0, 0, 0))
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, text)
@@ -316,7 +316,7 @@ def _document(mission: Mission, aircraft: str, *, template: bool) -> str:
 
 
 def _heading(yaw_deg: float) -> str:
-    # WPML counts whole degrees from −180 to 180.
+    # WPML takes whole degrees from −180 to 180.
     angle = round((yaw_deg + 180.0) % 360.0 - 180.0)
     return (
         "<wpml:waypointHeadingMode>smoothTransition</wpml:waypointHeadingMode>"
@@ -359,7 +359,7 @@ def _placemark(mission: Mission, k: int, template: bool) -> str:
 
 
 def _actions(mission: Mission, k: int) -> str:
-    """Gimbal, rest and photograph; nothing where the drone only passes."""
+    """Return gimbal, rest and photograph; nothing where the drone only passes."""
     if not mission.photo[k]:
         return ""
     position = "<wpml:payloadPositionIndex>0</wpml:payloadPositionIndex>"
@@ -389,7 +389,7 @@ def _actions(mission: Mission, k: int) -> str:
         f"<wpml:actionActuatorFuncParam>{how}</wpml:actionActuatorFuncParam></wpml:action>"
         for i, (what, how) in enumerate(steps)
     )
-    # The waypoint's number serves as the group's: it is unique in the file.
+    # The waypoint's number identifies the group: it is unique in the file.
     return (
         f"<wpml:actionGroup><wpml:actionGroupId>{k}</wpml:actionGroupId>"
         f"<wpml:actionGroupStartIndex>{k}</wpml:actionGroupStartIndex>"
@@ -401,12 +401,12 @@ def _actions(mission: Mission, k: int) -> str:
 
 
 def read_wpml(path: str | Path) -> Mission:
-    """Return the flight that the executable wayline of a KMZ holds.
+    """Return the flight of the executable wayline in a KMZ.
 
     Raises
     ------
     FormatError
-        If it is no such file.
+        If it is not such a file.
     """
     from lxml import etree
 
@@ -416,13 +416,13 @@ def read_wpml(path: str | Path) -> Mission:
             text = {n: archive.read(f"wpmz/{n}") for n in ("template.kml", "waylines.wpml")}
     except (zipfile.BadZipFile, KeyError) as error:
         raise FormatError(
-            file, f"no KMZ with wpmz/template.kml and waylines.wpml ({error})"
+            file, f"not a KMZ with wpmz/template.kml and waylines.wpml ({error})"
         ) from None
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         roots = {name: etree.fromstring(body, parser) for name, body in text.items()}
     except etree.XMLSyntaxError as error:
-        raise FormatError(file, f"no XML ({error})") from None
+        raise FormatError(file, f"not XML ({error})") from None
     spaces = {"k": _KML, "w": _WPMZ}
     marks = roots["waylines.wpml"].findall(".//k:Placemark", spaces)
     config = roots["template.kml"].find(".//w:missionConfig", spaces)
@@ -464,7 +464,7 @@ def _triple(text: str) -> tuple[float, float, float]:
 
 _TAKE_OFF, _WAYPOINT, _RETURN = 22, 16, 20
 _SPEED, _GIMBAL, _PHOTO = 178, 205, 2000
-#: MAVLink's frames: heights relative to home, and commands without a place.
+#: MAVLink's frames: heights relative to home, and commands without a position.
 _RELATIVE, _NO_PLACE = 3, 2
 
 
@@ -565,7 +565,7 @@ def read_qgc(path: str | Path) -> Mission:
     Raises
     ------
     FormatError
-        If it is no plan, or one with items that are not simple.
+        If it is not such a plan, or has items that are not simple.
     """
     root = read_json(path, "a QGroundControl plan")
     if root["fileType"].text() != "Plan" or root["version"].number() != 1:

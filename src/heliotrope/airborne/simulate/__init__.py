@@ -1,1 +1,47 @@
-"""Simulated flights: rendered photographs with exact truth."""
+"""Simulated flights with their truth: reflections by the law, rendered photographs, and trials.
+
+:func:`fly` simulates a flight. :func:`render_flight` writes its photographs, and
+:func:`reflections_of` gives its reflections without images. :func:`trials` measures one mirror
+again and again, to find how many photographs a flight needs.
+"""
+
+from heliotrope.airborne.simulate.rendering import (
+    Conditions,
+    dark,
+    night,
+    render_flight,
+    write_photo,
+)
+from heliotrope.airborne.simulate.simulation import (
+    Errors,
+    Flight,
+    Installed,
+    exact_reflections,
+    fly,
+    hover_grid,
+    install,
+    look_counts,
+    reflections_of,
+)
+from heliotrope.airborne.simulate.trial import TrialConditions, Trials, four_facets, trials
+
+__all__ = [
+    "Conditions",
+    "Errors",
+    "Flight",
+    "Installed",
+    "TrialConditions",
+    "Trials",
+    "dark",
+    "exact_reflections",
+    "fly",
+    "four_facets",
+    "hover_grid",
+    "install",
+    "look_counts",
+    "night",
+    "reflections_of",
+    "render_flight",
+    "trials",
+    "write_photo",
+]

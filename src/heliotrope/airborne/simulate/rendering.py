@@ -1,8 +1,9 @@
 """Photographs of a simulated flight: ground, shadows, mirrors that show the sky, and the lamp.
 
-Light is counted in full scales of the sensor. Facets cover pixels by an 8-fold finer grid; the
-lamp's reflections stand at the exact places of :mod:`heliotrope.airborne.mirror`. A blur of
-the lens and of motion goes over all of it, then noise, clipping, the curve of sRGB and JPEG.
+Light is measured in full scale of the sensor. The share of a pixel that a facet covers is taken
+from an 8-fold finer grid; the lamp's reflections are at the exact positions of
+:mod:`heliotrope.airborne.mirror`. The blur of lens and motion is applied to all of it, then noise,
+clipping, the curve of sRGB and JPEG.
 """
 
 import math
@@ -31,7 +32,7 @@ Picture = npt.NDArray[np.uint8]
 
 #: Blue, green, red of sky, ground and lamp, relative.
 SKY_TINT, GROUND_TINT, LED_TINT = (1.25, 1.0, 0.80), (0.72, 0.95, 1.15), (1.0, 1.0, 1.0)
-#: Of a facet's edge, how much finer than a pixel it is drawn.
+#: Fine cells of a pixel, each way, in which edges of facets are drawn.
 FINER = 8
 _TEXTURE, _TEXEL = 1024, 0.04
 
@@ -43,22 +44,22 @@ class Conditions:
     Attributes
     ----------
     sky
-        Light of the sky at 45° of elevation, full scales.
+        Light of the sky at 45° of elevation, full scale.
     ground
         Mean light of the ground.
     contrast
         Relative standard deviation of the ground's texture.
     sun
-        Azimuth and elevation of the sun, rad, for shadows; None for none.
+        Azimuth and elevation of the sun, rad, for shadows; None for no shadows.
     led
-        Light of the lamp's reflection in a flat mirror when lamp and camera are 100 m from
-        it: the sum over its pixels. It falls with the square of the distance.
+        Light of the lamp's reflection in a flat mirror with lamp and camera 100 m away: the sum
+        over its pixels. It decreases with the square of the distance.
     led_spread
-        Standard deviation of its spot on the mirror from the roughness of the glass, m.
+        Standard deviation of its spot on the mirror due to the roughness of the glass, m.
     blur
         Standard deviation of the lens's blur, pixels.
     motion
-        Way of the picture during the exposure, pixels right and down.
+        Motion of the image during the exposure, pixels right and down.
     electrons
         At full scale.
     read_noise
@@ -92,18 +93,18 @@ class Conditions:
 
 
 def night(led: float = 6.0) -> Conditions:
-    """Return conditions of a moonlit night with a longer exposure and a dimmed lamp."""
+    """Return conditions of a moonlit night, with a longer exposure and a dimmed lamp."""
     return Conditions(sky=0.05, ground=0.012, sun=None, led=led, electrons=2500.0, read_noise=8.0)
 
 
 def dark(led: float = 6.0) -> Conditions:
-    """Return conditions of a night without moon: of the mirrors only the lamp is seen."""
+    """Return conditions of a night without moon: only the lamp can be seen on the mirrors."""
     return Conditions(sky=4e-4, ground=1e-4, sun=None, led=led, electrons=2500.0, read_noise=8.0)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What a photograph shows.
+    """Content of a photograph.
 
     Attributes
     ----------
@@ -129,7 +130,7 @@ def render(
     Parameters
     ----------
     scene
-        What there is.
+        Mirrors, ground and light.
     camera, photo
         Lens, and true exterior orientation.
     lamp
@@ -144,7 +145,7 @@ def render(
         _shadows(image, camera, photo, scene)
     hit = {int(h): np.flatnonzero(lamp.heliostat == h) for h in np.unique(lamp.heliostat)}
     for row in order:
-        # What is nearer hides mirrors and spots behind it.
+        # Nearer mirrors hide mirrors and spots behind them.
         _mirror(image, camera, photo, scene, int(row))
         for k in hit.get(int(row), ()):
             _spot(image, camera, photo, scene, lamp, int(k))
@@ -152,7 +153,7 @@ def render(
 
 
 def sky_light(way: npt.ArrayLike, conditions: Conditions) -> FloatArray:
-    """Return the light (...) of the sky in unit directions (..., 3): brighter to the horizon."""
+    """Return the sky's light (...) in unit directions (..., 3), brighter towards the horizon."""
     up = np.clip(as_float(way)[..., 2], 0.0, 1.0)
     return as_float(conditions.sky * (1.0 + 0.5 * (math.sqrt(0.5) - up)))
 
@@ -162,7 +163,7 @@ def sky_light(way: npt.ArrayLike, conditions: Conditions) -> FloatArray:
 
 @lru_cache(maxsize=1)
 def _texture() -> Light:
-    """Return a ground that repeats every 41 m: grains, stones and patches, mean 0, spread 1."""
+    """Return a ground texture that repeats every 41 m, with mean 0 and spread 1."""
     rng = np.random.default_rng(20)
     k = np.hypot(*np.meshgrid(*[np.fft.fftfreq(_TEXTURE)] * 2)) * _TEXTURE
     spectrum = np.fft.fft2(rng.standard_normal((_TEXTURE, _TEXTURE)))
@@ -180,7 +181,7 @@ def _ground(camera: LedCamera, photo: Photo, scene: Scene) -> Light:
     plane = undistort(camera, grid)
     way = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ photo.rotation.T
     down = -way[..., 2] / np.linalg.norm(way, axis=-1)
-    # What looks at the horizon or above it sees haze.
+    # Rays to the horizon or above it see haze.
     depth = (photo.position[2] - scene.ground) / np.maximum(-way[..., 2], 0.02)
     place = (photo.position[:2] + depth[..., None] * way[..., :2]) / _TEXEL
     place = np.mod(place - place.min(axis=(0, 1)), 1e7).astype(np.float32)
@@ -243,7 +244,7 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: Scene, row: in
 
 
 def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: float) -> None:
-    """Lay a colour over the pixels in a polygon (K, 2), each by its covered share."""
+    """Blend a colour over the pixels in a polygon (K, 2), each by its covered share."""
     import cv2
 
     height, width = image.shape[:2]
@@ -253,7 +254,7 @@ def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: floa
         return
     size = high - low
     fine = np.zeros((size[1] * FINER, size[0] * FINER), np.uint8)
-    # Pixel centres are whole numbers: the first fine cell's centre lies at -1/2 + 1/(2 FINER).
+    # Pixel centres are whole numbers: the centre of the first fine cell is at -1/2 + 1/(2 FINER).
     places = (_shrunk(outline, 0.5 / FINER) - low + 0.5) * FINER - 0.5
     cv2.fillPoly(fine, [np.round(places * 16.0).astype(np.int32)], 255, shift=4)
     share = cv2.resize(fine, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
@@ -286,7 +287,7 @@ def _spot(
     if not np.isfinite(seen).all():
         return
     distance = float(np.linalg.norm(place - photo.position))
-    # Narrower than a third of a pixel nothing changes any more.
+    # Below a third of a pixel the width no longer matters.
     sigma = max(scene.conditions.led_spread * camera.focal / distance, 0.3)
     reach = math.ceil(4.0 * sigma) + 1
     x, y = (np.arange(round(c) - reach, round(c) + reach + 1) for c in seen.tolist())
@@ -364,7 +365,7 @@ def write_photo(
     origin: tuple[float, float, float],
     quality: int = 95,
 ) -> None:
-    """Write a JPEG with what the drone tells in EXIF and DJI's XMP.
+    """Write a JPEG with the drone's records in EXIF and DJI's XMP.
 
     Parameters
     ----------
@@ -373,7 +374,7 @@ def write_photo(
     picture
         Blue-green-red, (H, W, 3).
     told
-        Position, rotation and time as the drone tells them.
+        Position, rotation and time as recorded.
     origin
         Latitude and longitude (degrees) and height (m) of ENU's origin.
     quality
@@ -416,14 +417,14 @@ def render_flight(
     seed: int = 0,
     progress: Any = None,
 ) -> Reflections:
-    """Write the photographs of a flight with camera.toml and commands.csv; return the truth.
+    """Write the photographs of a flight with camera and commands; return the true reflections.
 
     Parameters
     ----------
     flight
         Of :func:`heliotrope.airborne.simulate.simulation.fly`.
     folder
-        Where to; it is made if need be.
+        Is made if need be.
     origin
         As :func:`write_photo`.
     conditions
@@ -431,7 +432,7 @@ def render_flight(
     seed
         Of the noise.
     progress
-        Is told how many photographs are done, of how many.
+        Called with (done, all) photographs.
     """
     light = conditions or Conditions()
     place = Path(folder)

@@ -1,11 +1,10 @@
-"""A flight with its truth: mirrors as they really stand, positions as the drone tells them.
+"""A simulated flight with its truth: mirrors as they really stand, and what the drone records.
 
-A flight holds two pictures of the same thing. What is *true*: mechanisms with imperfections,
-surveyed positions that are off, facets with slope errors, where the camera really was. What is
-*told*: the plant file, the commands, and for each photograph a position from RTK and the
-angles of a gimbal. :func:`fly` makes both; :func:`reflections_of` gives the reflections that
-an image evaluation would find, without images; `heliotrope.airborne.simulate.rendering` draws
-them.
+A flight holds two versions of the same thing. *True*: mechanisms with imperfections, surveyed
+positions with errors, facets with slope errors, the real positions of the camera. *Told*: the
+plant file, the commands, and for each photograph a position from RTK and the angles of a gimbal.
+:func:`fly` makes both; :func:`reflections_of` gives the reflections that an image evaluation would
+find, without images; :mod:`heliotrope.airborne.simulate.rendering` draws them.
 """
 
 from collections.abc import Mapping
@@ -26,7 +25,7 @@ from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, rotation
 from heliotrope.mechanism.tracking import Status, track
 
-#: Deviations of mechanisms that were roughly adjusted, standard deviations in rad.
+#: Standard deviations of roughly aligned mechanisms, rad.
 ADJUSTED: Mapping[str, float] = {
     "tilt_north": 1e-3,
     "tilt_east": 1e-3,
@@ -37,24 +36,24 @@ ADJUSTED: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Errors:
-    """How far what is told differs from what is true; standard deviations but for the offset.
+    """Standard deviations of records from the truth; the offset is a value.
 
     Attributes
     ----------
     rtk
         Of each position east, north, up, independent from photograph to photograph, m, (3,).
     rtk_offset
-        Told less true, the same in all photographs, m, (3,).
+        Recorded less true, the same in all photographs, m, (3,).
     gimbal
-        Of each of three turns of the camera, rad.
+        Of each of three rotations of the camera, rad.
     survey
         Of each coordinate of a heliostat's position, m.
     slope
-        RMS of each component of the slope deviations of the mirrors, rad.
+        RMS of each component of the mirrors' slope deviations, rad.
     slope_length
-        Over which slopes stay alike, m.
+        Correlation length of the slopes, m.
     reflection
-        Of where a reflection is seen on the mirror, each of x and y, m.
+        Of the detected position of a reflection on the mirror, x and y, m.
     mechanism
         Of parameters of the mechanisms, rad.
     """
@@ -78,7 +77,7 @@ class Flight:
     camera
         With its lamp.
     heliostats
-        As the plant file has them.
+        As in the plant file.
     counts
         Drive positions during the flight, (N, D).
     truth
@@ -86,9 +85,9 @@ class Flight:
     shapes
         Their surfaces with slope deviations, N of them.
     taken
-        Photographs as they were taken.
+        Photographs with their true exterior orientation.
     told
-        The same as the drone tells them.
+        The same, as recorded by the drone.
     """
 
     camera: LedCamera
@@ -102,14 +101,14 @@ class Flight:
 
 @dataclass(frozen=True)
 class Installed:
-    """N heliostats as they really are: their mechanisms, and their surfaces with slopes."""
+    """N heliostats as they really are: mechanisms, and surfaces with slope deviations."""
 
     heliostats: Heliostats
     shapes: tuple[MirrorShape, ...]
 
 
 def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
-    """Return the drive counts (N, D) at which all mirrors look at one point.
+    """Return the drive counts (N, D) at which all mirrors face one point.
 
     Raises
     ------
@@ -120,14 +119,14 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
     mechanism = heliostats.calibrated
     vertex = mechanism.position
     for _ in range(4):
-        # A mirror looks at what it sends light back to; its vertex moves with it.
+        # A mirror faces the point to which it returns light; its vertex moves with the pose.
         result = track(mechanism, normalize(to - vertex), to)
         vertex = result.chosen(result.vertex)
     status = result.chosen(result.status)
     if (status != Status.OK).any():
         i = int(np.flatnonzero(status != Status.OK)[0])
         raise InputError(
-            f"heliostat {heliostats.names[i]}: cannot look at {to.tolist()} m; choose another point"
+            f"heliostat {heliostats.names[i]}: cannot face {to.tolist()} m; choose another point"
         )
     return as_float(result.chosen(result.counts))
 
@@ -142,11 +141,11 @@ def hover_grid(
     center
         Middle of the pattern, ENU metres.
     focus
-        What the camera looks at.
+        Point that the camera looks at.
     columns, rows
-        Level, and along the slope.
+        Horizontally, and along the slope.
     step
-        Between neighbours, m. Lines are flown back and forth.
+        Between neighbours, m. Rows are flown back and forth.
     """
     turned = look_at(center, focus)
     across = (np.arange(columns) - 0.5 * (columns - 1)) * step
@@ -179,15 +178,15 @@ def fly(
     Parameters
     ----------
     heliostats
-        As the plant file has them.
+        As in the plant file.
     camera
         With its lamp.
     counts
         Drive positions, (N, D).
     positions
-        Where photographs are to be taken, ENU metres, (P, 3).
+        Planned positions of the photographs, ENU metres, (P, 3).
     focus
-        What the camera is to look at, ENU metres, (3,).
+        Point that the camera is to look at, ENU metres, (3,).
     errors
         By default those of :class:`Errors`.
     focal
@@ -197,10 +196,10 @@ def fly(
     seed
         Of all randomness.
     installed
-        The heliostats as they really are, of :func:`install`, if several flights are over them;
-        ``focal`` is then not used.
+        The heliostats as they really are, of :func:`install`, for several flights over the same
+        ones; ``focal`` is then ignored.
     flight
-        Number of this one of several flights: its photographs have errors of their own.
+        Number of this flight among several: its photographs have errors of their own.
     """
     wrong = errors or Errors()
     rng = np.random.default_rng(seed)
@@ -239,9 +238,9 @@ def install(
     Parameters
     ----------
     heliostats
-        The whole field, as the plant file has it.
+        The whole field, as in the plant file.
     rows
-        Which of them.
+        Rows of the field.
     errors, focal, seed
         As :func:`fly`. A heliostat is the same whichever others are asked for.
     """
@@ -285,8 +284,8 @@ def _photograph(
     wrong: Errors,
     rng: np.random.Generator,
 ) -> tuple[Photo, Photo]:
-    """Return a photograph as it was taken and as the drone tells it."""
-    # The drone steers by its own RTK: what it believes is where it was sent.
+    """Return a photograph with its true orientation, and as the drone records it."""
+    # The drone steers by its own RTK: it believes to be where it was sent.
     true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
     wanted = look_at(place, focus)
     lean = rng.normal(0.0, wrong.gimbal, 3)
@@ -298,9 +297,9 @@ def _photograph(
 
 
 def exact_reflections(flight: Flight) -> Reflections:
-    """Return every reflection of the flight by the exact law: true places, true positions.
+    """Return every reflection of the flight by the exact law, at true positions.
 
-    ``sigma`` is 1e-9 m. Mirrors that hide others are not looked at.
+    ``sigma`` is 1e-9 m. Obstruction by other mirrors is not considered.
     """
     camera = as_float([p.position for p in flight.taken]).reshape(-1, 3)
     led = as_float([p.led_position(flight.camera) for p in flight.taken]).reshape(-1, 3)
@@ -334,13 +333,13 @@ def reflections_of(
     flight
         Of :func:`fly`.
     errors
-        Only ``reflection`` is used: noise of the places on the mirror.
+        Only ``reflection`` is used: noise of the positions on the mirror.
     seed
         Of that noise.
     corrected
-        Whether the common offset of RTK is known and taken off, as the evaluation of images
-        does. The angles of the camera, which place the lamp, are known to 0.1 mrad from the
-        images and taken as true.
+        Whether RTK's common offset is known and removed, as the evaluation of images does. The
+        camera's attitude, which locates the lamp, is known to 0.1 mrad from the images and taken
+        as true.
     """
     wrong = errors or Errors()
     exact = exact_reflections(flight)

@@ -1,7 +1,7 @@
-"""Trials of the orientation on simulated reflections: how many images are needed, how well.
+"""Trials of the orientation on simulated reflections: how many photographs, and how accurate.
 
-One mirror is measured again and again, with other slope errors, positions and noise each time.
-As the truth is known, its error can be set beside what the evaluation says of it.
+One mirror is measured repeatedly, each time with other slope errors, positions and noise. As the
+truth is known, the true error can be compared with the stated one.
 """
 
 from dataclasses import dataclass, field, replace
@@ -21,29 +21,29 @@ _NINETY = 1.6448536269514722
 
 
 @dataclass(frozen=True)
-class Conditions:
-    """Of a flight over one mirror; lengths in m, angles in rad, standard deviations per axis.
+class TrialConditions:
+    """Settings of a flight over one mirror; m and rad, standard deviations per axis.
 
     Attributes
     ----------
     distance
         From mirror to drone.
     columns, rows
-        Of the hover positions; they reach two slope errors beyond its edge.
+        Of the hover positions, which extend two slope errors beyond the mirror's edge.
     slope, length
-        RMS of each component of the slope deviations, and over which they stay alike.
+        RMS of each component of the slope deviations, and their correlation length.
     rtk
         Of each photograph's position.
     reflection
-        Of where the reflection is seen on the mirror.
+        Of the detected position of a reflection on the mirror.
     hover
-        How far the drone stands off its place (and knows it).
+        Of the drone's distance from its planned position, which it knows.
     pointing
-        How far the mirror is turned from where it is expected.
+        Of the mirror's rotation from the expected orientation.
     lamp
-        Beside the camera, to the right.
+        Offset from the camera, to the right.
     budget
-        Of what all points share.
+        Errors common to all points.
     """
 
     distance: float = 150.0
@@ -67,8 +67,8 @@ class Conditions:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """One mirror with its truth, and what is told of it.
+class TrialMirror:
+    """One mirror with its truth, and what the evaluation is given.
 
     Attributes
     ----------
@@ -97,13 +97,13 @@ class Trials:
     Attributes
     ----------
     count
-        Points that were used, (K,).
+        Points without outliers, (K,).
     error
-        Of the mean alone: the mirror's true place known, (K, 2).
+        Of the mean alone: with the mirror's true position known, (K, 2).
     total_error
-        With all that was wrong, (K, 2).
+        With all errors, (K, 2).
     sigma_plain, sigma_mean, systematic
-        As the evaluation gives them, (K, 2).
+        As stated by the evaluation, (K, 2).
     """
 
     count: FloatArray
@@ -115,7 +115,7 @@ class Trials:
 
     @property
     def coverage(self) -> float:
-        """Share of the total errors within 90 % of what σ_tot says."""
+        """Share of the total errors within the 90 % interval of σ_tot."""
         total = np.hypot(self.sigma_mean, self.systematic)
         return float(np.mean(np.abs(self.total_error) < _NINETY * total))
 
@@ -125,7 +125,7 @@ def four_facets() -> MirrorShape:
     return tiled(2, 2, 1.6, 1.25, gap=0.02, focal=200.0)
 
 
-def scene(shape: MirrorShape, conditions: Conditions, seed: int) -> Scene:
+def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> TrialMirror:
     """Return a mirror of the given ideal shape with random slopes, measured once."""
     c, rng = conditions, np.random.default_rng(seed)
     real = shape
@@ -137,15 +137,15 @@ def scene(shape: MirrorShape, conditions: Conditions, seed: int) -> Scene:
     true = turned(told, c.pointing * rng.standard_normal(2))
     told_vertex = np.array([0.0, 100.0, 3.0])
     vertex = told_vertex + np.hypot(c.budget.position, c.budget.kinematics) * rng.standard_normal(3)
-    # The foot of the perpendicular runs over the mirror with the drone, slower where it focuses.
+    # The reflection moves over the mirror with the drone, less where the mirror focuses.
     corners = shape.corners[..., :2].reshape(-1, 2)
     narrow = abs(1.0 - c.distance / (2.0 * float(shape.focal.mean())))
-    # Beyond its edge, so that parts of the surface that look outwards are not missed.
+    # Beyond the edge, so that parts of the surface that lean outwards are not missed.
     half = narrow * 0.5 * np.ptp(corners, axis=0) + 2.0 * c.slope * c.distance
     places = np.stack(np.meshgrid(_line(c.columns) * half[0], _line(c.rows) * half[1]), axis=-1)
     places = places.reshape(-1, 2) + c.hover * rng.standard_normal((c.columns * c.rows, 2))
     own = np.concatenate([places, np.full((len(places), 1), c.distance)], axis=-1)
-    # Roughly where the mirror really looks: a first look of the camera shows it.
+    # Roughly where the mirror really points, which a first photograph shows.
     camera = told_vertex + own @ true.T
     led = camera + c.lamp * right
     seen = reflection_points(real, true, vertex, camera, led)
@@ -161,11 +161,11 @@ def scene(shape: MirrorShape, conditions: Conditions, seed: int) -> Scene:
         (led + off + lamp_off)[seen.position],
         max(c.reflection, 1e-6),
     )
-    return Scene(real, true, vertex, told, told_vertex, found)
+    return TrialMirror(real, true, vertex, told, told_vertex, found)
 
 
 def trials(
-    conditions: Conditions,
+    conditions: TrialConditions,
     count: int,
     *,
     shape: MirrorShape | None = None,
@@ -186,7 +186,7 @@ def trials(
     mean
         As :func:`heliotrope.airborne.evaluate.orientation.measure`.
     seed
-        Of the first; the others follow.
+        Of the first trial; the others follow.
 
     Raises
     ------
@@ -197,7 +197,7 @@ def trials(
     bare = replace(conditions.budget, position=0.0, kinematics=0.0)
     rows = []
     for k in range(count):
-        s = scene(ideal, conditions, seed + k)
+        s = trial_mirror(ideal, conditions, seed + k)
         known = s.shape if map_known else ideal
         alone = measure(s.reflections, known, s.told_rotation, s.vertex, budget=bare, mean=mean)
         told = measure(
@@ -223,16 +223,18 @@ def trials(
 
 
 def table(count: int = 40, *, seed: int = 0) -> str:
-    """Return the figures of the paper's conditions as a table of text, mrad.
+    """Return the figures under HelioPoint's conditions as a table of text, mrad.
 
     Three patterns of hover positions, with the ideal surface (both means) and the measured one;
-    ``count`` mirrors each. Errors are RMS over the mirrors and both components.
+    ``count`` mirrors each. Errors are RMS over the mirrors and both components. Facets, patterns
+    and the positions' errors on the mirror are ours; distance, slope deviations, RTK, position and
+    kinematics are the paper's.
     """
     lines = ["surface   mean   points  σ/√n   σ_mean  error  systematic  σ_tot  error  in 90 %"]
     kinds: list[tuple[str, Mean]] = [("ideal", "plain"), ("ideal", "area"), ("measured", "area")]
     for name, mean in kinds:
         for columns, rows, reflection in ((7, 6, 0.010), (10, 8, 0.015), (13, 10, 0.020)):
-            c = Conditions(columns=columns, rows=rows, reflection=reflection)
+            c = TrialConditions(columns=columns, rows=rows, reflection=reflection)
             t = trials(c, count, map_known=name == "measured", mean=mean, seed=seed)
             total = np.hypot(t.sigma_mean, t.systematic)
             figures = [

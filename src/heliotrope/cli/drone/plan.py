@@ -1,4 +1,4 @@
-"""``heliotrope drone plan``: a campaign of a drone over a field, as waypoint files."""
+"""``heliotrope drone plan``: a drone's campaign over a field, as waypoint files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -24,28 +24,32 @@ def plan(
     criterion: Annotated[
         Literal["d", "v"], typer.Option(help="d: most information; v: smallest beam error.")
     ] = "d",
-    distance: Annotated[float, typer.Option(help="Of the drone from a cluster, m.")] = 150.0,
+    distance: Annotated[
+        float, typer.Option(help="Distance of the drone from a cluster, m.")
+    ] = 150.0,
     size: Annotated[float, typer.Option(help="Diameter of a cluster, m.")] = 100.0,
     spread_deg: Annotated[
-        float, typer.Option(help="Largest angle of an axis from its cluster's.")
+        float, typer.Option(help="Largest angle of an optical axis from its cluster's mean.")
     ] = 25.0,
     view_deg: Annotated[
-        float, typer.Option(help="What the camera sees across its shorter side.")
+        float, typer.Option(help="Angle of view across the shorter side of a photograph.")
     ] = 56.0,
     pointing_mrad: Annotated[
-        float, typer.Option(help="Error of the normals that patterns must cover.")
+        float, typer.Option(help="Pointing error of mirrors that patterns must cover.")
     ] = 5.0,
     samples: Annotated[float, typer.Option(help="Reflections on each facet.")] = 9.0,
     facet_focal: Annotated[
-        float | None, typer.Option(help="Focal length of the facets, m. Default: flat.")
+        float | None, typer.Option(help="Focal length of the facets, m; default: flat.")
     ] = None,
-    least_spacing: Annotated[float, typer.Option(help="Of hover points, m.")] = 0.6,
+    least_spacing: Annotated[float, typer.Option(help="Least distance of hover points, m.")] = 0.6,
     led: Annotated[
-        str, typer.Option(help="Lamp from the camera: right,down,ahead in m.")
+        str, typer.Option(help="Lamp from the camera: right,down,forward in m.")
     ] = "0,0,0",
-    sigma_mrad: Annotated[float, typer.Option(help="Of a measured normal.")] = 0.3,
+    sigma_mrad: Annotated[
+        float, typer.Option(help="Standard deviation of a measured normal.")
+    ] = 0.3,
     elevations: Annotated[
-        str, typer.Option(help="Lowest,highest of the drone as mirrors see it, degrees.")
+        str, typer.Option(help="Lowest,highest elevation of the drone from the mirrors, degrees.")
     ] = "20,85",
     airspace: Annotated[
         Path | None, typer.Option(help="JSON with keep-outs, fence, heights, home.")
@@ -53,22 +57,24 @@ def plan(
     tower: Annotated[
         bool, typer.Option("--tower/--no-tower", help="Keep away from receivers and targets.")
     ] = True,
-    min_height: Annotated[float, typer.Option(help="Above ground, m.")] = 15.0,
-    max_height: Annotated[float, typer.Option(help="Above ground, m.")] = 120.0,
-    home: Annotated[str | None, typer.Option(help="Place of take-off: east,north,up in m.")] = None,
-    drones: Annotated[int, typer.Option(help="That fly at the same time.")] = 1,
-    speed: Annotated[float, typer.Option(help="m/s.")] = 8.0,
-    photo: Annotated[str, typer.Option(help="Time to come to rest and take one.")] = "2.5s",
-    endurance: Annotated[str, typer.Option(help="Flight on one battery.")] = "25min",
-    change: Annotated[str, typer.Option(help="Time on the ground between.")] = "5min",
-    hours_a_day: Annotated[float, typer.Option(help="In which is flown.")] = 8.0,
+    min_height: Annotated[float, typer.Option(help="Lower limit above ground, m.")] = 15.0,
+    max_height: Annotated[float, typer.Option(help="Upper limit above ground, m.")] = 120.0,
+    home: Annotated[str | None, typer.Option(help="Take-off: east,north,up in m.")] = None,
+    drones: Annotated[int, typer.Option(help="Drones flying at the same time.")] = 1,
+    speed: Annotated[float, typer.Option(help="Between stations, m/s.")] = 8.0,
+    photo: Annotated[
+        str, typer.Option(help="Time to come to rest and take a photograph.")
+    ] = "2.5s",
+    endurance: Annotated[str, typer.Option(help="Flying time on one battery.")] = "25min",
+    change: Annotated[str, typer.Option(help="Time to change the battery.")] = "5min",
+    hours_a_day: Annotated[float, typer.Option(help="Flying hours a day.")] = 8.0,
     target_minutes: Annotated[
-        float, typer.Option(help="Of camera and target, to compare: from photo to photo.")
+        float, typer.Option(help="Camera and target, for comparison: time between photographs.")
     ] = 2.0,
     formats: Annotated[
-        str, typer.Option(help="Of waypoint files: some of dji,qgc,litchi, or none.")
+        str, typer.Option(help="Formats of waypoint files: some of dji,qgc,litchi, or none.")
     ] = "dji,qgc,litchi",
-    aircraft: Annotated[str, typer.Option(help="Of DJI's files.")] = "M3E",
+    aircraft: Annotated[str, typer.Option(help="Drone for DJI's files.")] = "M3E",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
@@ -159,7 +165,7 @@ def _numbers(text: str, count: int, what: str) -> tuple[float, ...]:
     except ValueError:
         values = ()
     if len(values) != count or not all(math.isfinite(v) for v in values):
-        raise InputError(f"{what} {text!r}: give {count} numbers with a comma between them")
+        raise InputError(f"{what} {text!r}: give {count} numbers separated by commas")
     return values
 
 
@@ -198,9 +204,9 @@ def _print(s: dict[str, Any]) -> None:
     ]
     print_table(["campaign", ""], rows)
     if s["drones"] > 1:
-        print(f"drones come no closer to each other than {s['separation_m']:.0f} m")
+        print(f"least distance between drones in the air: {s['separation_m']:.0f} m")
     if s["fewest_points_of_a_heliostat"] < s["calibration_points"]:
         print(
-            f"some heliostats are stopped short of a direction; the worst has "
+            "some heliostats cannot reach all directions within their stops; the worst has "
             f"{s['fewest_points_of_a_heliostat']} calibration points: see commands.csv"
         )

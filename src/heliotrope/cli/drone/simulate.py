@@ -24,43 +24,48 @@ def simulate(
     folder: Annotated[Path, typer.Argument(help="Folder for the photographs.")],
     group: Annotated[str, typer.Option(help="Group of heliostats; default: the first.")] = "",
     heliostats: Annotated[
-        int, typer.Option(min=1, help="How many, those nearest to the middle.")
+        int, typer.Option(min=1, help="Number of heliostats, nearest to the middle.")
     ] = 80,
     hover: Annotated[
-        str, typer.Option(help="Middle of the pattern, E,N,U in m; default: towards the tower.")
+        str,
+        typer.Option(help="Middle of the pattern, E,N,U in m; default: on the side of the tower."),
     ] = "",
     distance: Annotated[float, typer.Option(min=5.0, help="From the mirrors, m.")] = 100.0,
-    columns: Annotated[int, typer.Option(min=1, help="Of the pattern.")] = 6,
-    rows: Annotated[int, typer.Option(min=1, help="Of the pattern.")] = 6,
+    columns: Annotated[int, typer.Option(min=1, help="Columns of the pattern.")] = 6,
+    rows: Annotated[int, typer.Option(min=1, help="Rows of the pattern.")] = 6,
     step: Annotated[float, typer.Option(min=0.01, help="Between hover positions, m.")] = 0.5,
-    size: Annotated[str, typer.Option(help="Of a photograph, WIDTHxHEIGHT, pixels.")] = "4000x3000",
+    size: Annotated[
+        str, typer.Option(help="Size of a photograph, WIDTHxHEIGHT, pixels.")
+    ] = "4000x3000",
     focal_px: Annotated[
         float, typer.Option(min=0.0, help="Focal length, pixels; 0: three quarters of the width.")
     ] = 0.0,
     slope_mrad: Annotated[float, typer.Option(min=0.0, help="RMS of slope deviations.")] = 0.8,
-    rtk_mm: Annotated[float, typer.Option(min=0.0, help="Of each position.")] = 8.0,
-    offset_mm: Annotated[str, typer.Option(help="Common offset, E,N,U.")] = "0,0,0",
-    survey_mm: Annotated[float, typer.Option(min=0.0, help="Of the heliostats' positions.")] = 5.0,
+    rtk_mm: Annotated[float, typer.Option(min=0.0, help="RTK error of each position.")] = 8.0,
+    offset_mm: Annotated[str, typer.Option(help="RTK's common offset, E,N,U.")] = "0,0,0",
+    survey_mm: Annotated[
+        float, typer.Option(min=0.0, help="Survey error of the heliostats' positions.")
+    ] = 5.0,
     plan: Annotated[
         Path | None,
         typer.Option(
-            help="plan.json of a campaign: its patterns are flown, each into a folder of its own; "
-            "--hover, --distance, --columns, --rows, --step, --heliostats do not count."
+            help="plan.json of a campaign: each pattern is flown into a folder of its own; "
+            "--hover, --distance, --columns, --rows, --step, --heliostats are ignored."
         ),
     ] = None,
     stations: Annotated[
-        str, typer.Option(help="Of the plan: some, as C1-1,C1-4. Default: all.")
+        str, typer.Option(help="Stations of the plan to fly, such as C1-1,C1-4; default: all.")
     ] = "",
     focal: Annotated[
-        float | None, typer.Option(min=1.0, help="Of the facets, m; default: flat.")
+        float | None, typer.Option(min=1.0, help="Focal length of the facets, m; default: flat.")
     ] = None,
     night: Annotated[bool, typer.Option("--night", help="By moonlight.")] = False,
     dark: Annotated[
-        bool, typer.Option("--dark", help="Without moon: of the mirrors only the lamp is seen.")
+        bool, typer.Option("--dark", help="Without moon: only the lamp is seen on the mirrors.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of all randomness.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
 ) -> None:
-    """Render a flight: photographs as a drone of DJI writes them, commands, camera, truth."""
+    """Render a flight: photographs as a DJI drone writes them, commands, camera, truth."""
     import numpy as np
 
     from heliotrope.airborne.simulate import rendering
@@ -83,7 +88,7 @@ def simulate(
         return
     chosen = _nearest(mirrors, heliostats)
     middle = chosen.position.mean(axis=0)
-    # By default as seen from the tower's side, half way up to the zenith.
+    # By default on the side of the tower, half way up to the zenith.
     level = -middle[:2] / max(float(np.linalg.norm(middle[:2])), 1e-9)
     place = middle + distance * np.sqrt(0.5) * np.array([*level, 1.0])
     place = np.array(parse_point(hover, "--hover")) if hover else place
@@ -95,7 +100,7 @@ def simulate(
 
 @dataclass(frozen=True)
 class _Drawing:
-    """What all flights of a simulation share."""
+    """Settings shared by all flights of a simulation."""
 
     site: "Site"
     camera: "LedCamera"
@@ -185,7 +190,7 @@ def _group(name: str, known: tuple[str, ...]) -> str:
     from heliotrope.errors import InputError, UnknownNameError
 
     if not known:
-        raise InputError("the plant has no heliostats; add a group of them")
+        raise InputError("the plant has no heliostats; add a group to the plant file")
     if name and name not in known:
         raise UnknownNameError("group", name, known)
     return name or known[0]
@@ -207,7 +212,7 @@ def _camera(size: str, focal_px: float) -> "LedCamera":
 
     match = re.fullmatch(r"(\d{2,5})[x×](\d{2,5})", size)
     if not match:
-        raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, as 4000x3000")
+        raise InputError(f"--size {size!r}: write WIDTHxHEIGHT in pixels, such as 4000x3000")
     width, height = int(match[1]), int(match[2])
     f = focal_px or 0.75 * width
     matrix = np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0, 0, 1.0]])
