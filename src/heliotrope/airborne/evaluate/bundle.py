@@ -308,10 +308,10 @@ def adjust(
             converged = True
             break
     assert solver is not None  # there is at least one round
-    return _told(layout, state, corners, solver, rounds, converged)
+    return _result(layout, state, corners, solver, rounds, converged)
 
 
-def _told(
+def _result(
     layout: _Layout,
     state: State,
     corners: Corners,

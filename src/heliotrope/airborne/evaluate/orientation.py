@@ -297,7 +297,7 @@ def measure(
     R = update(R, mean)
     found = differences(own, shape, R, where(R), slopes=slopes)
     known = budget or Budget()
-    return _told(own, shape, R, where(R), start, found, keep, known, mean, place)
+    return _result(own, shape, R, where(R), start, found, keep, known, mean, place)
 
 
 def measure_field(
@@ -393,7 +393,7 @@ def _mean(
     return as_float(spread_mean(omega[keep], shape, part.facet, uv).weights @ omega[keep])
 
 
-def _told(
+def _result(
     own: Reflections,
     shape: MirrorShape,
     R: FloatArray,

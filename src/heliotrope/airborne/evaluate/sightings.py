@@ -66,9 +66,11 @@ def to_sightings(
         Whether σ includes the error common to all points of a mirror. Leave it out if the fit
         estimates the positions, which are the larger part of it.
 
-    Returns ------- Sightings whose σ gives all sightings of an orientation together the weight of
-    σ_tot (or σ_mean), however many they are; single reflections share it as in the mean over the
-    mirror. Both ways give the same fit, and single reflections let it find its own outliers.
+    Returns
+    -------
+    Sightings whose σ gives all sightings of an orientation together the weight of σ_tot (or
+    σ_mean), however many they are; single reflections share it as in the mean over the mirror.
+    Both ways give the same fit, and single reflections let it find its own outliers.
 
     Raises
     ------

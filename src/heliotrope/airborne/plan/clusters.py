@@ -66,7 +66,9 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
     position
         ENU metres, (N, 3).
 
-    Notes ----- The Voronoi cell, without ground that is farther than 0.8 typical spacings from
+    Notes
+    -----
+    The Voronoi cell, without ground that is farther than 0.8 typical spacings from
     every heliostat; counted in squares, so accurate to a few per cent of a cell.
     """
     flat = _flat(position)

@@ -194,10 +194,10 @@ class _Ways:
             return way
         return self._found(a, b, max(whence, whither))
 
-    def _found(self, a: FloatArray, b: FloatArray, whose: int) -> FloatArray:
+    def _found(self, a: FloatArray, b: FloatArray, row: int) -> FloatArray:
         way = self.airspace.route(a, b)
         if way is None:
-            station = self.stations[whose]
+            station = self.stations[row]
             raise InputError(
                 f"{self.labels[station.cluster]}, calibration point {station.point + 1}: there is "
                 "no free route to it and back; widen the fence, raise the upper height limit or "
@@ -229,7 +229,9 @@ def fly(
     labels
         Names of the clusters, for errors.
 
-    Notes ----- Each drone gets a connected part of the tour with an equal share of the
+    Notes
+    -----
+    Each drone gets a connected part of the tour with an equal share of the
     photographs, and the size of groups, of 1 to 8 clusters, that brings it home first.
 
     Raises

@@ -34,7 +34,9 @@ def sortie_name(sortie: Sortie) -> str:
 def mission(plan: FlightPlan, sortie: Sortie, name: str) -> Mission:
     """Return a sortie in the form of waypoint files.
 
-    Notes ----- The drone looks along the axis of its station from every point. It rests for
+    Notes
+    -----
+    The drone looks along the axis of its station from every point. It rests for
     ``craft.photo`` before each photograph, and waits for mirrors that are still moving.
     """
     place, yaw, pitch, stay, photo = (list[Any]() for _ in range(5))

@@ -21,7 +21,9 @@ _SHADES = ("#7f9cc4", "#c49a6c", "#8fae7a", "#b58aa5", "#6fa3a3", "#a3a3a3", "#c
 def flight_map(plan: FlightPlan) -> "Figure":
     """Return the field from above, and the directions from which it is measured.
 
-    Notes ----- Left: heliostats in the colour of their cluster, its name, a dot for each station,
+    Notes
+    -----
+    Left: heliostats in the colour of their cluster, its name, a dot for each station,
     the routes of each drone's first sorties, homes, keep-outs and fence. Right: directions to the
     drone of all stations, azimuth around and elevation inwards.
     """

@@ -315,9 +315,9 @@ def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: 
     """Refuse patterns that leave the permitted airspace."""
     sizes = np.array([len(s.pattern) for s in stations])
     free = airspace.free(np.concatenate([s.pattern.camera for s in stations]))
-    whose = np.repeat(np.arange(len(stations)), sizes)
+    owner = np.repeat(np.arange(len(stations)), sizes)
     if not free.all():
-        station = stations[int(whose[np.argmin(free)])]
+        station = stations[int(owner[np.argmin(free)])]
         raise InputError(
             f"{labels[station.cluster]}, calibration point {station.point + 1}: its pattern of "
             f"{station.pattern.columns} by {station.pattern.rows} points, "

@@ -193,7 +193,9 @@ def face(
     current
         Present counts of the drives, to choose the nearer branch.
 
-    Notes ----- Lamp and camera are at the same point, so the law asks for the normal n ∥ p − m.
+    Notes
+    -----
+    Lamp and camera are at the same point, so the law asks for the normal n ∥ p − m.
     The vertex m moves with the pose. The direction to p is taken from the previous vertex, and its
     error shrinks by (offset / distance) in each of four rounds: at 100 m and an offset of 0.5 m,
     to less than a nanometre.
@@ -266,7 +268,9 @@ def reach(
     sampling
         Focal length and pointing error.
 
-    Returns ------- Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
+    Returns
+    -------
+    Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
     ``direction``), from ``point``, m, (2,) each. The mirrors' x axis is taken as horizontal.
     """
     away = point - vertex
