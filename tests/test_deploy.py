@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from heliotrope.errors import FormatError
 from heliotrope.lcu import messages, names, states
+from heliotrope.plant import refusals
 from heliotrope.plant.links_file import TABLES, read_links
 from heliotrope.safety import CONDITIONS, AlarmKind, Watcher, alarms
 
@@ -79,6 +80,40 @@ def test_every_alarm_of_the_table_is_raised() -> None:
     kinds = [name for name, value in vars(alarms).items() if isinstance(value, AlarmKind)]
     assert len(kinds) == len(alarms.KINDS) >= 15
     assert [name for name in kinds if f"alarms.{name}" not in source] == []
+
+
+def test_every_refusal_of_the_table_is_raised() -> None:
+    source = "".join(
+        path.read_text(encoding="utf-8")
+        for path in (ROOT / "src" / "heliotrope").rglob("*.py")
+        if path.name != "refusals.py"
+    )
+    kinds = [name for name, value in vars(refusals).items() if isinstance(value, refusals.Refusal)]
+    assert len(kinds) == len(refusals.KINDS) >= 10
+    assert [name for name in kinds if f"{name}." not in source] == []
+
+
+def test_the_page_of_alarms_is_current() -> None:
+    script = runpy.run_path(str(ROOT / "scripts" / "alarms_page.py"))
+    page = script["PAGE"].read_text(encoding="utf-8")
+    assert page == script["page"](), "run scripts/alarms_page.py to write the page anew"
+    for name in {row.name for row in CONDITIONS} | set(alarms.KINDS):
+        assert f"| `{name}` |" in page
+
+
+def test_an_alarm_says_what_is_wrong_what_happens_and_what_to_do() -> None:
+    raised = alarms.NODE_SILENT.raised("H7", worse=True, silence=10.0, last="never heard")
+    assert (raised.condition, raised.subject, raised.severity) == ("node_silent", "H7", "alarm")
+    assert raised.text == (
+        "H7: no answer for 10 s; never heard. The cluster goes on asking it. Assume that its beam "
+        "has not moved; check its supply and its cable."
+    )
+    assert alarms.NODE_SILENT.ended("H7").text == "H7: it answers again"
+    for row in CONDITIONS:
+        assert row.remedy.endswith("."), row.name
+    for kind in alarms.KINDS.values():
+        assert kind.consequence.endswith("."), kind.name
+        assert kind.remedy.endswith("."), kind.name
 
 
 @pytest.mark.parametrize(

@@ -137,7 +137,7 @@ def test_only_the_one_authority_commands(tmp_path: Path) -> None:
         with pytest.raises(RefusedError, match="Vera is viewer; it needs operator"):
             plant.take_authority(VIEWER)
         token = await bench.commanded()
-        with pytest.raises(RefusedError, match="Olga has it, kept up 0 s ago"):
+        with pytest.raises(RefusedError, match="Olga has it and renewed it 0 s ago"):
             plant.take_authority(ENGINEER)
         with pytest.raises(RefusedError, match="Olga has it, not Olga with this token"):
             plant.command(OPERATOR, token + 1, "APPROACH")
@@ -279,13 +279,13 @@ def test_a_later_command_takes_the_place_of_one_that_waits(tmp_path: Path) -> No
         assert await first.reached(Stage.DONE, timeout=2.0) is False
         assert (first.stage("P1A"), first.stage("P1B")) == (None, Stage.DONE)
         second = plant.aim(OPERATOR, token, {"P1A": (0.0, 0.0, 17.0)})
-        assert first.refusals == {"P1A": "another AIM came after it"}
+        assert first.refusals == {"P1A": "superseded by another AIM"}
         plant.command(OPERATOR, token, "LOCK_AIM", ("P1A", "P1B"), (1,))
         assert not track.finished
         assert plant.waiting == 2
         assert await plant.command(OPERATOR, token, "LOCK", ("P1A", "P1B")).end(2.0)
-        assert track.refusals == {"P1B": "LOCK came after it"}
-        assert second.refusals == {"P1A": "LOCK came after it"}
+        assert track.refusals == {"P1B": "superseded by LOCK"}
+        assert second.refusals == {"P1A": "superseded by LOCK"}
         assert plant.waiting == 0
         for bad, said in ((np.nan, "nan is not a finite number"), (2e5, "at most 100000 m")):
             with pytest.raises(InputError, match=said):

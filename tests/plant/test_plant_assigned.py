@@ -47,7 +47,7 @@ def test_what_cannot_be_kept_is_not_sent(tmp_path: Path) -> None:
             token = await bench.commanded()
             ticket = bench.plant.aim(OPERATOR, token, {"P1A": AIM})
             assert not await ticket.end(5.0)
-            assert "not sent, since it is not kept: assigned points" in ticket.text
+            assert "not sent, because it cannot be stored: assigned points" in ticket.text
             assert "No such file or directory; see to its disk" in ticket.text
             assert np.isnan(bench.plant.aims).all()
             assert not bench.cluster_of("P1A").commands("AIM")

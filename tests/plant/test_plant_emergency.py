@@ -15,7 +15,7 @@ from heliotrope.links.messages import NODE, Acknowledge, Emergency
 from heliotrope.mechanism.drives import Drive, rotary
 from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
-from heliotrope.plant.emergency import done
+from heliotrope.plant.emergency import carried_out
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import Act, adjusted, conditions
 from heliotrope.twin.wind import Wind
@@ -246,7 +246,7 @@ def test_who_comes_back_during_an_emergency_is_told(tmp_path: Path) -> None:
         assert bench.count(states.STOWED) == 15
         line.heal()
         await bench.until(lambda: bench.count(states.STOWED) == 18, 5.0)
-        with pytest.raises(InputError, match="HOLD is none"):
+        with pytest.raises(InputError, match="HOLD cannot be ordered"):
             bench.plant.raise_emergency("Olga", Act.HOLD)
         # Whoever calls it again is on record too.
         assert bench.plant.raise_emergency("Vera").act is Act.STOW
@@ -277,7 +277,7 @@ def test_defocus_of_some_is_repeated_until_it_is_acknowledged(tmp_path: Path) ->
         ticket = bench.plant.defocus("Olga", ("P4A", "P4B"))
         await bench.wait(1.5)
         bench.plant.stow("Olga", ("P4A",))
-        assert ticket.refusals == {"P4A": "STOW came after it"}
+        assert ticket.refusals == {"P4A": "superseded by STOW"}
         await bench.wait(3.5)
 
     bench = play(tmp_path, scene)
@@ -320,7 +320,7 @@ def test_done_is_judged_by_state_and_by_axes() -> None:
     def judged(act: Act, state: int, left: float, *, settled: bool = True, flags: int = 0) -> bool:
         rows = np.zeros(1, NODE)
         rows["state"], rows["primary_goal"], rows["flags"] = state, round(left / step), flags
-        return bool(done(act, rows, drives, np.array([settled]))[0])
+        return bool(carried_out(act, rows, drives, np.array([settled]))[0])
 
     for state in (states.TRACKING, states.IDLE, states.APPROACHING, states.SEARCHING):
         assert not judged(Act.DEFOCUS, state, 0.0)

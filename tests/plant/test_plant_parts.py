@@ -26,11 +26,11 @@ from heliotrope.mechanism.board_items import (
     items_of,
     packed,
 )
-from heliotrope.plant._joining import Job, JoinQueue
 from heliotrope.plant.aims import spread
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.joining import Job, JoinQueue
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat

@@ -1,1 +1,53 @@
-"""The plant controller: the one program that commands all clusters of a field."""
+"""The plant: the central controller of a field, and the operations built on it.
+
+`PlantController` ties the parts together: `Authority` (who may command), `PlantOrders` (records,
+tickets, messages), `JoinQueue` (the rate at which heliostats join the receiver), `BeamWatch` (no
+beam in a keep-out volume), `ParameterSync` (what local controllers store) and `Sentinel` (the
+safety table and emergencies). Begin with `heliotrope.plant.controller`.
+
+`operations` is what people and pages use, `visits` brings a beam to a target, and `schedule`
+chooses which heliostat is measured next. `kept_audit` needs the store's libraries and is imported
+from its module.
+"""
+
+from heliotrope.plant.aims import BeamCheck, default_aims, spread
+from heliotrope.plant.assigned import Assigned, AssignedError, AssignedFile, rest_on
+from heliotrope.plant.audit import Audit, AuditError, JsonLines, Record
+from heliotrope.plant.authority import OPERATOR_COMMANDS, Authority, Grant, Person, Role
+from heliotrope.plant.beam_watch import BeamError
+from heliotrope.plant.controller import JOINING, PlantController
+from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.field_state import FieldState, HeliostatState
+from heliotrope.plant.refusals import Refusal, RefusedError
+from heliotrope.plant.settings import PlantSettings, clusters_of
+from heliotrope.plant.tickets import Ticket
+
+__all__ = [
+    "JOINING",
+    "OPERATOR_COMMANDS",
+    "Assigned",
+    "AssignedError",
+    "AssignedFile",
+    "Audit",
+    "AuditError",
+    "Authority",
+    "BeamCheck",
+    "BeamError",
+    "EmergencyOrder",
+    "FieldState",
+    "Grant",
+    "HeliostatState",
+    "JsonLines",
+    "Person",
+    "PlantController",
+    "PlantSettings",
+    "Record",
+    "Refusal",
+    "RefusedError",
+    "Role",
+    "Ticket",
+    "clusters_of",
+    "default_aims",
+    "rest_on",
+    "spread",
+]

@@ -1,16 +1,11 @@
-"""Who may command: roles, and the one authority that holds the field.
+"""Who may command: roles, and the one command authority of the plant.
 
-One person at a time holds the command authority. With it comes a token of 32 bits, which the
-plant tells its clusters with every lease, and they their local controllers: a command with any
-other token moves nothing. Each change of holder makes a new token, so what an earlier holder
-left under way is void. An authority that is not kept up expires; another person may break it.
+One person at a time holds the command authority. With it comes a token of 32 bits, which the plant
+sends to its clusters with every lease, and they to their local controllers: a command with another
+token moves nothing. Each change of holder makes a new token, so that nothing an earlier holder left
+under way still takes effect. An authority that is not renewed expires; another person may break it.
 
 DEFOCUS and STOW need no authority, no role and no token.
-
-::
-
-    HeliotropeError
-    └── RefusedError          a command that is not accepted; nothing was sent
 """
 
 import secrets
@@ -19,12 +14,12 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 from heliotrope import safety
-from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
+from heliotrope.plant import refusals
+from heliotrope.plant.refusals import RefusedError
 
-
-class RefusedError(HeliotropeError):
-    """A command that is not accepted; nothing was sent and nothing moves."""
+__all__ = ["OPERATOR_COMMANDS", "Authority", "Grant", "Person", "RefusedError", "Role"]
 
 
 class Role(IntEnum):
@@ -35,11 +30,14 @@ class Role(IntEnum):
     ENGINEER = 2
 
     @property
-    def acknowledges_as(self) -> "safety.Role | None":
-        """The role in the safety table, where an engineer stands in for a supervisor."""
-        return {Role.OPERATOR: safety.Role.OPERATOR, Role.ENGINEER: safety.Role.SUPERVISOR}.get(
-            self
-        )
+    def title(self) -> str:
+        """The role in words."""
+        return self.name.lower()
+
+    @property
+    def acknowledges_as(self) -> safety.Role:
+        """The role in the safety table, where an engineer acts as supervisor; not for a viewer."""
+        return {Role.OPERATOR: safety.Role.OPERATOR, Role.ENGINEER: safety.Role.SUPERVISOR}[self]
 
 
 #: Commands that an operator may give; all others of the wire need an engineer.
@@ -61,14 +59,14 @@ OPERATOR_COMMANDS = frozenset(
 
 @dataclass(frozen=True)
 class Person:
-    """Who commands.
+    """A person who commands.
 
     Parameters
     ----------
     name
-        As it goes into the audit.
+        As the audit records it.
     role
-        What they may do.
+        See `Role`.
 
     Raises
     ------
@@ -81,21 +79,34 @@ class Person:
 
     def __post_init__(self) -> None:
         if not self.name.strip():
-            raise InputError("person: the name is empty; the audit needs to know who commands")
+            raise InputError("person: the name is empty; the audit must record who commands")
+
+    def must_be(self, needed: Role, what: str) -> None:
+        """Refuse ``what`` to a person whose role is too low.
+
+        Raises
+        ------
+        RefusedError
+            If it is.
+        """
+        if self.role < needed:
+            raise refusals.ROLE_TOO_LOW.error(
+                what=what, person=self.name, role=self.role.title, needed=needed.title
+            )
 
 
 @dataclass(frozen=True)
 class Grant:
-    """The authority of one holder.
+    """The command authority of one holder.
 
     Attributes
     ----------
     holder
-        Who has it.
+        The person.
     token
         1 to 2^32 - 1.
     since, kept
-        When it was taken and last kept up, monotonic s.
+        When it was taken and last renewed, monotonic s.
     """
 
     holder: Person
@@ -112,9 +123,9 @@ class Authority:
     clock
         Its monotonic time decides.
     lifetime
-        How long it lasts without being kept up, s.
+        How long it lasts without being renewed, s.
     entropy
-        Gives random bytes, for the tokens.
+        Random bytes, for the tokens.
 
     Raises
     ------
@@ -139,7 +150,7 @@ class Authority:
 
     @property
     def grant(self) -> Grant | None:
-        """Who has it now, None if nobody has."""
+        """The present holder's grant, None if nobody has the authority."""
         grant = self._grant
         if grant is not None and not self._clock.monotonic() - grant.kept < self.lifetime:
             self._grant = grant = None
@@ -147,61 +158,60 @@ class Authority:
 
     @property
     def token(self) -> int:
-        """The token that clusters are to take commands with; 0 while nobody may command."""
+        """The token that clusters accept commands with; 0 while nobody may command."""
         grant = self.grant
         return 0 if grant is None else grant.token
 
     @property
     def silent_for(self) -> float:
-        """How long ago any authority was kept up last (or the plant began), s."""
+        """Time since any authority was last renewed, or since the plant began, s."""
         return self._clock.monotonic() - self._last_kept
 
     def take(self, person: Person) -> Grant:
-        """Take the authority if nobody has it; who has it keeps it up.
+        """Take the authority if nobody has it; its holder renews it.
 
         Raises
         ------
         RefusedError
-            To a viewer; if somebody else has it.
+            For a viewer, or if another person has it.
         """
         grant = self.grant
-        self._may_hold(person)
+        person.must_be(Role.OPERATOR, "authority")
         if grant is None:
             return self._give(person)
         if grant.holder != person:
-            raise RefusedError(
-                f"authority: {grant.holder.name} has it, kept up "
-                f"{self._clock.monotonic() - grant.kept:.0f} s ago; ask for it, or break it"
-            )
+            age = self._clock.monotonic() - grant.kept
+            raise refusals.AUTHORITY_HELD.error(holder=grant.holder.name, age=age)
         return self.keep(person, grant.token)
 
     def seize(self, person: Person, reason: str) -> Grant:
-        """Break another's authority and take it; a reason is needed, for the audit.
+        """Break another person's authority and take it; the audit needs a reason.
 
         Raises
         ------
         RefusedError
-            To a viewer; if the holder has a higher role; without a reason.
+            For a viewer, without a reason, or if the holder has a higher role.
         """
         grant = self.grant
-        self._may_hold(person)
+        person.must_be(Role.OPERATOR, "authority")
         if not reason.strip():
-            raise RefusedError("authority: to break it a reason is needed; give one")
+            raise refusals.REASON_MISSING.error(what="breaking the command authority")
         if grant is not None and grant.holder.role > person.role:
-            raise RefusedError(
-                f"authority: {grant.holder.name} has it as {grant.holder.role.name.lower()}; "
-                f"{person.name} as {person.role.name.lower()} cannot break it; DEFOCUS and STOW "
-                "need no authority"
+            raise refusals.HOLDER_OUTRANKS.error(
+                holder=grant.holder.name,
+                holder_role=grant.holder.role.title,
+                person=person.name,
+                role=person.role.title,
             )
         return self._give(person)
 
     def keep(self, person: Person, token: int) -> Grant:
-        """Keep the authority up.
+        """Renew the authority.
 
         Raises
         ------
         RefusedError
-            If it is not theirs (any more).
+            If the person does not have it, or no longer has it.
         """
         grant = self._checked(person, token)
         self._last_kept = self._clock.monotonic()
@@ -214,30 +224,22 @@ class Authority:
         Raises
         ------
         RefusedError
-            If it is not theirs.
+            If the person does not have it.
         """
         self._checked(person, token)
         self._grant = None
 
     def check(self, person: Person, token: int, command: str) -> None:
-        """See that a person may give a command now; it keeps the authority up.
+        """Check that a person may give a command now, and renew the authority.
 
         Raises
         ------
         RefusedError
-            If the role is too low, or the authority is not theirs.
+            If the role is too low, or the person does not have the authority.
         """
         needed = Role.OPERATOR if command in OPERATOR_COMMANDS else Role.ENGINEER
-        if person.role < needed:
-            raise RefusedError(
-                f"{command}: {person.name} is {person.role.name.lower()}; it needs "
-                f"{needed.name.lower()}"
-            )
+        person.must_be(needed, command)
         self.keep(person, token)
-
-    def _may_hold(self, person: Person) -> None:
-        if person.role < Role.OPERATOR:
-            raise RefusedError(f"authority: {person.name} is viewer; it needs operator")
 
     def _give(self, person: Person) -> Grant:
         token = 0
@@ -251,10 +253,7 @@ class Authority:
     def _checked(self, person: Person, token: int) -> Grant:
         grant = self.grant
         if grant is None:
-            raise RefusedError(f"authority: nobody has it; {person.name} must take it first")
+            raise refusals.NO_AUTHORITY.error(person=person.name)
         if grant.holder != person or grant.token != token:
-            raise RefusedError(
-                f"authority: {grant.holder.name} has it, not {person.name} with this token; "
-                "take it anew"
-            )
+            raise refusals.OTHER_AUTHORITY.error(holder=grant.holder.name, person=person.name)
         return grant

@@ -1,4 +1,4 @@
-"""That no beam enters a keep-out volume: proven of commands before they go out, and looked at."""
+"""No beam enters a keep-out volume: commands are proven before they are sent, beams are watched."""
 
 from collections.abc import Callable, Sequence
 
@@ -11,19 +11,20 @@ from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status
 from heliotrope.plant.aims import BeamCheck
-from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
 from heliotrope.safety import Reading
 
 Rows = npt.NDArray[np.intp]
 
-#: Where beams go is looked at so often, s; who does not move, each so many times.
+#: Pause between two looks at the beams, s; a heliostat that stands still is seen every third time.
 LOOK_PERIOD, TURNS = 1.0, 3
-#: Steps between where a mirror stands and where it goes, from which on it moves.
+#: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
-#: States in which a beam is out by command; what leads to safety is never held up.
+#: States in which a beam is out by command. Motions that lead to safety are never held up.
 _BEAM_OUT = (states.IDLE, states.TRACKING, states.SEARCHING)
-#: States from which IDLE moves a mirror to its standby point straight away.
+#: States from which IDLE moves a heliostat straight to its standby point.
 _TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
 
 
@@ -33,42 +34,46 @@ class BeamError(RefusedError):
     Attributes
     ----------
     refusals
-        Why, by the names of the heliostats.
+        Reasons, by name of the heliostat.
     """
 
     def __init__(self, command: str, refusals: dict[str, str]) -> None:
         self.refusals = refusals
         first, text = next(iter(refusals.items()))
         more = f" (and {len(refusals) - 1} more)" if len(refusals) > 1 else ""
-        super().__init__(f"{command} {first}{more}: {text}")
+        super().__init__(
+            BEAM_REFUSED.text.format(what=command, heliostat=first, more=more, reason=text)
+        )
 
 
-class Ways:
-    """Says whose beams may not do what a command would make them do.
+class BeamWatch:
+    """Proves that a command brings no beam into a keep-out volume, and watches the beams.
 
-    What joins the receiver is looked at when its turn has come (see `Joiner`); the way from stow
-    is the local controller's own.
+    The watch sees what a proof cannot: counts that are not true, parameters that changed, a local
+    controller that does something else. Heliostats that move are looked at each second, the
+    others in turn. The way from stow is the local controller's own.
 
     Parameters
     ----------
-    beams, field
-        Of the plant.
-    aims, standbys
-        As assigned, ENU, m, (N, 3); NaN where none was.
+    check
+        Mirrors and keep-out volumes.
+    field
+        Where the axes stand.
+    points
+        Assigned aims and standby points.
     sun
         Gives the unit vector to the sun now, (3,).
     """
 
     def __init__(
-        self,
-        beams: BeamCheck,
-        field: FieldState,
-        aims: FloatArray,
-        standbys: FloatArray,
-        sun: Callable[[], FloatArray],
+        self, check: BeamCheck, field: FieldState, points: Points, sun: Callable[[], FloatArray]
     ) -> None:
-        self._beams, self._field = beams, field
-        self._aims, self._standbys, self._sun = aims, standbys, sun
+        self._check, self._field, self._points, self._sun = check, field, points, sun
+        self._seen: frozenset[str] = frozenset()
+        self._turn = 0
+        self._at = -np.inf
+
+    # -- proofs ----------------------------------------------------------------------------
 
     def check_points(
         self, name: str, rows: Rows, wanted: FloatArray, tracking: npt.NDArray[np.bool_]
@@ -80,34 +85,35 @@ class Ways:
         BeamError
             If one of the beams may not go there.
         """
-        start = np.where(tracking[:, None], self._aims[rows], self._standbys[rows])
+        aims, standbys = self._points.aims, self._points.standbys
+        start = np.where(tracking[:, None], aims[rows], standbys[rows])
         stopped, light = name == "AIM", self._sun()
-        wrong = self._beams.problems(rows, wanted, light, start=start, stopped=stopped)
+        wrong = self._check.problems(rows, wanted, light, start=start, stopped=stopped)
         if not stopped:
-            wrong |= self._beams.glare(rows, wanted, self._standbys, light)
+            wrong |= self._check.glare(rows, wanted, standbys, light)
         if wrong:
             raise BeamError(name, wrong)
 
     def clear(
-        self, name: str, values: Sequence[float], whom: tuple[str, ...], now: float
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...], now: float
     ) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Return who may be sent a command that moves mirrors, and why the others may not.
+        """Return the heliostats that may be sent a command, and why the others may not.
 
         Raises
         ------
         BeamError
-            If nobody may.
+            If none may.
         """
-        if not self._beams.volumes or name not in ("JOG", "GOTO", "DIAGNOSE", "IDLE"):
-            return whom, {}
-        rows = np.array([self._field.place(n) for n in whom], dtype=np.intp)
-        # Of whom nothing is known here, the local controller decides.
+        if not self._check.volumes or name not in ("JOG", "GOTO", "DIAGNOSE", "IDLE"):
+            return heliostats, {}
+        rows = np.array([self._field.place(n) for n in heliostats], dtype=np.intp)
+        # The local controller decides for a heliostat of which nothing is known here.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
         light = self._sun()
         wrong: dict[str, str] = {}
         if name == "IDLE":
             rows = rows[self._field.among(_TO_STANDBY, now)[rows]]
-            known = np.isfinite(self._standbys[rows]).all(axis=-1)
+            known = np.isfinite(self._points.standbys[rows]).all(axis=-1)
             wrong = {
                 self._field.names[row]: "its standby point is not known here; give it one "
                 "(STANDBY) first, or stow it"
@@ -116,20 +122,41 @@ class Ways:
             rows, path = self._to_standby(rows[known], light)
         else:
             path = self._by_counts(name, values, rows)
-        wrong |= self._beams.moving(rows, path, light)
-        if wrong and len(wrong) == len(whom):
+        wrong |= self._check.moving(rows, path, light)
+        if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
-        return tuple(n for n in whom if n not in wrong), wrong
+        return tuple(n for n in heliostats if n not in wrong), wrong
+
+    def joining(
+        self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
+    ) -> dict[str, str]:
+        """Return which heliostats may not join their aims now, and why."""
+        if not self._check.volumes:
+            return {}
+        rows = np.array([self._field.index[n] for n in heliostats], dtype=np.intp)
+        aims = self._points.aims[rows]
+        unknown = ~np.isfinite(aims).all(axis=-1)
+        found = {
+            heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
+            for i in np.flatnonzero(unknown)
+        }
+        if not unknown.all():
+            known = rows[~unknown]
+            counts, light = self._field.counts(known), self._sun()
+            found |= self._check.on_the_way(known, counts, aims[~unknown], light)
+            if name == "SEARCH":
+                found |= self._check.around(known, aims[~unknown], values[1], light)
+        return found
 
     def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
         counts = self._field.counts(rows)
-        found = self._beams.poses(rows, self._standbys[rows], light, counts)
+        found = self._check.poses(rows, self._points.standbys[rows], light, counts)
         path = np.stack([self._angles(rows, counts), found.chosen(found.angles)], axis=-2)
         good = found.chosen(found.status) == Status.OK
         return rows[good], path[good]
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:
-        """Return the angles that a command goes through, from where the axes stand, (K, W, 2)."""
+        """Return the angles that a command passes, from where the axes stand, (K, W, 2)."""
         begin = self._angles(rows, self._field.counts(rows))
         if name == "DIAGNOSE":
             nudges = NUDGE * np.array([(1, 0), (-1, 0), (0, 0), (0, 1), (0, -1)])
@@ -138,42 +165,32 @@ class Ways:
         if name == "JOG":
             axis, steps = int(values[0]), values[1]
             ends = self._field.goals(rows)
-            if axis < 2:  # another is refused by the local controller
+            if axis < 2:  # the local controller refuses any other axis
                 ends[:, axis] += steps
         return np.stack([begin, self._angles(rows, ends)], axis=-2)
 
     def _angles(self, rows: Rows, counts: FloatArray) -> FloatArray:
-        angles: FloatArray = Drive(self._beams.drives.table[rows]).angles(counts)
+        angles: FloatArray = Drive(self._check.drives.table[rows]).angles(counts)
         return angles
 
+    # -- the watch -------------------------------------------------------------------------
 
-class Lookout:
-    """Looks once a second where beams are and go, and says whose would enter a volume.
-
-    Commands are proven before they go out; this sees what comes of them: counts that are not where
-    they were thought, parameters that changed, a local controller that does something else. Who
-    moves is looked at each second, the others in turn.
-
-    Parameters
-    ----------
-    beams, field, sun
-        As of `Ways`.
-    """
-
-    def __init__(self, beams: BeamCheck, field: FieldState, sun: Callable[[], FloatArray]) -> None:
-        self._beams, self._field, self._sun = beams, field, sun
-        self._names: frozenset[str] = frozenset()
-        self._turn = 0
-        self._at = -np.inf
+    @property
+    def watches(self) -> bool:
+        """Whether there are keep-out volumes to watch."""
+        return bool(self._check.volumes)
 
     def readings(self, now: float) -> dict[tuple[str, str], Reading]:
-        """Return 1 for each heliostat whose beam is in a volume or goes there, 0 for the rest."""
-        if not self._beams.volumes:
+        """Return 1 for each heliostat whose beam is in a volume or heading for one, 0 for others.
+
+        The beams are looked at once a second; between two looks the last one counts.
+        """
+        if not self.watches:
             return {}
         if now - self._at >= LOOK_PERIOD:
             self._at = now
             self._look(now)
-        found = {("keep_out_predicted", name): Reading(1.0, now) for name in self._names}
+        found = {("keep_out_predicted", name): Reading(1.0, now) for name in self._seen}
         found["keep_out_predicted", ""] = Reading(0.0, now)
         return found
 
@@ -185,9 +202,8 @@ class Lookout:
         moves = (np.abs(end - begin) > _MOVES).any(axis=-1)
         chosen = moves | (out % TURNS == self._turn)
         rows = out[chosen]
-        drives = Drive(self._beams.drives.table[rows])
-        path = np.stack([drives.angles(begin[chosen]), drives.angles(end[chosen])], axis=-2)
-        wrong = self._beams.moving(rows, path, self._sun())
+        path = np.stack([self._angles(rows, begin[chosen]), self._angles(rows, end[chosen])], -2)
+        wrong = self._check.moving(rows, path, self._sun())
         looked = {field.names[row] for row in rows}
         still = {field.names[row] for row in out} - looked
-        self._names = frozenset(wrong) | (self._names & still)
+        self._seen = frozenset(wrong) | (self._seen & still)

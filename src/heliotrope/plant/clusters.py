@@ -1,14 +1,26 @@
-"""The plant's end of one cluster: what is posted to it, in what order, and what became of it."""
+"""The plant's ends of the links to its clusters: messages posted, leases, questions and answers."""
 
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, LinkClosedError, Outcome
-from heliotrope.links.messages import Message, encode
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.links.link import Link, LinkClosedError, Outcome, messages
+from heliotrope.links.messages import (
+    Answer,
+    Ask,
+    Lease,
+    Message,
+    ProtocolError,
+    decode,
+    encode,
+)
+from heliotrope.plant.settings import Counters
+
+#: A question is sent within this time or not at all, and its answer is awaited this long, s.
+QUESTION_LIFE, ANSWER_PATIENCE = 5.0, 60.0
 
 
 @dataclass(frozen=True)
@@ -19,32 +31,23 @@ class _Post:
 
 
 class ClusterEnd:
-    """One cluster, as the plant sees it.
+    """The plant's end of the link to one cluster.
 
-    Nothing that is posted waits for a connection: what cannot go out now comes back at once.
-    Urgent messages pass all others that have not begun.
+    A posted message does not wait for a connection: if it cannot be sent now, its outcome says so
+    at once. Urgent messages pass all others that have not been sent yet.
 
     Attributes
     ----------
     name, members
-        Of the cluster; its heliostats.
+        Name of the cluster; names of its heliostats.
     link
-        To it.
-    act
-        Strongest emergency act that it was told to carry out as a whole, and that still holds;
-        -1 if none.
-    greeted
-        Number of the connection that it was greeted in last.
-    asked_at
-        When it was asked for the names of its rows last, monotonic s.
+        To the cluster.
     """
 
     def __init__(self, name: str, members: tuple[str, ...], link: Link, clock: Clock) -> None:
         self.name, self.members, self.link = name, members, link
-        self.act = -1
-        self.greeted = -1
-        self.asked_at = -math.inf
         self._clock = clock
+        self._greeted = -1
         self._urgent: deque[_Post] = deque()
         self._normal: deque[_Post] = deque()
         self._news = (asyncio.Event(), asyncio.Event())
@@ -57,7 +60,7 @@ class ClusterEnd:
         *,
         urgent: bool = False,
     ) -> None:
-        """Send a message as soon as may be, within ``lifetime`` s (None: at once or never)."""
+        """Send a message as soon as possible, within ``lifetime`` s (None: at once or never)."""
         expires = None if lifetime is None else self._clock.monotonic() + lifetime
         box = self._urgent if urgent else self._normal
         box.append(_Post(encode(message), expires, told))
@@ -77,3 +80,111 @@ class ClusterEnd:
                     post.told(outcome)
             news.clear()
             await news.wait()
+
+    async def keep(
+        self, lease: Callable[[], Lease], period: float, greet: Callable[["ClusterEnd"], None]
+    ) -> None:
+        """Renew the plant's lease each ``period`` s; greet the cluster in each new connection."""
+        while True:
+            due = self._clock.monotonic() + period
+            opened = self.link.statistics.opened
+            if self.link.connected:
+                if self._greeted != opened:
+                    self._greeted = opened
+                    greet(self)
+                # A lease counts from its arrival, so an old one must not arrive at all.
+                self.post(lease(), period, urgent=True)
+            await sleep_until(self._clock, due)
+
+
+class Clusters:
+    """All clusters of a plant.
+
+    Parameters
+    ----------
+    members
+        Names of the heliostats, by name of the cluster.
+    links
+        By name of the cluster.
+    clock
+        Its monotonic time decides.
+    counters
+        Count refused messages.
+
+    Attributes
+    ----------
+    ends
+        By name of the cluster.
+    """
+
+    def __init__(
+        self,
+        members: Mapping[str, Sequence[str]],
+        links: Mapping[str, Link],
+        clock: Clock,
+        counters: Counters,
+    ) -> None:
+        self.ends = {
+            name: ClusterEnd(name, tuple(members[name]), links[name], clock) for name in members
+        }
+        self._clock, self._counters = clock, counters
+        self._home = {name: end for end in self.ends.values() for name in end.members}
+        self._numbers = 0
+        self._awaited: dict[str, tuple[float, Callable[[Answer], None]]] = {}
+
+    def __len__(self) -> int:
+        return len(self._home)
+
+    def home(self, heliostat: str) -> ClusterEnd:
+        """Return the cluster of a heliostat."""
+        return self._home[heliostat]
+
+    def parts(self, heliostats: Iterable[str]) -> list[tuple[ClusterEnd, tuple[str, ...]]]:
+        """Return heliostats by their clusters."""
+        found: dict[str, list[str]] = {}
+        for name in heliostats:
+            found.setdefault(self._home[name].name, []).append(name)
+        return [(self.ends[cluster], tuple(names)) for cluster, names in found.items()]
+
+    def connected(self, heliostats: Iterable[str]) -> list[str]:
+        """Return the heliostats whose clusters are connected."""
+        return [name for name in heliostats if self._home[name].link.connected]
+
+    async def hear(
+        self, end: ClusterEnd, take: Callable[[ClusterEnd, Message, float], None]
+    ) -> None:
+        """Hand on each message of a cluster, until its link is closed."""
+        async for data in messages(end.link):
+            now = self._clock.monotonic()
+            try:
+                take(end, decode(data), now)
+            except ProtocolError as error:
+                self._counters.refused += 1
+                self._counters.problems.append(f"cluster {end.name}: {error}")
+
+    def number(self, what: str) -> str:
+        """Return a new identity for a question or an acknowledgement."""
+        self._numbers += 1
+        return f"{what}-{self._numbers}"
+
+    def ask(
+        self, end: ClusterEnd, what: str, take: Callable[[Answer], None], heliostat: str = ""
+    ) -> None:
+        """Ask a cluster something; ``take`` is called with its answer, if one comes."""
+        now = self._clock.monotonic()
+        self._awaited = {i: a for i, a in self._awaited.items() if now - a[0] < ANSWER_PATIENCE}
+        identity = self.number(what)
+        self._awaited[identity] = now, take
+        end.post(Ask(identity, what, heliostat), QUESTION_LIFE)
+
+    def take_answer(self, answer: Answer) -> None:
+        """Hand an answer to whoever asked.
+
+        Raises
+        ------
+        ProtocolError
+            If the answer makes no sense.
+        """
+        _, take = self._awaited.pop(answer.identity, (math.nan, None))
+        if take is not None:
+            take(answer)

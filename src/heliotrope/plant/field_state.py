@@ -78,8 +78,10 @@ class FieldState:
     ----------
     names, index
         Names, N of them, and their rows.
-    clusters, cluster
-        Names of the clusters, and which one each heliostat hangs on, (N,).
+    clusters, members
+        Names of the clusters, and of their heliostats.
+    cluster
+        Row of each heliostat's cluster, (N,).
     rows
         Last known rows of dtype `NODE`, (N,): use `values`, which masks what is stale.
     heard
@@ -95,6 +97,7 @@ class FieldState:
 
     def __init__(self, clusters: Mapping[str, Sequence[str]], limit: float = STALE) -> None:
         self.clusters = tuple(clusters)
+        self.members = {name: tuple(held) for name, held in clusters.items()}
         pairs = [(name, c) for c, held in enumerate(clusters.values()) for name in held]
         self.names = tuple(name for name, _ in pairs)
         self.index = {name: row for row, name in enumerate(self.names)}

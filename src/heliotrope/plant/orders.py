@@ -1,4 +1,4 @@
-"""Accepted commands under way: their records, their messages, what came of them."""
+"""Accepted commands under way: their records, their messages, and their results."""
 
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -8,18 +8,18 @@ from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Outcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
-from heliotrope.plant._cluster_end import ClusterEnd
 from heliotrope.plant.audit import Audit, AuditError, Record
+from heliotrope.plant.clusters import ClusterEnd, Clusters
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
-#: Commands that are taken from anybody.
+#: Commands accepted from anybody.
 SAFE = ("DEFOCUS", "STOW")
-#: What is told of a message so long after it is of no use any more, s.
+#: Reports on a message are ignored this long after it was sent, once its ticket has ended, s.
 FORGOTTEN = 60.0
-#: DEFOCUS and STOW are sent again so often to those that have not acknowledged, s.
+#: Pause between repetitions of DEFOCUS and STOW to heliostats that have not acknowledged, s.
 REPEAT = 1.0
-#: What a cluster may need beyond a command's life to say that it failed, s.
+#: Time that a cluster may need beyond a command's life to report that it failed, s.
 GRACE = 3.0
 
 
@@ -34,7 +34,7 @@ class _Under:
 
 
 class PlantOrders:
-    """The desk over which every accepted command goes.
+    """Accepts commands: writes their records, sends their messages, follows their tickets.
 
     Parameters
     ----------
@@ -42,33 +42,32 @@ class PlantOrders:
         Of the plant.
     audit
         Where records are kept.
-    ends
-        Clusters by name.
+    clusters
+        Their links carry the messages.
     prefix
-        Of identities; no two runs of a plant may have the same.
+        Of identities; no two runs of a plant may have the same one.
     lifetime, patience
-        Of a command until it is acknowledged, and then until it is done, s.
+        Time allowed until a command is acknowledged, and from then until it is done, s.
 
     Attributes
     ----------
     confirmed_at
         When the audit last confirmed that it can write, monotonic s.
     problem
-        Why it does not, "" if it does.
+        Why it cannot, "" if it can.
     """
 
     def __init__(
         self,
         clock: Clock,
         audit: Audit,
-        ends: Mapping[str, ClusterEnd],
+        clusters: Clusters,
         prefix: str,
         lifetime: float,
         patience: float,
     ) -> None:
-        self._clock, self._audit, self._ends = clock, audit, ends
+        self._clock, self._audit, self._clusters = clock, audit, clusters
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
-        self._home = {name: end.name for end in ends.values() for name in end.members}
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
         self._under: dict[str, _Under] = {}
@@ -80,12 +79,12 @@ class PlantOrders:
 
     @property
     def open(self) -> tuple[Ticket, ...]:
-        """Commands that have not come to their end."""
+        """Tickets that have not ended."""
         return tuple(self._open.values())
 
     @property
     def owing(self) -> bool:
-        """Whether records wait to be written, and the audit took the last one."""
+        """Whether records wait to be written and the audit accepted the last one."""
         return bool(self._owed) and not self.problem
 
     def accept(
@@ -102,21 +101,21 @@ class PlantOrders:
         Parameters
         ----------
         record
-            Who, in which role, what.
+            The giver's name and role, and the command's name.
         values, heliostats, note
-            For the record, and the ticket.
+            For the record and the ticket.
         late
-            The record may follow: DEFOCUS and STOW wait for nothing.
+            The record may be written later: DEFOCUS and STOW wait for nothing.
 
         Raises
         ------
         AuditError
-            If the record could not be written, unless it may follow.
+            If the record could not be written, unless it may be ``late``.
         """
         self._number += 1
         who, role, what = record
         identity = f"{self._prefix}-{self._number}"
-        whom = () if len(heliostats) == len(self._home) else tuple(heliostats)
+        whom = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
         entry = Record(identity, who, role, what, self._utc(), tuple(values), whom, note)
         if late:
             self._owed.append(lambda: self._audit.begin(entry))
@@ -128,13 +127,13 @@ class PlantOrders:
         return ticket
 
     def note(self, who: str, role: str, what: str, note: str) -> None:
-        """Record what is done as soon as it is said, such as a change of the authority."""
+        """Record something that is done at once, such as a change of the command authority."""
         ticket = self.accept((who, role, what), (), (), note, late=True)
         del self._open[ticket.identity]
         self._owe_result(ticket.identity, "done")
 
     def pay(self) -> None:
-        """Write the records that are owed, in their order, as far as the audit takes them."""
+        """Write the records that are owed, in order, as far as the audit accepts them."""
         try:
             while self._owed:
                 self._owed[0]()
@@ -155,9 +154,9 @@ class PlantOrders:
         token: int,
         lifetime: float | None = None,
     ) -> None:
-        """Send a command to some of a ticket's heliostats; ``lifetime`` other than usual, in s."""
+        """Send a command to some heliostats of a ticket; ``lifetime`` in s replaces the usual."""
         life = self._lifetime if lifetime is None else lifetime
-        for end, part in self._by_cluster(heliostats):
+        for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
             whom = () if len(part) == len(end.members) else part
             message = Command(identity, name, values, whom, token, life)
@@ -166,43 +165,41 @@ class PlantOrders:
     def emergency(
         self, ticket: Ticket, act: Act, heliostats: Sequence[str], *, again: bool = False
     ) -> None:
-        """Send DEFOCUS or STOW, before all else that has not gone out.
+        """Send DEFOCUS or STOW before everything else that has not been sent.
 
-        ``again`` gives those that have not acknowledged no more time to do so.
+        A repetition (``again``) gives no more time to acknowledge.
         """
         if not again:
             self._supersede(ticket, frozenset(heliostats))
         self._sent_at[ticket.identity] = self._clock.monotonic()
-        for end, part in self._by_cluster(heliostats):
+        for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
             whom = () if len(part) == len(end.members) else part
             end.post(Emergency(identity, act.name, whom), None, self._told(identity), urgent=True)
 
+    def repeat(self, ticket: Ticket, act: Act, heliostats: Sequence[str]) -> None:
+        """Send DEFOCUS or STOW again to those heliostats whose clusters are connected."""
+        left = self._clusters.connected(heliostats)
+        if left:
+            self.emergency(ticket, act, left, again=True)
+
     def _supersede(self, ticket: Ticket, heliostats: frozenset[str]) -> None:
-        """End what is repeated to the same heliostats: an older DEFOCUS must not follow a STOW."""
+        """End older repeated orders to the same heliostats: no DEFOCUS may follow a STOW."""
         for identity in self._sent_at:
             other = self._open.get(identity)
             if other is not None and other is not ticket:
                 left = [name for name in other.unacknowledged() if name in heliostats]
-                other.advance(left, Stage.FAILED, f"{ticket.name} came after it")
+                other.advance(left, Stage.FAILED, f"superseded by {ticket.name}")
 
     def parameters(
         self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int
     ) -> None:
         """Send items of one heliostat."""
-        for end, part in self._by_cluster([heliostat]):
+        for end, part in self._clusters.parts([heliostat]):
             identity = self._begin(ticket, end, part)
             message = Parameters.of(identity, heliostat, items, token)
             ticket.expect(part, self._clock.monotonic() + message.lifetime + GRACE)
             end.post(message, message.lifetime, self._told(identity))
-
-    def _by_cluster(
-        self, heliostats: Iterable[str]
-    ) -> Iterable[tuple[ClusterEnd, tuple[str, ...]]]:
-        parts: dict[str, list[str]] = {}
-        for name in heliostats:
-            parts.setdefault(self._home[name], []).append(name)
-        return [(self._ends[cluster], tuple(part)) for cluster, part in parts.items()]
 
     def _begin(
         self, ticket: Ticket, end: ClusterEnd, part: tuple[str, ...], *, again: bool = False
@@ -218,7 +215,7 @@ class PlantOrders:
     def _told(self, identity: str) -> Callable[[Outcome], None]:
         def told(outcome: Outcome) -> None:
             under = self._under.get(identity)
-            # An emergency is sent again until it is acknowledged.
+            # DEFOCUS and STOW are repeated until they are acknowledged.
             if under is None or outcome is Outcome.SENT or under.ticket.name in SAFE:
                 return
             text = f"cluster {under.cluster}: {outcome.value}"
@@ -229,19 +226,19 @@ class PlantOrders:
     # What comes back.
 
     def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
-        """Take a stage; return its ticket and heliostats, None if it is of nothing known here."""
+        """Take a cluster's report; return its ticket and heliostats, None if neither is known."""
         under = self._under.get(progress.identity)
         if under is None or under.cluster != cluster:
             return None
         mine = set(under.heliostats)
         part = tuple(name for name in progress.heliostats if name in mine)
-        # Without a heliostat it is about all of them.
+        # A report without heliostats is about all of them.
         part = part if progress.heliostats else under.heliostats
         under.ticket.advance(part, progress.stage, progress.text)
         return under.ticket, part
 
     def beat(self, now: float) -> None:
-        """End what was not answered in time, and note the results of what has ended."""
+        """End what was not answered in time; record the results of tickets that have ended."""
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
@@ -260,19 +257,17 @@ class PlantOrders:
             }
 
     def _repeat(self, now: float) -> None:
-        """Send DEFOCUS and STOW again to those that have not acknowledged them."""
+        """Send DEFOCUS and STOW again to heliostats that have not acknowledged them."""
         for identity, at in list(self._sent_at.items()):
             ticket = self._open.get(identity)
             if ticket is None:
                 del self._sent_at[identity]
             elif now - at >= REPEAT:
-                left = [
-                    n for n in ticket.unacknowledged() if self._ends[self._home[n]].link.connected
-                ]
-                self.emergency(ticket, Act[ticket.name], left, again=True)
+                self._sent_at[identity] = now
+                self.repeat(ticket, Act[ticket.name], ticket.unacknowledged())
 
     def end(self, now: float) -> None:
-        """Record how far everything has come, at the end of the plant."""
+        """Record the state of every open ticket, at the end of the plant."""
         self.beat(now)
         for identity, ticket in self._open.items():
             self._owe_result(identity, f"{ticket.text}; then the plant was closed")
@@ -288,12 +283,12 @@ class PlantOrders:
 
 
 def whole(values: Sequence[float], codes: str, command: str) -> tuple[float, ...]:
-    """Return a command's numbers if they fit the wire's codes.
+    """Return a command's numbers as the wire carries them.
 
     Raises
     ------
     InputError
-        Another number of them, or one out of range.
+        Too many or too few numbers, or one out of range.
     """
     if len(values) != len(codes):
         raise InputError(f"{command}: {len(values)} numbers given; the wire takes {len(codes)}")

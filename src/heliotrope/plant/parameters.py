@@ -1,15 +1,19 @@
-"""What local controllers hold is kept as it is wanted: compared at connect, then pushed."""
+"""Parameters of local controllers, kept as they are wanted: compared at connection, then pushed."""
 
+import asyncio
 import math
 from collections.abc import Callable, Mapping
 
 from heliotrope.lcu import states
 from heliotrope.links.messages import Answer, ProtocolError
 from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, Wanted, checksums
+from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
+from heliotrope.plant.clusters import Clusters
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
+from heliotrope.safety import Alarm, alarms
 
 #: States in which a controller takes items of its calibration, and items of its machine.
 TAKES_CALIBRATION = (
@@ -21,23 +25,23 @@ TAKES_CALIBRATION = (
     states.DEFOCUSED,
 )
 TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
-#: Before what failed is tried again, s.
+#: Pause before another attempt, s.
 AGAIN = 30.0
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
-    """Return the items of an answer to ``stored``; empty if it could not be answered.
+    """Return the items in an answer to ``stored``; none if the cluster could not tell them.
 
     Raises
     ------
     ProtocolError
-        If names, sizes and block don't fit together.
+        Names, sizes and block that do not fit together.
     """
     names, sizes = answer.data.get("names"), answer.data.get("sizes")
     if "error" in answer.data:
         return {}
     if not (isinstance(names, list) and isinstance(sizes, list)) or len(names) != len(sizes):
-        raise ProtocolError(f"answer {answer.identity}: it tells no names and sizes of items")
+        raise ProtocolError(f"answer {answer.identity}: it lacks the names and sizes of items")
     if not all(isinstance(size, int) for size in sizes) or sum(sizes) != len(answer.block):
         raise ProtocolError(f"answer {answer.identity}: names, sizes and block do not fit together")
     found, place = {}, 0
@@ -47,54 +51,71 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
     return found
 
 
-class Pusher:
-    """Compares and pushes, a heliostat at a time.
+class ParameterSync:
+    """Compares what local controllers store with what is wanted, and pushes what differs.
 
     Parameters
     ----------
-    field, wanted, orders
+    field, wanted, orders, clusters
         Of the plant.
-    ask
-        Asks a cluster what a heliostat has stored; returns the question's identity.
+    tell
+        Called with each alarm.
     """
 
     def __init__(
-        self, field: FieldState, wanted: Wanted, orders: PlantOrders, ask: Callable[[str], str]
+        self,
+        field: FieldState,
+        wanted: Wanted,
+        orders: PlantOrders,
+        clusters: Clusters,
+        tell: Callable[[Alarm], None],
     ) -> None:
-        self._field, self._wanted, self._orders, self._ask = field, wanted, orders, ask
-        self._due = dict.fromkeys(wanted.items, -math.inf)  # who is to be compared, and when
-        self._asked: dict[str, str] = {}
+        self._field, self._wanted, self._orders = field, wanted, orders
+        self._clusters, self._tell = clusters, tell
+        #: Heliostats to be compared, and when, monotonic s.
+        self._due = dict.fromkeys(wanted.items, -math.inf)
         self._tickets: dict[str, Ticket] = {}
         self._tried: dict[str, float] = {}
 
     def compare(self, heliostat: str) -> None:
-        """Compare a heliostat as soon as may be."""
+        """Compare a heliostat as soon as possible."""
         if heliostat in self._wanted.items:
             self._due[heliostat] = -math.inf
 
-    def follow(self, heliostat: str, ticket: Ticket) -> None:
-        """Compare a heliostat when a push to it has come to its end."""
+    def push(self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int) -> None:
+        """Send items of an accepted ticket; compare the heliostat when the ticket has ended."""
+        self._orders.parameters(ticket, heliostat, items, token)
         self._tickets[heliostat] = ticket
 
-    def take(self, answer: Answer) -> tuple[str, tuple[str, ...]] | None:
-        """Take an answer; return the heliostat and what differs, None if it is of no question here.
+    async def stored(self, heliostat: str, timeout: float) -> dict[str, int]:
+        """Return the checksums of the items that a local controller stores, by item.
 
         Raises
         ------
-        ProtocolError
-            If it makes no sense.
+        RefusedError
+            If no answer comes within ``timeout`` s, or nothing is stored.
         """
-        heliostat = self._asked.pop(answer.identity, None)
-        if heliostat is None:
-            return None
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+
+        def take(answer: Answer) -> None:
+            if not future.done():
+                future.set_result(answer)
+
+        self._clusters.ask(self._clusters.home(heliostat), "stored", take, heliostat)
+        try:
+            async with asyncio.timeout(timeout):
+                answer = await future
+        except TimeoutError:
+            late = f"nothing within {timeout:g} s; check that it is live"
+            raise refusals.NOT_TOLD.error(heliostat=heliostat, problem=late) from None
         items = stored_items(answer)
         if not items:
-            return None
-        self._due.pop(heliostat, None)
-        return heliostat, self._wanted.compare(heliostat, checksums(items))
+            problem = answer.data.get("error", "nothing is stored")
+            raise refusals.NOT_TOLD.error(heliostat=heliostat, problem=problem)
+        return checksums(items)
 
     def beat(self, now: float, token: int, allowed: bool) -> None:
-        """Ask and push what is due."""
+        """Ask and push what is due; nothing is pushed unless ``allowed``."""
         for name, ticket in list(self._tickets.items()):
             if ticket.finished:
                 del self._tickets[name]
@@ -103,11 +124,23 @@ class Pusher:
         for name, due in self._due.items():
             if now >= due and live[self._field.index[name]]:
                 self._due[name] = now + AGAIN
-                self._asked[self._ask(name)] = name
+                self._ask(name)
         if token and allowed:
             for name, missing in list(self._wanted.missing.items()):
                 if live[self._field.index[name]] and name not in self._tickets:
                     self._push(name, missing, token, now)
+
+    def _ask(self, name: str) -> None:
+        def take(answer: Answer) -> None:
+            items = stored_items(answer)
+            if not items:
+                return
+            self._due.pop(name, None)
+            differing = self._wanted.compare(name, checksums(items))
+            if differing:
+                self._tell(alarms.PARAMETERS_DIFFER.raised(name, items=", ".join(differing)))
+
+        self._clusters.ask(self._clusters.home(name), "stored", take, name)
 
     def _push(self, name: str, missing: tuple[str, ...], token: int, now: float) -> None:
         state = int(self._field.rows["state"][self._field.index[name]])
@@ -119,12 +152,11 @@ class Pusher:
         if not able or now - self._tried.get(name, -math.inf) < AGAIN:
             return
         self._tried[name] = now
-        items: Mapping[str, bytes] = {item: self._wanted.items[name][item] for item in able}
+        items = {item: self._wanted.items[name][item] for item in able}
         try:
             ticket = self._orders.accept(
                 ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able)
             )
         except AuditError:
-            return  # nothing is sent without its record; the safety table tells of the disk
-        self._orders.parameters(ticket, name, items, token)
-        self.follow(name, ticket)
+            return  # nothing is sent without its record; the safety table reports the disk
+        self.push(ticket, name, items, token)

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from heliotrope.plant._watch import OWN_READINGS
+from heliotrope.plant.emergency import OWN_READINGS
 from heliotrope.safety import CONDITIONS, Watcher, watched_by
 
 #: Readings that have to come from outside.

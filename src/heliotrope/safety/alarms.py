@@ -252,7 +252,8 @@ STATE_UNWRITABLE = AlarmKind(
     Severity.ALARM,
     "The cluster cannot store its epoch.",
     "the cluster's epoch cannot be stored: {problem}",
-    "The cluster goes on; local controllers may reject signed messages after its next start.",
+    "The cluster goes on; after a restart without a known time, local controllers may refuse its "
+    "commands.",
     "Check the cluster's disk.",
     over="the cluster's epoch is stored again",
 )

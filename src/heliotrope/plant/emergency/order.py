@@ -1,8 +1,8 @@
-"""An emergency order: to whom it went, and the proof that it was carried out.
+"""An emergency order to the whole field, and the proof that it was carried out.
 
-Acknowledged is what a local controller has acknowledged, or what its state shows that was heard
-after the order. Done is judged by the state *and* by where the axes stand: off the beam means
-within `NEAR` of the goals of the defocus, whatever the state is called.
+A heliostat has acknowledged the order when its local controller says so, or when a state heard
+after the order shows it. A heliostat is done by its state *and* by its axes: its beam is off the
+receiver when the axes are within `NEAR` of the goals of the defocus, whatever the state is called.
 """
 
 from typing import Any
@@ -17,11 +17,11 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act, Proof, ProofReport
 
-#: A mirror this close (rad) to the goal of its defocus is off the receiver.
+#: An axis this close to the goal of its defocus (rad) has taken the beam off the receiver.
 NEAR = 5e-3
-#: A mirror that goes to stow has left the receiver so long (s) after the order.
+#: A heliostat on its way to stow has left the receiver this long (s) after the order.
 LEAVING = 5.0
-#: In these states a beam is on its way to, or on, the receiver or the standby point.
+#: States in which a beam is on the receiver or the standby point, or on its way there.
 ON_BEAM = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
 _AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
@@ -36,7 +36,7 @@ class EmergencyOrder:
     act
         `Act.DEFOCUS` or `Act.STOW`.
     who, reason
-        Who gave it and why.
+        The person or part of the plant that gave it, and why.
     at
         Monotonic s.
     ticket
@@ -46,24 +46,24 @@ class EmergencyOrder:
     def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
         self._proof = Proof.of(act.name, ticket.heliostats, at)
-        # A proof is a value: reports of a whole field are put into it together.
+        # A proof is a value, so reports of a whole field are added to it together.
         self._told: dict[str, float] = {}
         self._ready: dict[str, float] = {}
 
     @property
     def proof(self) -> Proof:
-        """What is proven; see `safety.Proof`."""
+        """Its proof so far."""
         if self._told or self._ready:
             self._proof = self._proof.with_news(acknowledged=self._told, done=self._ready)
             self._told, self._ready = {}, {}
         return self._proof
 
     def take_flux(self, share: float, at: float) -> None:
-        """Take the flux on the receiver, as a share of the nominal."""
+        """Take a flux reading, as a share of the nominal."""
         self._proof = self.proof.with_flux(share, at)
 
     def is_acknowledged(self, heliostat: str) -> bool:
-        """Whether a heliostat has acknowledged it."""
+        """Whether a heliostat has acknowledged the order."""
         return (
             heliostat in self._told
             or heliostat in self._ready
@@ -71,19 +71,19 @@ class EmergencyOrder:
         )
 
     def is_done(self, heliostat: str) -> bool:
-        """Whether a heliostat has carried it out."""
+        """Whether a heliostat has carried out the order."""
         return heliostat in self._ready or heliostat in self._proof.done
 
     def report(self, now: float) -> ProofReport:
-        """Return how far it has come."""
+        """Return how far the order has been carried out."""
         return self.proof.report(now)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return which of some heliostats have not acknowledged it."""
+        """Return those of some heliostats that have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:
-        """Take a cluster's progress."""
+        """Take a cluster's report on the order."""
         if stage is Stage.ACKNOWLEDGED:
             for name in heliostats:
                 self._told.setdefault(name, now)
@@ -99,30 +99,30 @@ class EmergencyOrder:
         drives: Drive,
         now: float,
     ) -> None:
-        """Take what is heard of heliostats (K,): rows of `NODE`, when they were true, drives."""
+        """Take the state of heliostats (K,): rows of `NODE`, when they were true, and drives."""
         fresh = heard >= self.at
-        fulfilled = fresh & done(self.act, rows, drives, heard >= self.at + LEAVING)
+        fulfilled = fresh & carried_out(self.act, rows, drives, heard >= self.at + LEAVING)
         ready = tuple(names[i] for i in np.flatnonzero(fulfilled))
         if ready:
             self.take_stage(ready, Stage.DONE, now)
             self.ticket.advance(ready, Stage.DONE)
 
 
-def done(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
-    """Return which rows (K,) of `NODE` show that DEFOCUS or STOW is carried out.
+def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask:
+    """Return which rows (K,) of `NODE` show that DEFOCUS or STOW has been carried out.
 
     Parameters
     ----------
     act
-        Which.
+        DEFOCUS or STOW.
     rows
-        As a cluster reports them.
+        As the clusters report them.
     drives
         Of these heliostats, (K, 2).
     settled
-        Whether a mirror on its way to stow has had the time to leave the receiver, (K,).
+        Whether a heliostat on its way to stow has had the time to leave the receiver, (K,).
     """
-    # A mirror that stands at stow and is IDLE has not obeyed: it may go on to track.
+    # A heliostat that stands at stow and is IDLE has not obeyed: it may go on to track.
     off = ~np.isin(rows["state"], ON_BEAM)
     stowed = off & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
     if act is Act.STOW:
@@ -130,6 +130,6 @@ def done(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) -> Mask
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
     goals = np.stack([rows["primary_goal"], rows["secondary_goal"]], axis=-1).astype(np.float64)
     left = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
-    # On the way to stow the goal is far away, but the beam has left all the same.
+    # On the way to stow the goal is far away, although the beam has left.
     leaving = rows["state"] == states.STOWING
     return np.asarray(stowed | (off & np.where(leaving, settled, left < NEAR)))

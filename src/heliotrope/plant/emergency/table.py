@@ -1,13 +1,22 @@
 """The plant's part of the safety table: readings in, demands and alarms out."""
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from heliotrope.errors import InputError
+import numpy as np
+
+from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray
+from heliotrope.plant.authority import Authority
+from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.orders import PlantOrders
 from heliotrope.safety import (
     Act,
     Action,
     Alarm,
     Condition,
+    Proof,
     Reading,
     Role,
     Scope,
@@ -15,11 +24,12 @@ from heliotrope.safety import (
     acknowledge,
     evaluate,
     narrowed,
+    proof_readings,
     start,
     watched_by,
 )
 
-#: Readings that the plant makes itself; all others must be fed by somebody.
+#: Readings that the plant makes itself; all others must come from sensors.
 OWN_READINGS = frozenset(
     {
         "emergency_order",
@@ -32,33 +42,97 @@ OWN_READINGS = frozenset(
         "node_fault_share",
     }
 )
-#: Rows that follow from an emergency, and alone keep none going.
+#: Rows that follow from an emergency; alone they keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
+#: Pause between two computations of the sun's elevation, s.
+SUN_PERIOD = 5.0
 
 
-class PlantWatch:
-    """Evaluates the rows of the table that the plant watches.
+class PlantReadings:
+    """The readings that the plant makes itself.
 
     Parameters
     ----------
-    table
-        All rows, as `safety.conditions` gives them and the plant adjusted them.
+    field, authority, orders, beams
+        Of the plant.
+    sun
+        Gives the unit vector to the sun now, (3,).
+
+    Attributes
+    ----------
+    names
+        Of the readings.
+    """
+
+    def __init__(
+        self,
+        field: FieldState,
+        authority: Authority,
+        orders: PlantOrders,
+        beams: BeamWatch,
+        sun: Callable[[], FloatArray],
+    ) -> None:
+        self._field, self._authority, self._orders = field, authority, orders
+        self._beams, self._sun = beams, sun
+        self._sun_at = -math.inf
+        self._elevation = -0.5 * np.pi
+        self.names = OWN_READINGS | ({"keep_out_predicted"} if beams.watches else set())
+
+    def take(
+        self, proof: Proof | None, *, called: bool, now: float
+    ) -> dict[tuple[str, str], Reading]:
+        """Return the readings now.
+
+        Parameters
+        ----------
+        proof
+            Of the emergency order that holds, None if there is none.
+        called
+            Whether a person has ordered an emergency and not withdrawn it.
+        now
+            Monotonic s.
+        """
+        if now - self._sun_at >= SUN_PERIOD:
+            self._sun_at = now
+            self._elevation = math.asin(float(self._sun()[2]))
+        found = {
+            **proof_readings(proof, now),
+            ("emergency_order", ""): Reading(float(called), now),
+            ("authority_silence", ""): Reading(self._authority.silent_for, now),
+            ("audit_silence", ""): Reading(now - self._orders.confirmed_at, now),
+            ("sun_elevation", ""): Reading(self._elevation, now),
+            ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
+            **self._beams.readings(now),
+        }
+        for name, at in self._field.status_at.items():
+            if math.isfinite(at):
+                found["cluster_silence", name] = Reading(0.0, at)
+        return found
+
+
+class TableWatch:
+    """Evaluates the rows of the safety table that the plant watches.
+
+    Parameters
+    ----------
+    rows
+        The table as `safety.conditions` gives it and the plant adjusted it.
     clusters
         Names.
+    own
+        Names of the readings that the plant makes itself.
     sensors
-        Readings that are fed from outside by `put`.
+        Names of the readings that come from sensors, by `put`.
     now
         Monotonic s.
-    looks
-        Whether beams are looked at, because there are volumes that they must keep out of.
 
     Attributes
     ----------
     rows
         Names of the rows that are evaluated.
     unwatched
-        Rows whose readings nobody gives: they are not evaluated, and whoever runs the plant must
-        know it.
+        Names of the rows without a reading: they are not evaluated, and whoever runs the plant
+        must know them.
     actions
         Of the last evaluation, the strongest first.
 
@@ -70,25 +144,22 @@ class PlantWatch:
 
     def __init__(
         self,
-        table: Iterable[Condition],
+        rows: Iterable[Condition],
         clusters: Sequence[str],
+        own: frozenset[str],
         sensors: Iterable[str],
         now: float,
-        *,
-        looks: bool = False,
     ) -> None:
-        rows = watched_by(table, Watcher.PLANT)
-        fed = frozenset(sensors)
-        known = {row.reading for row in rows} - OWN_READINGS
-        for name in sorted(fed - known):
+        table = watched_by(rows, Watcher.PLANT)
+        self._sensors = frozenset(sensors)
+        known = {row.reading for row in table} - OWN_READINGS
+        for name in sorted(self._sensors - known):
             raise InputError(
-                f"sensor {name}: no row of the safety table that the plant watches needs it from "
-                f"outside; known: {', '.join(sorted(known))}"
+                f"sensor {name}: no row of the safety table that the plant watches takes it from a "
+                f"sensor; known: {', '.join(sorted(known))}"
             )
-        self.sensors = fed
-        own = OWN_READINGS | ({"keep_out_predicted"} if looks else set())
-        able = tuple(row for row in rows if row.reading in fed | own)
-        self.unwatched = tuple(row.name for row in rows if row not in able)
+        able = tuple(row for row in table if row.reading in self._sensors | own)
+        self.unwatched = tuple(row.name for row in table if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
         self._single = tuple(row for row in able if row.scope is Scope.HELIOSTAT)
@@ -98,15 +169,23 @@ class PlantWatch:
         self._told: dict[tuple[str, str], Alarm] = {}
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
-        """Take a reading, taken at ``at`` (monotonic s)."""
+        """Take a reading of a sensor, made at ``at`` (monotonic s).
+
+        Raises
+        ------
+        UnknownNameError
+            If there is no such sensor.
+        """
+        if name not in self._sensors:
+            raise UnknownNameError("sensor of the plant", name, self._sensors)
         self._readings[name, subject] = Reading(value, at)
 
     def evaluate(self, own: Mapping[tuple[str, str], Reading], now: float) -> list[Alarm]:
-        """Look at all rows; return what is to be told since the last time."""
+        """Evaluate all rows; return the alarms raised and ended since the last time."""
         readings = {**self._readings, **own}
         for row in self._single:
-            whom = [subject for reading, subject in readings if reading == row.reading and subject]
-            self._state = narrowed(self._state, row.name, whom)
+            subjects = [name for reading, name in readings if reading == row.reading and name]
+            self._state = narrowed(self._state, row.name, subjects)
         self._state, self.actions = evaluate(readings, self._state, now)
         found: dict[tuple[str, str], Alarm] = {}
         news = []
@@ -123,7 +202,7 @@ class PlantWatch:
         return news
 
     def acknowledge(self, condition: str, who: str, role: Role, subject: str) -> str:
-        """Acknowledge a row; return why not, "" if it was."""
+        """Acknowledge a row; return why it is refused, "" if it is not."""
         self._state, refusal = acknowledge(self._state, condition, who, role, subject)
         if not refusal:
             key = (condition, subject)
@@ -131,13 +210,13 @@ class PlantWatch:
         return refusal
 
     def demanded(self, cluster: str = "") -> Act | None:
-        """Return the strongest act for the field, or for one cluster beside that."""
+        """Return the strongest act demanded of the field, or of one cluster alone."""
         scope = Scope.CLUSTER if cluster else Scope.FIELD
         acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
         return max(acts, default=None)
 
     def held(self) -> dict[str, str]:
-        """Return heliostats that are to be held from now on, and why."""
+        """Return the heliostats to be held from now on, and why."""
         return {
             a.subject: a.text
             for a in self.actions
@@ -145,14 +224,14 @@ class PlantWatch:
         }
 
     def caused(self) -> bool:
-        """Whether anything but the consequences of an emergency demands one for the field."""
+        """Whether more than the consequences of an emergency demands one for the field."""
         return any(
             a.scope is Scope.FIELD and a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES
             for a in self.actions
         )
 
     def reasons(self, least: Act, cluster: str = "") -> str:
-        """Return what demands at least an act for the field or a cluster, in words; "" if none."""
+        """Return what demands at least an act of the field or a cluster, in words; "" if none."""
         texts = [
             a.text
             for a in self.actions

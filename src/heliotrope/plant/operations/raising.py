@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.lcu import states
-from heliotrope.plant._beam_watch import BeamError
 from heliotrope.plant.authority import Person
+from heliotrope.plant.beam_watch import BeamError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.tickets import Ticket

@@ -2,10 +2,8 @@
 
 from collections.abc import Sequence
 
-from heliotrope.lcu import messages
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.orders import whole
 from heliotrope.plant.tickets import Ticket
 
 
@@ -46,7 +44,4 @@ def zero(
             f"ZERO: {len(heliostats) or 'all'} heliostats; the counts of one are not those of "
             "another, give one heliostat"
         )
-    numbers = whole(values, messages.ROW_OF[messages.NUMBER_OF["ZERO"]][3], "ZERO")
-    ticket = plant._accept(person, token, "ZERO", numbers, heliostats)  # noqa: SLF001 - a part of the plant
-    plant._orders.command(ticket, "ZERO", numbers, heliostats, token)  # noqa: SLF001 - as above
-    return ticket
+    return plant.zero(person, token, heliostats[0], values)

@@ -1,0 +1,19 @@
+"""Emergencies: the plant's rows of the safety table, the order that they demand, and its proof.
+
+`Sentinel` obeys the table and repeats and proves orders; all that begins or ends an emergency
+stands in its file. `TableWatch` evaluates the rows, and `EmergencyOrder` is one order to the whole
+field with its proof.
+"""
+
+from heliotrope.plant.emergency.order import EmergencyOrder, carried_out
+from heliotrope.plant.emergency.sentinel import Sentinel
+from heliotrope.plant.emergency.table import OWN_READINGS, PlantReadings, TableWatch
+
+__all__ = [
+    "OWN_READINGS",
+    "EmergencyOrder",
+    "PlantReadings",
+    "Sentinel",
+    "TableWatch",
+    "carried_out",
+]

@@ -1,0 +1,118 @@
+"""Every kind of refusal of the plant, as data: when, text and remedy.
+
+`docs/reference/alarms.md` lists them. The places that refuse fill in the text:
+``ROLE_TOO_LOW.error(what="TRACK", ...)``.
+
+::
+
+    HeliotropeError
+    └── RefusedError          a command that is not accepted; nothing was sent
+"""
+
+from dataclasses import dataclass
+
+from heliotrope.errors import HeliotropeError
+
+
+class RefusedError(HeliotropeError):
+    """A command that is not accepted; nothing was sent and nothing moves."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A kind of refusal.
+
+    Attributes
+    ----------
+    name
+        Unique.
+    meaning
+        When a command is refused so.
+    text
+        What people read, with fields to be filled in.
+    remedy
+        What to do: a sentence.
+    """
+
+    name: str
+    meaning: str
+    text: str
+    remedy: str
+
+    def error(self, **fields: object) -> RefusedError:
+        """Return the error to be raised; ``fields`` complete its text."""
+        return RefusedError(self.text.format(**fields))
+
+
+ROLE_TOO_LOW = Refusal(
+    "role too low",
+    "The person's role does not allow it.",
+    "{what}: {person} is {role}; it needs {needed}",
+    "Ask a person with that role. DEFOCUS, STOW and EMERGENCY need none.",
+)
+NO_AUTHORITY = Refusal(
+    "no command authority",
+    "Nobody has the command authority, or it has expired.",
+    "authority: nobody has it; {person} must take it first",
+    "Take command, then give the command again.",
+)
+OTHER_AUTHORITY = Refusal(
+    "another's command authority",
+    "Another person has the command authority, or the token is of an earlier grant.",
+    "authority: {holder} has it, not {person} with this token; take it anew",
+    "Ask the holder to give it back, or break it with a reason.",
+)
+AUTHORITY_HELD = Refusal(
+    "command authority held",
+    "A person takes the command authority while another holds it.",
+    "authority: {holder} has it and renewed it {age:.0f} s ago; ask for it, or break it",
+    "Ask the holder to give it back, or break it with a reason.",
+)
+HOLDER_OUTRANKS = Refusal(
+    "holder's role higher",
+    "A person breaks the command authority of a holder with a higher role.",
+    "authority: {holder} has it as {holder_role}; {person} as {role} cannot break it; "
+    "DEFOCUS and STOW need no authority",
+    "Ask the holder. DEFOCUS, STOW and EMERGENCY remain open to everybody.",
+)
+REASON_MISSING = Refusal(
+    "reason missing",
+    "Something that the audit must explain is done without a reason.",
+    "{what}: a reason is needed; give one",
+    "Give a reason.",
+)
+NOT_NOW = Refusal(
+    "not accepted now",
+    "An emergency holds, or a row of the safety table refuses new motions.",
+    "{what}: not accepted now: {reason}",
+    "Look up the alarm that the text names. LOCK, DEFOCUS and STOW are still accepted.",
+)
+NOT_RECORDED = Refusal(
+    "not recorded",
+    "The audit cannot write the record of the command.",
+    "{what}: not accepted, because it cannot be recorded: {problem}",
+    "Check the disk or the database. DEFOCUS and STOW are sent all the same.",
+)
+BEAM_REFUSED = Refusal(
+    "beam",
+    "A beam would enter a keep-out volume, burn an eye, or cannot reach the point.",
+    "{what} {heliostat}{more}: {reason}",
+    "Choose another point, or leave out the heliostat that the text names.",
+)
+NOT_ACKNOWLEDGED = Refusal(
+    "not acknowledged",
+    "The row is not tripped, its cause has not gone, or it needs another role.",
+    "{reason}",
+    "Remove the cause that the text names, then acknowledge again.",
+)
+NOT_TOLD = Refusal(
+    "no answer",
+    "A local controller does not tell what it stores.",
+    "{heliostat}: no answer to what it stores: {problem}",
+    "Check that the heliostat is live, and ask again.",
+)
+
+#: All of them, in the order of the reference.
+KINDS: tuple[Refusal, ...] = tuple(
+    kind for kind in tuple(globals().values()) if isinstance(kind, Refusal)
+)
