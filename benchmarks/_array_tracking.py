@@ -1,6 +1,6 @@
 """The peers of the tracking benchmark: the same method in whole-array NumPy.
 
-Written as well as that can be: components first, so that every operation runs over
+Written as fast as NumPy allows: components first, so that every operation runs over
 contiguous memory (vectors last take two to four times as long), blocks of rows that stay
 in the processor's cache, and no trigonometry inside the iteration but what SciPy's
 Rotation needs.
@@ -78,7 +78,7 @@ def _block(g: Array, sun: Array, aim: Array, turn: Turn, tolerance: float) -> tu
 def track_arrays(
     table: Array, sun: Array, aim: Array, turn: Turn, tolerance: float
 ) -> tuple[Array, int]:
-    """Track armatures in whole arrays, each block in step until its last row is there.
+    """Track armatures in whole arrays, each block in step until its last row has converged.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def track_arrays(
     sun, aim
         Unit vector to the sun and aim point in metres, (3,).
     turn
-        :func:`by_formula` or :func:`by_rotation`.
+        `by_formula` or `by_rotation`.
     tolerance
         Largest miss of the beam, m.
 
@@ -98,7 +98,7 @@ def track_arrays(
     Raises
     ------
     BenchmarkError
-        If a row does not get there.
+        If a row does not converge.
     """
     angles, most = np.empty((len(table), 2)), 0
     for first in range(0, len(table), BLOCK):

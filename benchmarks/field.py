@@ -30,13 +30,13 @@ def _plant(size: int) -> Plant:
 
 
 def _contenders(plant: Plant, table: Table, folder: Path) -> dict[str, Call]:
-    """Write the plant, see that it comes back, and return what is to be timed."""
+    """Write the plant, check that it reads back, and return the functions to time."""
     path = folder / "plant.toml"
     write_plant(plant, path, table)
     read = partial(READERS[table], path.with_suffix(f".{table}"))
     frame = read()
     if len(frame) != len(plant) or not np.array_equal(read_plant(path).position, plant.position):
-        raise BenchmarkError(f"{table}: what is read is not what was written")
+        raise BenchmarkError(f"{table}: the plant read differs from the one written")
     save = frame.to_csv if table == "csv" else frame.to_parquet
     return {
         "pandas writes": partial(save, folder / f"bare.{table}", index=False),

@@ -1,4 +1,4 @@
-"""How long a person waits for the command line, beside an empty Python."""
+"""Start-up time of the command line, beside an empty Python."""
 
 import subprocess
 import sys
@@ -16,7 +16,7 @@ def command() -> Path:
     Raises
     ------
     BenchmarkError
-        If it is not there.
+        If it is not installed.
     """
     path = Path(sys.executable).with_name("heliotrope")
     if not path.is_file():

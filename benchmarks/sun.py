@@ -1,4 +1,4 @@
-"""Positions of the sun beside pvlib's own front end, which computes the same."""
+"""Positions of the sun, beside pvlib's own front end for the same algorithm."""
 
 from typing import Any
 

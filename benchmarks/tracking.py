@@ -81,7 +81,7 @@ def _on_threads(count: int, call: Call) -> Call:
 
 
 def _contenders(mechanism: Mechanism) -> tuple[list[Contender], float]:
-    """Return the contenders, and by how much their angles differ, rad."""
+    """Return the contenders, and the largest difference of their angles, rad."""
     table = mechanism.armature.table
     found = []
     for branches in (1, 2):

@@ -1,9 +1,9 @@
 """Redraws figures 3.5 and 4.6 to 4.9 of Malan's thesis: ``python malan_figures.py FOLDER``.
 
-Figures 4.6 to 4.9 show where the beam of a heliostat goes on the plane of the aim over a day
-if one thing is wrong by one unit: the pedestal leans, an encoder's zero is off, the axes are
-not perpendicular, the survey is wrong. Places, dates and sizes that the thesis' text does not
-give are ours.
+Figures 4.6 to 4.9 show the path of a heliostat's beam on the plane of the aim over a day if one
+thing is wrong by one unit: the pedestal leans, an encoder's zero is off, the axes are not
+perpendicular, the survey is wrong. Positions, dates and sizes that the thesis does not give are
+ours.
 """
 
 import sys

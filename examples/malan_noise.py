@@ -1,9 +1,9 @@
-"""Malan's noise study (figure 4.11): how a centroid's noise comes back in the beam.
+"""Malan's noise study (figure 4.11): the effect of a centroid's noise on the beam.
 
 ``python malan_noise.py [FOLDER]``. His geometry: Stellenbosch, a heliostat 30.8 m south and
 19.2 m east of the tower with its pivot 1.2 m up, a target 13 m up; a measurement every half
-hour from 07:30 to 17:30 (UTC+2) on 2 September 2012. The calibrated mirror is then asked for
-the same day, four days later (within the season) and 21 December (another season).
+hour from 07:30 to 17:30 (UTC+2) on 2 September 2012. The calibrated mirror is then tested on
+the same day, four days later (within the season) and on 21 December (another season).
 """
 
 import sys
@@ -109,11 +109,11 @@ def study(
     Parameters
     ----------
     noise
-        Of a centroid in each direction on the target, m.
+        Standard deviation of a centroid in each direction on the target, m.
     mirrors
-        Number of them.
+        Number of mirrors.
     seed
-        Of mirrors and noise.
+        Seed of mirrors and noise.
     worm
         Amplitude of a once-per-turn error of the elevation's worm (40 : 1), rad.
     model

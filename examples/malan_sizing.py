@@ -1,7 +1,7 @@
 """The sizing arithmetic of chapter 3 of Malan's thesis, line by line: ``python malan_sizing.py``.
 
-From him: 5 MWe, about 10,000 heliostats of 5 m². Marked "ours" are inputs that his text does
-not give us; with them the arithmetic meets his number.
+From the thesis: 5 MWe, about 10,000 heliostats of 5 m². Inputs marked "ours" are not in its text;
+with them the arithmetic meets its numbers.
 """
 
 import math
@@ -10,7 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-#: name: (value, unit, whose)
+#: name: (value, unit, source)
 INPUTS = {
     "electric power": (5.0e6, "W", "Malan"),
     "mirror of a heliostat": (5.0, "m²", "Malan"),

@@ -3,6 +3,7 @@
 import gzip
 import hashlib
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,8 +21,6 @@ from support.paint_server import (
     PLANT,
     Answer,
     Database,
-    Handler,
-    Server,
     big,
     get,
     refused,
@@ -219,11 +218,12 @@ def test_places_that_cannot_be_written_to(database: Database, tmp_path: Path) ->
 
 
 def test_no_network_is_said(tmp_path: Path) -> None:
-    server = Server(("127.0.0.1", 0), Handler)
-    port = server.server_port
-    server.server_close()
-    with pytest.raises(FetchError) as error:
-        fetch_heliostats("AA39", tmp_path, base_url=f"http://127.0.0.1:{port}/x", settings=FAST)
+    # Bound but not listening: nobody else can take the port meanwhile.
+    with socket.socket() as held:
+        held.bind(("127.0.0.1", 0))
+        base = f"http://127.0.0.1:{held.getsockname()[1]}/x"
+        with pytest.raises(FetchError) as error:
+            fetch_heliostats("AA39", tmp_path, base_url=base, settings=FAST)
     assert "no connection; check the network and the address" in str(error.value)
     assert "gave up after 4 attempts" in str(error.value)
 

@@ -101,7 +101,7 @@ def _table(name: str) -> Literal["csv", "parquet"]:
 
 def _draw(plant: "Plant", place: Path) -> None:
     from heliotrope.field.layout_picture import picture
-    from heliotrope.files.text import write_file
+    from heliotrope.files import write_file
 
     figure = picture(plant)
     ending = place.suffix.removeprefix(".").lower()

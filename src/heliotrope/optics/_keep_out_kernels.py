@@ -3,8 +3,8 @@
 """Compiled: distances to keep-out volumes, and beams marched towards them.
 
 A volume is a row of SIZE numbers: kind; centre and radius of a sphere around it; then, by
-kind, as the constants say. Corners of prisms lie in one array of (x, y), a prism's row
-holding where its own begin and how many they are.
+kind, as listed at `SIZE`. Corners of prisms lie in one array of (x, y); a prism's row holds
+the place of its first corner and their number.
 
 A beam is a solid of revolution about a ray: at distance t along it its radius is
 r(t) = R · max(1, t / b) + q t, R being the mirror's, b the focal distance and q the spread.
@@ -229,7 +229,7 @@ def _move(row, corners, a, path, sun, reach, radius, near, spread, resolution, f
 
 @njit(**OPTIONS)
 def move(table, corners, armatures, path, sun, reach, radius, near, spread, resolution, found):
-    """As :func:`_move` for N heliostats and V volumes, into found (N, V, 8); NaN if clear.
+    """As `_move`, for N heliostats and V volumes, into found (N, V, 8); NaN if clear.
 
     Returns the number of poses that were tried.
     """

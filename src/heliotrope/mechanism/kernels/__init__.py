@@ -18,3 +18,7 @@ A kernel of another package may call these functions directly; numba compiles th
 
 Machine code is cached beside the source; `python -m heliotrope.warm` compiles all of it once.
 """
+
+from heliotrope.mechanism.kernels import block, chain, drives, slots, track, vectors, warm
+
+__all__ = ["block", "chain", "drives", "slots", "track", "vectors", "warm"]

@@ -197,7 +197,7 @@ def angles_block(drives, counts, rows, out, start, stop):
 
 @njit(**OPTIONS)
 def counts_block(drives, angles, rows, out, start, stop):
-    """Counts of every drive, the inverse of :func:`angles_block`."""
+    """Counts of every drive, the inverse of `angles_block`."""
     for i in range(start, stop):
         for k in range(angles.shape[1]):
             out[i, k] = drive_counts(drives[rows[i], k], angles[i, k])

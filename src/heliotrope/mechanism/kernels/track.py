@@ -105,7 +105,7 @@ def constants(g, u):
 def solve_direction(g, k, u, v, sign):
     """Turn both joints so that ``u`` (given at zero angles) comes to lie along v.
 
-    ``k`` are the :func:`constants` of u. Returns (whether v was reached, t). Inside
+    ``k`` are the `constants` of u. Returns (whether v was reached, t). Inside
     the dead cone the pose is the nearest.
     """
     a, b = axis_1(g), axis_2(g)
@@ -174,7 +174,7 @@ def wanted_normal(g, s, p, m):
     """(bisector of s and the way from m to p, that way, its length); length 0 if none.
 
     For a single axis the way is projected on the plane across it; s must be
-    :func:`served` already.
+    `served` already.
     """
     way = minus(p, m)
     if is_single(g):

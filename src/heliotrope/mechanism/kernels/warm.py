@@ -2,9 +2,8 @@
 
 One step is a chain of four square roots and as many divisions that wait for each other;
 one heliostat at a time leaves the processor idle. Here the lanes of a small table hold
-several heliostats, and the same step runs over them side by side. What comes out is only
-a vertex to start from: :func:`~heliotrope.mechanism.kernels.track.solve_aim` goes on
-from there and decides.
+several heliostats, and the same step runs over them side by side. The result is only a
+vertex to start from: `track.solve_aim` goes on from there and decides.
 """
 
 import math
