@@ -1,0 +1,166 @@
+"""Write the pages of the library: each package's public names, as its ``__all__`` lists them.
+
+``python scripts/library_pages.py`` writes ``docs/reference/library/``; with ``--check`` it ends
+with status 1 if a page is not what it would write. A name that several faces offer is described
+once, in the package that defines it.
+"""
+
+import argparse
+import ast
+import re
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PAGES = ROOT / "docs" / "reference" / "library"
+#: Packages in the order of the reference: from what a researcher needs to the programs of a plant.
+ORDER = (
+    "", "sun", "geometry", "mechanism", "field", "optics", "calibration", "imaging", "airborne",
+    "files", "errors", "links", "safety", "cluster", "plant", "store", "console", "lcu", "twin",
+)  # fmt: skip
+
+
+def _face(path: Path) -> tuple[list[str], dict[str, str]]:
+    """Return the public names of a face, and the modules that they come from."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    names: list[str] = []
+    homes: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("heliotrope"):
+            homes |= {a.asname or a.name: f"{node.module}.{a.name}" for a in node.names}
+    for node in tree.body:
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(t, ast.Name) and t.id == "__all__" for t in targets):
+                assert isinstance(node.value, ast.List | ast.Tuple), path
+                names = [e.value for e in node.value.elts if isinstance(e, ast.Constant)]
+    return names, homes
+
+
+def _defined(path: Path) -> list[str]:
+    """Return the public names that a module without a face defines."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    return [n.name for n in tree.body if isinstance(n, kinds) and not n.name.startswith("_")]
+
+
+def _described(place: str) -> bool:
+    """Whether a name has a definition of its own: not one of several that share a statement."""
+    module, _, name = place.rpartition(".")
+    if _source(place.removeprefix("heliotrope.")).exists():
+        return True
+    path = _source(module.removeprefix("heliotrope").lstrip("."))
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if getattr(node, "name", "") == name:
+            return True
+        if isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            if any(isinstance(target, ast.Name) and target.id == name for target in targets):
+                return True
+    return False
+
+
+def _lead(path: Path) -> str:
+    """Return the docstring of a face."""
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return re.sub(r"::$", ":", text, flags=re.MULTILINE)
+
+
+def _source(room: str) -> Path:
+    base = ROOT / "src" / "heliotrope" / room.replace(".", "/")
+    return base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+
+
+def _home(place: str) -> str:
+    """Return where a name is defined, through the faces of packages."""
+    for _ in range(10):
+        module, _, name = place.rpartition(".")
+        path = _source(module.removeprefix("heliotrope").lstrip("."))
+        if path.name != "__init__.py" or not path.exists():
+            return place
+        _, homes = _face(path)
+        if name not in homes or homes[name] == place:
+            return place
+        place = homes[name]
+    return place
+
+
+def _rooms(package: str) -> list[str]:
+    """Return a package and its inner rooms."""
+    base = ROOT / "src" / "heliotrope" / package
+    inner = sorted(p.parent for p in base.rglob("*/__init__.py")) if base.is_dir() else []
+    rooms = [".".join((package, *p.relative_to(base).parts)) for p in inner]
+    return [package, *(room for room in rooms if "migrations" not in room)]
+
+
+def _listed(room: str) -> list[tuple[str, str]]:
+    """Return the public names of a room, each with the place that defines it."""
+    path = _source(room)
+    dotted = f"heliotrope.{room}" if room else "heliotrope"
+    if path.name != "__init__.py":
+        return [(name, f"{dotted}.{name}") for name in _defined(path)]
+    names, homes = _face(path)
+    return [
+        (name, _home(homes.get(name, f"{dotted}.{name}")))
+        for name in names if name != "__version__"
+    ]  # fmt: skip
+
+
+def pages() -> dict[str, str]:
+    """Return the pages by file name."""
+    found, written = {}, set()
+    for package in ORDER[1:]:
+        lines = [f"# heliotrope.{package}", ""]
+        for room in _rooms(package):
+            if room != package:
+                lines += [f"## heliotrope.{room}", ""]
+            lines += [_lead(_source(room)), ""]
+            for name, place in _listed(room):
+                if place in written:
+                    lines += [f"- [`{name}`][{place}]", ""]
+                elif not _described(place):
+                    lines += [f"- `{name}`", ""]
+                else:
+                    written.add(place)
+                    lines += [f"::: {place}", "    options: {heading_level: 3}", ""]
+        found[f"{package}.md"] = "\n".join(lines).rstrip() + "\n"
+    lines = ["# The library", "", _lead(_source("")), ""]
+    links = [(name, place) for name, place in _listed("")]
+    lines += [f"- [`heliotrope.{name}`][{place}]" for name, place in links if place in written]
+    lines += ["", "Packages:", ""]
+    for package in ORDER[1:]:
+        first = _lead(_source(package)).split("\n\n")[0].replace("\n", " ")
+        lines.append(f"- [`heliotrope.{package}`]({package}.md): {first}")
+    lines.append("")
+    for _, place in links:
+        if place not in written and place.removeprefix("heliotrope.") not in ORDER:
+            lines += [f"::: {place}", "    options: {heading_level: 2}", ""]
+    found["index.md"] = "\n".join(lines).rstrip() + "\n"
+    return found
+
+
+def main() -> int:
+    """Write the pages, or compare them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="compare, write nothing")
+    given = parser.parse_args()
+    wanted = pages()
+    stale = [
+        name for name, text in wanted.items()
+        if not (PAGES / name).is_file() or (PAGES / name).read_text(encoding="utf-8") != text
+    ]  # fmt: skip
+    extra = [p.name for p in PAGES.glob("*.md") if p.name not in wanted] if PAGES.is_dir() else []
+    if given.check:
+        for name in [*stale, *extra]:
+            print(f"docs/reference/library/{name} is stale: python scripts/library_pages.py")
+        return 1 if stale or extra else 0
+    PAGES.mkdir(parents=True, exist_ok=True)
+    for name in extra:
+        (PAGES / name).unlink()
+    for name in stale:
+        (PAGES / name).write_text(wanted[name], encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
