@@ -116,9 +116,9 @@ def test_screen_names_spots_and_reasons(folder: Path, call: Any) -> None:
         folder / "two.png", folder / "none.png", "--plant", folder / "plant.toml", "--no-pictures"
     )
     assert code == 0
-    assert "several spots: another spot on it has" in out
+    assert "several spots: a second spot has" in out
     assert "spot 2  E" in out
-    assert "no spot: no spot stands out of the background" in out
+    assert "no spot: no spot stands out from the background" in out
     assert "annotated" not in out
 
 
@@ -262,7 +262,7 @@ def test_empty_targets_are_learnt_and_used(folder: Path, call: Any) -> None:
     photograph = folder / "photographs" / "p0.png"
     code, _, err = call(photograph, "--plant", plant, "--memory", memory)
     assert code == 2
-    assert "there is no model of an empty target" in err
+    assert "no model of an empty target" in err
     code, _, err = call(
         folder / "before", "--plant", plant, "--live", "--limit", 4, "--memory", memory
     )
@@ -312,7 +312,7 @@ def test_crops_need_their_target(folder: Path, call: Any) -> None:
     common = (folder / "crop.png", "--plant", folder / "plant.toml", "--no-pictures", "--crop")
     code, _, err = call(*common)
     assert code == 2
-    assert "a crop shows one target, but which? Give --target (one of target)" in err
+    assert "a crop shows one target; name it by --target (one of target)" in err
     assert call(*common, "--target", "target")[0] == 0
 
 
@@ -321,10 +321,10 @@ BAD: list[tuple[str, list[str], str]] = [
     ("photographs/p0.png", ["--target", "tower"], "there is no target 'tower'"),
     ("photographs/p0.png", ["--camera", "left"], "there is no camera 'left'"),
     ("photographs/p0.png", ["--log", "absent.csv"], "there is no such file"),
-    ("photographs/p0.png", ["--log", "bad.csv"], "there is no column heliostat"),
+    ("photographs/p0.png", ["--log", "bad.csv"], "column heliostat is missing"),
     ("photographs/p0.png", ["--log", "naive.csv"], "line 2, column timestamp"),
     ("photographs/p0.png", ["--log", "text.csv"], "'x' is not a number"),
-    ("nothing", [], "there is no image in this folder"),
+    ("nothing", [], "no image in this folder"),
 ]
 
 
@@ -355,7 +355,7 @@ def test_plant_without_targets_is_refused(tmp_path: Path, call: Any) -> None:
     write_image(_photograph((0.5, 0.3), 1).frame, tmp_path / "a.png")
     code, _, err = call(tmp_path / "a.png", "--plant", tmp_path / "tower-measurements.json")
     assert code == 2
-    assert "there is no target in it" in err
+    assert "the plant has no targets" in err
 
 
 def test_live_folder_is_read_and_kept(folder: Path, call: Any) -> None:
@@ -410,7 +410,7 @@ def test_a_burst_is_averaged(folder: Path, call: Any) -> None:
     ("source", "text"),
     [
         (["nowhere"], "source nowhere: there is no such"),
-        (["a", "b"], "--live follows one source, not 2"),
+        (["a", "b"], "--live follows one source, but 2 were given"),
         (["usb:97"], "there is no such device"),
         (["http://127.0.0.1:9/x"], "127.0.0.1:9"),
     ],

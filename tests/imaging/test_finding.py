@@ -211,7 +211,7 @@ def test_covered_marks_are_named_and_not_used(names: tuple[str, ...]) -> None:
     for mark in found.marks:
         assert mark.used == (mark.mark.name not in names)
         if not mark.used:
-            assert "covered or not there" in mark.reason or "size or shape" in mark.reason
+            assert "covered or absent" in mark.reason or "size or shape" in mark.reason
             # Where it should be is told nevertheless.
             truth = next(m.pixel for m in plain().marks if m.name == mark.mark.name)
             np.testing.assert_allclose(mark.pixel, truth, rtol=0, atol=0.5)
@@ -236,13 +236,13 @@ def test_marks_beyond_the_frame_are_missed_in_words() -> None:
     found = only(render(scene(camera=camera), 1).frame)
     beyond = {m.mark.name for m in found.marks if not m.used}
     assert beyond == {"upper_right", "right", "lower_right"}
-    assert all("beyond the frame" in m.reason for m in found.marks if not m.used)
+    assert all("outside the frame" in m.reason for m in found.marks if not m.used)
     assert off(found, camera, 0.05) < 0.02
     matrix[0, 2] += 110.0
     lost = only(render(scene(camera=replace(CAMERA, matrix=matrix)), 1).frame)
     assert not lost.found
     # Three on one line tell no plane.
-    assert lost.reason.startswith("its 8 marks were not seen together; 3 shapes")
+    assert lost.reason.startswith("its 8 marks were not found together; 3 shapes")
 
 
 def test_what_was_seen_of_a_covered_target_is_said() -> None:
@@ -256,15 +256,17 @@ def test_what_was_seen_of_a_covered_target_is_said() -> None:
     assert not searched.found
     assert "of its 8 marks were seen" in searched.reason or "not seen together" in searched.reason
     nothing = only(Frame(np.full((360, 480), 120, dtype=np.uint8)))
-    assert nothing.reason == "none of its 8 marks was seen: not in the frame, or covered"
+    assert nothing.reason == "none of its 8 marks was seen: outside the frame, or covered"
 
 
 def test_targets_without_enough_marks_are_not_searched() -> None:
     found = only(plain().frame, replace(TARGET, marks=TARGET.marks[:2]))
-    assert found.reason == ("2 marks are known of it; name 3 or more (heliotrope camera teach)")
+    assert found.reason == (
+        "it has 2 known marks; three or more are needed (heliotrope camera teach)"
+    )
     tags = with_marks("tag", 2, 0.9)
     seen = only(render(scene(tags), 2).frame, tags)
-    assert seen.reason == "all marks that were seen lie on one side of it: m0, m1"
+    assert seen.reason == "all marks seen lie on one side of it: m0, m1"
 
 
 # -- geometry --------------------------------------------------------------------------
@@ -426,7 +428,7 @@ def test_like_targets_are_told_by_the_camera_alone() -> None:
     frame = plain().frame
     unsure = find_targets(frame, (TARGET, other))
     assert [f.reason for f in unsure] == [
-        f"what was seen may be {name} as well; name the targets that the camera sees"
+        f"the frame may show {name} there; name the targets that the camera sees"
         for name in ("other", "target")
     ]
     first, second = find_targets(frame, (TARGET, other), CAMERA)
@@ -442,7 +444,7 @@ def test_neighbours_are_told_apart_or_neither_is_believed() -> None:
         if found.found:
             assert off(found, CAMERA, 0.05) < WRONG
         else:
-            assert "beyond the frame" in found.reason or "may be" in found.reason
+            assert "outside the frame" in found.reason or "may be" in found.reason
 
 
 def test_views_are_as_certain_as_they_say() -> None:
@@ -512,7 +514,7 @@ def test_taught_pictures_are_found_about_a_pose_or_anywhere() -> None:
     assert not lost.found
     without = find_targets(other, (target,), CAMERA)[0]
     assert not without.found
-    assert without.marks[0].reason == "its picture 0.png is not at hand"
+    assert without.marks[0].reason == "its picture 0.png is missing"
 
 
 # -- photographs -----------------------------------------------------------------------

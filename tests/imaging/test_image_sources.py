@@ -575,7 +575,7 @@ def test_texts_that_are_no_source(tmp_path: Path) -> None:
     (tmp_path / "a.xyz").touch()
     for text, wanted in {
         "": "no source given; name a folder",
-        "ftp://me:secret@host/a": r"source ftp://host/a: frames come by rtsp://, rtsps://, http://",
+        "ftp://me:secret@host/a": r"source ftp://host/a: frames come over rtsp://, rtsps://, http://",
         "none": "there is no such file: give a folder, an image or a video",
         "a.xyz": "is neither a folder, an image or a video",
         "usb:front": "give the number of a device",

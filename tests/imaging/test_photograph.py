@@ -138,7 +138,7 @@ def test_memory_is_kept_and_comes_back(tmp_path: Path) -> None:
 
 def test_memory_that_is_none_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(InputError, match="a folder is wanted"):
+    with pytest.raises(InputError, match="not a folder; give one"):
         Memory.load(tmp_path / "file")
     (tmp_path / "target.npz").write_bytes(b"PK nothing")
     with pytest.raises(FormatError, match="no model of an empty target"):
@@ -154,9 +154,9 @@ def test_models_of_other_targets_are_not_used() -> None:
     assert read(rendered, empty={"a": other}).faces[0].background.method == "frame"
     smaller = EmptyTarget(model.reflectance[1:], model.weight[1:], targets=model.targets)
     assert read(rendered, empty={"a": smaller}).faces[0].background.method == "frame"
-    with pytest.raises(InputError, match="none is known of target"):
+    with pytest.raises(InputError, match="has no model; learn one"):
         read(rendered, background="model")
-    with pytest.raises(InputError, match="give a frame without the beam"):
+    with pytest.raises(InputError, match="needs a frame without the beam"):
         read(rendered, background="difference")
 
 

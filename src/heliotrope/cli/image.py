@@ -1,10 +1,13 @@
-"""``heliotrope image``: where the beams of photographs stand on their targets."""
+"""``heliotrope image``: find beams on targets, in photographs or live."""
 
+import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,27 +20,33 @@ if TYPE_CHECKING:
     from heliotrope.field.camera import Camera
     from heliotrope.field.target import Target
     from heliotrope.imaging.campaign import Job, Outcome
+    from heliotrope.imaging.frame import Frame
     from heliotrope.imaging.log import Entry, Log
+    from heliotrope.imaging.memory import Memory
+    from heliotrope.imaging.sources import Source
     from heliotrope.sun import Site
+
+#: Frames after which models of empty targets are saved.
+_OFTEN = 20
 
 
 def image(
     paths: Annotated[
-        list[str], typer.Argument(help="Photographs, folders of them; with --live a source.")
+        list[str], typer.Argument(help="Photographs or folders; with --live one source.")
     ],
     plant: Annotated[
         Path, typer.Option(help="Plant file or folder, or PAINT's tower-measurements.json.")
     ],
-    target: Annotated[str, typer.Option(help="The target that the beam was sent to.")] = "",
+    target: Annotated[str, typer.Option(help="Target that the beam was sent to.")] = "",
     crop: Annotated[
         bool, typer.Option("--crop", help="Each picture shows exactly one target.")
     ] = False,
-    camera: Annotated[str, typer.Option(help="Which camera of the plant took them.")] = "",
+    camera: Annotated[str, typer.Option(help="Camera that took them.")] = "",
     empty: Annotated[
-        Path | None, typer.Option(help="The same camera's photograph without the beam.")
+        Path | None, typer.Option(help="Photograph of the same camera without the beam.")
     ] = None,
     memory: Annotated[
-        Path | None, typer.Option(help="Folder of models of the empty targets, learnt with --live.")
+        Path | None, typer.Option(help="Folder of empty-target models, learnt with --live.")
     ] = None,
     annotated: Annotated[Path | None, typer.Option(help="Folder for annotated pictures.")] = Path(
         "out/image"
@@ -51,9 +60,9 @@ def image(
     log: Annotated[
         Path | None, typer.Option(help="CSV: file or id, heliostat, motor positions, time.")
     ] = None,
-    heliostat: Annotated[str, typer.Option(help="Whose beam it is, if no log says so.")] = "",
+    heliostat: Annotated[str, typer.Option(help="Heliostat of the beam, without a log.")] = "",
     processes: Annotated[
-        int, typer.Option(min=0, help="Processes on this machine; 0: one a core.")
+        int, typer.Option(min=0, help="Processes on this machine; 0: one per core.")
     ] = 0,
     scheduler: shared.SchedulerOption = None,
     live: Annotated[
@@ -61,15 +70,15 @@ def image(
         typer.Option("--live", help="Follow a watched folder, video, rtsp://, http://, usb:0."),
     ] = False,
     limit: Annotated[
-        int | None, typer.Option(min=1, help="With --live: frames after which it ends.")
+        int | None, typer.Option(min=1, help="With --live: stop after this many frames.")
     ] = None,
-    burst: Annotated[int, typer.Option(min=1, help="With --live: frames averaged into one.")] = 1,
+    burst: Annotated[int, typer.Option(min=1, help="With --live: frames to average.")] = 1,
     archive: Annotated[
         Path | None, typer.Option("--keep", help="With --live: folder for frames and results.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Find targets and spots in photographs: metres with covariance, or the reason why not."""
+    """Find spots on targets: in metres with covariance, or the reason why not."""
     from heliotrope.imaging import campaign
     from heliotrope.imaging.log import read_log
 
@@ -80,7 +89,7 @@ def image(
         return
     files = _files([Path(path) for path in paths])
     table: Log | None = None if log is None else read_log(log)
-    entries = campaign.known_of(files, table, heliostat)
+    entries = campaign.entries_of(files, table, heliostat)
     job = _job(place, target, crop, camera, empty, memory, annotated if pictures else None)
     with shared.connected(scheduler) as client, shared.progress("reading", as_json) as advance:
         outcomes = campaign.process_many(
@@ -113,13 +122,12 @@ def _follow(
     memory: Path | None,
     as_json: bool,
 ) -> None:
-    from heliotrope.cli._live import follow
     from heliotrope.errors import InputError
     from heliotrope.imaging.sources import open_source
 
     if len(paths) != 1:
-        raise InputError(f"--live follows one source, not {len(paths)}; give one")
-    # The name of one of the plant's cameras stands for its source.
+        raise InputError(f"--live follows one source, but {len(paths)} were given; give one")
+    # A camera of the plant may be given by its name.
     named = next((c for c in place.cameras if c.name == paths[0]), None)
     text = named.source if named is not None else paths[0]
     folder = place.folder if named is not None else Path()
@@ -130,7 +138,7 @@ def _follow(
 
 @dataclass(frozen=True)
 class Place:
-    """What of a plant the photographs need.
+    """The parts of a plant that photographs need.
 
     Attributes
     ----------
@@ -141,7 +149,7 @@ class Place:
     names
         Of its heliostats; empty if the file has none.
     folder
-        Of the plant file: taught pictures lie there.
+        Of the plant file; taught pictures lie there.
     """
 
     targets: "tuple[Target, ...]"
@@ -166,7 +174,7 @@ def open_place(path: Path) -> Place:
         folder = path if path.is_dir() else path.parent
         place = Place(found.targets, found.cameras, found.site, found.names, folder)
     if not place.targets:
-        raise InputError(f"{path}: there is no target in it; add [[targets]] with their marks")
+        raise InputError(f"{path}: the plant has no targets; add [[targets]] with their marks")
     return place
 
 
@@ -179,7 +187,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
         if path.is_dir():
             found = find_images(path)
             if not found:
-                raise FormatError(path, "there is no image in this folder; give PNG, JPEG or TIFF")
+                raise FormatError(path, "no image in this folder; give PNG, JPEG or TIFF")
             files += found
         else:
             files.append(path)
@@ -208,7 +216,7 @@ def _job(
     cameras = [c.name for c in place.cameras]
     if camera and camera not in cameras:
         raise UnknownNameError("camera", camera, cameras)
-    # A plant with one camera took them with that; its size of frames is checked on use.
+    # The only camera of a plant took them; its frame size is checked on use.
     known = next((c for c in place.cameras if c.name == camera), None)
     if not camera and len(place.cameras) == 1:
         known = place.cameras[0]
@@ -218,7 +226,7 @@ def _job(
     known_empty = Memory() if memory is None else Memory.load(memory)
     if memory is not None and not known_empty:
         raise InputError(
-            f"{memory}: there is no model of an empty target (*.npz) in it; --live with --memory "
+            f"{memory}: no model of an empty target (*.npz) in this folder; --live with --memory "
             "learns one"
         )
     return Job(
@@ -236,11 +244,11 @@ def _job(
 def _write(
     path: Path, outcomes: "Sequence[Outcome]", entries: "Sequence[Entry | None]", place: Place
 ) -> tuple[int, list[str]]:
-    """Write the table of sightings; return how many, and a line for each that gives none."""
+    """Write the table of sightings; return their number and a line for each photograph left out."""
     from heliotrope.calibration.sighting_table import write_sightings
     from heliotrope.imaging.campaign import to_sightings
 
-    # A tower's file names no heliostats: those of the log are what there is.
+    # A tower file names no heliostats; use those of the log.
     names = place.names or tuple(sorted({e.heliostat for e in entries if e and e.heliostat}))
     seen, left_out = to_sightings(outcomes, entries, names, place.site)
     if seen is None:
@@ -294,7 +302,7 @@ def print_spots(outcomes: "Sequence[Outcome]") -> None:
         readings = outcome.document["targets"]
         for reading in readings:
             if not reading["found"]:
-                # A camera sees few of a plant's targets: what is absent matters if all are.
+                # A camera sees few of a plant's targets: absent ones matter only if all are absent.
                 if not any(r["found"] for r in readings):
                     print(f"  {reading['target']}: {reading['reasons'][0]['text']}")
                 continue
@@ -318,3 +326,96 @@ def _numbers(spot: "dict[str, Any]") -> str:
         f"   {spot['latitude_deg']:.8f}° {spot['longitude_deg']:.8f}° {spot['altitude_m']:.3f} m"
         f"   ± {1e3 * right:.0f} right, {1e3 * up:.0f} up mm, correlation {correlation:+.2f}"
     )
+
+
+# -- live ------------------------------------------------------------------------------
+
+
+def follow(
+    source: "Source",
+    job: "Job",
+    *,
+    burst: int = 1,
+    archive: Path | None = None,
+    memory: Path | None = None,
+    as_json: bool = False,
+) -> int:
+    """Read every frame of a source and print its spots; return the number of frames.
+
+    Parameters
+    ----------
+    source
+        Frames.
+    job
+        How to read them.
+    burst
+        Number of frames averaged into one.
+    archive
+        Folder for frames and their results.
+    memory
+        Folder of models of the empty targets: they are used, learn from every frame, and are
+        kept for the next time.
+    as_json
+        Print one JSON document per line.
+    """
+    from heliotrope.errors import HeliotropeError
+    from heliotrope.imaging.campaign import look
+    from heliotrope.imaging.memory import Memory
+    from heliotrope.imaging.sources import keep
+
+    count = 0
+    known = Memory() if memory is None else Memory.load(memory)
+    with source, _kept(known, memory):
+        views: tuple[object, ...] = ()
+        for frame in _averaged(source, burst):
+            count += 1
+            place = Path(frame.name or f"frame-{count}")
+            if memory is not None:
+                job = replace(job, settings=replace(job.settings, empty=known.models))
+            try:
+                # The camera hardly moves from one frame to the next.
+                outcome = look(frame, place, job, previous=views)  # type: ignore[arg-type]
+            except HeliotropeError as error:
+                print(f"heliotrope: {error}", file=sys.stderr)
+                continue
+            views = outcome.views or views
+            if memory is not None:
+                known.learn(outcome.faces)
+                if count % _OFTEN == 0:
+                    known.save(memory)
+            kept = keep(frame, dict(outcome.document), archive) if archive is not None else None
+            _print_live(outcome, kept, as_json)
+    for problem in getattr(source, "skipped", ()):
+        print(f"heliotrope: {problem}", file=sys.stderr)
+    return count
+
+
+@contextmanager
+def _kept(known: "Memory", folder: Path | None) -> "Iterator[None]":
+    """Save the models at the end, also after Ctrl-C."""
+    try:
+        yield
+    finally:
+        if folder is not None:
+            known.save(folder)
+
+
+def _averaged(source: "Source", burst: int) -> "Iterator[Frame]":
+    from heliotrope.imaging.sources import average
+
+    frames = iter(source)
+    while together := list(islice(frames, burst)):
+        yield together[0] if burst == 1 else average(together)
+
+
+def _print_live(outcome: "Outcome", kept: Path | None, as_json: bool) -> None:
+    from heliotrope.cli._common import plain
+
+    if as_json:
+        document = {**outcome.document, "kept": None if kept is None else str(kept)}
+        print(json.dumps(plain(document), ensure_ascii=False), flush=True)
+        return
+    print_spots([outcome])
+    if kept is not None:
+        print(f"  kept: {kept}")
+    sys.stdout.flush()

@@ -1,4 +1,4 @@
-"""Marks on a target: what a camera finds it by."""
+"""Marks on a target, by which a camera finds it."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ import numpy as np
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_vectors
 
-#: Kinds of marks, each with its point (where its coordinates are) and its drawing at turn 0.
+#: Kinds of marks, with the point that their coordinates refer to and the drawing at turn 0.
 KINDS: dict[str, str] = {
     "corner": "an L; its outer vertex, arms to the right and down",
     "tee": "a T; the middle of the outer edge of its bar, stem down",
     "square": "a filled square; its centre",
     "disc": "a filled disc; its centre",
     "tag": "an ArUco or AprilTag square; its centre, upright",
-    "picture": "whatever a taught picture shows; the picture's centre",
+    "picture": "the content of a taught picture; the picture's centre",
 }
 
 
@@ -29,16 +29,16 @@ class Mark:
     kind
         One of :data:`KINDS`.
     point
-        Where it is, ENU metres, (3,): of which point of the drawing, :data:`KINDS` says.
+        ENU metres, (3,), of the point of the drawing given in :data:`KINDS`.
     size
-        Length of an arm, of the bar and of the whole T, side or diameter, m.
+        Length of an L's arm, of a T's bar and stem, side or diameter, m.
     stroke
-        Breadth of the strokes of a corner or a tee, m.
+        Width of the strokes of a corner or a tee, m.
     turn
-        The drawing is turned by this, counterclockwise as seen from the front, rad.
+        Of the drawing, counterclockwise as seen from the front, rad.
     code
-        Of a tag: dictionary of OpenCV and number, "4X4_50:7" or "APRILTAG_36h11:7". Of a
-        picture: its file, beside the plant file.
+        For a tag, OpenCV dictionary and number, "4X4_50:7" or "APRILTAG_36h11:7"; for a
+        picture, its file beside the plant file.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What the software saw in a photograph, drawn into it."""
+"""Draw the result of reading a photograph into it."""
 
 import numpy as np
 
@@ -15,13 +15,13 @@ _NINETY = 2.146
 
 
 def annotate(photograph: Photograph) -> Image:
-    """Return the photograph with marks, outlines, spots, centroids and what is said of them.
+    """Return the photograph with marks, outlines, spots, centroids and remarks.
 
     Returns
     -------
-    Blue, green, red, (H, W, 3) of uint8; larger photographs are reduced. A spot is drawn
-    with the border of its pixels, its centroid, its ellipse of one standard deviation of
-    its light, and, filled, the 90 % ellipse of the centroid's error.
+    Blue, green, red, (H, W, 3) of uint8; larger photographs are reduced. A spot is drawn as the
+    border of its pixels, its centroid, the one-sigma ellipse of its light, and, filled, the 90 %
+    ellipse of the centroid's error.
     """
     sheet = _Sheet(photograph)
     for face in photograph.faces:
@@ -46,7 +46,7 @@ class _Sheet:
         frame = photograph.frame
         pixels = frame.pixels
         if pixels.dtype != np.uint8:
-            # 12 bits in 16 are common: show what is there.
+            # 12 bits in 16 are common: scale to the brightest pixel.
             top = max(int(pixels.max()), 1)
             pixels = (pixels.astype(np.float32) * (255.0 / top)).astype(np.uint8)
         if pixels.ndim == 2:
@@ -61,12 +61,12 @@ class _Sheet:
         self.faces = photograph.faces
 
     def at(self, pixels: FloatArray) -> Image:
-        """Frame pixels to sheet pixels in sixteenths, for OpenCV's ``shift=4``."""
+        """Return sheet pixels in sixteenths, for OpenCV's ``shift=4``, of frame pixels."""
         place = (np.asarray(pixels) + 0.5) * self.factor - 0.5
         return np.round(16.0 * np.clip(place, -1e5, 1e5)).astype(np.int32)
 
     def seen(self, face: LookedAt, plane: FloatArray) -> FloatArray:
-        """Places in a face's plane to frame pixels; a crop has its own."""
+        """Return frame pixels of places in a face's plane; a crop has no view."""
         picture = face.picture
         if picture.view is not None:
             return picture.view.to_pixels(plane)
@@ -129,12 +129,12 @@ class _Sheet:
         )
 
     def legend(self, photograph: Photograph) -> None:
-        """Say of each target what was found, under the picture: nothing of it is hidden."""
+        """Write the result for each target below the picture."""
         import cv2
 
         lines = []
         seen = [r for r in photograph.readings if r.found.found]
-        # A camera sees few of a plant's targets: the absent ones matter if all are.
+        # A camera sees few of a plant's targets: absent ones matter only if all are absent.
         for reading in seen or photograph.readings:
             colour = GOOD if reading.good else BAD
             lines += [(line, colour) for line in _said(reading)]
@@ -176,7 +176,7 @@ def _said(reading: Reading) -> list[str]:
 
 
 def _ellipse(centre: FloatArray, covariance: FloatArray, radius: float = 1.0) -> FloatArray:
-    """Points (64, 2) of the ellipse of a covariance."""
+    """Return points (64, 2) of the ellipse of a covariance."""
     values, vectors = np.linalg.eigh(covariance)
     angle = np.arange(64) * (2.0 * np.pi / 64)
     circle = np.stack([np.cos(angle), np.sin(angle)])

@@ -1,4 +1,4 @@
-"""Many photographs: read one by one or many at once, and turned into sightings."""
+"""Read many photographs, in parallel or one by one, and turn them into sightings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -38,12 +38,12 @@ if TYPE_CHECKING:
 Progress = Callable[[int, int], None]
 Origin = tuple[float, float, float]
 
-#: Below this number of photographs another process costs more than it gains.
+#: With fewer photographs another process costs more than it gains.
 FEWEST_FOR_PROCESSES = 8
-#: The sun moves by at most this, rad/s.
+#: Greatest angular speed of the sun, rad/s.
 _SUN_RATE = 7.292e-5
-#: Air and mirror between the law and a spot: deviation of a beam, rad. What cannot be seen
-#: in one photograph; repeated sightings show how large it is.
+#: Standard deviation of a beam caused by air and mirror, rad. One photograph cannot show it;
+#: repeated sightings do.
 BEAM_SIGMA = 1e-4
 
 
@@ -54,21 +54,21 @@ class Job:
     Attributes
     ----------
     targets
-        That may be seen.
+        Targets that may be in view.
     origin
         Latitude, longitude (degrees) and height (m) of ENU's origin.
     camera
-        What is known of the camera.
+        The camera, as far as it is known.
     settings
         How to read.
     crop
-        Each picture shows exactly one target: that of its log entry, or this one.
+        Each picture shows exactly one target: that of its log entry, or ``target``.
     target
-        Whose reading counts where the log names none; "" takes any that is good.
+        Target whose reading counts where the log names none; "" takes any that is good.
     annotated
-        Folder for annotated pictures; None for none.
+        Folder for annotated pictures, or None.
     without
-        The camera's frame without beams.
+        A frame of the camera without beams.
     """
 
     targets: tuple[Target, ...]
@@ -83,30 +83,30 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one photograph.
+    """The result of one photograph.
 
     Attributes
     ----------
     path
         The file.
     document
-        All that was found, ready for JSON; empty if it could not be read.
+        Everything found, ready for JSON; empty if the file could not be read.
     problem
         Why it could not be read; "" if it could.
     point, covariance
-        Of the spot that counts, ENU, (3,) and (3, 3); None if none may be believed.
+        Of the spot that counts, ENU, (3,) and (3, 3); None if no spot can be trusted.
     target
-        On which it is.
+        Target of that spot.
     refusal
-        Why none may be believed.
+        Why no spot can be trusted.
     time, time_deviation
         Of the photograph.
     annotated
         The annotated picture, if one was written.
     views
-        How the faces lie in the frame, for the next one.
+        How the faces lie in the frame, for the next frame.
     faces
-        What was seen on each face: the models of the empty targets learn from it.
+        The faces found, from which models of empty targets learn.
     """
 
     path: Path
@@ -124,7 +124,7 @@ class Outcome:
 
 
 def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
-    """Return what one file shows; what is wrong with it is said, not raised.
+    """Read one file; a problem with it is returned, not raised.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def process(path: Path, job: Job, entry: Entry | None = None) -> Outcome:
     job
         How to read it.
     entry
-        What is known of it: its target above all.
+        Its entry in the log: above all its target.
     """
     try:
         frame = read_image(path)
@@ -151,24 +151,23 @@ def look(
     entry: Entry | None = None,
     previous: Sequence[View] = (),
 ) -> Outcome:
-    """Return what a frame shows.
+    """Read one frame.
 
     Parameters
     ----------
     frame, path
-        The photograph and what to call it.
+        The photograph and its name.
     job
         How to read it.
     entry
-        What is known of it.
+        Its entry in the log.
     previous
         Views of an earlier frame of the same camera.
 
     Raises
     ------
     InputError
-        If its target is not known where it must be, or the annotated picture cannot be
-        written.
+        If its target is needed and not known, or the annotated picture cannot be written.
     """
     name = entry.target if entry is not None and entry.target else job.target
     if job.crop:
@@ -209,7 +208,7 @@ def _target(job: Job, name: str, path: Path) -> Target:
     if not name:
         known = ", ".join(t.name for t in job.targets)
         raise InputError(
-            f"{path}: a crop shows one target, but which? Give --target (one of {known}) or a log"
+            f"{path}: a crop shows one target; name it by --target (one of {known}) or a log"
         )
     for target in job.targets:
         if target.name == name:
@@ -218,15 +217,14 @@ def _target(job: Job, name: str, path: Path) -> Target:
 
 
 def meant(photograph: Photograph, target: str) -> tuple[Reading | None, str]:
-    """Return the reading that counts and why it may not be believed, "" if it may.
+    """Return the reading that counts and why it cannot be trusted ("" if it can).
 
     Parameters
     ----------
     photograph
-        What was seen.
+        As read.
     target
-        The target that the beam was sent to; "" if nobody knows: then there must be just
-        one with a spot.
+        Target that the beam was sent to; "" if unknown, and then exactly one must have a spot.
     """
     if target:
         reading = photograph.reading(target)
@@ -234,7 +232,7 @@ def meant(photograph: Photograph, target: str) -> tuple[Reading | None, str]:
     lit = [r for r in photograph.readings if r.spots]
     if len(lit) > 1:
         names = ", ".join(r.found.target.name for r in lit)
-        return None, f"several targets have spots ({names}), and nobody says which is meant"
+        return None, f"several targets have spots ({names}) and none is named as the intended one"
     if lit:
         return lit[0], _why(lit[0])
     found = [r for r in photograph.readings if r.found.found]
@@ -249,7 +247,7 @@ def _why(reading: Reading) -> str:
 
 
 def document(photograph: Photograph, origin: Origin, annotated: Path | None) -> dict[str, Any]:
-    """Return all that was found in a photograph, ready for JSON; units stand in the names."""
+    """Return everything found in a photograph, ready for JSON, with units in the names."""
     frame = photograph.frame
     return {
         "file": frame.name,
@@ -319,20 +317,20 @@ def process_many(
     client: "Client | None" = None,
     progress: Progress | None = None,
 ) -> list[Outcome]:
-    """Return what many files show, in their order.
+    """Read many files, and return their results in the same order.
 
     Parameters
     ----------
     paths, entries
-        Files, and what is known of each.
+        Files, and their entries in the log.
     job
         How to read them.
     processes
-        On this machine; a few photographs are read in this process whatever it is.
+        On this machine; few photographs are read in this process whatever the number.
     client
-        Of a dask scheduler, which takes them instead.
+        Of a dask scheduler, used instead of processes.
     progress
-        Is told how many are done, of how many.
+        Called with the numbers of finished and of all photographs.
     """
     tasks = list(zip(paths, entries, strict=True))
     found: list[Outcome | None] = [None] * len(tasks)
@@ -346,11 +344,11 @@ def process_many(
 def _outcomes(
     tasks: Sequence[tuple[Path, Entry | None]], job: Job, processes: int, client: "Client | None"
 ) -> Iterator[tuple[int, Outcome]]:
-    """Give the number of each task and its outcome as they are done."""
+    """Yield the index and the outcome of each task as it finishes."""
     if client is not None:
         yield from _on_cluster(tasks, job, client)
     elif processes > 1 and len(tasks) >= FEWEST_FOR_PROCESSES:
-        # A forked child would inherit the locks of this one's threads.
+        # A forked child would inherit the locks of this process's threads.
         with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
             futures = {pool.submit(process, path, job, e): k for k, (path, e) in enumerate(tasks)}
             try:
@@ -368,7 +366,7 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Outcome]]:
     from distributed import as_completed as completed
 
-    # The job holds the targets and may hold an empty frame: it travels once.
+    # The job may hold an empty frame: send it once.
     shared = client.scatter(job, broadcast=True)  # type: ignore[no-untyped-call]
     futures = {
         client.submit(process, path.resolve(), shared, entry, pure=False): k
@@ -378,22 +376,22 @@ def _on_cluster(
         yield futures[future], future.result()
 
 
-def known_of(paths: Sequence[Path], log: Log | None, heliostat: str = "") -> list[Entry | None]:
-    """Return what the log or the files beside say of each photograph.
+def entries_of(paths: Sequence[Path], log: Log | None, heliostat: str = "") -> list[Entry | None]:
+    """Return the entry of each photograph, from the log or from a file beside it.
 
     Parameters
     ----------
     paths
         Photographs.
     log
-        Goes first.
+        Searched first.
     heliostat
-        Whose beams they show, where nothing else says it.
+        Heliostat whose beams they show, where nothing else says it.
 
     Raises
     ------
     FormatError
-        If a file beside cannot be read.
+        If a file beside a photograph cannot be read.
     """
     found: list[Entry | None] = []
     for path in paths:
@@ -411,22 +409,22 @@ def to_sightings(
     site: Site,
     sigma: float = BEAM_SIGMA,
 ) -> tuple[Sightings | None, list[str]]:
-    """Return the sightings of photographs, and a line for each that gives none.
+    """Return the sightings of photographs, and a line for each photograph left out.
 
     Parameters
     ----------
     outcomes, entries
-        Of :func:`process_many` and :func:`known_of`.
+        Of :func:`process_many` and :func:`entries_of`.
     names
-        Of the heliostats, in the plant's order.
+        Names of the heliostats, in the plant's order.
     site
-        For the sun, where the log does not give it.
+        For the sun's direction, where the log does not give it.
     sigma
-        Standard deviation of a beam beside that of its centroid, rad.
+        Standard deviation of a beam in addition to that of its centroid, rad.
 
     Returns
     -------
-    None in place of the sightings if there is none.
+    None instead of sightings if there are none.
     """
     rows: list[tuple[int, FloatArray, FloatArray, Outcome, float, float]] = []
     left_out: list[str] = []
@@ -459,11 +457,11 @@ def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -
     if outcome.problem:
         return outcome.problem.removeprefix(f"{outcome.path}: ")
     if entry is None:
-        return "nothing is known of it: no row of the log, no file beside"
+        return "nothing is known of it: no row in the log, no file beside it"
     if outcome.point is None:
         return outcome.refusal
     if not entry.heliostat:
-        return "nobody says whose beam it shows; give --heliostat or a log"
+        return "its heliostat is not known; give --heliostat or a log"
     if entry.heliostat not in index:
         return f"the plant has no heliostat {entry.heliostat}"
     if entry.counts is None:
@@ -472,13 +470,13 @@ def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -
 
 
 def _sun(outcome: Outcome, entry: Entry, site: Site) -> tuple[FloatArray | None, float, float, str]:
-    """Direction, Unix seconds, variance (rad²) of the sun, and what is wrong."""
+    """Return direction, Unix seconds and variance (rad²) of the sun, and the problem if any."""
     time = entry.time or outcome.time
     seconds = float("nan") if time is None else time.astimezone(UTC).timestamp()
     if entry.sun is not None:
         return entry.sun, seconds, 0.0, ""
     if time is None:
-        return None, seconds, 0.0, "neither its time nor the sun's angles are known"
+        return None, seconds, 0.0, "neither its time nor the angles of the sun are known"
     with suppress(HeliotropeError):
         deviation = outcome.time_deviation if entry.time is None else 0.0
         spread = (_SUN_RATE * deviation) ** 2 if np.isfinite(deviation) else 0.0

@@ -1,4 +1,4 @@
-"""A frame: what a camera saw, when, and how certain the time is."""
+"""A frame: the pixels of a photograph, its time and the time's uncertainty."""
 
 from dataclasses import dataclass
 from datetime import datetime
@@ -12,7 +12,7 @@ from heliotrope.errors import InputError
 
 #: Pixels of a frame: grey (H, W) or blue-green-red (H, W, 3), 8 or 16 bit.
 Pixels = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
-#: Values on a grid of pixels, of any type: what OpenCV takes and gives.
+#: Values on a grid of pixels, of any type that OpenCV handles.
 Image = npt.NDArray[Any]
 
 
@@ -25,17 +25,17 @@ class Frame:
     pixels
         Grey (H, W) or blue-green-red (H, W, 3), uint8 or uint16.
     name
-        What to call it: a file's path, a source and a number.
+        Path of a file, or a source and a number.
     time
-        Middle of the exposure, with its zone; None if unknown.
+        Middle of the exposure, with a zone; None if unknown.
     time_deviation
         Standard deviation of the time, s; NaN if unknown.
     exposure
         s; NaN if unknown.
     gain
-        Of the sensor, relative; NaN if unknown.
+        Relative, of the sensor; NaN if unknown.
     count
-        Frames averaged into it.
+        Number of frames averaged.
     """
 
     pixels: Pixels
@@ -55,7 +55,7 @@ class Frame:
                 f"{self.name or 'frame'}: pixels of {self.pixels.dtype}; give uint8 or uint16"
             )
         if self.time is not None and self.time.tzinfo is None:
-            raise InputError(f"{self.name or 'frame'}: its time has no zone")
+            raise InputError(f"{self.name or 'frame'}: time {self.time} has no zone; add one")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -64,7 +64,7 @@ class Frame:
 
     @property
     def full_scale(self) -> float:
-        """The greatest value that a pixel can have."""
+        """Greatest possible value of a pixel."""
         return float(np.iinfo(self.pixels.dtype).max)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What is known of a photograph beside its pixels: heliostat, motors, target, time or sun."""
+"""Facts about a photograph besides its pixels: heliostat, motors, target, time or sun."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from heliotrope.field.formats.paint import read_calibration_properties
 from heliotrope.files.text import check_file
 from heliotrope.geometry import FloatArray, direction
 
-#: Columns of a log; a row needs a file's name or id, a heliostat and two counts.
+#: Columns of a log; a row needs a file name or id, a heliostat and two counts.
 COLUMNS = (
     "file", "id", "heliostat", "timestamp", "target", "axis_1_motor_position",
     "axis_2_motor_position", "sun_azimuth_deg_south0_east", "sun_elevation_deg_apparent", "empty",
@@ -22,22 +22,22 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Entry:
-    """What is known of one photograph.
+    """Facts about one photograph.
 
     Attributes
     ----------
     heliostat
-        Whose beam it shows; "" if unknown.
+        Heliostat of the beam; "" if unknown.
     counts
         Motor counts, (D,); None if unknown.
     target
-        Which target the beam was sent to; "" if unknown.
+        Target that the beam was sent to; "" if unknown.
     time
         With its zone; None if unknown.
     sun
         Unit vector to the apparent sun, ENU, (3,); None if unknown.
     empty
-        The camera's photograph without the beam, of the same minute; None if there is none.
+        Photograph of the camera without the beam, of the same minute, or None.
     """
 
     heliostat: str = ""
@@ -49,10 +49,10 @@ class Entry:
 
 
 class Log:
-    """Entries by the name of the file or by its number.
+    """Entries by file name or number.
 
-    A row belongs to a photograph if its ``file`` is the photograph's name, or its ``id``
-    the name's beginning up to the first hyphen, underscore or dot.
+    A row belongs to a photograph if its ``file`` is the photograph's name, or its ``id`` is the
+    beginning of that name up to the first hyphen, underscore or dot.
     """
 
     def __init__(self, entries: Mapping[str, Entry]) -> None:
@@ -82,13 +82,13 @@ def read_log(path: str | Path) -> Log:
     Parameters
     ----------
     path
-        With columns of :data:`COLUMNS`; the Jülich ``measurements.csv`` is one. ``empty`` is
-        seen from the log's folder.
+        With the columns :data:`COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
+        relative to the log's folder.
 
     Raises
     ------
     FormatError
-        If it cannot be read, or lacks what every row needs.
+        If it cannot be read, or lacks a required value.
     """
     import pandas as pd
 
@@ -96,14 +96,14 @@ def read_log(path: str | Path) -> Log:
     try:
         table = pd.read_csv(file, dtype=str, keep_default_na=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
-        raise FormatError(file, f"no table in CSV ({str(error).strip()})") from None
+        raise FormatError(file, f"not a CSV table ({str(error).strip()})") from None
     needed = ("heliostat", "axis_1_motor_position", "axis_2_motor_position")
     missing = [c for c in needed if c not in table.columns]
     if not {"file", "id"} & set(table.columns):
         missing.insert(0, "file (or id)")
     if missing:
         there = ", ".join(map(str, table.columns[:12]))
-        raise FormatError(file, f"there is no column {missing[0]}; there are {there}", "line 1")
+        raise FormatError(file, f"column {missing[0]} is missing; present are {there}", "line 1")
     entries: dict[str, Entry] = {}
     for number, row in enumerate(table.to_dict("records"), start=2):
         key = str(row.get("file") or row.get("id") or "").strip()
@@ -135,7 +135,7 @@ def _entry(file: Path, line: int, row: Mapping[str, str]) -> Entry:
         if time is None or time.tzinfo is None:
             raise FormatError(
                 file,
-                f"{text!r} is no time with a zone; write 2026-06-21T12:00:00Z",
+                f"{text!r} is not a time with a zone; write 2026-06-21T12:00:00Z",
                 f"line {line}, column timestamp",
             )
     empty = row.get("empty", "").strip()
@@ -150,26 +150,26 @@ def _entry(file: Path, line: int, row: Mapping[str, str]) -> Entry:
 
 
 def _sun(azimuth_deg: float, elevation_deg: float) -> FloatArray | None:
-    """0 is south, east is positive, as PAINT counts."""
+    """Return the direction for PAINT's azimuth: 0 is south, east is positive."""
     if not (np.isfinite(azimuth_deg) and np.isfinite(elevation_deg)):
         return None
     return direction(np.pi - np.radians(azimuth_deg), np.radians(elevation_deg))
 
 
 def beside(path: Path, heliostat: str = "") -> Entry | None:
-    """Return what PAINT's file beside a photograph says; None if there is none.
+    """Return the entry in PAINT's file beside a photograph; None if there is no such file.
 
     Parameters
     ----------
     path
         ``ID/Calibration/137608-raw.png`` with ``137608-calibration-properties.json``.
     heliostat
-        If the folder does not name it.
+        Used if the folder does not name it.
 
     Raises
     ------
     FormatError
-        If the file is there and cannot be read.
+        If the file exists and cannot be read.
     """
     file = path.with_name(f"{_number(path)}-calibration-properties.json")
     if not file.exists():

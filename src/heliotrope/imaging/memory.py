@@ -1,4 +1,4 @@
-"""What the empty targets of a plant look like, kept up to date from photograph to photograph."""
+"""Models of a plant's empty targets, updated from photograph to photograph."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -10,12 +10,12 @@ from heliotrope.imaging.spots.background import EmptyTarget
 
 
 class Memory:
-    """Models of empty targets, one for each face that was seen.
+    """Models of empty targets, one for each face.
 
     Parameters
     ----------
     models
-        To begin with.
+        Initial models.
 
     Examples
     --------
@@ -39,9 +39,10 @@ class Memory:
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:
-        """Take in what was seen on faces; where beams were, nothing is learnt.
+        """Learn from faces, except where beams are.
 
-        A face that is mostly in beams or shadows, or whose grid has changed, teaches nothing.
+        Nothing is learnt from a face that is mostly in beams or shadows, or that has another grid
+        than before.
         """
         for face in faces:
             picture = face.picture
@@ -54,18 +55,18 @@ class Memory:
 
     @classmethod
     def load(cls, folder: str | Path) -> "Memory":
-        """Return the memory of a folder; of one that is not there yet, an empty one.
+        """Return the memory stored in a folder; an empty one if there is no such folder.
 
         Raises
         ------
         FormatError
-            If a file in it is no model.
+            If a file in it is not a model.
         InputError
-            If it is no folder.
+            If the path is not a folder.
         """
         place = Path(folder)
         if place.exists() and not place.is_dir():
-            raise InputError(f"{place}: a folder is wanted here, for models of empty targets")
+            raise InputError(f"{place}: not a folder; give one for models of empty targets")
         return cls(EmptyTarget.load(file) for file in sorted(place.glob("*.npz")))
 
     def save(self, folder: str | Path) -> None:
@@ -85,7 +86,7 @@ class Memory:
             model.save(place / f"{name}.npz")
 
 
-#: A face with less of its paint free of light teaches nothing.
+#: Least share of a face's paint without beams for learning.
 _LEAST_FREE = 0.3
 
 

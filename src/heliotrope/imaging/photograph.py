@@ -1,4 +1,4 @@
-"""A photograph read: its targets, their spots in metres with covariance, and what is wrong."""
+"""Read a photograph: its targets, their spots in metres with covariance, reasons against them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -23,21 +23,21 @@ from heliotrope.imaging.targets.view import Face, View
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
 
-#: Pixels at a target's border that show part of what is beyond it: at least so many, or this
-#: times the softness of the marks' edges, and at most so many.
+#: Rim of a target whose pixels show part of what lies beyond: least width, multiple of the
+#: softness of the marks' edges, and greatest width, px.
 _LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
 
 
 @dataclass(frozen=True)
 class PlacedSpot:
-    """A spot and where it is.
+    """A spot and its place.
 
     Attributes
     ----------
     spot
         Its shape, on its face.
     target
-        On which its centroid lies; None beside all targets.
+        The target under its centroid; None beside all targets.
     plane
         Metres right of and above the target's centre (of the face's origin if there is no
         target), (2,).
@@ -46,12 +46,12 @@ class PlacedSpot:
     point
         ENU metres, (3,).
     covariance_enu
-        Of the point, m², (3, 3): nothing across the plane.
+        Of the point, m², (3, 3); 0 across the plane.
     pixel
-        Where it is in the frame, (2,).
+        In the frame, (2,).
     flux
-        Its light over the frame's exposure and gain, full scales m² per second at gain 1:
-        frames of one camera can be compared by it. NaN if they are not known.
+        Its light over the frame's exposure and gain, full scales m² per second at gain 1,
+        which makes frames of one camera comparable; NaN if exposure or gain is unknown.
     """
 
     spot: Spot
@@ -78,9 +78,9 @@ class Reading:
     found
         The target in the frame.
     spots
-        On it: the one that is meant first, then by power.
+        On it: the intended one first, then by power.
     reasons
-        What speaks against the first; empty if it is good.
+        Against the first spot; empty if it is good.
     """
 
     found: FoundTarget
@@ -89,22 +89,22 @@ class Reading:
 
     @property
     def good(self) -> bool:
-        """Whether the first spot may be believed."""
+        """Whether the first spot can be trusted."""
         return bool(self.spots) and not self.reasons
 
 
 @dataclass(frozen=True)
 class LookedAt:
-    """A face and what was seen on it: for pictures, and to learn the empty target from.
+    """A face and its background: for pictures, and for learning the empty target.
 
     Attributes
     ----------
     picture
         The face on a grid of metres.
     background
-        Without its beams.
+        The face without beams.
     unexplained
-        Part of its paint beside the spots that is brighter or darker than that.
+        Share of its paint beside the spots that is brighter or darker than the background.
     """
 
     picture: Rectified
@@ -114,14 +114,14 @@ class LookedAt:
 
 @dataclass(frozen=True)
 class Photograph:
-    """What a photograph shows.
+    """The result of reading a photograph.
 
     Attributes
     ----------
     frame
-        Itself.
+        The photograph.
     readings
-        For each target that was looked for.
+        One for each target that was searched for.
     beside
         Spots on a found face, but on none of its targets.
     faces
@@ -139,16 +139,16 @@ class Photograph:
         Raises
         ------
         InputError
-            If it was not looked for.
+            If the target was not searched for.
         """
         for reading in self.readings:
             if reading.found.target.name == target:
                 return reading
-        raise InputError(f"target {target}: it was not looked for in {self.frame.name}")
+        raise InputError(f"target {target} was not searched for in {self.frame.name}")
 
     @property
     def views(self) -> tuple[View, ...]:
-        """How the faces lie in the frame: where to look in the next one."""
+        """How the faces lie in the frame; the next frame is searched there first."""
         return tuple(f.picture.view for f in self.faces if f.picture.view is not None)
 
 
@@ -159,19 +159,19 @@ class Settings:
     Attributes
     ----------
     limits
-        Of quality.
+        Tolerances of the spot's quality.
     background
         "frame", "model" (with ``empty``) or "difference" (with an empty frame); "auto"
-        takes the best of what is there.
+        takes the best that is available.
     empty
-        Models of the empty faces by any names; the one of a face's targets is taken.
+        Models of empty faces under any names; a face's targets select its model.
     expectations
         By target.
     pictures
         Of taught marks, by their code.
     gamma
-        Of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2
-        comes near to sRGB. It is undone before anything is measured.
+        Of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2 is
+        close to sRGB. It is undone before anything is measured.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -191,22 +191,22 @@ def read_photograph(
     previous: Sequence[View] = (),
     without: Frame | None = None,
 ) -> Photograph:
-    """Return where the beams of a photograph stand on its targets.
+    """Find the targets of a photograph and the beams on them.
 
     Parameters
     ----------
     frame
         The photograph.
     targets
-        That may be in it.
+        Targets that may be in it.
     camera
-        What is known of it.
+        The camera, as far as it is known.
     settings
         How to read.
     previous
-        Views of an earlier photograph of the same camera: it need not be searched then.
+        Views of an earlier photograph of the same camera, which save the search.
     without
-        The same camera's frame without the beam.
+        A frame of the same camera without the beam.
     """
     with _one_thread().limit(limits=1, user_api="blas"):
         return _read(frame, targets, camera, settings or Settings(), previous, without)
@@ -214,7 +214,7 @@ def read_photograph(
 
 @lru_cache(maxsize=1)
 def _one_thread() -> "ThreadpoolController":
-    """Matrices of a photograph are small: threads would wait longer than they work."""
+    """Return the controller of BLAS threads; matrices here are too small for threads to pay."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -252,14 +252,14 @@ def _read(
 
 
 def read_crop(frame: Frame, target: Target, settings: Settings | None = None) -> Photograph:
-    """Return where the beam stands in a picture of exactly one target.
+    """Find the beam in a picture that shows exactly one target.
 
     Parameters
     ----------
     frame
-        Its corners are the target's; its size is free.
+        Its corners are those of the target; its size is free.
     target
-        What it shows.
+        The target that it shows.
     settings
         How to read.
     """
@@ -277,14 +277,14 @@ def read_crop(frame: Frame, target: Target, settings: Settings | None = None) ->
 
 
 def linear(frame: Frame, gamma: float) -> Frame:
-    """Return a frame whose pixels are proportional to light, 16 bit, if they are not yet.
+    """Return a 16-bit frame whose pixels are proportional to light; the frame itself if gamma is 1.
 
     Parameters
     ----------
     frame
         As the camera gives it.
     gamma
-        Its pixels are light to the power 1/gamma.
+        The frame's pixels are light to the power 1/gamma.
 
     Raises
     ------
@@ -301,7 +301,7 @@ def linear(frame: Frame, gamma: float) -> Frame:
 
 
 def _rim(found: Sequence[FoundTarget]) -> int:
-    """How many grid pixels at a target's border show what is beyond it, by the marks' blur."""
+    """Return the width of the rim that shows what lies beyond a target, grid pixels."""
     soft = [m.blur.max() for f in found for m in f.marks if m.used and np.isfinite(m.blur).all()]
     if not soft:
         return _LEAST_RIM
@@ -310,7 +310,7 @@ def _rim(found: Sequence[FoundTarget]) -> int:
 
 
 def _trimmed(picture: Rectified, rim: int) -> Rectified:
-    """Return a face without the rim of its surface, which shows what is beyond it in part."""
+    """Return a face without the rim of its surface."""
     import cv2
 
     inner = cv2.erode(
@@ -337,7 +337,7 @@ def _views(found: Sequence[FoundTarget]) -> list[View]:
 def _empty_picture(
     without: Frame, view: View, camera: Camera | None, chosen: Settings
 ) -> Rectified:
-    """The face in the frame without the beam, found there anew: the camera may have moved."""
+    """Return the face in the frame without the beam, found anew: the camera may have moved."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:
@@ -370,12 +370,12 @@ def _background(picture: Rectified, chosen: Settings, empty: Rectified | None) -
         way = "difference" if empty is not None else "model" if ready else "frame"
     if way == "difference":
         if empty is None:
-            raise InputError("background by difference: give a frame without the beam as well")
+            raise InputError("background by difference needs a frame without the beam; give one")
         return backgrounds.from_difference(picture, empty)
     if way == "model":
         if model is None:
             raise InputError(
-                f"background by model: none is known of target {names[0]}; learn one from empty "
+                f"background by model: target {names[0]} has no model; learn one from empty "
                 "frames, or use the frame alone"
             )
         return backgrounds.from_model(picture, model)
@@ -383,7 +383,7 @@ def _background(picture: Rectified, chosen: Settings, empty: Rectified | None) -
 
 
 def _placed(picture: Rectified, spot: Spot) -> PlacedSpot:
-    """Put a spot on the target that it is on, with the covariance of the view added."""
+    """Place a spot on its target, and add the covariance of the view."""
     face, view = picture.face, picture.view
     point = face.point(spot.centroid)
     covariance, pixel = spot.covariance, picture.pixels(spot.centroid)

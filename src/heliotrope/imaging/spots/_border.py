@@ -1,4 +1,4 @@
-"""What the border of a target cuts off a beam, estimated from how it falls there."""
+"""Estimate the light of a beam beyond a target's border from its decline at the border."""
 
 from dataclasses import dataclass
 
@@ -8,28 +8,28 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: Rays from the centroid.
+#: Number of rays from the centroid.
 _RAYS = 120
-#: How steeply a beam falls is read over this much before the border, m.
+#: Distance before the border over which the decline is measured, m.
 _SLOPE = 0.3
-#: It falls as a Gaussian of its second moments does, or up to so many times as steeply.
+#: Greatest decline, relative to a Gaussian of the beam's second moments.
 _STEEPER = 3.0
-#: Where it is fainter than this part of its peak it ends; from the second on it goes on.
+#: At the border: below the first share of its peak a beam ends, above the second it goes on.
 _ENDS, _GOES_ON = 0.05, 0.25
 
 
 @dataclass(frozen=True)
 class Beyond:
-    """Light that the border cuts off.
+    """Light beyond the border.
 
     Attributes
     ----------
     share
-        Of all light, what is cut off included.
+        Of all light, that beyond included.
     shift
-        By how much it moves the centroid, m, (2,).
+        Of the centroid, m, (2,).
     most
-        By how much it would if the beam went on as a Gaussian however faint, m, (2,).
+        Shift if the beam went on as a Gaussian however faint, m, (2,).
     """
 
     share: float
@@ -49,30 +49,29 @@ def beyond(
     centroid: FloatArray,
     moments: FloatArray,
 ) -> Beyond:
-    """Return what of a beam lies beyond the border of what is seen.
+    """Return the light of a beam beyond the border of the visible target.
 
     Parameters
     ----------
     picture
         The face.
     soft
-        Light of beams, softened, (H, W).
+        Light of beams, smoothed, (H, W).
     region
-        The beam's, (H, W).
+        Pixels of the beam, (H, W).
     total, peak, centroid, moments
-        Sum of its light, m², and greatest; its centre, m, and second moments, m², of what
-        is seen.
+        Of the visible light: sum, m², maximum, centre, m, and second moments, m².
 
     Notes
     -----
-    Along a ray from the centroid the beam is taken as b exp((r0² − r²)/2σ²) beyond the
-    border at r0, where it has the brightness b, with the σ of the second moments in that
-    direction, or less if it falls more steeply before the border. Its light is then b σ² for
-    each radian, and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
+    Along a ray from the centroid the beam is taken as b exp((r0² − r²)/2σ²) beyond the border
+    at r0, where its brightness is b. σ is that of the second moments in this direction, or
+    less if the beam falls more steeply before the border. The light is then b σ² per radian,
+    and its first moment b (σ² r0 + σ³ √(π/2) erfcx(r0/√2σ)).
 
-    Beams of heliostats end where a Gaussian goes on: what lies beyond counts from nothing
-    where b is a twentieth of the peak to full where it is a quarter. On 107 rendered beams
-    that lose up to a tenth of their light this leaves a third of the shift.
+    Beams of heliostats end where a Gaussian goes on. So the light beyond is weighted from 0,
+    where b is a twentieth of the peak, to 1, where it is a quarter. On 107 rendered beams that
+    lose up to a tenth of their light, a third of the shift remains.
     """
     from scipy.special import erfcx
 
@@ -101,9 +100,9 @@ def beyond(
 def _at_border(
     picture: Rectified, soft: Image, region: Mask, centroid: FloatArray, ray: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where rays leave the seen part of a beam, its brightness, and its logarithm's fall, 1/m.
+    """Return where rays leave a beam, its brightness there, and its logarithmic decline, 1/m.
 
-    The brightness is 0 where they leave it elsewhere than at the border.
+    The brightness is 0 for rays that leave the beam elsewhere than at the border.
     """
     r = picture.step * np.arange(1, int(np.hypot(*picture.shape)))
     pixel = np.round(picture.pixels(centroid + r[:, None, None] * ray)).astype(int)

@@ -1,7 +1,7 @@
-"""The straight edge of a shadow across a face: found, and followed while a background is fitted.
+"""Straight edges of shadows across a face: find them, and adjust them in a background fit.
 
-Places are those of the grid that backgrounds are fitted on: columns and rows from its middle,
-rows downwards.
+Places are columns and rows from the middle of the grid on which backgrounds are fitted; rows run
+downwards.
 """
 
 from dataclasses import dataclass, replace
@@ -12,34 +12,34 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.targets.rectify import Mask
 
-#: Brightness is compared across a line over so many cells to either side.
+#: Distance to either side of a line at which brightness is compared, cells.
 _ARM = 2.0
-#: Directions and shifts of lines that are tried: rad and cells apart.
+#: Steps between the directions (rad) and offsets (cells) of lines that are tried.
 _TURN, _SHIFT = np.radians(5.0), 1.0
-#: A line must be seen over so many cells.
+#: Least visible length of a line, cells.
 _LENGTH = 12
-#: Brightness must change by this part of the face's, and so many times what other lines have.
+#: Least change of brightness: relative to the face, and to the median of all lines.
 _CHANGE, _ABOVE = 0.02, 5.0
-#: At one end of a line it must change by as much as elsewhere, to this part.
+#: At one end of a line at least, the change must agree with the rest to this share.
 _ALIKE = 0.25
-#: What one step of the fit may turn, shift and widen an edge by: rad, cells, and relative.
+#: Greatest turn (rad), shift (cells) and relative widening of an edge in one step of the fit.
 _STEP = np.array([0.06, 1.5, 0.5])
 
 
 @dataclass(frozen=True)
 class Edge:
-    """A border between two brightnesses.
+    """An edge between two levels of brightness.
 
     Attributes
     ----------
     angle
         Of its normal, clockwise from the right, rad.
     offset
-        Of it along the normal, from the middle, cells.
+        Along the normal, from the middle, cells.
     breadth
-        Standard deviation of what softens it, cells.
+        Standard deviation of its blur, cells.
     height
-        By how much brightness rises across it, about.
+        Approximate rise of brightness across it.
     """
 
     angle: float
@@ -48,11 +48,11 @@ class Edge:
     height: float = 0.0
 
     def distance(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        """Return how far beyond it places are, cells."""
+        """Return the distances of places beyond it, cells."""
         return np.asarray(x * np.cos(self.angle) + y * np.sin(self.angle) - self.offset)
 
     def step(self, x: FloatArray, y: FloatArray, breadth: float | None = None) -> FloatArray:
-        """Return 0 on this side of it, 1 beyond, and what is between."""
+        """Return 0 on this side, 1 beyond, and a smooth step between."""
         from scipy.special import ndtr
 
         soft = self.breadth if breadth is None else breadth
@@ -81,7 +81,7 @@ class Edge:
         )
 
     def moved(self, numbers: FloatArray) -> "Edge":
-        """Return where it is after a fit gave its six columns these numbers."""
+        """Return the edge moved by the six numbers fitted to its columns."""
         height = numbers[0]
         if abs(height) < 1e-9:
             return self
@@ -94,7 +94,7 @@ class Edge:
         )
 
     def crosses(self, odd: Mask, paint: Mask, near: float = 6.0) -> bool:
-        """Return whether something odd is near both of its ends, at the face's border."""
+        """Return whether unexplained places lie near both of its ends at the face's border."""
         x, y = places((odd.shape[0], odd.shape[1]))
         ends = border(paint) & (np.abs(self.distance(x, y)) < near + self.breadth)
         along = y * np.cos(self.angle) - x * np.sin(self.angle)
@@ -105,7 +105,7 @@ class Edge:
 
 
 def border(paint: Mask) -> Mask:
-    """Return what of the paint is among its outermost three rows and columns."""
+    """Return the outermost three rows and columns of the paint."""
     rows, columns = np.flatnonzero(paint.any(axis=1)), np.flatnonzero(paint.any(axis=0))
     rim = paint.copy()
     rim[rows[0] + 3 : rows[-1] - 2, columns[0] + 3 : columns[-1] - 2] = False
@@ -113,7 +113,7 @@ def border(paint: Mask) -> Mask:
 
 
 def prior(level: float) -> FloatArray:
-    """Return the precision of the six numbers of an edge's columns on a face of brightness."""
+    """Return the prior precision of an edge's six numbers on a face of a brightness."""
     height = 0.5 * level
     deviation = np.array([height, 0.1 * level, 0.1 * level, 0.1 * height, height, height])
     return np.asarray(1.0 / np.maximum(deviation, 1e-4) ** 2)
@@ -127,10 +127,10 @@ def places(shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
 
 
 def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
-    """Return straight lines across which brightness changes all along, the likeliest first.
+    """Return straight lines with a uniform change of brightness across them, the best first.
 
-    Along the edge of a shadow brightness changes by as much everywhere: the lower and the
-    upper quarter of the changes agree. A beam's flank is bent, and ends.
+    The change is uniform along a shadow's edge: its quartiles agree. The flank of a beam is
+    curved and ends.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
     paint
         Where it is that of bare paint.
     most
-        How many lines at most.
+        Greatest number of lines.
     """
     rows, columns = soft.shape
     reach = 0.5 * float(np.hypot(rows, columns))
@@ -153,7 +153,7 @@ def find_edges(soft: FloatArray, paint: Mask, most: int = 3) -> list[Edge]:
         a, o = np.unravel_index(int(np.argmax(size)), size.shape)
         found.append(_nearer(soft, paint, float(angles[a]), float(offsets[o])))
         turn = np.abs((angles - angles[a] + 0.5 * np.pi) % np.pi - 0.5 * np.pi)[:, None]
-        # Turned past half a circle, a line's offset changes its sign.
+        # Beyond half a turn, the offset of a line changes sign.
         same = np.where(np.abs(angles - angles[a]) < 0.5 * np.pi, 1.0, -1.0)[:, None]
         shift = np.abs(same * offsets[None, :] - offsets[o])
         size = np.where((turn < 4.5 * _TURN) & (shift < 8.0), 0.0, size)
@@ -171,10 +171,10 @@ def _nearer(soft: FloatArray, paint: Mask, angle: float, offset: float) -> Edge:
 def _changes(
     soft: FloatArray, paint: Mask, angles: FloatArray, offsets: FloatArray, apart: float
 ) -> FloatArray:
-    """By how much brightness changes across lines, (A, O); 0 where it changes unevenly.
+    """Return the changes of brightness across lines, (A, O); 0 where they are not uniform.
 
-    It is the middle of the shortest range that holds half of a line's changes, less that
-    range, and less the shorter the line is.
+    The score is the middle of the shortest range that holds half of a line's changes, minus
+    the range, reduced for short lines.
     """
     difference = _differences(soft, paint, angles, offsets, apart)
     there = np.isfinite(difference)
@@ -186,7 +186,7 @@ def _changes(
         np.median(difference[each[:, None], np.clip(at, 0, samples - 1)], axis=1)
         for at in (first[:, None] + three, last[:, None] - three)
     ]
-    difference.sort(axis=1)  # the unknown ones last
+    difference.sort(axis=1)  # NaN last
     half = np.maximum(count // 2, 1)
     upper = np.minimum(np.arange(samples) + half[:, None], samples - 1)
     ranges = np.take_along_axis(difference, upper, axis=1) - difference
@@ -195,8 +195,7 @@ def _changes(
     width = ranges[each, best]
     middle = 0.5 * (difference[each, best] + difference[each, upper[each, best]])
     size = np.abs(middle)
-    # A beam's flank ends before the face does; at one of a shadow's ends at least there is
-    # no beam.
+    # A beam's flank ends before the face does; one end of a shadow at least is free of beams.
     even = np.zeros(len(count), dtype=bool)
     for end in ends:
         even |= np.abs(end - middle) < _ALIKE * size
@@ -210,7 +209,7 @@ def _changes(
 def _differences(
     soft: FloatArray, paint: Mask, angles: FloatArray, offsets: FloatArray, apart: float
 ) -> FloatArray:
-    """Changes of brightness across lines along each, (A · O, T); NaN beyond the paint."""
+    """Return changes of brightness along each line, (A · O, T); NaN outside the paint."""
     import cv2
 
     rows, columns = soft.shape

@@ -1,6 +1,6 @@
 # mypy: disable-error-code="no-untyped-call, untyped-decorator"
 # mypy: allow-untyped-defs
-"""Compiled: which of a picture's tops each of its pixels descends from."""
+"""Compiled: the top of a picture from which each pixel descends."""
 
 import numpy as np
 from numba import njit
@@ -10,7 +10,7 @@ from heliotrope.jit import OPTIONS
 
 @njit(**OPTIONS)
 def _root(parent, number):
-    """Return the top that a top has become part of."""
+    """Return the top into which a top was merged."""
     while parent[number] != number:
         parent[number] = parent[parent[number]]
         number = parent[number]
@@ -21,10 +21,10 @@ def _root(parent, number):
 def number_tops(values, inside, foot, seed, dip, least, owner):
     """Number the tops of a picture in ``owner`` (H, W), and return how many there are.
 
-    The water falls: pixels appear in the order of their brightness. One without a neighbour
-    is a new top; where two tops meet, the lower one becomes part of the higher one unless
-    brightness has fallen by the part ``dip`` of its height, and by ``least``, since then, and
-    it is as high as ``seed``. Other pixels go where their brightest neighbour went.
+    Pixels are taken in the order of brightness. A pixel without a neighbour starts a new top.
+    Where two tops meet, the lower one is merged into the higher one, unless it is as high as
+    ``seed`` and brightness has fallen from it by the share ``dip`` and by ``least``. Other pixels
+    join the top of their brightest neighbour.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def number_tops(values, inside, foot, seed, dip, least, owner):
     inside
         Which pixels count, (H, W).
     foot
-        Fainter ones belong to no top.
+        Fainter pixels belong to no top.
     seed, dip, least
         See above.
     owner

@@ -1,4 +1,4 @@
-"""What the target would look like without a beam."""
+"""Estimate what a target would look like without beams."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,71 +16,70 @@ from heliotrope.imaging.spots._shadow import Edge, border, find_edges, places
 from heliotrope.imaging.spots._shadow import prior as edge_prior
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: The fit looks at every so-many-th pixel.
+#: The fit uses every sixth pixel each way.
 _STRIDE = 6
-#: Order of the polynomial across a target; more along a longer face.
+#: Order of the polynomial across a target; higher along a longer face.
 _ORDER = 6
-#: Light on a target is smooth: standard deviation of the terms of order n, over the mean,
-#: is this over n^1.5. Photographs of empty targets have 0.06 at the first order and 0.005
-#: at the sixth.
+#: Light on a target is smooth: terms of order n have a standard deviation of this over n^1.5,
+#: relative to the mean. Photographs of empty targets have 0.06 at order 1 and 0.005 at order 6.
 _UNEVEN = 0.1
-#: Joints and stains hang together over about this area, m², until it is measured.
+#: Initial area over which joints and stains are correlated, m²; it is then measured.
 _PATCH = 0.4
-#: Brighter than the background by this many deviations: a beam.
+#: Beams are brighter than the background by this many deviations,
 _HOT = 3.0
-#: And by at least this part of it.
+#: and by at least this share of it.
 _HOT_PART = 0.002
-#: A model that stands on so many frames says more of the paint than one frame does.
+#: Frames from which on a model knows the paint better than a single frame.
 _KNOWN = 3.0
-#: How uneven the light of a frame is, over that: held by so many numbers' worth, and between.
+#: Unevenness of a frame's light relative to the prior: weight of the prior, and bounds.
 _EVEN = (0.01, 0.05, 1.5)
-#: The face is softened by this many grid pixels before the fit looks at it.
+#: Blur of the face before the fit, grid pixels.
 _SOFT = 2.0
-#: A shadow leaves this many places at a face's border unexplained, or more.
+#: Unexplained places at a face's border above which a shadow is looked for.
 _BORDER = 4
-#: Unexplained is what is off by three deviations, within these bounds of the brightness.
+#: Bounds, relative to the brightness, on the three deviations beyond which a place is unexplained.
 _ODD = (0.015, 0.03)
-#: An edge explains this part of the paint besides, and its height is this many deviations.
+#: Least gain in explained paint by an edge, and least height of the edge in its deviations.
 _GAIN, _CERTAIN = 0.02, 4.5
-#: Paint is as it should be within so many deviations, or this part of the brightness.
+#: Paint is as expected within this many deviations, or this share of the brightness.
 _PLAIN, _PLAIN_PART = 4.0, 0.02
-#: What is off over less than this is paint, m.
+#: Deviations over less than this belong to the paint, m.
 BROAD = 0.3
-#: With less of the paint free of beams than this, no more is left out.
+#: Least share of the paint that the fit keeps.
 _FEWEST = 0.06
-#: Turns of the fit in which a shadow's edge is moved to its place.
+#: Iterations of the fit in which the edge of a shadow is moved.
 _SETTLING = 6
-#: What is near a beam holds its tails: pixels of the fit's grid.
+#: Margin around a beam for its tails, pixels of the fit's grid.
 _NEAR = 3
 
 
 @dataclass(frozen=True)
 class Background:
-    """A face without its beams, and how certain that is.
+    """A face without its beams, with its covariance.
 
     Attributes
     ----------
     values
         Brightness over full scale, (H, W).
     deviation
-        Standard deviation of what is left of the paint after smoothing, of full scale.
+        Standard deviation of the residuals of the smoothed paint, of full scale.
     noise
         Standard deviation of a pixel, of full scale.
     patch
-        Area over which what is left hangs together, m².
+        Area over which the residuals are correlated, m².
     basis
-        Derivatives of the values by the numbers of the fit at the fit's grid, (h, w, K).
+        Derivatives of the values by the parameters of the fit, on the fit's grid, (h, w, K).
     covariance
-        Of those numbers, (K, K).
+        Of the parameters, (K, K).
     stride
-        Grid pixels from one row of the fit's grid to the next.
+        Pixels between rows of the fit's grid.
     method
         "frame", "difference" or "model".
     seen
-        Part of the paint that was free of beams.
+        Share of the paint that was free of beams.
     reflectance
-        Of the paint over its usual one, (H, W), if it is known: light divided by it is what
-        falls on the face.
+        Of the paint relative to the usual one, (H, W), or None. Light divided by it is the
+        light that falls on the face.
     """
 
     values: Image
@@ -96,11 +95,11 @@ class Background:
 
 
 def from_frame(picture: Rectified) -> Background:
-    """Return the background of one frame alone: smooth light on even paint.
+    """Return the background from one frame alone: smooth light on even paint.
 
-    A polynomial is fitted to what no beam lights. Beams are bright, so they are what
-    stands out above the fit; their surroundings are left out with them, and the fit is
-    made again until nothing changes.
+    A polynomial is fitted to the paint that no beam lights. Beams are bright and stand out above
+    the fit. They are left out with their surroundings, and the fit is repeated until nothing
+    changes.
     """
     return _fit(picture, np.ones(picture.shape, dtype=np.float32), _orders(picture), "frame")
 
@@ -108,7 +107,7 @@ def from_frame(picture: Rectified) -> Background:
 def from_difference(picture: Rectified, without: Rectified) -> Background:
     """Return the background from a second frame that shows the target without the beam.
 
-    The light may have changed from frame to frame: a plane of ratios is fitted.
+    A plane of ratios is fitted, because the light may have changed between the frames.
 
     Raises
     ------
@@ -117,24 +116,24 @@ def from_difference(picture: Rectified, without: Rectified) -> Background:
     """
     if without.shape != picture.shape or not np.allclose(without.first, picture.first):
         raise InputError(
-            f"the empty frame shows {without.shape} pixels of another face than the frame with "
-            f"the beam, {picture.shape}; give two frames of the same target"
+            f"the empty frame shows another face ({without.shape} px) than the frame with the "
+            f"beam ({picture.shape} px); give two frames of the same target"
         )
     return _fit(picture, without.values, (1, 1), "difference")
 
 
 @dataclass(frozen=True)
 class EmptyTarget:
-    """A running model of an empty face: how bright its paint is, pixel by pixel.
+    """A running model of an empty face: the reflectance of its paint, pixel by pixel.
 
     Attributes
     ----------
     reflectance
         Brightness over that of the smooth light, (H, W).
     weight
-        Frames that each pixel stands on, forgotten ones less, (H, W).
+        Number of frames behind each pixel, old ones counting less, (H, W).
     memory
-        Frames after which a frame counts a third.
+        Frames after which the weight of a frame falls to 1/e.
     targets
         Names of the face's targets.
     """
@@ -146,7 +145,7 @@ class EmptyTarget:
 
     @staticmethod
     def of(picture: Rectified, memory: float = 50.0) -> "EmptyTarget":
-        """Return a model that has seen nothing yet."""
+        """Return a model without any frame."""
         ones = np.ones(picture.shape, dtype=np.float32)
         names = tuple(target.name for target in picture.face.targets)
         return EmptyTarget(ones, np.zeros_like(ones), memory, names)
@@ -159,8 +158,8 @@ class EmptyTarget:
         picture
             A frame, with or without beams.
         spots
-            Where beams are in it, (H, W): nothing is learnt there. By default they are
-            looked for.
+            Where beams are in it, (H, W); nothing is learnt there. By default they are
+            searched for.
         """
         self._check(picture)
         known = self.ready
@@ -183,7 +182,7 @@ class EmptyTarget:
         Raises
         ------
         InputError
-            If it cannot be written.
+            If the file cannot be written.
         """
         write_file(
             path,
@@ -205,7 +204,7 @@ class EmptyTarget:
         InputError
             If there is no such file.
         FormatError
-            If it is not one of ours.
+            If the file is not such a model.
         """
         file = check_file(path, "a model of an empty target", binary=True)
         try:
@@ -214,24 +213,24 @@ class EmptyTarget:
                 memory, names = float(held["memory"]), tuple(str(n) for n in held["targets"])
         except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
             raise FormatError(
-                file, f"no model of an empty target ({error}); learn one anew from empty frames"
+                file, f"no model of an empty target ({error}); learn a new one from empty frames"
             ) from None
         good = reflectance.ndim == 2 and reflectance.shape == weight.shape and memory > 0.0
         if not good or not (np.isfinite(reflectance).all() and np.isfinite(weight).all()):
             raise FormatError(
                 file,
                 f"reflectance {reflectance.shape} and weight {weight.shape} must be finite, and "
-                f"memory {memory} above 0; learn a model anew from empty frames",
+                f"memory {memory} above 0; learn a new model from empty frames",
             )
         return EmptyTarget(reflectance.astype(np.float32), weight.astype(np.float32), memory, names)
 
     @property
     def ready(self) -> bool:
-        """Whether it has seen enough to say more of the paint than one frame does."""
+        """Whether it knows the paint better than a single frame does."""
         return float(np.median(self.weight)) >= _KNOWN
 
     def fits(self, picture: Rectified) -> bool:
-        """Whether it is a model of just the targets that a picture shows, on its grid."""
+        """Return whether it is a model of exactly the targets and the grid of a picture."""
         names = {target.name for target in picture.face.targets}
         same = not self.targets or set(self.targets) == names
         return same and picture.shape == self.reflectance.shape
@@ -245,15 +244,15 @@ class EmptyTarget:
             )
         if picture.shape != self.reflectance.shape:
             raise InputError(
-                f"the model is of {self.reflectance.shape} pixels, the frame of {picture.shape}; "
-                "learn a model of this target anew"
+                f"the model has {self.reflectance.shape} px, the frame {picture.shape} px; learn a "
+                "new model of this target"
             )
 
 
 def from_model(picture: Rectified, model: EmptyTarget) -> Background:
-    """Return the background of a frame from what the empty target is known to look like.
+    """Return the background of a frame from a model of the empty target.
 
-    Light that falls on stained paint is divided by its reflectance afterwards.
+    Light on stained paint is later divided by its reflectance.
 
     Raises
     ------
@@ -263,13 +262,13 @@ def from_model(picture: Rectified, model: EmptyTarget) -> Background:
     model._check(picture)  # noqa: SLF001 (its own module)
     columns, rows = _orders(picture)
     orders = (max(columns // 3, 1), max(rows // 3, 1))
-    # A pixel that was always in a beam is as bright as others, for all that is known.
+    # Assume usual paint where a beam has always been.
     known = np.where(model.weight > 0.0, model.reflectance, np.float32(1.0))
     return _fit(picture, known, orders, "model", known)
 
 
 def beams(picture: Rectified, background: Background) -> Mask:
-    """Return what a beam lights, tails included, (H, W)."""
+    """Return the pixels that a beam lights, tails included, (H, W)."""
     import cv2
 
     above = smooth(picture, picture.values - background.values, 2.0)
@@ -279,10 +278,10 @@ def beams(picture: Rectified, background: Background) -> Mask:
 
 
 def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask]) -> float:
-    """Return the part of the paint beside the spots that is brighter or darker than it should be.
+    """Return the share of paint beside the spots that is brighter or darker than it should be.
 
-    Shadows, stray light and what stands before a target make it. Single pixels, joints and
-    stains do not count: what counts is broader than :data:`BROAD` metres.
+    Causes are shadows, stray light and obstacles. Only areas broader than :data:`BROAD` metres
+    count, so that single pixels, joints and stains do not.
     """
     import cv2
 
@@ -301,12 +300,12 @@ def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask
 
 
 def smooth(picture: Rectified, values: Image, sigma: float) -> Image:
-    """Return values smoothed over bare paint; on a mark what its surroundings say.
+    """Return values smoothed over bare paint and interpolated on marks.
 
     Parameters
     ----------
     picture
-        Whose marks and edges are left out.
+        Its marks and edges are left out.
     values
         (H, W).
     sigma
@@ -329,7 +328,7 @@ def _orders(picture: Rectified) -> tuple[int, int]:
 
 
 def _terms(orders: tuple[int, int]) -> list[tuple[int, int, float]]:
-    """Which products of polynomials are fitted: order across, order up, and order in all."""
+    """Return the fitted products of polynomials: order across, order up, and total order."""
     top = min(order for order in orders if order > 0)
     found = []
     for i in range(orders[0] + 1):
@@ -359,11 +358,11 @@ def _ridge(
     scale: float = 1.0,
     turns: int = 8,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Numbers of greatest posterior probability and their covariance.
+    """Return the parameters of greatest posterior probability and their covariance.
 
-    The first numbers, up to ``evenness``, are those of smooth light. How smooth it is differs
-    from frame to frame: their prior deviations are scaled by what they turn out to be,
-    the expectation-maximisation of a variance, held by one number's worth of a small one.
+    The first ``evenness`` parameters describe smooth light. Its smoothness differs from frame to
+    frame, so their prior deviations are scaled to the values found (expectation maximisation of
+    a variance, with a weak prior for a small one).
     """
     G, r = A.T @ A / variance, A.T @ b / variance
     numbers, covariance = np.zeros(len(prior)), np.zeros((len(prior), len(prior)))
@@ -383,7 +382,7 @@ def _ridge(
 
 @dataclass(frozen=True)
 class _Grid:
-    """What a fit looks at: paint on its grid, and the functions of smooth light there."""
+    """The data of a fit: paint on its grid, and the functions of smooth light there."""
 
     soft: FloatArray
     paint: Mask
@@ -399,7 +398,7 @@ class _Grid:
 
 @dataclass(frozen=True)
 class _Fit:
-    """What came of it."""
+    """The result of a fit."""
 
     basis: FloatArray
     prior: FloatArray
@@ -419,11 +418,11 @@ def _fit(
     method: str,
     reflectance: Image | None = None,
 ) -> Background:
-    """Fit pattern × polynomial, and a shadow's edge if there is one, to what no beam lights."""
+    """Fit pattern × polynomial, and the edge of a shadow if any, to paint without beams."""
     grid = _grid(picture, pattern, orders)
     found = _converged(grid, None)
     even, odd = grid.soft / np.maximum(grid.multiplier, 0.05), _odd(found, grid)
-    # A shadow's edge is not explained where it meets the face's border.
+    # The edge of a shadow leaves unexplained places where it meets the face's border.
     for edge in find_edges(even, grid.paint) if odd[border(grid.paint)].sum() > _BORDER else []:
         if not edge.crosses(odd, grid.paint):
             continue
@@ -467,7 +466,7 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
     count = int(paint.sum())
     if count < 4 * table.shape[-1]:
         raise InputError(
-            f"only {count} places of bare paint are seen: too few for a background; the target "
+            f"only {count} places of bare paint are visible, too few for a background: the target "
             "is too small in the frame or covered"
         )
     level = float(np.median(soft[paint]))
@@ -478,10 +477,10 @@ def _grid(picture: Rectified, pattern: Image, orders: tuple[int, int]) -> _Grid:
 
 
 def _better(other: _Fit, found: _Fit, grid: _Grid) -> bool:
-    """Whether a fit with an edge is to be believed rather than one without, or with another.
+    """Return whether a fit with an edge is better than one without, or with another.
 
     It must explain more of the paint to the same accuracy, and the height of its edge must be
-    certain from what no beam lights.
+    significant in paint without beams.
     """
     limit = _HOT * min(found.spread, other.spread)
     explained = [float((np.abs(f.left(grid))[grid.paint] < limit).mean()) for f in (found, other)]
@@ -496,7 +495,7 @@ def _better(other: _Fit, found: _Fit, grid: _Grid) -> bool:
 
 
 def _odd(found: _Fit, grid: _Grid) -> Mask:
-    """Where smooth light does not explain the paint, single places aside."""
+    """Return where smooth light does not explain the paint, ignoring single places."""
     import cv2
 
     limit = float(np.clip(_HOT * found.spread, _ODD[0] * grid.level, _ODD[1] * grid.level))
@@ -505,7 +504,7 @@ def _odd(found: _Fit, grid: _Grid) -> Mask:
 
 
 def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
-    """Fit, leave out what stands out and its surroundings, and again until nothing changes."""
+    """Fit, leave out places that stand out with their surroundings, and repeat to convergence."""
     import cv2
 
     paint, soft, basis, prior = grid.paint, grid.soft, grid.basis, grid.prior
@@ -530,7 +529,7 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
         spread = 1.4826 * float(np.median(np.abs(left[free] - middle))) + 0.15 / 255.0
         hot = paint & (left > max(_HOT * spread, _HOT_PART * grid.level))
         if edge is not None and turn < _SETTLING:
-            # What is off because the edge is not yet where it belongs is no beam.
+            # Until the edge has settled, residuals near it are not a beam.
             hot &= np.abs(edge.distance(x, y)) > 2.0 * edge.breadth + 2.0
         grown = cv2.dilate(cv2.morphologyEx(hot.astype(np.uint8), cv2.MORPH_OPEN, cross), reach)
         now = paint & (grown == 0)
@@ -545,7 +544,7 @@ def _converged(grid: _Grid, edge: Edge | None) -> _Fit:
 def _upscaled(
     shape: tuple[int, int], orders: tuple[int, int], numbers: FloatArray, edge: Edge | None
 ) -> FloatArray:
-    """The light on the whole grid; the fit's grid lies evenly in it."""
+    """Return the light on the whole grid, in which the fit's grid lies evenly."""
     rows = len(np.arange(_STRIDE // 2, shape[0], _STRIDE))
     columns = len(np.arange(_STRIDE // 2, shape[1], _STRIDE))
 
@@ -564,7 +563,7 @@ def _upscaled(
         return light
     u = (np.arange(shape[1]) - _STRIDE // 2) / _STRIDE - 0.5 * (columns - 1)
     v = (np.arange(shape[0]) - _STRIDE // 2) / _STRIDE - 0.5 * (rows - 1)
-    # The fit saw the face softened.
+    # The fit saw a blurred face.
     sharp = float(np.sqrt(max(edge.breadth**2 - (_SOFT / _STRIDE) ** 2, 0.1**2)))
     step = edge.step(u[None, :], v[:, None], sharp)
     height, right, down = numbers[len(terms) : len(terms) + 3]
@@ -573,10 +572,11 @@ def _upscaled(
 
 
 def _patch(left: FloatArray, held: Mask) -> float:
-    """Over how many grid places what is left hangs together: the integral of its correlation.
+    """Return the number of grid places over which residuals are correlated.
 
-    The correlation of an irregular region is that of its values over that of its mask, both
-    by Fourier transforms; it is summed outwards until it first falls to nothing.
+    This is the integral of the correlation, which for an irregular region is that of its values
+    over that of its mask, both by Fourier transforms; it ends where the correlation first
+    falls to 0.
     """
     count = float(held.sum())
     if count < 10.0:

@@ -1,4 +1,4 @@
-"""Whether a spot may be believed: named reasons against it, each with its measured value."""
+"""Whether a spot can be trusted: named reasons against it, each with its measured value."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,67 +9,67 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.spots.spot import Spot
 from heliotrope.imaging.targets.finding import FoundTarget
 
-#: Reasons, each with what it means.
+#: Reasons and their meanings.
 REASONS: dict[str, str] = {
     "target not found": "the target's marks were not seen in the frame",
-    "no spot": "nothing on the target stands out of its background",
-    "several spots": "the second spot's power over the first one's, or power over what is expected",
+    "no spot": "nothing on the target stands out from its background",
+    "several spots": "power of the second spot over that of the first, or power over the expected",
     "lopsided": "third moments of the spot in units of its standard deviations",
-    "cut at the edge": "brightness of the spot at the target's border over its peak, or by how "
-    "much what the border cuts off moves its centroid, m",
-    "saturated": "part of the spot's light in clipped pixels",
+    "cut at the edge": "brightness of the spot at the target's border over its peak, or shift of "
+    "the centroid by the light beyond the border, m",
+    "saturated": "share of the spot's light in clipped pixels",
     "flare": "brightness of the target's marks over that of its paint: stray light fills them",
-    "cloud": "power of the spot over what is expected, or its peak over the background",
+    "cloud": "power of the spot over the expected, or its peak over the background",
     "moved": "blur of the marks in one direction over that in the other",
     "out of focus": "blur of the marks, m",
-    "smeared": "length or breadth of the spot over what is expected",
-    "covered": "part of the spot that marks cover",
+    "smeared": "length or width of the spot over the expected",
+    "covered": "share of the spot that marks cover",
     "uncertain": "standard deviation of the centroid, m",
-    "background": "part of the target that no spot lights, or that is brighter or darker than "
+    "background": "share of the target that no spot lights, or that is brighter or darker than "
     "light on its paint explains",
 }
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How much of each is borne.
+    """Tolerances of the checks.
 
     Attributes
     ----------
     second_spot
-        Power of another spot on the same target, of the first one's.
+        Power of another spot on the same target, over that of the first.
     edge
-        Brightness at the target's border, of the peak. What the border cuts off is estimated,
-        to about a third of the shift that it makes while this holds.
+        Brightness at the target's border over the peak. Within this limit the light beyond
+        the border is estimated to about a third of the shift it causes.
     cut
         That shift, m.
     clipped
-        Part of the light in clipped pixels.
+        Share of the light in clipped pixels.
     mark_contrast
-        Brightness of the marks, of their surroundings.
+        Brightness of the marks over that of their surroundings.
     power
-        Least power, of the expected one.
+        Least power over the expected.
     surprise
-        By how many of an expectation's deviations a beam may be more powerful, longer or
-        broader than expected.
+        Standard deviations of an expectation by which a beam may exceed it in power, length
+        or width.
     skewness
-        Lopsidedness: two beams that overlap are more lopsided than the beam of one heliostat
-        (98 % of the measured beams of Jülich are below 0.28).
+        Two overlapping beams are more skewed than the beam of one heliostat (98 % of the
+        measured beams of Jülich are below 0.28).
     contrast
-        Peak over background, if nothing is expected.
+        Least peak over background, if nothing is expected.
     motion
         Blur of the marks in one direction over that in the other.
     blur
         Of the marks, m.
     covered
-        Part of a spot under marks.
+        Share of a spot under marks.
     deviation
         Standard deviation of the centroid along its worse axis, m.
     free
-        Part of the face that must be free of light.
+        Least share of the face without light of beams.
     unexplained
-        Part of the face, beside its spots, that is brighter or darker than it should be:
-        shadows with more than one edge, stray light, things in the way.
+        Share of the face, beside its spots, that is brighter or darker than it should be:
+        shadows with more than one edge, stray light, obstacles.
     """
 
     second_spot: float = 0.15
@@ -91,24 +91,24 @@ class Limits:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What is known of a beam beforehand.
+    """Prior knowledge of a beam.
 
     Attributes
     ----------
     power
-        As :class:`heliotrope.imaging.spots.spot.Spot` has it, over the ambient light, m²; NaN if
+        As of :class:`~heliotrope.imaging.spots.spot.Spot`, over the ambient light, m²; NaN if
         unknown.
     flux
-        As :class:`heliotrope.imaging.photograph.PlacedSpot` has it, full scales m²/s at gain
-        1: it depends on the sun alone, and is used before ``power`` where a frame's exposure
-        and gain are known. NaN if unknown.
+        As of :class:`~heliotrope.imaging.photograph.PlacedSpot`, full scales m²/s at gain 1; NaN
+        if unknown. It depends on the sun alone and is preferred to ``power`` where exposure
+        and gain of a frame are known.
     length, width
         Standard deviations along its major and minor axis, m; NaN if unknown.
     deviation
         Relative standard deviation of power, flux, length and width.
     place
-        Where it should be, metres right of and above the target's centre, (2,): of several
-        spots the nearest one is taken. None if unknown.
+        Expected place, metres right of and above the target's centre, (2,), or None; of
+        several spots the nearest is taken.
     """
 
     power: float = float("nan")
@@ -119,20 +119,20 @@ class Expectation:
     deviation: float = 0.15
 
     def most(self, limits: Limits) -> float:
-        """Return how many times what is expected is borne."""
+        """Return the greatest tolerated ratio to the expected value."""
         return float(np.exp(limits.surprise * self.deviation))
 
 
 @dataclass(frozen=True)
 class Reason:
-    """One thing that speaks against a spot.
+    """A reason against a spot.
 
     Attributes
     ----------
     name
         One of :data:`REASONS`.
     value, limit
-        Measured, and what is borne; NaN where there is nothing to measure.
+        Measured and tolerated; NaN where there is nothing to measure.
     text
         In words.
     """
@@ -153,69 +153,74 @@ def judge(
     flux: float = float("nan"),
     unexplained: float = 0.0,
 ) -> list[Reason]:
-    """Return what speaks against the first of the spots on one target.
+    """Return the reasons against the first of the spots on one target.
 
     Parameters
     ----------
     found
         The target in its frame; None for a crop.
     spots
-        On this target, the one that is meant first.
+        On this target, the intended one first.
     deviation
         Standard deviation of its centroid along its worse axis, target included, m.
     free
-        Part of the face that no beam lights.
+        Share of the face that no beam lights.
     limits
-        What is borne.
+        Tolerances.
     expectation
-        What is known beforehand.
+        Prior knowledge.
     flux
         Of the first spot, full scales m²/s at gain 1; NaN if unknown.
     unexplained
-        Part of the face beside its spots that is not as it should be.
+        Share of the face beside its spots that is not as it should be.
     """
     reasons = [] if found is None else _of_frame(found, limits)
     if not spots:
         nothing = float("nan")
         return [
-            Reason("no spot", nothing, nothing, "no spot stands out of the background"),
+            Reason("no spot", nothing, nothing, "no spot stands out from the background"),
             *reasons,
         ]
     first = spots[0]
     second = max((s.power for s in spots[1:]), default=0.0) / max(first.power, 1e-12)
     checks = [
-        ("several spots", second, limits.second_spot, "another spot on it has {:.0%} of its power"),
+        (
+            "several spots",
+            second,
+            limits.second_spot,
+            "a second spot has {:.0%} of its power",
+        ),
         ("cut at the edge", first.edge, limits.edge, "at the border it has {:.0%} of its peak"),
-        ("cut at the edge", first.cut, limits.cut, "what the border cuts off moves it by {:.2f} m"),
+        ("cut at the edge", first.cut, limits.cut, "light beyond the border moves it by {:.2f} m"),
         ("saturated", first.clipped, limits.clipped, "{:.0%} of its light is clipped"),
         ("covered", first.covered, limits.covered, "marks cover {:.0%} of it"),
-        ("uncertain", deviation, limits.deviation, "its centroid is certain to {:.3f} m only"),
+        ("uncertain", deviation, limits.deviation, "its centroid is certain only to {:.3f} m"),
     ]
     for name, value, limit, text in checks:
         if not value <= limit and name not in {r.name for r in reasons}:
             reasons.append(Reason(name, float(value), limit, text.format(value)))
     if free < limits.free:
-        text = f"only {free:.0%} of the target are free of light"
+        text = f"only {free:.0%} of the target is free of light"
         reasons.append(Reason("background", free, limits.free, text))
     elif unexplained > limits.unexplained:
-        text = f"{unexplained:.0%} of the target are brighter or darker than its light explains"
+        text = f"{unexplained:.0%} of the target is brighter or darker than its light explains"
         reasons.append(Reason("background", unexplained, limits.unexplained, text))
     reasons += _of_power(first, flux, limits, expectation)
     if first.skewness > limits.skewness:
-        text = f"its third moments are {first.skewness:.2f}: two beams, or one with a part missing"
+        text = f"its skewness is {first.skewness:.2f}: two beams, or one with a part missing"
         reasons.append(Reason("lopsided", first.skewness, limits.skewness, text))
     most = expectation.most(limits)
-    sizes = {"long": expectation.length, "broad": expectation.width}
+    sizes = {"long": expectation.length, "wide": expectation.width}
     for (word, size), axis in zip(sizes.items(), first.axes, strict=False):
         if axis / size > most:
-            text = f"it is {axis / size:.1f} times as {word} as expected: it moved, or is two"
+            text = f"it is {axis / size:.1f} times as {word} as expected: moved, or two beams"
             reasons.append(Reason("smeared", float(axis / size), most, text))
             break
     return reasons
 
 
 def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation) -> list[Reason]:
-    """What a spot's power says: less than expected is a cloud, more is another beam."""
+    """Judge the power of a spot: less than expected is a cloud, more is another beam."""
     share = flux / expectation.flux
     if not np.isfinite(share):
         share = spot.power / expectation.power
@@ -235,7 +240,7 @@ def _of_power(spot: Spot, flux: float, limits: Limits, expectation: Expectation)
 
 
 def _of_frame(found: FoundTarget, limits: Limits) -> list[Reason]:
-    """What the marks say of the frame: stray light, focus, shake."""
+    """Judge the frame by its marks: stray light, focus, shake."""
     used = [m for m in found.marks if m.used and np.isfinite(m.contrast)]
     if not used:
         return []
@@ -249,7 +254,7 @@ def _of_frame(found: FoundTarget, limits: Limits) -> list[Reason]:
         text = f"the marks' edges are {float(blur.min()):.2f} m soft"
         reasons.append(Reason("out of focus", float(blur.min()), limits.blur, text))
     motion = float(blur.max() / max(blur.min(), 1e-9))
-    # Less than a mark's stroke is told by no eye, and moves no centroid.
+    # Blur below a mark's stroke cannot be seen and moves no centroid.
     if motion > limits.motion and float(blur.max()) > 0.4 * limits.blur:
         text = f"the marks are {motion:.1f} times as soft in one direction: the camera moved"
         reasons.append(Reason("moved", motion, limits.motion, text))

@@ -1,4 +1,4 @@
-"""Beams on a face: which pixels belong to which, and where each one's centroid is."""
+"""Spots on a face: which pixels belong to each, and where its centroid is."""
 
 from dataclasses import dataclass
 
@@ -11,37 +11,36 @@ from heliotrope.imaging.spots._top_kernels import number_tops
 from heliotrope.imaging.spots.background import Background, smooth
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
-#: A beam rises by this many deviations of the background's remains, and this much of it.
+#: Least peak of a beam: in deviations of the background's residuals, and relative to it.
 _SEED, _SEED_PART = 8.0, 0.06
-#: It reaches to where it falls below this many deviations.
+#: A beam ends where it falls below this many deviations,
 _FOOT = 5.0
-#: And, however faint the paint's structure, below this part of its peak.
+#: and below this share of its peak, however faint the paint's structure.
 _FOOT_PART = 0.03
-#: A neck is narrower than this part of a beam's breadth at half its height, either side.
+#: A neck is narrower, either side, than this share of a beam's width at half its height.
 _NECK = 0.3
-#: Beyond its foot it has tails: grown by this part of its radius.
+#: Growth of a beam beyond its foot to include its tails, in its radius.
 _TAIL = 0.15
-#: Paint that is darker than this part of the usual one is no measure of light.
+#: Paint darker than this share of the usual one does not measure light.
 _DARKEST = 0.4
-#: Two tops are two beams if between them brightness falls by this part of the lower one:
-#: facets of one heliostat make 0.16 at most on a hundred measured beams of Jülich.
+#: Two tops are two beams if brightness between them falls by this share of the lower one (facets
+#: of one heliostat reach 0.16 at most on a hundred measured beams of Jülich),
 _DIP = 0.18
-#: And by this many deviations of the background's remains.
+#: and by this many deviations of the background's residuals.
 _DIP_LEAST = 4.0
-#: Its lopsidedness is that of what is brighter than this part of its peak.
+#: Skewness is measured where a beam is brighter than this share of its peak.
 _BODY = 0.1
-#: The smallest beam, m²; the sun's image at 20 m is 0.03.
+#: Smallest beam, m²; the sun's image at 20 m is 0.03.
 _SMALLEST = 0.03
-#: A centroid over the foot and one over the tails differ by what the tails may hide.
+#: Share of the difference between centroids over foot and tails that counts as error.
 _TAIL_SHARE = 0.5
-#: Light below the foot is not seen. With the foot at the part φ of the peak it moves the
-#: centroid by about this times φ^1.5 deviations of the beam: measured on 400 simulated
-#: beams over photographs of empty targets, where it holds for peaks of 0.25 to 2 times
-#: the background.
+#: Light below the foot is not seen. With the foot at the share φ of the peak, it moves the
+#: centroid by about this times φ^1.5 deviations of the beam. Measured on 400 simulated beams over
+#: photographs of empty targets, for peaks of 0.25 to 2 times the background.
 _HIDDEN = 0.6
-#: What the border cuts off is known to this part of the shift that it makes at most.
+#: Error of the estimated light beyond the border, as a share of the shift it can make at most.
 _CUT_SHARE = 0.4
-#: Of the radius: what clipping the brightest part may move a centroid by.
+#: Shift of a centroid by clipping of the brightest part, in the beam's radius.
 _CLIP_SHARE = 0.15
 
 
@@ -52,26 +51,26 @@ class Spot:
     Attributes
     ----------
     centroid
-        Of its light, plane coordinates of the face, m, (2,): of what the target's border cuts
-        off too, as far as that can be told.
+        Of its light, plane coordinates of the face, m, (2,); includes the estimated light
+        beyond the target's border.
     covariance
         Of the centroid, m², (2, 2): background, noise, tails, border and clipping.
     second_moments
-        Of its light on the target about the centre of that, m², (2, 2).
+        Of its light on the target about that light's centre, m², (2, 2).
     power
-        Sum of its brightness over the background's, m².
+        Sum of its brightness over that of the background, m².
     peak
-        Its greatest brightness, of full scale, background not included.
+        Greatest brightness above the background, of full scale.
     contrast
-        That over the background's there.
+        Peak over the background there.
     deviation
-        Of the background's remains, of full scale: what the peak stands out of.
+        Of the background's residuals, of full scale.
     clipped
-        Part of its light that lies in clipped pixels.
+        Share of its light in clipped pixels.
     edge
-        Brightness where it meets the border of the seen target, over its peak.
+        Brightness at the border of the visible target, over its peak.
     covered
-        Part of its area that marks cover.
+        Share of its area that marks cover.
     area
         m².
     sharpness
@@ -79,13 +78,11 @@ class Spot:
     region
         Its pixels, (H, W), tails included.
     cut
-        By how much the light that the border cuts off moves the centroid, m: ``centroid`` is
-        moved by it.
+        Shift of ``centroid`` by the light beyond the border, m.
     light
         Sum of its brightness, full scales m².
     skewness
-        Norm of the third moments of its body, in units of its standard deviations: 0 of what
-        is even about its centre.
+        Norm of the third moments of its body, in its standard deviations; 0 if symmetric.
     """
 
     centroid: FloatArray
@@ -119,17 +116,17 @@ class Spot:
 
 
 def find_spots(picture: Rectified, background: Background) -> list[Spot]:
-    """Return the beams of a face, the most powerful first.
+    """Return the spots on a face, the most powerful first.
 
-    Every pixel that stands out of the background belongs to the top that it descends
-    from. A top counts as a beam of its own where brightness falls in between.
+    Every pixel above the background belongs to the top from which it descends. Tops are
+    separate beams if brightness falls between them.
     """
     light = _light(picture, background)
     soft = smooth(picture, light, max(0.07 / picture.step, 1.0))
     foot = _FOOT * background.deviation
     level = float(np.median(background.values[picture.paint]))
     seed = max(_SEED * background.deviation, _SEED_PART * level)
-    # Tops are broad: every third pixel shows them.
+    # Tops are broad; every third pixel shows them.
     small = np.ascontiguousarray(soft[::3, ::3])
     coarse = np.zeros(small.shape, dtype=np.int32)
     least = _DIP_LEAST * background.deviation
@@ -147,7 +144,7 @@ def find_spots(picture: Rectified, background: Background) -> list[Spot]:
 
 
 def _core(soft: Image, owned: Mask, foot: float) -> Mask:
-    """What hangs together with a beam's top above its foot."""
+    """Return the pixels above the foot that are connected to a beam's top."""
     import cv2
 
     height = float(soft[owned].max())
@@ -155,15 +152,15 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
     above = owned & (soft > max(foot, _FOOT_PART * height))
     _, labels = cv2.connectedComponents(above.astype(np.uint8), connectivity=4)
     core = labels == labels[top]
-    # A beam is bounded by what its upper half says of its breadth: through a neck that is
-    # narrower something else hangs on to it.
+    # The upper half gives the width of the beam; anything connected through a narrower neck is
+    # something else.
     _, labels = cv2.connectedComponents((core & (soft > 0.5 * height)).astype(np.uint8))
     half = labels == labels[top]
     breadth = min(cv2.minAreaRect(np.argwhere(half).astype(np.float32))[1])
     neck = int(_NECK * breadth)
     if neck < 2:
         return np.asarray(core)
-    # Opened by a disc: what is farther from the rim than its radius, and what is near that.
+    # Opening by a disc: pixels farther from the rim than its radius, and those near them.
     inner = cv2.distanceTransform(core.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     opened = cv2.distanceTransform(inner.astype(np.uint8), cv2.DIST_L2, 5) <= neck
     _, labels = cv2.connectedComponents((core & opened | half).astype(np.uint8), connectivity=4)
@@ -171,9 +168,9 @@ def _core(soft: Image, owned: Mask, foot: float) -> Mask:
 
 
 def _light(picture: Rectified, background: Background) -> Image:
-    """What beams add, as paint of the usual reflectance would show it.
+    """Return the light of beams, as paint of the usual reflectance would show it.
 
-    Where a mark covers the paint, what is around it says.
+    On marks it is interpolated from their surroundings.
     """
     added = picture.values - background.values
     if background.reflectance is not None:
@@ -192,7 +189,7 @@ def _measure(
     core: Mask,
     tops: Image,
 ) -> Spot:
-    """Return the moments of one beam and how certain they are."""
+    """Return the moments of one beam with their covariance."""
     import cv2
 
     step = picture.step
@@ -267,7 +264,7 @@ def _second(weight: FloatArray, dx: FloatArray, dy: FloatArray) -> FloatArray:
 
 
 def _skewness(weight: FloatArray, x: FloatArray, y: FloatArray) -> float:
-    """Norm of the third moments of light with unit second moments."""
+    """Return the norm of the third moments of light scaled to unit second moments."""
     total, centre = _centroid(weight, x, y)
     dx, dy = x - centre[0], y - centre[1]
     moments = _second(weight, dx, dy)
@@ -292,14 +289,14 @@ def _from_background(
     dy: FloatArray,
     total: float,
 ) -> FloatArray:
-    """Covariance of a centroid by the background's: of its fit, its remains, and noise.
+    """Return the covariance of a centroid by background fit, its residuals, and noise.
 
     With light w = value − b, the centroid moves by −Σ (x − c) δb / Σ w.
     """
     inside = region[box].astype(np.float64)
     arms = np.stack([inside * dx[None, :], inside * dy[:, None]]) / max(total, 1e-12)
     spread = np.einsum("iyx,jyx->ij", arms, arms)
-    # The fit: its derivatives are known on a coarser grid.
+    # The derivatives of the fit are known on a coarser grid.
     stride = background.stride
     rows = np.arange(stride // 2, picture.shape[0], stride)
     columns = np.arange(stride // 2, picture.shape[1], stride)
@@ -309,13 +306,13 @@ def _from_background(
     basis = background.basis[in_rows][:, in_columns]
     moved = stride**2 * np.einsum("iyx,yxk->ik", part, basis)
     fit = moved @ background.covariance @ moved.T
-    # What the fit leaves hangs together over patches of this many pixels.
+    # Residuals of the fit are correlated over patches of this many pixels.
     patch = max(background.patch / picture.step**2, 1.0)
     return np.asarray(fit + (patch * background.deviation**2 + background.noise**2) * spread)
 
 
 def _edge(picture: Rectified, soft: Image, region: Mask) -> float:
-    """Greatest brightness of a beam at the border of what is seen of the target."""
+    """Return the greatest brightness of a beam at the border of the visible target."""
     import cv2
 
     seen = picture.surface.astype(np.uint8)

@@ -1,4 +1,4 @@
-"""One way of looking for a face: marks found about given places, a view fitted, and judged."""
+"""One attempt to find a face: find marks near given places, fit a view, and judge it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,41 +18,40 @@ from heliotrope.imaging.targets.view import Face, View, fit_view, homography, un
 
 Pictures = Mapping[str, FloatArray]
 
-#: Survey and paint: standard deviation of a mark's place on its target, m.
+#: Standard deviation of a mark's place on its target, by survey and paint, m.
 SURVEY = 0.005
-#: The same of a tag's corners among each other, m.
+#: Standard deviation of a tag's corners relative to each other, m.
 PRINT = 0.001
-#: A mark must correlate so well where it is looked for, explain this much of what is around
-#: it there, and be darker than its surroundings.
+#: Least correlation of a mark; least share of the variance that its drawing explains (without and
+#: with a code that was read); greatest brightness over its surroundings.
 LIKE, EXPLAINED, EXPLAINED_READ, CONTRAST = 0.45, 0.65, 0.3, 0.93
-#: A mark farther from where the others put it than this many deviations is not used.
+#: A mark this many standard deviations from the place given by the others is not used.
 STRAY = 5.0
-#: A mark may be so much longer, broader or more askew than drawn; all of them may be so much
-#: larger, and are then alike to so much. Measured: 0.03 in photographs, 0.2 in clutter.
+#: Greatest distortion of one mark against its drawing, of the size of all marks, and of the marks
+#: against each other. Measured: 0.03 in photographs, 0.2 in clutter.
 MISSHAPEN, WRONG_SIZE, ALIKE = 0.2, 0.12, 0.08
-#: All of them together are so much longer one way than the other, or askew. Measured: 0.01.
+#: Greatest common stretch or skew of all marks. Measured: 0.01.
 ASKEW = 0.04
-#: Where the marks are no more than a view has unknowns, each is alike to this, and explains this.
+#: Limits for each mark where there are no more marks than unknowns of a view.
 ALIKE_EACH, EXPLAINED_EACH = 0.12, 0.75
-#: Residuals that a view may have, as a part of the face's extent, and pixels on top.
+#: Greatest residual of a view: share of the face's extent, plus pixels.
 MISFIT, MISFIT_PIXELS = 0.005, 1.0
-#: Standard deviation, as a part of its extent, to which a target's centre must be known.
+#: Greatest standard deviation of a target's centre, as a share of its extent.
 VAGUE = 0.005
-#: A target's centre may be so far from the middle of what was seen, in its standard deviations:
-#: beyond, lens and perspective are guessed.
+#: Greatest distance of a target's centre from the middle of the marks seen, in their standard
+#: deviations; beyond, lens and perspective are guesses.
 FAR = 4.0
-#: Part of the paint between the marks that must be lighter than the print of the nearest.
+#: Least share of the paint between marks that is lighter than the nearest mark.
 LIGHTER = 0.8
-#: A face is not seen flatter than this (least over greatest scale), and its far side not
-#: this much smaller than its near side.
+#: Least ratio of the scales of a face, and greatest ratio of the scales of its near and far side.
 FLATTEST, NEAREST = 0.2, 3.0
-#: Of points that make a view: fewest if it is known beforehand about where they are, and fewest
-#: otherwise; and part of those in the frame, likewise.
+#: Fewest points of a view, with and without prior knowledge of their places; least share of the
+#: points in the frame, likewise.
 FEWEST, ALONE, SHARE, SHARE_ALONE = 3, 4, 0.5, 0.7
 
 
 class Look:
-    """One frame, and what was worked out of it."""
+    """One frame, with intermediate results that all faces share."""
 
     def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
         self.grey = np.ascontiguousarray(frame.grey)
@@ -66,17 +65,17 @@ class Look:
 
     @cached_property
     def eight(self) -> Image:
-        """The frame in 8 bit."""
+        """The frame in 8 bits."""
         if self.grey.dtype == np.uint8:
             return self.grey
-        # Sensors leave bits empty, and a beam is brighter than all else: the brightest
-        # thousandth may clip.
+        # Sensors leave bits empty, and a beam outshines everything else: let the brightest
+        # thousandth clip.
         top = max(float(np.percentile(self.grey[::4, ::4], 99.9)), 1.0)
         scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
         return np.asarray(np.minimum(scaled, 255.0), dtype=np.uint8)
 
     def outlines(self, reduction: int, ratio: float) -> detection.Outlines:
-        """Dark parts of the frame, worked out once for all faces."""
+        """Return the dark parts of the frame, computed once for all faces."""
         key = (reduction, ratio)
         if reduction not in self._light:
             self._light[reduction] = detection.lighten(self.grey, reduction)
@@ -85,7 +84,7 @@ class Look:
         return self._outlines[key]
 
     def tags(self, marks: list[Mark]) -> dict[int, FloatArray]:
-        """Corners (4, 2) of the tags among marks that are seen exactly once, by index."""
+        """Return the corners (4, 2) of tags that are seen exactly once, by the mark's index."""
         found = {}
         for k, mark in enumerate(marks):
             if mark.kind != "tag":
@@ -101,26 +100,26 @@ class Look:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of looking in one way.
+    """The result of one attempt.
 
     Attributes
     ----------
     view
-        None if there is none that can be believed.
+        None if no view can be trusted.
     seen
-        Pixel and covariance of marks that were recognised, by index.
+        Pixel and covariance of recognised marks, by index.
     used
-        Those that fit together.
+        Marks that fit together.
     reasons
-        Why others are not used.
+        Why other marks are not used.
     text
         Why there is no view.
     looks
-        What was measured of each mark.
+        Measurements of each mark.
     known
-        Whether it was known beforehand about where the face is.
+        Whether the face's rough place was known beforehand.
     vague
-        Why of some targets it is not told where they are, by name.
+        By name, why the places of some targets remain unknown.
     """
 
     view: View | None
@@ -135,7 +134,7 @@ class Attempt:
 
 @dataclass
 class _Seen:
-    """Marks while they are looked for."""
+    """Marks found so far."""
 
     places: dict[int, tuple[FloatArray, FloatArray]]
     reasons: dict[int, str]
@@ -145,7 +144,7 @@ class _Seen:
 
 
 class Search:
-    """One face in one frame."""
+    """The search for one face in one frame."""
 
     def __init__(self, look: Look, face: Face, marks: list[Mark], plane: FloatArray) -> None:
         self.look, self.face, self.marks, self.plane = look, face, marks, plane
@@ -155,16 +154,16 @@ class Search:
     def attempt(
         self, pixels: FloatArray, scales: FloatArray, search: float, known: bool = False
     ) -> Attempt:
-        """Look for every mark about ``pixels`` (M, 2) with ``scales`` (M, 2, 2).
+        """Search for every mark near ``pixels`` (M, 2) with ``scales`` (M, 2, 2).
 
-        First roughly, which gives a view with its perspective and lens; then again with the
-        scales of that view, on which the places of corners depend.
+        The first, rough search gives a view with its perspective and lens. The second uses
+        the scales of that view, on which the places of corners depend.
         """
         rough = self._locate(pixels, scales, search)
         view, used = self._fit(rough, pixels if known else None)
         if view is None:
             return self._failed(rough, used, known)
-        # What is refined may yet be found where it was not found roughly, but not by much.
+        # Refining may find a mark or two that the rough search missed, but not more.
         if self._points_of(used) + 2 < self._needed(view, known) or self._impossible(view):
             return self._failed(rough, used, known)
         fine = self._refine(view, used)
@@ -194,13 +193,13 @@ class Search:
                 continue
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
-                seen.reasons[k] = f"its picture {mark.code} is not at hand"
+                seen.reasons[k] = f"its picture {mark.code} is missing"
                 continue
             found = locate(self.look.grey, mark, pixels[k], scales[k], search, picture)
             if found is None:
-                seen.reasons[k] = "beyond the frame or too small"
+                seen.reasons[k] = "outside the frame or too small"
             elif found[2] < LIKE:
-                seen.reasons[k] = f"covered or not there: a likeness of {found[2]:.2f}"
+                seen.reasons[k] = f"covered or absent: correlation {found[2]:.2f}"
             else:
                 seen.places[k] = found[0], found[1] ** 2 * np.eye(2)
                 if mark.kind == "tag":
@@ -213,7 +212,7 @@ class Search:
         for k, mark in enumerate(self.marks):
             picture = self._picture(mark)
             if mark.kind == "picture" and picture is None:
-                seen.reasons[k] = f"its picture {mark.code} is not at hand"
+                seen.reasons[k] = f"its picture {mark.code} is missing"
                 continue
             search = 0.0 if k in used else 0.2
             around = self.face.span - self.plane[k]
@@ -225,7 +224,7 @@ class Search:
             seen.places[k] = refined.pixel, refined.covariance
             seen.looks[k] = refined
             if mark.kind == "tag":
-                # The view bends it by perspective and lens; what is left is affine.
+                # The view holds perspective and lens; the rest is affine.
                 box = _square(mark) @ (np.eye(2) + refined.shape).T
                 seen.corners[k] = view.to_pixels(self.plane[k] + box) + refined.pixel - pixels[k]
         return seen
@@ -234,7 +233,7 @@ class Search:
         return self.look.pictures.get(mark.code) if mark.kind == "picture" else None
 
     def tag_map(self) -> FloatArray:
-        """Return a map, plane to pixels, (3, 3), of all tags; of one tag an affine one."""
+        """Return the map from plane to pixels (3, 3) of all tags; affine for a single tag."""
         places = np.concatenate([self.plane[k] + _square(self.marks[k]) for k in self.tags])
         pixels = np.concatenate(list(self.tags.values()))
         if len(self.tags) > 1:
@@ -246,7 +245,7 @@ class Search:
     # -- fitting -----------------------------------------------------------------------
 
     def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[View | None, list[int]]:
-        """Fit a view to what was seen; what strays is left out, the worst first."""
+        """Fit a view to the marks seen, leaving out strays, the worst first."""
         used = list(seen.places)
         while True:
             points = self._points(used, seen, known)
@@ -264,13 +263,13 @@ class Search:
             worst = int(np.argmax(apart / spread))
             if apart[worst] < STRAY * spread[worst] or len(used) <= 4:
                 return view, used
-            seen.reasons[used[worst]] = f"{apart[worst]:.1f} px from where the others put it"
+            seen.reasons[used[worst]] = f"{apart[worst]:.1f} px from the place given by the others"
             del used[worst]
 
     def _points(
         self, used: list[int], seen: _Seen, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """Points, pixels, their covariance; a tag gives four corners, three marks four points."""
+        """Return points, pixels, covariance: four corners of a tag, four points for three marks."""
         plane, pixels, covariance = [], [], []
         per_metre = self._per_metre(used, seen)
         for k in used:
@@ -279,7 +278,7 @@ class Search:
             if mark.kind == "tag":
                 plane += list(self.plane[k] + _square(mark))
                 pixels += list(seen.corners[k])
-                # Its corners share the survey and what moves it as a whole.
+                # Its corners share the errors of survey and place.
                 own = (per_metre * PRINT) ** 2 + 2.0 * np.trace(spread)
                 covariance.append(np.kron(np.ones((4, 4)), common) + own * np.eye(8))
             else:
@@ -303,11 +302,11 @@ class Search:
     def _fourth(
         self, used: list[int], points: FloatArray, places: FloatArray, known: FloatArray | None
     ) -> tuple[FloatArray, FloatArray, float] | None:
-        """A fourth point of three, where it is seen, and its standard deviation, pixels.
+        """Return a fourth point for three, its pixel and its standard deviation, px.
 
-        Three marks give an affine map. If it is known about where the marks are, that map
-        corrects the known places; otherwise perspective is unknown up to what the lens, or
-        one of fifty degrees, would have at this slant.
+        Three marks give an affine map. If the rough places of the marks are known, the map
+        corrects them. Otherwise perspective is unknown, up to that of the lens (or of a lens
+        of fifty degrees) at this slant.
         """
         if np.linalg.matrix_rank(points - points[0], tol=0.1) < 2:
             return None
@@ -352,7 +351,7 @@ class Search:
         return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
 
     def _problem(self, view: View, used: list[int], seen: _Seen, known: bool) -> str:
-        """Why a view cannot be believed; empty if it can."""
+        """Return why a view cannot be trusted; empty if it can."""
         needed = self._needed(view, known)
         if self._points_of(used) < needed:
             return self._too_few(used, needed)
@@ -360,26 +359,28 @@ class Search:
         per_metre = np.sqrt(np.abs(np.linalg.det(scale)))
         limit = MISFIT * self.extent * float(per_metre.mean()) + MISFIT_PIXELS
         if not view.residual <= limit:
-            return f"its marks do not fit together: {view.residual:.1f} px RMS, {limit:.1f} borne"
+            return (
+                f"its marks do not fit together: {view.residual:.1f} px RMS, limit {limit:.1f} px"
+            )
         if self._impossible(view):
-            return "its marks lie as no camera sees a plane"
+            return "its marks lie as no camera can see a plane"
         return self._misshapen(used, seen, known) or self._dark(view, used, seen)
 
     def _points_of(self, used: list[int]) -> int:
         return sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
 
     def _needed(self, view: View, known: bool) -> int:
-        """How many points a view must stand on."""
+        """Return the number of points that a view needs."""
         least = FEWEST if known or len(self.marks) <= ALONE else ALONE
         share = SHARE if known else SHARE_ALONE
         return max(least, int(np.ceil(share * len(self.expected(view)))))
 
     def expected(self, view: View) -> list[int]:
-        """Marks that the frame should show."""
+        """Return the marks that the frame should show."""
         return self.within(view.to_pixels(self.plane))
 
     def within(self, pixels: FloatArray) -> list[int]:
-        """Which of some places (N, 2) are in the frame."""
+        """Return the indices of places (N, 2) in the frame."""
         inside = (pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)
         return [int(k) for k in np.flatnonzero(inside.all(axis=-1))]
 
@@ -394,7 +395,7 @@ class Search:
         return bool(np.abs(depth).max() > NEAREST * np.abs(depth).min())
 
     def _misshapen(self, used: list[int], seen: _Seen, known: bool) -> str:
-        """Marks of another size or shape show another target, or something else."""
+        """Return why the marks' sizes and shapes are wrong; empty if they are not."""
         drawn = [k for k in used if k in seen.looks and self.marks[k].kind != "picture"]
         if not drawn:
             return ""
@@ -403,26 +404,26 @@ class Search:
         size = 0.5 * float(np.trace(middle))
         if abs(size) > WRONG_SIZE:
             return (
-                f"its marks are seen {1.0 + size:.2f} times as large as they should be: another "
+                f"its marks appear {1.0 + size:.2f} times as large as they should be: another "
                 "target, or wrong sizes of the marks"
             )
         common = float(np.abs(middle - size * np.eye(2)).max())
         if len(drawn) >= FEWEST and common > ASKEW:
             return (
-                f"its marks are all {common:.0%} longer, broader or more askew than they should "
-                "be: another target, or wrong places of the marks"
+                f"its marks are all stretched or skewed by {common:.0%}: another target, or wrong "
+                "places of the marks"
             )
         unlike = np.abs(shapes - size * np.eye(2)).max(axis=(1, 2))
         explained = min((seen.looks[k].explained for k in drawn if k not in self.tags), default=1.0)
         few = len(used) <= ALONE and not known
         if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
-            return f"what lies as its marks do is not of their shape: up to {unlike.max():.0%} off"
+            return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
         if few and explained < EXPLAINED_EACH:
-            return f"what lies as its marks do is not they: one explains {explained:.0%} only"
+            return f"shapes that lie like its marks are not they: one explains only {explained:.0%}"
         return ""
 
     def _dark(self, view: View, used: list[int], seen: _Seen) -> str:
-        """What lies between marks is paint, which is lighter than print."""
+        """Return why the space between the marks is not paint, which is lighter; empty if it is."""
         flat = ("corner", "tee", "square", "disc")
         shown = [k for k in used if k in seen.looks and self.marks[k].kind in flat]
         if not shown:
@@ -444,10 +445,10 @@ class Search:
         lighter = float((values[valid] > level[valid]).mean())
         if lighter >= LIGHTER:
             return ""
-        return f"only {lighter:.0%} of what lies between its marks is lighter than they are"
+        return f"only {lighter:.0%} of the area between its marks is lighter than the marks"
 
     def _levels(self, view: View, shown: list[int], seen: _Seen) -> tuple[FloatArray, FloatArray]:
-        """Brightness of marks' prints and of what is around them, (K,) each."""
+        """Return the brightness of marks and of their surroundings, (K,) each."""
         inner = []
         for k in shown:
             mark = self.marks[k]
@@ -462,7 +463,7 @@ class Search:
         return dark, dark / np.clip(contrast, 0.05, 1.0)
 
     def _at(self, pixels: FloatArray) -> FloatArray:
-        """The frame's values at pixels (N, 2), NaN beyond it."""
+        """Return the frame's values at pixels (N, 2); NaN outside."""
         height, width = self.look.grey.shape
         column, row = np.round(np.nan_to_num(pixels, nan=-1.0)).astype(int).T
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -470,7 +471,7 @@ class Search:
         return np.where(inside, values.astype(np.float64), np.nan)
 
     def _vague(self, view: View, used: list[int]) -> dict[str, str]:
-        """Targets of which the marks that were seen tell too little, and why, by name."""
+        """Return by name why the marks seen do not determine some targets."""
         parts = [
             self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
             for k in used
@@ -484,19 +485,19 @@ class Search:
             off = center - middle
             deviation = float(np.sqrt(np.linalg.eigvalsh(view.covariance_at(center))[-1]))
             if not self._shown(view, target):
-                found[target.name] = "it lies beyond the frame"
+                found[target.name] = "it lies outside the frame"
             elif float(off @ np.linalg.solve(moments, off)) > FAR**2:
                 names = ", ".join(self.marks[k].name for k in used)
-                found[target.name] = f"all marks that were seen lie on one side of it: {names}"
+                found[target.name] = f"all marks seen lie on one side of it: {names}"
             elif not deviation <= limit:
                 found[target.name] = (
-                    f"the marks that were seen tell where it is to {deviation:.3f} m only; "
+                    f"the marks seen determine its place only to {deviation:.3f} m; "
                     f"{limit:.3f} m is needed"
                 )
         return found
 
     def _shown(self, view: View, target: Target) -> bool:
-        """Whether the frame shows any of a target."""
+        """Return whether the frame shows any part of a target."""
         part = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
         corners = self.face.plane(target.corners)
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -504,20 +505,20 @@ class Search:
 
 
 def _problem(refined: Refined | None, mark: Mark, read: bool) -> str:
-    """Why what was found about a mark's place is not the mark; empty if it is.
+    """Return why what was found near a mark's place is not the mark; empty if it is.
 
-    A tag whose code was ``read`` need not be explained as well: its cells may be small.
+    A tag whose code was ``read`` may be explained less well: its cells may be small.
     """
     if refined is None:
-        return "beyond the frame or too small"
+        return "outside the frame or too small"
     if refined.explained < (EXPLAINED_READ if read else EXPLAINED):
-        return f"covered or not there: its drawing explains {100 * refined.explained:.0f} %"
+        return f"covered or absent: its drawing explains {100 * refined.explained:.0f} %"
     if mark.kind == "picture":
         return ""
     if refined.contrast > CONTRAST:
-        return f"too faint: {100 * refined.contrast:.0f} % of its surroundings"
+        return f"too faint: {100 * refined.contrast:.0f} % of the brightness around it"
     if np.abs(refined.shape).max() > MISSHAPEN:
-        return "what is there is not of its size or shape"
+        return "its size or shape is wrong"
     return ""
 
 
@@ -529,7 +530,7 @@ def _square(mark: Mark) -> FloatArray:
 
 
 def _crossing(corners: FloatArray) -> FloatArray:
-    """Where the diagonals of four corners cross: the centre of a square, in perspective too."""
+    """Return where the diagonals of four corners cross: a square's centre, also in perspective."""
     a, b = corners[2] - corners[0], corners[3] - corners[1]
     across = a[0] * b[1] - a[1] * b[0]
     if abs(across) < 1e-9:

@@ -1,4 +1,4 @@
-"""Which candidates are which marks: by what they look like and how they lie together."""
+"""Assign candidates to marks, by their looks and their arrangement."""
 
 from dataclasses import dataclass
 
@@ -12,32 +12,32 @@ from heliotrope.imaging.targets.view import homography
 
 Places = npt.NDArray[np.intp]
 
-#: A first guess is scaled from one candidate alone: so much of a distance it may be wrong.
+#: Relative error of distances in a first guess, which is scaled from one candidate.
 _LOOSE = 0.25
-#: Of the size of a mark: a candidate nearer than this to its place is the mark.
+#: A candidate this near to a mark's place, in sizes of the mark, is the mark.
 _TIGHT = 0.5
-#: Second moments over those that a guess predicts: so much more or less is the same mark.
+#: Greatest ratio of second moments to the predicted ones, for one mark.
 _SPREAD = 2.6
-#: The same of all marks together, and along one axis over the other. Measured: 1.1 at most.
+#: The same for all marks together, and between the axes. Measured: 1.1 at most.
 _SIZED, _ASKEW = 1.6, 1.4
-#: A camera is upright if the face's up is so near the frame's, rad.
+#: A camera is upright if the face's upward direction is this near the expected one, rad.
 _UPRIGHT = 0.3
-#: Least correlation of what is found where a mark should be.
+#: Least correlation of a candidate at a mark's place.
 _RESEMBLES = 0.55
-#: Guesses that are weighed, and those that are followed.
+#: Numbers of guesses weighed and followed.
 _GUESSES, _FOLLOWED = 1200, 10
 
 
 @dataclass(frozen=True)
 class Constellation:
-    """Marks as they lie in their plane.
+    """The arrangement of marks in their plane.
 
     Attributes
     ----------
     drawn
-        The different drawings.
+        The distinct drawings.
     which
-        For each mark its drawing, (M,).
+        Drawing of each mark, (M,).
     plane
         Places of the marks' points, m, (M, 2).
     middle
@@ -63,11 +63,11 @@ class Match:
     Attributes
     ----------
     marks, candidates
-        Which mark is which candidate, (K,) each.
+        Indices of assigned pairs, (K,) each.
     H_pixel_plane
         From plane metres to pixels, (3, 3); affine if fewer than five match.
     score
-        Number of marks; among as many, the more upright view, then the likelier shapes.
+        Number of marks; then uprightness of the view, then likeness of the shapes.
     """
 
     marks: Places
@@ -98,8 +98,8 @@ def constellation(
 def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool) -> Match | None:
     """Return the assignment that explains most marks, or None if no three agree.
 
-    Every candidate gives, in every way in which it may be a mark, a first guess of where all
-    marks are; those found there give an affine map, then a homography.
+    Each candidate, taken for each mark that it may be, predicts the places of all marks.
+    Candidates found there give an affine map, then a homography.
 
     Parameters
     ----------
@@ -108,9 +108,9 @@ def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool)
     marks
         The marks.
     up
-        Where the face's upper side is in the frame, as far as anybody knows, (2,).
+        Expected upward direction of the face in the frame, (2,).
     upright
-        Look only at guesses that agree with that.
+        Consider only guesses that agree with it.
     """
     linear, mark, part = _guesses(seen, marks, up, upright)
     if len(linear) == 0:
@@ -142,7 +142,7 @@ def match(seen: Candidates, marks: Constellation, up: FloatArray, upright: bool)
 def _guesses(
     seen: Candidates, marks: Constellation, up: FloatArray, upright: bool
 ) -> tuple[FloatArray, Places, Places]:
-    """Return linear maps plane to pixels (G, 2, 2), each with a mark (G,) and its candidate."""
+    """Return linear maps plane to pixels (G, 2, 2), and the mark and candidate of each (G,)."""
     way, mark = np.nonzero(seen.drawing[:, None] == marks.which[None])
     # A drawing is turned first, then laid in the plane: B = A · turn.
     linear = seen.linear[way] @ np.swapaxes(marks.turn[mark], 1, 2)
@@ -155,7 +155,7 @@ def _guesses(
 
 
 def _lean(linear: FloatArray, up: FloatArray) -> FloatArray:
-    """Angles, rad, (G,), between where linear maps (G, 2, 2) take up, and where it should be."""
+    """Return angles (G,), rad, between the upward direction of maps (G, 2, 2) and the expected."""
     seen = linear[:, :, 1]
     along, across = seen @ up, seen[:, 0] * up[1] - seen[:, 1] * up[0]
     return np.asarray(np.abs(np.arctan2(across, along)))
@@ -168,7 +168,7 @@ def _gather(
     linear: FloatArray,
     slack: FloatArray,
 ) -> Places:
-    """Return for each guess (G, M, 2) and mark the nearest candidate that fits, or −1, (G, M)."""
+    """Return the nearest fitting candidate of each guess and mark, or −1, (G, M)."""
     apart = np.linalg.norm(seen.middle[None, None] - guess[:, :, None], axis=-1)
     alike = seen.likeness.T[marks.which] > _RESEMBLES
     g, m, p = np.nonzero((apart < slack[..., None]) & alike[None])
@@ -180,7 +180,7 @@ def _gather(
     fits = (trace < _SPREAD) & (area > 1.0 / _SPREAD) & (area < _SPREAD)
     g, m, p = g[fits], m[fits], p[fits]
     taken = np.full(guess.shape[:2], -1)
-    # The nearest is written last; then a candidate that is two marks is the nearer one.
+    # The nearest is written last. A candidate of two marks then belongs to the nearer one.
     order = np.argsort(-apart[g, m, p], kind="stable")
     taken[g[order], m[order]] = p[order]
     owner = np.full((len(guess), len(seen.middle)), -1)
@@ -191,7 +191,7 @@ def _gather(
 
 
 def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArray) -> Match | None:
-    """Fit, gather again, and fit, until nothing changes."""
+    """Fit and gather in turn until nothing changes."""
     H = np.eye(3)
     for _ in range(5):
         held = np.flatnonzero(taken >= 0)
@@ -208,7 +208,7 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
         size = np.sqrt(
             12.0 * np.trace(linear @ marks.covariance @ np.swapaxes(linear, 1, 2), axis1=1, axis2=2)
         )
-        # An affine map bends by perspective.
+        # An affine map lacks perspective.
         loose = 0.04 * float(np.ptp(guess, axis=0).max()) if len(held) < 5 else 0.0
         again = _gather(seen, marks, guess[None], linear[None], (_TIGHT * size + loose)[None])[0]
         if (again == taken).all():
@@ -225,9 +225,9 @@ def _settle(seen: Candidates, marks: Constellation, taken: Places, up: FloatArra
 def _in_shape(
     seen: Candidates, marks: Constellation, H: FloatArray, held: Places, taken: Places
 ) -> bool:
-    """Whether marks are as broad and as high as the distances between them say.
+    """Return whether sizes of marks agree with the distances between them.
 
-    Those of another target, with other distances, are not: one map does not fit both.
+    They disagree for another target with other distances: no map fits both.
     """
     back = np.linalg.inv(scales(H, marks.middle[held]))
     found = (back @ seen.covariance[taken] @ np.swapaxes(back, 1, 2)).sum(axis=0)
@@ -243,7 +243,7 @@ def _affine(plane: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def mapped(H: FloatArray, plane: FloatArray) -> FloatArray:
-    """Return places (M, 2) of a homography (3, 3)."""
+    """Return places (M, 2) mapped by a homography (3, 3)."""
     places = np.column_stack([plane, np.ones(len(plane))]) @ H.T
     return np.asarray(places[:, :2] / places[:, 2:])
 
@@ -255,7 +255,7 @@ def scales(H: FloatArray, plane: FloatArray) -> FloatArray:
 
 
 def _front(H: FloatArray, plane: FloatArray) -> bool:
-    """Whether the face is seen from its front: a right turn in it is one in the frame."""
+    """Return whether a face is seen from its front: right turns remain right turns."""
     corners = np.column_stack([plane, np.ones(len(plane))]) @ H.T
     if (corners[:, 2] * corners[0, 2] <= 0.0).any():
         return False

@@ -1,9 +1,9 @@
-"""Dark drawings on something light, wherever they are in a frame: candidates for marks.
+"""Candidates for marks: dark drawings on a light ground, anywhere in a frame.
 
-A flat drawing seen from far is an affine map of itself. A part of a frame and a drawing are
-compared after both were made as broad as they are long, by their second moments; what is left
-is a rotation, which their brightness around the middle tells. So each candidate gives the whole
-affine map, whatever the roll of the camera and however far it stands to the side.
+Seen from far, a flat drawing appears as an affine map of itself. A part of a frame and a drawing
+are compared after their second moments have been made round. What remains is a rotation, which
+follows from the brightness around the middle. So each candidate gives a complete affine map,
+whatever the roll of the camera and its position to the side.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,14 +21,14 @@ from heliotrope.optics.coverage import coverage
 
 #: Least correlation of a candidate's shape with a drawing.
 _ALIKE = 0.72
-#: Other rotations within this of the best are kept as well.
+#: Rotations within this of the best are kept too.
 _NEARLY = 0.08
 #: Profiles: radii in standard deviations, and directions.
 _RADII = np.linspace(0.3, 2.7, 9)
 _TURNS = 32
-#: A square seen at 75° off its normal is this much longer than broad.
+#: A square seen at 75° off its normal is this many times as long as wide.
 _OBLIQUE = 4.0
-#: Parts of a frame that are looked at, and candidates that are kept.
+#: Numbers of parts of a frame examined and of candidates kept.
 _PARTS, _KEPT = 300, 60
 
 
@@ -45,9 +45,9 @@ class Drawing:
     profile
         Fourier transform of its brightness around the middle, (9, 17).
     size
-        As the mark's, m.
+        As of the mark, m.
     turning
-        Whether it looks another way when turned; a disc does not.
+        Whether a turn changes its look; false for a disc.
     """
 
     middle: FloatArray
@@ -70,9 +70,9 @@ class Candidates:
     likeness
         Correlation with each drawing, (P, D).
     part, drawing
-        Each way in which a shape may be a drawing: which, (K,) each.
+        Each pair of a shape and a drawing that it may be, (K,) each.
     linear
-        d(pixel)/d(drawing's metres) in that way, (K, 2, 2).
+        d(pixel)/d(drawing's metres) of the pair, (K, 2, 2).
     """
 
     middle: FloatArray
@@ -85,7 +85,7 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Outlines:
-    """What is darker than its surroundings.
+    """Parts of a frame that are darker than their surroundings.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Outlines:
     covariance
         Second moments, pixels², (N, 2, 2).
     profile
-        As :class:`Drawing` has it, (N, 9, 17).
+        As of :class:`Drawing`, (N, 9, 17).
     """
 
     middle: FloatArray
@@ -103,7 +103,7 @@ class Outlines:
 
 
 def drawings(marks: Sequence[Mark]) -> tuple[list[Drawing], npt.NDArray[np.intp]]:
-    """Return the different drawings of marks, without tags and pictures, and each mark's (M,)."""
+    """Return the distinct drawings of marks (no tags or pictures), and each mark's index (M,)."""
     known: dict[tuple[str, float, float], int] = {}
     found: list[Drawing] = []
     which = []
@@ -137,7 +137,7 @@ def _drawing(kind: str, size: float, stroke: float) -> Drawing:
 
 
 def _roots(covariance: FloatArray) -> FloatArray:
-    """Symmetric square roots of symmetric matrices (N, 2, 2)."""
+    """Return symmetric square roots of symmetric matrices (N, 2, 2)."""
     values, vectors = np.linalg.eigh(covariance)
     lengths = np.sqrt(np.maximum(values, 1e-12))
     return np.asarray((vectors * lengths[:, None, :]) @ np.swapaxes(vectors, 1, 2))
@@ -146,7 +146,7 @@ def _roots(covariance: FloatArray) -> FloatArray:
 def _profiles(
     mask: Image, middle: FloatArray, covariance: FloatArray
 ) -> npt.NDArray[np.complex128]:
-    """Fourier transforms, along circles, of a mask about places (N, 2), (N, 9, 17)."""
+    """Return Fourier transforms along circles of a mask around places (N, 2), (N, 9, 17)."""
     import cv2
 
     if len(middle) == 0:
@@ -163,7 +163,7 @@ def _profiles(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=0,
     )
-    # A ring stands for its area.
+    # Weight a ring by its area.
     weight = np.repeat(np.sqrt(_RADII), _TURNS)
     values = np.asarray(seen, dtype=np.float64).reshape(len(middle), -1)
     values = (values - values @ weight[:, None] ** 2 / np.sum(weight**2)) * weight
@@ -173,7 +173,7 @@ def _profiles(
 
 @dataclass(frozen=True)
 class Lightened:
-    """A frame, reduced, and what it would be without narrow dark things.
+    """A reduced frame, and the same without narrow dark strokes.
 
     Attributes
     ----------
@@ -189,17 +189,17 @@ class Lightened:
 
 
 def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
-    """Return a frame (H, W), 8 or 16 bit, reduced, and closed where it is narrowly dark.
+    """Return a frame (H, W) of 8 or 16 bits, reduced, and its morphological closing.
 
-    A mark's reflectance is a fraction of the paint's, whatever the light: the frame over its
-    closing, which has no marks any more, is that fraction, in the shade and in a beam.
+    The closing contains no marks. The frame divided by it is the reflectance of a mark over
+    that of the paint, whatever the light: in the shade as in a beam.
 
     Parameters
     ----------
     grey
         The frame.
     reduction
-        It is looked at at this fraction of its size.
+        Factor by which the frame is reduced.
     broad
         Strokes narrower than this are closed, reduced pixels.
     """
@@ -223,10 +223,10 @@ def outlines(light: Lightened, ratio: float) -> Outlines:
 
     small, closed, reduction = light.small, light.closed, light.reduction
     if small.dtype == np.uint8:
-        # Nothing is told by one count.
+        # A difference of one count means nothing.
         limit = cv2.convertScaleAbs(closed, alpha=ratio, beta=-1.0)
     else:
-        # Of 16 bit as much of what is there, for sensors leave bits empty.
+        # The same share for 16 bits: sensors leave bits empty.
         limit = ratio * closed - 0.01 * float(small.mean())
     mask = cv2.compare(small, limit, cv2.CMP_LT)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
@@ -240,14 +240,14 @@ def outlines(light: Lightened, ratio: float) -> Outlines:
         & (high <= most)
     )
     keep[0] = False
-    # Clutter has thousands of parts; marks are among the larger ones.
+    # Clutter has thousands of parts, and marks are among the larger ones.
     numbers = np.flatnonzero(keep)
     numbers = numbers[np.argsort(-area[numbers], kind="stable")][:_PARTS]
     renamed = np.full(count, -1)
     renamed[numbers] = np.arange(len(numbers))
     middle, covariance = _moments(labels, mask, renamed, len(numbers))
     profile = _profiles(mask, middle, covariance)
-    # Pixel centres are at whole numbers, in the reduced frame and in the full one.
+    # Pixel centres are whole numbers in both the reduced and the full frame.
     middle = reduction * (middle + 0.5) - 0.5
     return Outlines(middle, reduction**2 * covariance, profile)
 
@@ -255,7 +255,7 @@ def outlines(light: Lightened, ratio: float) -> Outlines:
 def _moments(
     labels: Image, mask: Image, renamed: npt.NDArray[np.intp], count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Centres (N, 2) and covariances (N, 2, 2) of labelled parts, reduced pixels."""
+    """Return centres (N, 2) and covariances (N, 2, 2) of labelled parts, reduced pixels."""
     import cv2
 
     spots = cv2.findNonZero(mask)
@@ -273,13 +273,13 @@ def _moments(
     center = np.stack([mean(x), mean(y)], axis=-1)
     x, y = x - center[part, 0], y - center[part, 1]
     xy = mean(x * y)
-    # A pixel has an extent itself.
+    # A pixel has an extent of its own.
     rows = [np.stack([mean(x * x) + 1 / 12, xy], -1), np.stack([xy, mean(y * y) + 1 / 12], -1)]
     return center, np.stack(rows, axis=-2)
 
 
 def candidates(seen: Outlines, drawn: Sequence[Drawing]) -> Candidates:
-    """Return the outlines that look like one of the drawings, the likest first, at most 60."""
+    """Return at most 60 outlines that look like one of the drawings, the best first."""
     profiles = np.stack([d.profile for d in drawn])
     spectrum = np.einsum("prk,drk->pdk", seen.profile, profiles.conj())
     alike = np.fft.irfft(spectrum, n=_TURNS, axis=2)
@@ -314,9 +314,9 @@ def candidates(seen: Outlines, drawn: Sequence[Drawing]) -> Candidates:
 
 
 def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list[FloatArray]]:
-    """Return the corners (4, 2), pixels, of all tags of some dictionaries of OpenCV.
+    """Return the corners (4, 2), px, of all tags of some OpenCV dictionaries.
 
-    By dictionary and number; from the upper left as seen, clockwise, of the upright tag.
+    Keys are dictionary and number. Corners run clockwise from the upright tag's upper left.
     """
     import cv2
 
@@ -335,23 +335,23 @@ def find_tags(grey: Image, numbers: Sequence[int]) -> dict[tuple[int, int], list
 
 
 def tag_number(mark: Mark) -> tuple[int, int]:
-    """Return OpenCV's dictionary and the number in it of a tag."""
+    """Return the OpenCV dictionary of a tag and its number in it."""
     return tag_dictionary(mark)
 
 
 def find_pictures(
     grey: Image, marks: Sequence[Mark], pictures: Mapping[str, FloatArray]
 ) -> Candidates:
-    """Return where taught pictures may be in an upright frame, at any of fourteen sizes.
+    """Return places of taught pictures in an upright frame, at fourteen sizes.
 
     Parameters
     ----------
     grey
         A frame, (H, W), 8 bit.
     marks
-        Pictures all; drawing k is mark k.
+        All of kind picture; drawing k belongs to mark k.
     pictures
-        By the marks' codes.
+        By the codes of the marks.
     """
     import cv2
 
@@ -397,7 +397,7 @@ def find_pictures(
 
 
 def picture_drawings(marks: Sequence[Mark]) -> list[Drawing]:
-    """Return filled squares for pictures: where they are and how large, not how they look."""
+    """Return filled squares in place of pictures: position and size only."""
     none = np.zeros((len(_RADII), _TURNS // 2 + 1), dtype=np.complex128)
     return [
         Drawing(np.zeros(2), mark.size**2 / 12.0 * np.eye(2), none, mark.size, True)

@@ -1,4 +1,4 @@
-"""Targets in a raw frame, by their marks: where, how well, or why not."""
+"""Find targets in a raw frame by their marks: where, how well, or why not."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -18,13 +18,13 @@ __all__ = [
     "SURVEY", "FoundMark", "FoundTarget", "Pictures", "face_marks", "find_targets",
 ]  # fmt: skip
 
-#: Of what should be in the frame: with so much of it, other ways of looking are left.
+#: Share of the expected marks from which on no other way of looking is tried.
 _ENOUGH = 0.7
-#: Darker than these fractions of the surroundings.
+#: Outlines are darker than these fractions of their surroundings.
 _RATIOS = (0.72, 0.85)
-#: The longer side of a frame, reduced, in which outlines are looked for first, pixels.
+#: Longer side of the reduced frame that is searched for outlines first, px.
 _LONGER = 700
-#: Two faces that lie in one place of the frame: one is it, if so much more of it was seen.
+#: Of two faces in one place of the frame, one wins if this much more of it was seen.
 _CLEARER = 0.2
 
 
@@ -35,19 +35,19 @@ class FoundMark:
     Attributes
     ----------
     mark
-        Which.
+        The mark.
     pixel
-        Where it was seen, (2,); where it should be, if it was not.
+        Where it was seen, (2,), or where it should be if it was not seen.
     covariance
-        pixels², (2, 2); NaN if it was not seen.
+        px², (2, 2); NaN if it was not seen.
     used
-        Whether the view stands on it.
+        Whether the view was fitted to it.
     reason
-        Why not; empty if it is used.
+        Why it was not used; empty if it was.
     contrast
-        Its brightness over that of its surroundings; NaN of a tag.
+        Its brightness over that of its surroundings; NaN for a tag.
     blur
-        Of its upright and level edges, m, (2,); NaN of a tag.
+        Of its upright and level edges, m, (2,); NaN for a tag.
     """
 
     mark: Mark
@@ -66,13 +66,13 @@ class FoundTarget:
     Attributes
     ----------
     target
-        Which.
+        The target.
     found
         Whether it was found.
     reason
-        Why not; empty if it was found.
+        Why it was not found; empty if it was.
     marks
-        Those of its own marks that were looked for.
+        Its marks that were searched for.
     view
         How its face lies in the frame; None if it was not found.
     """
@@ -91,33 +91,34 @@ def find_targets(
     previous: Sequence[View] = (),
     pictures: Pictures | None = None,
 ) -> list[FoundTarget]:
-    """Return for each target where it is in a frame, or why it was not found.
+    """Return where each target is in a frame, or why it was not found.
 
     Parameters
     ----------
     frame
         As the camera gives it.
     targets
-        Of which marks are known. Those in one plane are found together.
+        With known marks. Targets in one plane are found together.
     camera
-        If its lens is known it is used; if its pose is known too, marks are first looked
-        for where they should be. One of another size of frames is not believed.
+        Its lens is used; if its pose is known too, marks are searched for at their expected
+        places first. A camera of another frame size is ignored.
     previous
-        Views of earlier frames of the same camera: looked at first.
+        Views of earlier frames of the same camera, tried first.
     pictures
         Of taught marks, by their code.
 
     Notes
     -----
-    Marks that look the same after a quarter or half a turn of the target do not tell a turned
-    camera from an upright one: without a pose or an earlier view, the more upright is taken.
+    If the marks look the same after a quarter or half a turn of the target, they cannot tell a
+    turned camera from an upright one. Without a pose or an earlier view, the more upright
+    solution is taken.
     """
     look = Look(frame, camera, pictures or {})
     searches = []
     for face in faces(tuple(targets)):
         marks, plane = face_marks(face)
         searches.append(_Face(Search(look, face, marks, plane), _earlier(face, previous, look)))
-    # A camera that shows one face upright is not turned for another.
+    # A camera that sees one face upright is not turned for another.
     for turned in (False, True):
         for each in searches:
             each.look(turned)
@@ -140,18 +141,18 @@ def _same(a: Face, b: Face) -> bool:
 
 
 def face_marks(face: Face) -> tuple[list[Mark], FloatArray]:
-    """Return the marks of a face, each once, and their places in its plane (M, 2), m."""
+    """Return each mark of a face once, and their places in its plane (M, 2), m."""
     kept: list[Mark] = []
     for target in face.targets:
         for mark in target.marks:
-            # Two targets that meet share the marks of their common corners.
+            # Adjacent targets share the marks of their common corners.
             if not any(_one(mark, m) for m in kept):
                 kept.append(mark)
     return kept, face.plane(np.array([m.point for m in kept]).reshape(-1, 3))
 
 
 def _one(a: Mark, b: Mark) -> bool:
-    """Whether two targets' marks are one mark on their common edge."""
+    """Return whether marks of two targets are one mark on their common edge."""
     return a.kind == b.kind and float(np.linalg.norm(a.point - b.point)) < 0.05
 
 
@@ -161,12 +162,12 @@ class _Face:
     def __init__(self, search: Search, previous: View | None) -> None:
         self.search, self.previous = search, previous
         self.best: Attempt | None = None
-        #: Shapes that look like one of its marks.
+        #: Number of shapes that look like one of its marks.
         self.shapes = 0
         self.text = ""
 
     def look(self, turned: bool) -> None:
-        """Look in one way after another until the face is found."""
+        """Try one way of looking after another until the face is found."""
         if not self._known_enough():
             return
         for attempt in self._turned() if turned else self._upright():
@@ -182,11 +183,13 @@ class _Face:
         tags = sum(mark.kind == "tag" for mark in marks)
         if len(marks) + 3 * tags >= FEWEST:
             return True
-        self.text = f"{len(marks)} marks are known of it; name 3 or more (heliotrope camera teach)"
+        self.text = (
+            f"it has {len(marks)} known marks; three or more are needed (heliotrope camera teach)"
+        )
         return False
 
     def _upright(self) -> Iterator[Attempt]:
-        """The quick ways, made as they are asked for."""
+        """Yield the quick attempts one by one."""
         search, camera = self.search, self.search.look.camera
         if self.previous is not None:
             pixels, scales = (
@@ -204,7 +207,7 @@ class _Face:
             yield from self._outlined(base, ratio, upright=True)
 
     def _turned(self) -> Iterator[Attempt]:
-        """The thorough ways."""
+        """Yield the thorough attempts."""
         base = self._base()
         for reduction in dict.fromkeys((base, max(1, base // 2), 2 * base, 4 * base)):
             for ratio in _RATIOS:
@@ -215,7 +218,7 @@ class _Face:
         return max(1, round(max(self.search.look.size) / _LONGER))
 
     def _projected(self, camera: Camera) -> tuple[FloatArray, FloatArray] | None:
-        """Pixels and scales of the marks as a camera's pose has them."""
+        """Return pixels and scales of the marks by the camera's pose; None if not visible."""
         face, plane = self.search.face, self.search.plane
         towards = np.asarray(camera.position) - face.origin
         if float(towards @ np.cross(*face.axes)) <= 0.0:
@@ -226,7 +229,7 @@ class _Face:
         return (pixels, scales) if np.isfinite(scales).all() else None
 
     def _up(self) -> FloatArray:
-        """Where the upper side of the face is in the frame, as far as anybody knows, (2,)."""
+        """Return the expected upward direction of the face in the frame, (2,)."""
         camera = self.search.look.camera
         scale = np.diag([1.0, -1.0])[None]
         if self.previous is not None:
@@ -238,7 +241,7 @@ class _Face:
         return np.asarray(up / max(float(np.linalg.norm(up)), 1e-12))
 
     def _tags(self) -> Iterator[Attempt]:
-        """From the tags that were recognised by their code."""
+        """Yield an attempt from the tags recognised by their code."""
         search = self.search
         if not search.tags:
             return
@@ -258,7 +261,7 @@ class _Face:
         return replace(settled, view=None, text=text) if text else settled
 
     def _elsewhere(self, attempt: Attempt, view: View) -> str:
-        """Whether what was seen may as well be another target of the face; empty if not."""
+        """Return why what was seen may be another target of the face; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
         near = 0.05 * search.extent
@@ -274,15 +277,15 @@ class _Face:
                     for k in attempt.used
                 ):
                     continue
-                # Seen from there, marks that are not where they should be speak against it.
+                # Marks missing from their places speak against the other target.
                 missing = len(search.within(view.to_pixels(plane - shift))) - len(attempt.used)
                 if missing <= unseen + 1:
                     names = f"{targets[a].name} or {targets[b].name}"
-                    return f"what was seen may be {names}; name the targets that the camera sees"
+                    return f"this may be {names}; name the targets that the camera sees"
         return ""
 
     def _settled(self, attempt: Attempt, view: View) -> Attempt:
-        """Take the turn, of those in which marks lie alike, that shows most, or is upright."""
+        """Return the attempt, among turns with like marks, that shows most or is more upright."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
         scale = view.scale(middle)
@@ -294,7 +297,7 @@ class _Face:
         best, least = attempt, lean(np.eye(2))
         whole = len(attempt.used) == len(search.expected(view))
         for turn, share in symmetries(search.marks, search.plane):
-            # Marks that all look as they should do not look like others.
+            # If all marks look as they should, a turn with unlike marks is out of the question.
             more_upright = lean(turn) < least - 0.01
             if whole if share < 1.0 else not more_upright:
                 continue
@@ -306,7 +309,7 @@ class _Face:
         return best
 
     def _outlined(self, reduction: int, ratio: float, upright: bool) -> Iterator[Attempt]:
-        """Dark shapes that look like the marks and lie as they do."""
+        """Yield an attempt from dark shapes that look and lie like the marks."""
         search = self.search
         kept = [k for k, m in enumerate(search.marks) if m.kind not in ("tag", "picture")]
         if len(kept) < FEWEST:
@@ -316,7 +319,7 @@ class _Face:
         yield from self._matched(seen, kept, drawn, which, upright)
 
     def _pictured(self) -> Iterator[Attempt]:
-        """Taught pictures wherever they are, in upright frames."""
+        """Yield an attempt from taught pictures anywhere in an upright frame."""
         search = self.search
         kept = [k for k, m in enumerate(search.marks) if m.kind == "picture"]
         if len(kept) < FEWEST:
@@ -345,16 +348,16 @@ class _Face:
             yield self._mapped(found.H_pixel_plane, 0.4)
 
     def results(self) -> list[FoundTarget]:
-        """What is to be said of each target of the face."""
+        """Return the result for each target of the face."""
         search, best = self.search, self.best
         targets = search.face.targets
         if best is None:
             total = len(search.marks)
             text = self.text or (
-                f"none of its {total} marks was seen: not in the frame, or covered"
+                f"none of its {total} marks was seen: outside the frame, or covered"
                 if self.shapes == 0
-                else f"its {total} marks were not seen together; {self.shapes} shapes in the frame "
-                "look like one of them"
+                else f"its {total} marks were not found together; {self.shapes} shapes in the "
+                "frame look like one of them"
             )
             return [FoundTarget(t, False, text) for t in targets]
         results = []
@@ -375,9 +378,9 @@ def _rank(attempt: Attempt) -> tuple[bool, int]:
 
 
 def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArray, float]]:
-    """Return turns (2, 2) by quarters about their middle after which marks lie as before.
+    """Return quarter turns (2, 2) about their middle that map marks onto places of marks.
 
-    Each with the share of the marks, half or more, that then also look as before.
+    Each comes with the share of marks, half or more, that then also look the same.
 
     Parameters
     ----------
@@ -406,7 +409,7 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArra
 
 
 def _alike(a: Mark, b: Mark, turned: float) -> bool:
-    """Whether a mark turned by an angle, rad, looks like another."""
+    """Return whether a mark turned by an angle (rad) looks like another."""
     if a.kind in ("tag", "picture") or (a.kind, a.size, a.stroke) != (b.kind, b.size, b.stroke):
         return False
     if a.kind == "disc":
@@ -417,7 +420,7 @@ def _alike(a: Mark, b: Mark, turned: float) -> bool:
 
 
 def _one_place_each(found: Sequence[_Face]) -> None:
-    """Of two faces that were found in one place of the frame at most one is there."""
+    """Reject at least one of two faces that were found in one place of the frame."""
     for k, first in enumerate(found):
         for second in found[k + 1 :]:
             a, b = first.best, second.best
@@ -429,10 +432,10 @@ def _one_place_each(found: Sequence[_Face]) -> None:
             if a.known != b.known:
                 clear = 1.0 if a.known else -1.0
             names = [each.search.face.targets[0].name for each in (first, second)]
-            lost = [f"what was seen there is {name}" for name in reversed(names)]
+            lost = [f"the frame shows {name} there" for name in reversed(names)]
             if abs(clear) < _CLEARER:
                 lost = [
-                    f"what was seen may be {name} as well; name the targets that the camera sees"
+                    f"the frame may show {name} there; name the targets that the camera sees"
                     for name in reversed(names)
                 ]
             if clear < _CLEARER:
@@ -446,7 +449,7 @@ def _share(each: _Face, attempt: Attempt) -> float:
 
 
 def _covers(a: View, b: View) -> bool:
-    """Whether the middle of one face is seen on another."""
+    """Return whether the middle of face b is seen on face a."""
     place = a.to_plane(b.to_pixels(b.face.span.mean(axis=0)))
     low, high = a.face.span
     return bool(((place > low) & (place < high)).all())

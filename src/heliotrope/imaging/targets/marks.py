@@ -1,4 +1,4 @@
-"""What marks look like: dark polygons in the plane of their target, metres."""
+"""The drawings of marks: dark polygons in the plane of their target, metres."""
 
 import re
 
@@ -15,7 +15,7 @@ def polygons(mark: Mark) -> list[FloatArray]:
     Raises
     ------
     InputError
-        If a tag is of an unknown dictionary, or the mark is a picture, which has none.
+        If a tag's dictionary is unknown, or the mark is a picture, which has no polygons.
     """
     shapes = _upright(mark)
     cos, sin = np.cos(mark.turn), np.sin(mark.turn)
@@ -58,7 +58,7 @@ def _box(left: float, low: float, right: float, high: float) -> FloatArray:
 
 
 def _tag(mark: Mark) -> list[FloatArray]:
-    """Return a tag's dark cells, row by row, joined along each row."""
+    """Return a tag's dark cells, joined along each row."""
     cells = tag_cells(mark)
     n = len(cells)
     side = mark.size / n
@@ -75,12 +75,12 @@ def _tag(mark: Mark) -> list[FloatArray]:
 
 
 def tag_dictionary(mark: Mark) -> tuple[int, int]:
-    """Return OpenCV's number of a tag's dictionary, and the number of the tag in it.
+    """Return OpenCV's number of a tag's dictionary, and the tag's number in it.
 
     Raises
     ------
     InputError
-        If the code names none.
+        If the code names no tag.
     """
     import cv2
 

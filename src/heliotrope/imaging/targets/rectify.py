@@ -1,4 +1,4 @@
-"""A face as seen from its front: the frame's brightness on a grid of metres."""
+"""A face seen from its front: the frame's brightness on a grid of metres."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,12 +15,12 @@ from heliotrope.imaging.targets.view import Face, View, faces
 
 Mask = npt.NDArray[np.bool_]
 
-#: Pixels across the narrower side of a target: a beam's width is tens of them, and a
-#: centroid is found to a twentieth.
+#: Pixels across the narrower side of a target. A beam is tens of them wide, and a centroid is
+#: found to a twentieth of one.
 ACROSS = 256
-#: A pixel from this part of the full scale on may be clipped; tone curves end below it.
+#: Pixels above this share of the full scale may be clipped; tone curves end below it.
 CLIPPED = 0.985
-#: The print of a mark is masked with a rim of this, m.
+#: Width of the rim masked around marks, m.
 _RIM = 0.06
 
 
@@ -35,15 +35,15 @@ class Rectified:
     values
         Brightness over full scale, (H, W) of float32, row 0 at the top.
     step
-        Metres from a pixel to the next.
+        Size of a pixel, m.
     first
         Plane coordinates of the first pixel's centre, m, (2,).
     surface
-        Where a target's surface is that the frame shows, (H, W).
+        Where a target's surface is in the frame, (H, W).
     marks
         Where marks are printed, (H, W).
     clipped
-        Part of each pixel that is at full scale, (H, W).
+        Share of each pixel at full scale, (H, W).
     view
         How the face lies in the frame; None for a crop.
     """
@@ -64,7 +64,7 @@ class Rectified:
 
     @cached_property
     def paint(self) -> Mask:
-        """Where bare paint is seen: neither beyond the targets nor on a mark."""
+        """Where bare paint is seen: on a target and not on a mark."""
         return np.asarray(self.surface & ~self.marks)
 
     @cached_property
@@ -72,7 +72,7 @@ class Rectified:
         return {}
 
     def share(self, sigma: float) -> Image:
-        """Return how much bare paint is about each pixel, (H, W), softened by ``sigma`` pixels."""
+        """Return the share of bare paint around each pixel, (H, W), smoothed by ``sigma`` px."""
         import cv2
 
         if sigma not in self._shares:
@@ -107,7 +107,7 @@ def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
     view
         How the face lies in it.
     grey
-        Its brightness, if it is at hand.
+        Its brightness, if already computed.
     """
     import cv2
 
@@ -127,7 +127,7 @@ def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
     at = (places - corner + np.float32(0.5)) / np.float32(reduction) - np.float32(0.5)
     values = _resample(part, reduction, at, frame.full_scale)
     clipped = np.zeros_like(values)
-    # Clipped pixels are many together, or they do no harm: their mean is bright, too.
+    # Single clipped pixels do no harm; many make the mean bright too.
     if float(values.max()) > 0.7 * CLIPPED:
         limit = float(np.ceil(CLIPPED * frame.full_scale))
         clipped = _resample(_at_least(part, limit), reduction, at, 255.0)
@@ -147,16 +147,16 @@ def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
 
 
 def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
-    """Return a picture that shows exactly one target, its corners at the picture's corners.
+    """Return the grid of a picture whose corners are those of its only target.
 
     Parameters
     ----------
     frame
-        The crop, whatever its size.
+        The crop, of any size.
     target
-        What it shows.
+        The target that it shows.
     marks
-        Whether the target's marks are in it.
+        Whether it contains the target's marks.
     """
     import cv2
 
@@ -190,10 +190,9 @@ def _at_least(brightness: Image, limit: float) -> Image:
 
 
 def _places(view: View, first: FloatArray, step: float, shape: tuple[int, int]) -> Image:
-    """Return the frame's pixels (H, W, 2) that a grid shows.
+    """Return the frame's pixels (H, W, 2) of a grid.
 
-    Worked out at every eighth pixel and interpolated: between them a view bends by some
-    thousandths of a pixel.
+    Computed at every eighth pixel and interpolated, which errs by some thousandths of a pixel.
     """
     import cv2
 
@@ -202,7 +201,7 @@ def _places(view: View, first: FloatArray, step: float, shape: tuple[int, int]) 
     x = first[0] + step * apart * np.arange(columns // apart + 2)
     y = first[1] - step * apart * np.arange(rows // apart + 2)
     nodes = view.to_pixels(np.stack(np.meshgrid(x, y), axis=-1)).astype(np.float32)
-    # OpenCV interpolates at thirty-seconds, and eighths are among them.
+    # OpenCV interpolates in steps of 1/32, which include eighths.
     scale = np.array([[1.0 / apart, 0.0, 0.0], [0.0, 1.0 / apart, 0.0]])
     spread = cv2.warpAffine(
         nodes, scale, (columns, rows), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -211,7 +210,7 @@ def _places(view: View, first: FloatArray, step: float, shape: tuple[int, int]) 
 
 
 def _around(grey: Image, places: Image, reduction: int) -> tuple[Image, Image]:
-    """Return the corner (column, row) and the part of a frame that some places lie in."""
+    """Return the part of a frame that holds some places, and its corner (column, row)."""
     margin = 2 * reduction
     sides = []
     for k, length in ((0, grey.shape[1]), (1, grey.shape[0])):
@@ -230,7 +229,7 @@ def _resample(grey: Image, reduction: int, at: Image, full: float) -> Image:
     small = grey
     if reduction > 1:
         height, width = grey.shape
-        # Whole blocks only, so that a block's centre is where it should be.
+        # Whole blocks only, so that their centres are exact.
         whole = grey[: height // reduction * reduction, : width // reduction * reduction]
         size = (width // reduction, height // reduction)
         small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)

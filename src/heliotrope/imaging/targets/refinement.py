@@ -1,8 +1,8 @@
-"""A mark to a fraction of a pixel: its drawing laid over the frame by least squares.
+"""Locate a mark to a fraction of a pixel by fitting its drawing to the frame.
 
-What a pixel sees of a mark is a + b·x + c·y + (d + e·x + f·y)·drawing: light that changes
-evenly over paint and over print, and stray light. Second derivatives of the drawing stand for
-a blur that is not the one it is drawn with, so blur moves no mark.
+A pixel sees a + b·x + c·y + (d + e·x + f·y)·drawing of a mark: light that changes evenly over
+paint and print, and stray light. Second derivatives of the drawing account for blur that differs
+from that of the drawing, so that blur does not move the mark.
 """
 
 from dataclasses import dataclass, replace
@@ -19,48 +19,48 @@ from heliotrope.optics.coverage import coverage
 
 Values = npt.NDArray[np.float32]
 
-#: Samples across a mark: one for so many pixels, and no more than that in all. What is
-#: searched for is searched more coarsely.
+#: Samples across a mark: pixels per sample, greatest number, greatest number while searching,
+#: and least number.
 _PIXELS, _MOST, _COARSE, _FEWEST = 1.5, 32, 20, 6
-#: Neighbouring samples share light by lens and interpolation: so many count as one.
+#: Samples that count as one, because lens and interpolation correlate neighbours.
 _SHARED = 4.0
-#: A mark that is as bright as this part of the paint around it is pale; how much softer drawings
-#: are then tried, strokes.
+#: A mark brighter than this share of the paint around it is pale; blurs of the drawing that are
+#: then tried, in strokes.
 _PALE, _SOFTNESS = 0.6, (0.0, 0.4, 0.6, 0.8, 1.0, 1.3, 1.7)
-#: What no fit of a drawing can see: print, relief and blur of a mark, pixels.
+#: Error that no fit shows: print, relief and blur of a mark, px.
 _FLOOR = 0.1
-#: A drawing is softened by this, samples: about what pixels and a lens do.
+#: Blur of a drawing, samples: about that of pixels and a lens.
 _SOFT = 0.8
-#: Samples are softened by this, so that they and the drawing can be told between samples.
+#: Blur of the samples, so that they can be interpolated.
 _SMOOTH = 0.7
-#: Gauss-Newton steps; from a tenth of a stroke two or three are enough. A place that moves by
-#: less than this part of a sample is found.
+#: Greatest number of Gauss-Newton steps (two or three suffice from a tenth of a stroke), and the
+#: step, in samples, below which the fit has converged.
 _STEPS, _STILL = 6, 0.01
-#: Around a drawing, in its own sizes.
+#: Margin around a drawing, in its own size.
 _MARGIN = 0.3
-#: An even light that explains less than this is worth a second look without the light.
+#: If even light explains less than this, the fit is repeated with the light divided out.
 _CLEAR = 0.8
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Where a mark is.
+    """The refined place of a mark.
 
     Attributes
     ----------
     pixel
         Of its point, (2,).
     covariance
-        pixels², (2, 2), of the image alone; the survey's is not in it.
+        px², (2, 2), of the image alone, without the survey.
     contrast
-        Brightness of the drawing over that of its surroundings, 1 for nothing there.
+        Brightness of the drawing over that of its surroundings; 1 if nothing is there.
     explained
-        Part of the variance that the drawing explains, at most 1.
+        Share of the variance that the drawing explains, at most 1.
     blur
-        Standard deviation of what softens its edges, across upright and level ones, m,
-        (2,); it cannot be told below two pixels.
+        Standard deviation of the blur across upright and level edges, m, (2,); not
+        measurable below two pixels.
     shape
-        What of it is not as drawn: a place d of the drawing is seen where ``d + shape @ d``
+        Distortion against the drawing: a place d of the drawing is seen where ``d + shape @ d``
         should be, (2, 2).
     """
 
@@ -79,18 +79,18 @@ class _Template:
     Attributes
     ----------
     values
-        How much of each cell is drawn, softened, (H, W).
+        Share of each cell that is drawn, softened, (H, W).
     first
-        Plane coordinates of the first cell's centre from the mark's point, m, (2,).
+        Centre of the first cell relative to the mark's point, m, (2,).
     step
-        From a cell to the next, m.
+        Size of a cell, m.
     basis
         Columns: even light (3), drawing, its slopes (2) and second slopes (2), light over
         the print (2), then its shape (4), (H · W, 14).
     sign
-        −1 for a drawing, which is darker than what is around it; 1 for a picture.
+        −1 for a drawing, which is darker than its surroundings; 1 for a picture.
     stroke
-        Breadth of its strokes, cells.
+        Width of its strokes, cells.
     """
 
     values: FloatArray
@@ -110,31 +110,31 @@ def refine(
     picture: FloatArray | None = None,
     within: FloatArray | None = None,
 ) -> Refined | None:
-    """Return where a mark is, given where about.
+    """Return the exact place of a mark near a given place.
 
     Parameters
     ----------
     grey
         The frame, (H, W).
     mark
-        What to look for.
+        The mark.
     pixel
-        About where its point is, (2,).
+        Rough place of its point, (2,).
     scale
-        d(pixel)/d(plane) there, pixels per metre, (2, 2). The point is as wrong as this is,
-        by half a size of the mark.
+        d(pixel)/d(plane) there, px/m, (2, 2). Its errors, over half the size of the mark,
+        are errors of the point.
     search
-        How far off it may be, in sizes of the mark; 0 for no farther than a stroke.
+        Search radius, in sizes of the mark; 0: within a stroke.
     picture
-        Of a taught mark: its picture, upright in the plane, (N, N).
+        Of a taught mark, upright in the plane, (N, N).
     within
-        Least and greatest place, from the mark's point, that the target's paint reaches to,
-        m, (2, 2); what is seen beyond is not looked at.
+        Bounds of the target's paint relative to the mark's point, m, (2, 2); pixels outside
+        are ignored.
 
     Returns
     -------
-    None if it lies beyond the frame's edge, is smaller than nine pixels, or nothing like it
-    is there.
+    None if it lies outside the frame, is smaller than nine pixels, or nothing like it is
+    there.
     """
     start = pixel
     if search > 0.0:
@@ -163,9 +163,9 @@ def locate(
     search: float,
     picture: FloatArray | None = None,
 ) -> tuple[FloatArray, float, float] | None:
-    """Return where about a mark is, (2,), its standard deviation, pixels, and its likeness.
+    """Return the rough place of a mark, (2,), its standard deviation, px, and the correlation.
 
-    Parameters are those of :func:`refine`. The likeness is a correlation, at most 1.
+    Parameters are those of :func:`refine`.
     """
     import cv2
 
@@ -196,7 +196,7 @@ def locate(
 
 
 def _peak(values: Image, at: int) -> float:
-    """Where the parabola through a maximum and its neighbours is highest."""
+    """Return where the parabola through a maximum and its neighbours peaks."""
     if not 0 < at < len(values) - 1:
         return 0.0
     before, here, after = (float(v) for v in values[at - 1 : at + 2])
@@ -205,7 +205,7 @@ def _peak(values: Image, at: int) -> float:
 
 
 def _count(mark: Mark, scale: FloatArray, most: int) -> int:
-    """Samples across a mark."""
+    """Return the number of samples across a mark."""
     if not np.isfinite(scale).all():
         return 0
     return min(most, int(mark.size * np.sqrt(abs(np.linalg.det(scale))) / _PIXELS))
@@ -274,13 +274,13 @@ def _sample(
     step: float,
     shape: tuple[int, int],
 ) -> tuple[Values, npt.NDArray[np.bool_] | None] | None:
-    """Return a frame on a grid of the plane, and which of it is in the frame, None for all.
+    """Return a frame on a grid of the plane, and which cells are in the frame (None: all).
 
-    None if less than most of it is. What is finer than the grid is averaged first.
+    None if most of the grid is outside. Pixels finer than the grid are averaged first.
     """
     import cv2
 
-    # Column and row to plane, to pixel: one affine map.
+    # One affine map from column and row to the plane and to pixels.
     A = scale @ np.array([[step, 0.0], [0.0, -step]])
     b = pixel + scale @ first
     rows, columns = shape
@@ -320,11 +320,11 @@ def _sample(
 
 
 def _paint(template: _Template, within: FloatArray | None) -> Values:
-    """1 for cells of a template that lie within bounds, and 0 for others, (H · W,)."""
+    """Return 1 for cells of a template within bounds and 0 for others, (H · W,)."""
     rows, columns = template.values.shape
     if within is None:
         return np.ones(rows * columns, dtype=np.float32)
-    # What is softened reaches over the bound.
+    # Softened light reaches across the bound.
     low, high = within + 1.5 * template.step * np.array([[1.0], [-1.0]])
     x = template.first[0] + template.step * np.arange(columns)
     y = template.first[1] - template.step * np.arange(rows)
@@ -333,7 +333,7 @@ def _paint(template: _Template, within: FloatArray | None) -> Values:
 
 
 def _relit(samples: Image, stroke: float) -> Image:
-    """Return samples over the light on them, which is what is left when strokes are closed."""
+    """Return samples divided by the light on them, which is their closing without strokes."""
     import cv2
 
     broad = 2 * int(0.65 * stroke + 1.5) + 1
@@ -349,7 +349,7 @@ def _adjust(
     paint: Values,
     relit: bool,
 ) -> Refined | None:
-    """Gauss-Newton on the place, with everything else of the model solved at each step."""
+    """Fit the place by Gauss-Newton, solving for all other unknowns at each step."""
     import cv2
 
     basis, step, shape = template.basis, template.step, template.values.shape
@@ -369,7 +369,7 @@ def _adjust(
         off = np.abs(residual)
         spread = max(1.4826 * _quantile(off, 0.5), 0.1)
         weight = (1.0 / np.maximum(off / (2.0 * spread), 1.0)).astype(np.float32)
-        # A drawing moved by δ is the drawing less δ times its slope.
+        # A drawing moved by δ is the drawing minus δ times its slope.
         depth = numbers[3] if abs(numbers[3]) > 1e-9 else 1e-9
         move = np.clip(-numbers[4:6] / depth, -2.0 * step, 2.0 * step)
         shift = shift + move
@@ -394,8 +394,8 @@ def _solve(basis: Values, weight: Values, samples: Values) -> tuple[FloatArray, 
     information = (weighted.T @ basis).astype(np.float64)
     aim = (weighted.T @ samples).astype(np.float64)
     size = np.sqrt(np.maximum(np.diag(information), 1e-12))
-    # Columns of a disc's turn or of a broad blur are nothing: a ridge keeps them so. It is
-    # also above the rounding of sums in single precision.
+    # The columns of a disc's turn or of a broad blur vanish; a ridge keeps their numbers at 0.
+    # It also exceeds the rounding of sums in single precision.
     ridge = information / np.outer(size, size) + 1e-6 * np.eye(len(size))
     return information, np.linalg.solve(ridge, aim / size) / size
 
@@ -410,7 +410,7 @@ def _judged(
     place: FloatArray,
     scale: FloatArray,
 ) -> Refined:
-    """Covariance, contrast and the other measures of a mark that was found."""
+    """Return covariance, contrast and the other measures of a mark that was found."""
     step, depth = template.step, float(numbers[3])
     weight = weight * inside
     information, full = _solve(template.basis, weight, samples)
@@ -428,7 +428,7 @@ def _judged(
     down, right = np.gradient(samples.reshape(template.values.shape))
     steepest = np.array([_quantile(np.abs(slope), 0.985) for slope in (right, down)])
     blur = step * abs(depth) / (np.sqrt(2.0 * np.pi) * np.maximum(steepest, 1e-9))
-    # A drawing stretched by 1 + s is the drawing less s times the place times its slope.
+    # A drawing stretched by 1 + s is the drawing minus s times the place times its slope.
     shape = -full[10:].reshape(2, 2) / (full[3] if abs(full[3]) > 1e-9 else 1e-9)
     return Refined(
         pixel=place,
@@ -443,10 +443,10 @@ def _judged(
 def _softer(
     template: _Template, samples: Values, weight: Values, contrast: float, blur: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Return contrast and blur of a pale mark: under stray light, or only out of focus.
+    """Return contrast and blur of a pale mark, under stray light or only out of focus.
 
-    The model's terms for blur hold while that is small to the stroke. Beyond, drawings
-    of several softnesses each way are compared, and the one that explains most tells.
+    The model's terms for blur hold while it is small against the stroke. Beyond, drawings of
+    several blurs each way are compared, and the one that explains most decides.
     """
     import cv2
 

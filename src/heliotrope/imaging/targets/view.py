@@ -1,4 +1,4 @@
-"""A view: how a plane with targets lies in one frame, with its covariance."""
+"""A view: the map from a plane with targets to one frame, with its covariance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -11,8 +11,8 @@ from heliotrope.field.camera import Camera, undistort
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
-#: Of a lens of which nothing is known: standard deviation of k1 at a focal length of
-#: the frame's longer side. A lens for photography stays below.
+#: Standard deviation of k1 of an unknown lens, at a focal length of the frame's longer side.
+#: Photographic lenses stay below.
 LENS_DEVIATION = 0.1
 
 
@@ -23,7 +23,7 @@ class Face:
     Attributes
     ----------
     targets
-        Of which each lies within some centimetres of the plane.
+        Each within some centimetres of the plane.
     origin
         ENU metres, (3,).
     axes
@@ -50,21 +50,21 @@ class Face:
 
 
 def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
-    """Return targets grouped by the plane that they lie in.
+    """Return targets grouped by their planes.
 
     Parameters
     ----------
     targets
         Of a plant.
     apart
-        Corners nearer to a plane than this, m, lie in it.
+        Greatest distance of a corner from its plane, m.
     """
     groups: list[list[Target]] = []
     for target in targets:
         for group in groups:
             first = group[0]
             depth = np.abs((target.corners - first.center) @ first.normal)
-            # Two towers may show their targets in one plane by chance, apart.
+            # Targets of two towers may lie in one plane by chance.
             near = any(_meet(target, other) for other in group)
             if depth.max() < apart and near and float(target.normal @ first.normal) > 0.98:
                 group.append(target)
@@ -79,7 +79,7 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
 
 
 def _meet(a: Target, b: Target) -> bool:
-    """Whether the gap between two targets of one plane is less than a quarter of their size."""
+    """Return whether two targets of a plane are closer than a quarter of their size."""
     corners, others = a.plane_coordinates(a.corners), a.plane_coordinates(b.corners)
     gap = np.maximum(
         others.min(axis=0) - corners.max(axis=0), corners.min(axis=0) - others.max(axis=0)
@@ -99,9 +99,9 @@ class View:
     lens
         Focal length and distortion, known or estimated with the view.
     H_norm_plane
-        From plane metres to undistorted x/z, y/z, (3, 3).
+        Homography from plane metres to undistorted x/z, y/z, (3, 3).
     covariance
-        Of the eight free numbers of the homography and of k1, (9, 9), in the scaled
+        Of the eight free parameters of the homography and of k1, (9, 9), in the scaled
         coordinates of :func:`fit_view`.
     residual
         RMS of the points' residuals, pixels.
@@ -134,9 +134,9 @@ class View:
         return np.stack(sides, axis=-1)
 
     def covariance_at(self, plane: npt.ArrayLike) -> FloatArray:
-        """Return the covariance, m², (2, 2), of the place that a certain pixel shows.
+        """Return the covariance, m², (2, 2), of the place seen at a given pixel.
 
-        It is that of the view alone: of the marks, their survey and the lens.
+        It contains the errors of the view alone: of the marks, their survey and the lens.
         """
         place = np.asarray(plane, dtype=np.float64)
         numbers = _numbers(self.face, self.H_norm_plane, self.lens)
@@ -163,7 +163,7 @@ def _distort(
 
 
 def unknown_lens(size: tuple[int, int]) -> Camera:
-    """Return a lens of which only the size of the frames is known, without distortion."""
+    """Return a lens without distortion of which only the frame size is known."""
     focal = float(max(size))
     matrix = np.array(
         [[focal, 0.0, 0.5 * (size[0] - 1)], [0.0, focal, 0.5 * (size[1] - 1)], [0.0, 0.0, 1.0]]
@@ -197,27 +197,27 @@ def fit_view(
     lens: Camera,
     lens_known: bool,
 ) -> View:
-    """Return the view of greatest posterior probability.
+    """Return the view with the greatest posterior probability.
 
     Parameters
     ----------
     face
         The plane.
     plane, pixels
-        Points in the plane, m, and where they are seen, (N, 2), N ≥ 4.
+        Points in the plane, m, and their pixels, (N, 2), N ≥ 4.
     covariance
         Of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
     lens
-        To begin with; without ``lens_known`` its k1 is estimated, with a prior of
+        Initial lens; unless ``lens_known``, its k1 is estimated with the prior
         :data:`LENS_DEVIATION`.
 
     Notes
     -----
-    The covariance is scaled by the residuals as far as there are more of them than
-    unknowns: (ν + χ²)/(ν + dof) with ν = 4, never below 1.
+    The covariance is scaled by the residuals, as far as they exceed the unknowns in number:
+    (ν + χ²)/(ν + dof) with ν = 4, never below 1.
     """
     white = np.linalg.inv(np.linalg.cholesky(covariance))
-    # A thousandth of the prior holds a known lens without a second code path.
+    # A tiny deviation of the prior fixes a known lens without a second code path.
     deviation = LENS_DEVIATION * (1e-4 if lens_known else 1.0)
     prior = lens.distortion[0]
 
@@ -236,7 +236,7 @@ def fit_view(
         miss, J = residuals(numbers), _slopes(residuals, numbers)
         step = np.linalg.lstsq(J, -miss, rcond=None)[0]
         numbers = numbers + step
-        # The start is within a pixel or two: Gauss-Newton converges from there.
+        # The start is within a pixel or two, from where Gauss-Newton converges.
         before, cost = cost, float(miss @ miss)
         if before - cost <= 1e-6 * cost:
             break
@@ -260,7 +260,7 @@ def fit_view(
 
 
 def _slopes(function: Callable[[FloatArray], FloatArray], numbers: FloatArray) -> FloatArray:
-    """Return the derivatives by central differences, (M, 9), of a function of (..., 9)."""
+    """Return derivatives (M, 9) of a function of (..., 9), by central differences."""
     steps = 1e-6 * np.eye(len(numbers))
     ahead, back = function(numbers + steps), function(numbers - steps)
     return np.asarray(((ahead - back) / 2e-6).T)
@@ -279,12 +279,12 @@ def _apply(H: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _scales(face: Face) -> FloatArray:
-    """Plane coordinates over this are of order one."""
+    """Return divisors that bring plane coordinates to order one."""
     return np.array([1.0, 1.0, 0.0]) * 0.5 * float(np.ptp(face.span, axis=0).max()) + [0, 0, 1]
 
 
 def _numbers(face: Face, H: FloatArray, lens: Camera) -> FloatArray:
-    """Return the nine unknowns: H of scaled coordinates, its last at 1, and k1."""
+    """Return the nine unknowns: H of scaled coordinates with its last number 1, and k1."""
     scaled = (H / H[2, 2]) * _scales(face)
     return np.append(scaled.ravel()[:8], lens.distortion[0])
 
