@@ -277,7 +277,7 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH[:2], "none.png", *TEACH[3:]), "none.png"),
         ((*TEACH[:2], "text.png", *TEACH[3:]), "text.png"),
         ((*TEACH[:3], "--target", "targte"), "there is no target 'targte'; did you mean target?"),
-        (TEACH, "target target: 0 points are given; four or more"),
+        (TEACH, "target target: 0 points given; four or more"),
         ((*TEACH, "--at", "upper_left"), "--at 'upper_left': write NAME=X,Y"),
         ((*TEACH, "--at", "upper_left=1"), "--at 'upper_left=1': write NAME=X,Y"),
         ((*TEACH, "--at", "upper_left=1,b"), "write NAME=X,Y"),

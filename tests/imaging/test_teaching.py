@@ -230,7 +230,7 @@ def test_what_is_not_there_becomes_a_picture(frame: Frame) -> None:
     points = {p.name: p for p in taught.points}
     for name, kind in (("dot", "corner"), ("middle", "square")):
         point = points[name]
-        assert re.match(rf"no {kind} of 0\.[45] m was recognised there", point.note)
+        assert re.match(rf"no {kind} of 0\.[45] m was recognised", point.note)
         assert not point.refined
         assert point.mark is not None
         assert point.mark.kind == "picture"
@@ -303,7 +303,7 @@ def test_an_edge_or_nothing_is_no_mark(frame: Frame) -> None:
     for point in taught.points[4:]:
         assert point.mark is None
         assert "only an edge, or nothing" in point.note
-        assert "it tells the camera's place, but is no mark" in point.note
+        assert "the point locates the camera but is no mark" in point.note
     assert [m.name for m in taught.plant.target("target").marks] == list(TURNS)
     assert taught.fit.residuals.shape == (6, 2)
 
@@ -404,7 +404,7 @@ def test_another_file_is_not_written_over(frame: Frame, tmp_path: Path) -> None:
     place = tmp_path / "notes.toml"
     place.write_text("not = [toml")
     taught = teach(BARE, "target", frame, clicked(ALL), wishes=DRAWN)
-    with pytest.raises(FormatError, match="this is no plant file; write to another place"):
+    with pytest.raises(FormatError, match="not a plant file; write to another place"):
         write_taught(taught, place)
     assert place.read_text() == "not = [toml"
 
@@ -418,7 +418,7 @@ def test_pictures_that_are_missing_or_no_pictures(blotted: Frame, tmp_path: Path
     with pytest.raises(FormatError, match="30 × 40 px; a mark's picture is square"):
         read_pictures(tmp_path, taught.plant.targets)
     file.unlink()
-    with pytest.raises(FormatError, match=r"there is no such picture of mark blot_0; copy it"):
+    with pytest.raises(FormatError, match=r"the picture of mark blot_0 is missing; copy it"):
         read_pictures(tmp_path, taught.plant.targets)
 
 
@@ -467,19 +467,19 @@ FOUR = list(TURNS)
             changed(lambda g: g.update(upper_leff=(10.0, 10.0))),
             r"there is no point of target target 'upper_leff'; did you mean upper_left",
         ),
-        ({n: tuple(TRUE[n]) for n in FOUR[:3]}, r"3 points are given; four or more.*it has up"),
+        ({n: tuple(TRUE[n]) for n in FOUR[:3]}, r"3 points given; four or more.*it has up"),
         (
             changed(lambda g: g.update(dot=(640.0, 10.0))),
             r"point dot: 640.0, 10.0 is not in the picture of 640 × 480 px",
         ),
         (changed(lambda g: g.update(dot=(float("nan"), 10.0))), r"point dot: nan, 10.0 is not in"),
-        (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are given at one"),
-        (changed(mirror), r"lie mirrored in the picture; are left and right exchanged\?"),
+        (changed(lambda g: g.update(dot=g["middle"])), r"points middle and dot are at the same"),
+        (changed(mirror), r"are mirrored in the picture; are left and right swapped\?"),
         (
             changed(lambda g: exchange(g, "upper_left", "upper_right")),
-            r"do not lie in the picture as on the target; are two exchanged\?",
+            r"are not arranged as on the target; are two swapped\?",
         ),
-        (changed(lambda g: exchange(g, "dot", "middle")), r"are two exchanged\?"),
+        (changed(lambda g: exchange(g, "dot", "middle")), r"are two swapped\?"),
     ],
 )
 def test_points_that_cannot_be(frame: Frame, given: dict[str, Any], text: str) -> None:
@@ -490,7 +490,7 @@ def test_points_that_cannot_be(frame: Frame, given: dict[str, Any], text: str) -
 def test_four_points_with_two_exchanged(frame: Frame) -> None:
     given = {name: tuple(TRUE[name]) for name in FOUR}
     exchange(given, "upper_left", "lower_left")
-    with pytest.raises(InputError, match="as on the target; are two exchanged"):
+    with pytest.raises(InputError, match="as on the target; are two swapped"):
         teach(BARE, "target", frame, given)
 
 
@@ -514,7 +514,7 @@ def test_other_refusals(frame: Frame) -> None:
         InputError, match="camera south: its frames have 1280 × 960 px, the picture"
     ):
         teach(other, "target", frame, given, camera="south")
-    with pytest.raises(InputError, match="no target that this camera sees has marks; teach them"):
+    with pytest.raises(InputError, match="no target of this camera has marks; teach them"):
         see_marks(BARE, ".", [frame], None)
     hidden = replace(BARE, targets=(replace(BARE.targets[0], marks=MARKS),))
     blank = Frame(np.full((480, 640), 128, np.uint8), "blank.png")
@@ -664,11 +664,11 @@ def test_cancelling_ends_it_too(asked: Asked) -> None:
 @pytest.mark.parametrize(
     ("body", "text"),
     [
-        (b"{", "the answer is no JSON"),
+        (b"{", "the answer is not JSON"),
         (b"[]", 'the answer has no "points"'),
         (b'{"points": []}', 'the answer has no "points"'),
-        (b'{"points": {"nose": [1, 2]}}', "nobody asked for point 'nose'"),
-        (b'{"points": {"dot": [1, 2]}}', "nobody asked for point 'dot'"),
+        (b'{"points": {"nose": [1, 2]}}', "point 'nose' was not asked for"),
+        (b'{"points": {"dot": [1, 2]}}', "point 'dot' was not asked for"),
         (b'{"points": {"middle": [1]}}', "point middle: give two numbers"),
         (b'{"points": {"middle": [1, "2"]}}', "point middle: give two numbers"),
         (b'{"points": {"middle": [true, 2]}}', "point middle: give two numbers"),

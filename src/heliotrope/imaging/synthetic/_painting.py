@@ -1,4 +1,4 @@
-"""What stays from frame to frame: where pixels look, and the paint that they see there."""
+"""The constant part of frames: where pixels look, and the paint that they see there."""
 
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -18,11 +18,11 @@ from heliotrope.optics.coverage import coverage
 
 Image = npt.NDArray[np.float32]
 
-#: The lens is inverted at every so many pixels, and by cubic splines between: 1e-6 px.
+#: Spacing of the pixels at which the lens is inverted; cubic splines between err by 1e-6 px.
 _KNOTS = 16
-#: Pieces of polygons' edges, px: a lens bends them by less than 1e-4 px.
+#: Length of pieces of polygons' edges, px; a lens bends them by less than 1e-4 px.
 _PIECE = 4.0
-#: Cells of a pixel, each way, in which paint is blurred, and pixels at a time, each way.
+#: Subdivision of pixels for blurring paint, and size of a tile, px, each way.
 _FINE, _TILE = 5, 64
 
 
@@ -38,7 +38,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Background:
-    """What does not depend on light and beams: planes, and the sky's share and relative light."""
+    """The part without light and beams: planes, and the sky's share and relative light."""
 
     planes: tuple[Plane, ...]
     sky: Image
@@ -46,7 +46,7 @@ class Background:
 
 @dataclass(frozen=True)
 class View:
-    """A camera and targets, compared by what matters to the picture."""
+    """A camera and targets, compared by their effect on the picture."""
 
     key: tuple[object, ...]
     camera: Camera = field(compare=False)
@@ -68,12 +68,12 @@ def _key(camera: Camera, targets: tuple[Target, ...]) -> tuple[object, ...]:
 
 
 def background(scene: Scene) -> Background:
-    """Return what stays of a scene; kept for the last four combinations.
+    """Return the constant part of a scene, cached for the last four combinations.
 
     Raises
     ------
     InputError
-        If nobody knows where the camera stands, or it does not see the front of a target.
+        If the camera has no pose, or does not see the front of a target.
     """
     view = View(_key(scene.camera, scene.targets), scene.camera, scene.targets)
     return _painted(view, scene.paint, scene.surroundings, scene.lens.base)
@@ -97,19 +97,19 @@ def _painted(view: View, paint: Paint, around: Surroundings, blur: float) -> Bac
 def _areas(
     view: View, wall: tuple[float, float, float, float], blur: float
 ) -> tuple[list[Image], list[Image], Image]:
-    """Return the shares of pixels that targets, their walls, and the sky take, (H, W) each."""
+    """Return the shares of pixels covered by targets, their walls, and the sky, (H, W) each."""
     camera, shape = view.camera, view.camera.size[::-1]
     free = np.ones(shape, dtype=np.float32)
     areas: list[Image] = []
     walls: list[Image] = []
-    # Targets hide walls, and what is named first hides what comes later.
+    # Targets hide walls, and earlier targets hide later ones.
     for target in view.targets:
         _check_seen(camera, target)
         border = _seen(camera, target, target.plane_coordinates(target.corners))
         areas.append(np.minimum(soft_coverage([border], shape, blur), free))
         free -= areas[-1]
     for target in view.targets:
-        # A wall reaches behind what is in front of it: its share is what that leaves.
+        # A wall gets the share that everything in front of it leaves.
         outline = _seen(camera, target, _wall(target, wall))
         behind = soft_coverage([outline], shape, blur) - (1.0 - free)
         walls.append(np.maximum(behind, np.float32(0.0)))
@@ -124,15 +124,15 @@ def _check_seen(camera: Camera, target: Target) -> None:
     if front <= 0.0 or not np.isfinite(pixels).all():
         raise InputError(
             f"camera {camera.name}: it does not see the front of target {target.name}; place it "
-            "in front of the target and turn it there"
+            "in front of the target, facing it"
         )
 
 
 def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: float) -> Image:
-    """Return the share of each pixel that polygons take, seen with a Gaussian blur, (H, W).
+    """Return the share of each pixel that polygons cover under a Gaussian blur, (H, W).
 
-    A lens blurs before the pixels sample; pixels blurred afterwards would move edges by up to
-    0.02 px with their phase. Polygons (K, 2) and ``blur``, a standard deviation, are in pixels.
+    A lens blurs before pixels sample. Blurring pixels afterwards would move edges by up to 0.02 px,
+    depending on their phase. Polygons (K, 2) and ``blur``, a standard deviation, are in pixels.
     """
     import cv2
 
@@ -143,7 +143,7 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
     kernel = np.convolve(np.exp(-0.5 * taps**2), np.ones(_FINE), mode="same")
     kernel /= kernel.sum()
     out = coverage(polygons, shape).astype(np.float32)
-    # Only near edges is there anything to blur.
+    # Blur matters only near edges.
     window = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
     near = np.asarray(cv2.dilate(out, window)) - np.asarray(cv2.erode(out, window)) > 0.0
     first = _FINE * margin + _FINE // 2
@@ -161,7 +161,7 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
 
 @lru_cache(maxsize=4)
 def _plane_map(view: View) -> tuple[Image, Image]:
-    """Return metres right of and above the target's centre that pixels look at, (H, W) each."""
+    """Return the places of pixels, metres right of and above the target's centre, (H, W) each."""
     from scipy.interpolate import RectBivariateSpline
 
     camera, target = view.camera, view.targets[0]
@@ -186,12 +186,12 @@ def _plane_map(view: View) -> tuple[Image, Image]:
 
 
 def _seen(camera: Camera, target: Target, polygon: FloatArray) -> FloatArray:
-    """Return a polygon of the plane (K, 2), m, as the lens shows it, pixels (L, 2)."""
+    """Return the pixels (L, 2) of a polygon (K, 2) in the plane, m, as the lens shows it."""
     ends = np.roll(polygon, -1, axis=0)
     rough = project(camera, target.point(np.stack([polygon, ends])))
     if not np.isfinite(rough).all():
         raise InputError(
-            f"camera {camera.name}: a part of the wall around target {target.name} is behind it; "
+            f"camera {camera.name}: part of the wall around target {target.name} is behind it; "
             "make the surroundings' wall smaller"
         )
     pieces = np.ceil(np.linalg.norm(rough[1] - rough[0], axis=-1) / _PIECE).astype(int)
@@ -212,7 +212,7 @@ def _wall(target: Target, wall: tuple[float, float, float, float]) -> FloatArray
 def _texture(
     rng: np.random.Generator, low: FloatArray, high: FloatArray, coarse: float, amplitude: float
 ) -> tuple[FloatArray, float]:
-    """Return smooth noise about 1 over a rectangle with features of ``coarse`` m, and its step."""
+    """Return smooth noise around 1 over a rectangle, of grain ``coarse`` (m), and its step."""
     from scipy.ndimage import zoom
 
     columns, rows = (np.ceil((high - low) / coarse).astype(int) + 4).tolist()
@@ -222,14 +222,14 @@ def _texture(
 
 @dataclass(frozen=True)
 class _Brush:
-    """What paints polygons of a target's plane over a picture."""
+    """Paints polygons of a target's plane over a picture."""
 
     camera: Camera
     target: Target
     blur: float
 
     def lay(self, reflectance: Image, shapes: list[FloatArray], value: float) -> None:
-        """Paint polygons of the plane (m) over what is there."""
+        """Paint polygons of the plane (m) over the picture."""
         seen = [_seen(self.camera, self.target, shape) for shape in shapes]
         corners = np.concatenate(seen)
         size = np.array(reflectance.shape[::-1])
@@ -302,7 +302,7 @@ def _paint_wall(
     for _ in range(around.clutter):
         half = 0.5 * np.exp(rng.uniform(np.log(0.05), np.log(1.5), 2))
         box = np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)]) * half
-        # Around the target: what lies on it would be hidden.
+        # Beside the target, which would hide them.
         middle = rng.uniform(near_low, near_high)
         k = int(np.argmax(np.abs(middle) / reach))
         if abs(middle[k]) < 0.55 * reach[k]:

@@ -1,7 +1,7 @@
-"""Synthetic frames: a target with beams on it as a camera sees it, with the truth.
+"""Synthetic frames: a camera's view of a target with beams, and the truth.
 
-Light is written as the irradiance (W/m²) on perfectly white diffuse paint that would look as
-bright. Paint, borders and marks cover pixels by exact areas; beams are averaged over pixels.
+Light is expressed as the irradiance (W/m²) on perfectly white diffuse paint of equal brightness.
+Paint, borders and marks cover pixels by exact areas; beams are averaged over pixels.
 See docs/explanation/rendering.md.
 """
 
@@ -53,30 +53,30 @@ __all__ = [
 
 #: Blue, green, red of beams and of ambient light in colour frames, relative to grey.
 BEAM_TINT, AMBIENT_TINT = (0.80, 1.0, 1.08), (1.15, 1.0, 0.88)
-#: A mark is lit if beams add this much of the ambient light, and covered if its contrast is
-#: below this many standard deviations of the noise.
+#: A mark is lit if beams add this share of the ambient light, and covered if its contrast is below
+#: this many standard deviations of the noise.
 LIT, COVERED = 0.5, 3.0
 
 
 @dataclass(frozen=True)
 class BeamTruth:
-    """Where one beam is.
+    """The true place of a beam.
 
     Attributes
     ----------
     target
-        Its name.
+        Name of the target.
     centroid, point, pixel
-        Centre of the energy on the plane, also beyond the border: metres right of and above
-        the target's centre (2,), ENU metres (3,), and where the camera sees that point (2,).
+        Centre of the energy on the plane, including that beyond the border: metres right of
+        and above the target's centre (2,), ENU metres (3,), and the pixel of that point (2,).
     centroid_on_target, pixel_on_target
-        The same of what falls on the target; NaN if nothing does.
+        The same for the energy on the target; NaN if there is none.
     share_on_target
         Of the energy.
     share_clipped
-        Of its light in the frame, as painted surfaces return it: on clipped pixels.
+        Of its light in the frame, on clipped pixels.
     peak
-        Reading, in full scales and not clipped, where its light is strongest.
+        Reading at its strongest light, in full scales, before clipping.
     """
 
     target: str
@@ -92,22 +92,22 @@ class BeamTruth:
 
 @dataclass(frozen=True)
 class MarkTruth:
-    """What one mark looks like.
+    """The true appearance of a mark.
 
     Attributes
     ----------
     target, name
-        Which mark.
+        Of the mark.
     pixel
-        Where its point is seen, (2,).
+        Of its point, (2,).
     in_frame
-        Whether that is in the frame.
+        Whether the pixel is in the frame.
     light
-        Flux of the beams on it over the ambient light, mean.
+        Mean flux of the beams on it over the ambient light.
     contrast
-        Reading of the paint less that of the mark, after clipping, in full scales, mean.
+        Mean reading of the paint minus that of the mark, after clipping, in full scales.
     lit
-        Whether ``light`` is above a half.
+        Whether ``light`` is above one half.
     covered
         Whether the contrast is below three standard deviations of a pixel's noise.
     """
@@ -129,14 +129,14 @@ class Rendered:
     Attributes
     ----------
     frame
-        What the camera gives.
+        The camera's frame.
     beams, marks
         In the order of the scene.
     clipped
         Share of the readings at full scale.
     level
-        Readings without noise, clipping and encoding, in full scales, float32, of the shape
-        of the frame; None unless asked for.
+        Readings without noise, clipping and encoding, in full scales, float32, in the shape
+        of the frame; None unless requested.
     """
 
     frame: Frame
@@ -154,24 +154,24 @@ def render(
     time: datetime | None = None,
     level: bool = False,
 ) -> Rendered:
-    """Return a frame of a scene and its truth; the same seed gives the same noise.
+    """Return a frame of a scene with its truth; equal seeds give equal noise.
 
     Parameters
     ----------
     scene
-        What there is to see. What stays (camera, targets, paint, surroundings) is worked
-        out once and kept for the last four combinations.
+        The scene. Its constant part (camera, targets, paint, surroundings) is cached for
+        the last four combinations.
     seed
         Of the noise, 0 or more.
     name, time
-        For the frame.
+        Of the frame.
     level
-        Whether to give the readings without noise too.
+        Whether to return the readings without noise too.
 
     Raises
     ------
     InputError
-        If nobody knows where the camera stands, or it does not see the front of a target.
+        If the camera has no pose, or does not see the front of a target.
     """
     stays = background(scene)
     ambient = stays.sky * np.float32(scene.surroundings.sky)
@@ -220,7 +220,7 @@ def _add_ambient(scene: Scene, plane: Plane, image: Image) -> None:
 def _beam_image(
     scene: Scene, plane: Plane, index: int, thrown: Thrown
 ) -> tuple[slice, slice, Image]:
-    """Return the rows and columns that a beam reaches, and its returned light there, W/m²."""
+    """Return the rows and columns that a beam reaches, and its reflected light there, W/m²."""
     width, height = scene.camera.size
     outline = thrown.beam.corners
     ends = np.roll(outline, -1, axis=0)
@@ -289,7 +289,7 @@ def _bell(sigma: float) -> FloatArray:
 
 
 def point_spread(lens: Lens) -> FloatArray:
-    """Return disc or Gaussian of a lens with its shake, of sum 1 and symmetric, (K, K)."""
+    """Return the kernel (K, K) of a lens's disc or Gaussian with its shake; symmetric, sum 1."""
     from scipy.signal import convolve2d
 
     spread = np.ones((1, 1))
@@ -319,10 +319,10 @@ def _add_ghost(level: Image, lens: Lens) -> None:
 
 
 def _expose(sensor: Sensor, level: Image, seed: int) -> tuple[Pixels, float]:
-    """Return pixels, and which share of them is clipped."""
+    """Return pixels, and the share of clipped readings."""
     if seed < 0:
         raise InputError(f"render: seed {seed} must be 0 or more")
-    # The noise is not for secrets: the quickest generator that NumPy has.
+    # NumPy's fastest generator; the noise keeps no secrets.
     rng = np.random.Generator(np.random.SFC64(seed))
     noise = rng.standard_normal(level.size, dtype=np.float32)
     out: Pixels = np.empty(level.shape, np.uint8 if sensor.bits == 8 else np.uint16)
@@ -386,7 +386,7 @@ def _mark_truths(scene: Scene, thrown: list[Thrown]) -> tuple[MarkTruth, ...]:
     tints = (AMBIENT_TINT, BEAM_TINT) if scene.sensor.colour else ((1.0,), (1.0,))
     for target in scene.targets:
         for mark in target.marks:
-            # A grid over what the mark spans, paint and strokes alike.
+            # A grid over the mark's extent, paint and strokes alike.
             corners = np.concatenate(mark_shapes(target, mark))
             low, high = corners.min(axis=0), corners.max(axis=0)
             part = (np.arange(5) + 0.5) / 5
@@ -409,7 +409,7 @@ def _mark_truth(
     tints: tuple[tuple[float, ...], tuple[float, ...]],
 ) -> MarkTruth:
     sensor = scene.sensor
-    # The darkest channel keeps its contrast longest.
+    # The darkest channel is the last to lose its contrast.
     light = sensor.scale * np.min([a * ambient + b * flux for a, b in zip(*tints, strict=True)], 0)
     white, dark = (
         np.minimum(sensor.offset + r * light, 1.0)

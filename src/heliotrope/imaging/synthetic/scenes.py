@@ -15,7 +15,7 @@ from heliotrope.optics.mirror_image import Beam
 
 @dataclass(frozen=True)
 class Paint:
-    """How a target is painted, and has aged.
+    """The paint of a target and its age.
 
     Attributes
     ----------
@@ -24,15 +24,15 @@ class Paint:
     panels
         Columns and rows of metal sheets.
     seam, seam_width
-        Reflectance of the gaps between sheets, and their breadth, m.
+        Reflectance of the gaps between sheets, and their width, m.
     wear
         Standard deviation of the reflectance over decimetres, relative.
     stains, stain
-        How many, and the greatest loss of reflectance in one, relative.
+        Number of stains, and greatest relative loss of reflectance in one.
     patch
-        Reflectance of a repaired patch; 0: there is none.
+        Reflectance of a repaired patch; 0: none.
     seed
-        Where stains, wear and patch are.
+        For the places of stains, wear and patch.
     """
 
     reflectance: float = 0.85
@@ -57,22 +57,22 @@ class Paint:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What is around the target: a wall in its plane, and sky.
+    """The surroundings of a target: a wall in its plane, and sky.
 
     Attributes
     ----------
     wall
-        How far the wall reaches beyond the target to the left, right, up and down, m.
+        Extent of the wall beyond the target to the left, right, up and down, m.
     reflectance
-        Of the wall. Light of beams that misses the target falls on it.
+        Of the wall, which catches the light of beams that misses the target.
     sky
         Brightness of the sky, W/m² on white.
     texture
-        Standard deviation over metres, relative, of wall and sky.
+        Relative standard deviation of wall and sky over metres.
     clutter
         Number of light and dark boxes on the wall.
     seed
-        Where they are.
+        For their places.
     """
 
     wall: tuple[float, float, float, float] = (1.5, 1.5, 3.0, 30.0)
@@ -95,18 +95,18 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Shadow:
-    """An edge of shadow of the ambient light.
+    """The edge of a shadow in the ambient light.
 
     Attributes
     ----------
     point
         On the edge, metres right of and above the target's centre, (2,).
     angle
-        Into the shadow, counterclockwise from the right as seen from the front, rad.
+        Direction into the shadow, counterclockwise from the right as seen from the front, rad.
     softness
-        Breadth of the edge, m.
+        Width of the edge, m.
     left
-        Share of the light that is left in the shadow.
+        Share of the light that remains in the shadow.
     """
 
     point: tuple[float, float] = (0.0, 0.0)
@@ -122,17 +122,17 @@ class Shadow:
 
 @dataclass(frozen=True)
 class Lens:
-    """What blurs and veils a frame.
+    """Blur and stray light of a frame.
 
     Attributes
     ----------
     defocus
         Standard deviation of a Gaussian, or radius of a disc, px.
     disc
-        Which of the two. A disc comes on top of a Gaussian of 0.5 px.
+        Whether it is a disc, which is added to a Gaussian of 0.5 px.
     shake
-        Movement of the camera during the exposure, to the right and down, px; the truth is
-        the middle of it.
+        Movement of the camera during the exposure, to the right and down, px; the truth
+        refers to its middle.
     veil
         Stray light everywhere, as a share of the frame's mean light.
     ghost, ghost_at, ghost_radius
@@ -159,14 +159,14 @@ class Lens:
 
     @property
     def base(self) -> float:
-        """Standard deviation, px, of the part of the blur that paint is seen with beforehand."""
+        """Standard deviation, px, of the blur that is applied to the paint itself."""
         if self.disc and self.defocus > 0.0:
             return 0.5
         return min(self.defocus, 0.6)
 
     @property
     def rest(self) -> "Lens":
-        """What is left to be blurred in the frame."""
+        """The blur that remains for the frame."""
         if self.disc:
             return self
         return replace(self, defocus=float(np.sqrt(self.defocus**2 - self.base**2)))
@@ -174,14 +174,14 @@ class Lens:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes numbers.
+    """The conversion of light to numbers.
 
     Attributes
     ----------
     electrons
-        At full scale, at gain 1.
+        At full scale and gain 1.
     sensitivity
-        Electrons a second for each W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
+        Electrons per second and W/m² on white; 6000 and 1 ms fill the scale at 1667 W/m².
     exposure
         s.
     gain
@@ -189,13 +189,13 @@ class Sensor:
     read_noise
         Standard deviation, electrons.
     offset
-        What darkness reads, as a share of the full scale.
+        Reading in darkness, as a share of the full scale.
     bits
-        8, or 12, which are spread over 16 so that 4095 reads 65535.
+        8, or 12 spread over 16 so that 4095 reads 65535.
     srgb
-        Encoded by the curve of sRGB; otherwise linear.
+        Encode by the sRGB curve instead of linearly.
     colour
-        Blue, green, red with light of two tints; otherwise grey.
+        Blue, green, red with light of two tints, instead of grey.
     """
 
     electrons: float = 10_000.0
@@ -222,7 +222,7 @@ class Sensor:
 
     @property
     def scale(self) -> float:
-        """Share of the full scale for each W/m² on white."""
+        """Share of the full scale per W/m² on white."""
         return self.sensitivity * self.exposure * self.gain / self.electrons
 
 
@@ -235,12 +235,11 @@ class Thrown:
     target
         Name of the target.
     beam
-        What falls on it.
+        Flux in its plane, at the middle of the exposure.
     strength
-        Factor of its flux.
+        Factor of the flux.
     motion
-        How far it moves during the exposure, metres right and up; the beam is as it is in
-        the middle.
+        During the exposure, metres right and up.
     """
 
     target: str
@@ -255,26 +254,26 @@ class Thrown:
 
 @dataclass(frozen=True)
 class Scene:
-    """What there is to see.
+    """Everything that a synthetic frame shows.
 
     Attributes
     ----------
     camera
         With its position and rotation.
     targets
-        With their marks; pictures cannot be drawn.
+        With their marks, except pictures, which cannot be drawn.
     beams
         :class:`Thrown`, or tuples of its arguments.
     ambient
         Irradiance of the targets without beams, W/m².
     gradient
-        Relative increase of it to the right and upwards, 1/m, about each target's centre.
+        Its relative increase to the right and upwards, 1/m, about each target's centre.
     shadow
         On each target's plane.
     cloud
-        Factor of all beams: 1 under a clear sky.
+        Factor of all beams; 1 under a clear sky.
     paint, surroundings, lens, sensor
-        See there.
+        As of their classes.
     """
 
     camera: Camera
@@ -309,14 +308,14 @@ class Scene:
 
 
 def exposed(scene: Scene, peak: float = 0.8) -> Scene:
-    """Return the scene with the exposure at which its brightest beam reads ``peak``.
+    """Return the scene exposed such that its brightest beam reads ``peak``.
 
     Parameters
     ----------
     scene
-        With beams, or with ambient light alone, whose paint then reads ``peak``.
+        With beams, or with ambient light alone; then the paint reads ``peak``.
     peak
-        Reading on the target's paint where the strongest beam is strongest, of the full scale.
+        Reading of the target's paint at the peak of the strongest beam, of the full scale.
     """
     sensor = scene.sensor
     if not peak > sensor.offset:
@@ -332,13 +331,13 @@ def exposed(scene: Scene, peak: float = 0.8) -> Scene:
 def example_target(
     side: float = 8.0, center: tuple[float, float, float] = (0.0, 0.0, 40.0), name: str = "target"
 ) -> Target:
-    """Return a square target that faces north, with eight marks a little inside its border.
+    """Return a square target that faces north, with eight marks just inside its border.
 
-    Corners at its four corners and tees half-way, of 0.6 m with strokes of 0.12 m on a side
-    of 8 m, and in proportion on others.
+    Corners stand at its four corners and tees half-way between. For a side of 8 m they measure
+    0.6 m with strokes of 0.12 m, otherwise in proportion.
     """
     middle, half = as_float(center), 0.5 * side
-    # Who looks south at it has west on the right.
+    # Looking south at it, west is on the right.
     right, up = np.array([-1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     inset = half - 0.0375 * side
     size, stroke = 0.075 * side, 0.015 * side
@@ -370,12 +369,12 @@ def example_camera(
     distortion: float = 0.004,
     name: str = "camera",
 ) -> Camera:
-    """Return a camera that sees a target from below and from the side, through a bent lens.
+    """Return a camera that sees a target from below and from the side, with distortion.
 
     Parameters
     ----------
     target
-        What it looks at, nearly: the target's centre is a little off the frame's middle.
+        In view; its centre is a little off the middle of the frame.
     distance
         From the target's centre, m.
     size
@@ -385,7 +384,7 @@ def example_camera(
     roll
         Turn about the line of sight, rad.
     fill
-        Share of the frame's lesser side that the target takes up.
+        Share of the frame's shorter side that the target takes up.
     distortion
         Inward shift of the frame's corners, as a share of their distance from the middle.
     name

@@ -1,7 +1,7 @@
-"""A page on this machine alone that asks where points are in a picture.
+"""A page, for this machine alone, on which a person clicks points in a picture.
 
-OpenCV is used without windows, so the browser shows the picture: one address on 127.0.0.1
-that ends in a random word, one page without anything from elsewhere, one answer.
+OpenCV is used without windows, so a browser shows the picture: one address on 127.0.0.1 that ends
+in a random word, one self-contained page, one answer.
 """
 
 import json
@@ -21,14 +21,14 @@ from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.targets.teaching import known_points
 
-#: An answer is a few hundred bytes for each point.
+#: Longest answer, bytes; a point takes a few hundred.
 _LONGEST = 1 << 20
 Pixel = tuple[float, float]
 
 
 @dataclass
 class _State:
-    """What is asked, and what came."""
+    """The question, and the answer."""
 
     token: str
     nonce: str
@@ -41,7 +41,7 @@ class _State:
 
 
 class _Server(ThreadingTCPServer):
-    # Not http.server's own, which asks the network for this machine's name.
+    # Not http.server.HTTPServer, which asks the network for this machine's name.
     daemon_threads = True
 
     def __init__(self, state: _State) -> None:
@@ -65,8 +65,8 @@ class _Handler(BaseHTTPRequestHandler):
         """Keep quiet: the terminal belongs to the command."""
 
     def _allowed(self) -> str | None:
-        """Return what is asked for, behind the random word; None if it is not for us."""
-        # A page from elsewhere may resolve its own name to this machine, but says that name.
+        """Return the path after the random word; None if the request is not for this page."""
+        # A foreign page may resolve its own name to this machine, but then sends that name.
         here = self.headers.get("Host") in (f"127.0.0.1:{self._port}", f"localhost:{self._port}")
         _, word, *rest = (self.path.split("/") + ["", ""])[:4]
         known = secrets.compare_digest(word.encode(), self._state.token.encode())
@@ -128,7 +128,7 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             document = json.loads(self.rfile.read(int(length)))
         except ValueError:
-            raise InputError("the answer is no JSON") from None
+            raise InputError("the answer is not JSON") from None
         points = document.get("points") if isinstance(document, dict) else None
         if not isinstance(points, dict):
             raise InputError('the answer has no "points"')
@@ -136,7 +136,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _point(self, name: str, value: object) -> Pixel:
         if name not in self._state.names:
-            raise InputError(f"nobody asked for point {name!r}")
+            raise InputError(f"point {name!r} was not asked for")
         width, height = self._state.size
         if not (
             isinstance(value, list)
@@ -167,16 +167,17 @@ def ask(
     picture
         Grey (H, W) or blue-green-red (H, W, 3), uint8.
     places
-        What to ask for, in this order, and where each lies on the target: from the left and
+        Points to ask for, in this order, with their places on the target from the left and
         from above, 0 to 1.
     given
-        Points that are known already; the page shows them.
+        Points already known; the page shows them.
     title
         Of the page.
     announce
-        Is told the page's address once it can be opened; this function waits for the answer.
+        Called with the page's address once it can be opened; this function waits for the
+        answer.
     fewest
-        The page takes no answer with fewer points, those given included.
+        Least number of points in an answer, those given included.
     aspect
         Width of the target over its height, for the page's sketch of it.
 
@@ -199,7 +200,7 @@ def ask(
         thread.start()
         try:
             announce(f"http://127.0.0.1:{server.port}/{token}/")
-            # In pieces, so that Ctrl-C is heard.
+            # In short waits, so that Ctrl-C works.
             while not state.over.wait(0.2):
                 pass
         finally:
@@ -217,9 +218,9 @@ def click_points(
     title: str,
     announce: Callable[[str], None],
 ) -> dict[str, Pixel]:
-    """Ask a person in a browser for the points of a target that are not given yet.
+    """Ask a person in a browser for the points of a target that are not given.
 
-    ``announce`` is told the page's address, on this machine alone.
+    ``announce`` is called with the page's address, on this machine alone.
 
     Raises
     ------
@@ -233,7 +234,7 @@ def click_points(
     low, high = corners.min(axis=0), corners.max(axis=0)
     share = np.clip((plane - low) / (high - low), 0.0, 1.0)
     places = {name: (float(x), float(1.0 - y)) for name, (x, y) in zip(known, share, strict=True)}
-    # As bright as the screen can: faint frames are hard to click in.
+    # As bright as possible: faint frames are hard to click in.
     pixels = frame.pixels.astype(np.float32)
     top = max(float(np.percentile(pixels, 99.9)), 1.0)
     shown = np.clip(pixels * (255.0 / top), 0.0, 255.0).astype(np.uint8)

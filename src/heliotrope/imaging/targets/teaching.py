@@ -1,8 +1,7 @@
-"""Teaching: a person says once where the known points of a target are in a picture.
+"""Teaching: a person points out the known points of a target in one picture.
 
-Each point is refined to a fraction of a pixel where a mark of a known kind is there;
-otherwise what the picture shows around it becomes a mark itself. The points also tell where
-the camera stands.
+Where there is a mark of a known kind, the point is refined to a fraction of a pixel. Otherwise the
+part of the picture around it becomes a mark. The points also locate the camera.
 """
 
 import hashlib
@@ -25,17 +24,17 @@ from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.lens import CameraFit, calibrate_marks, resection
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
-#: Kinds that a person can name.
+#: Kinds of marks that can be taught.
 KINDS = ("corner", "tee", "square", "disc", "picture")
-#: A taught picture's side over the target's shorter one, where no size is named.
+#: Default side of a taught picture over the target's shorter side.
 SHARE = 0.12
 #: Sides of a taught picture, px.
 SMALLEST, LARGEST = 12, 512
-#: A hand is wrong by no more than this, px.
+#: Greatest error of a point given by hand, px.
 REACH = 12.0
-#: A drawing must explain this much of what is there, and be darker than its surroundings.
+#: Least share of the variance that a drawing explains; greatest brightness over its surroundings.
 EXPLAINED, CONTRAST = 0.5, 0.93
-#: A picture that can be found again no better than this shows an edge or nothing, px.
+#: A picture that can be located no better than this, px, shows only an edge or nothing.
 VAGUE = 0.5
 
 Pixel = tuple[float, float]
@@ -43,15 +42,15 @@ Pixel = tuple[float, float]
 
 @dataclass(frozen=True)
 class Wish:
-    """What is to be taught at a point.
+    """The mark to be taught at a point.
 
     Attributes
     ----------
     kind
-        One of :data:`KINDS`; None: the mark that the target has there, or a picture.
+        One of :data:`KINDS`; None: the target's present mark, or a picture.
     size, stroke
-        As of :class:`~heliotrope.field.marks.Mark`, m; None: of a picture a share of the
-        target, of strokes a fifth of the size.
+        As of :class:`~heliotrope.field.marks.Mark`, m; None: :data:`SHARE` of the target for
+        a picture, a fifth of the size for strokes.
     """
 
     kind: str | None = None
@@ -77,13 +76,13 @@ class TaughtPoint:
     name
         Of the point.
     pixel, covariance
-        Where it is, (2,), and how well that is known, px² (2, 2).
+        Its place, (2,), with covariance, px² (2, 2).
     mark
-        What the target has there from now on; None: nothing that could be found again.
+        The target's new mark there; None if nothing there could be found again.
     refined
-        Whether the mark's drawing was laid over the picture; else it is where the hand put it.
+        Whether the place was refined by the mark's drawing; otherwise it is as given.
     note
-        Why it is not as wished; empty if it is.
+        Why it differs from the wish; empty if it does not.
     """
 
     name: str
@@ -96,20 +95,20 @@ class TaughtPoint:
 
 @dataclass(frozen=True)
 class Taught:
-    """What came of teaching.
+    """The result of teaching.
 
     Attributes
     ----------
     plant
-        With the marks and the camera.
+        With the new marks and the camera.
     target, camera
         Names of the target and the camera.
     fit
         Of the camera.
     points
-        As they were given.
+        In the order given.
     pictures
-        Taught pictures (N, N), uint8, by the name of their file, which is their code.
+        Taught pictures (N, N), uint8, by file name, which is their code.
     """
 
     plant: Plant
@@ -121,9 +120,9 @@ class Taught:
 
 
 def known_points(target: Target) -> dict[str, FloatArray]:
-    """Return the points of a target that have names: marks, markers, corners; ENU metres.
+    """Return the named points of a target, ENU metres: marks, then markers, then corners.
 
-    A name that occurs among several of them is that of the first.
+    Of equal names the first one counts.
     """
     points = {mark.name: mark.point for mark in target.marks}
     for name, point in target.markers.items():
@@ -153,31 +152,31 @@ def teach(
     Parameters
     ----------
     plant
-        Which has the target.
+        With the target.
     target
         Its name.
     frame
         The picture.
     given
-        Where points are, pixels by the names of :func:`known_points`; four or more, each
-        within :data:`REACH` of the truth.
+        Pixels by the names of :func:`known_points`; four or more, each within :data:`REACH`
+        of the truth.
     camera
-        Its name. If the plant has it, its lens counts as known; else it is solved too, see
-        :func:`~heliotrope.imaging.lens.calibrate_marks`.
+        Its name. The lens of a camera of the plant counts as known; otherwise it is solved
+        too, see :func:`~heliotrope.imaging.lens.calibrate_marks`.
     wishes, wish
-        What to teach at points by name, and at the others.
+        Marks to teach, by the name of the point, and at all others.
     sigma
         Standard deviation of a coordinate of a point given by hand, px.
     anew
         Whether to solve the lens of a camera that the plant has.
     prefix
-        What names of taught pictures begin with.
+        Beginning of the file names of taught pictures.
 
     Raises
     ------
     InputError
-        If names are unknown, points are too few, not in the picture, or do not lie there as
-        they do on the target.
+        If names are unknown, or points are too few, outside the picture, or arranged unlike
+        the target.
     """
     if not (np.isfinite(sigma) and sigma > 0.0):
         raise InputError(f"sigma {sigma} px; give a standard deviation above 0")
@@ -201,7 +200,7 @@ def teach(
         TaughtPoint(n, x, sigma**2 * np.eye(2), None, False)
         for n, x in zip(named, pixels, strict=True)
     ]
-    # Once more with the scale and turn of what was found: a hand's are off by some per cent.
+    # A second pass with the scale and turn found, since those given by hand err by some per cent.
     for search in (REACH, 0.25 * REACH):
         for k, mark in enumerate(drawn):
             if mark is not None:
@@ -221,9 +220,9 @@ def teach(
 
 
 def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = None) -> None:
-    """Write the new pictures beside a plant file, then the rest as :func:`write_with_pictures`.
+    """Write the new pictures beside a plant file, then the file by :func:`write_with_pictures`.
 
-    Names of pictures depend on what they show, so that an older plant file keeps its own.
+    File names depend on the pictures' contents, so that an older plant file keeps its own.
     """
     from heliotrope.imaging.files import write_image
 
@@ -233,9 +232,9 @@ def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = N
 
 
 def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | None = None) -> None:
-    """Write a plant file, last, after copies of the taught pictures that lie in ``folder``.
+    """Copy the taught pictures of ``folder``, then write the plant file.
 
-    Its table stays CSV or parquet as it was.
+    Its table remains CSV or Parquet.
     """
     import tomllib
     from operator import methodcaller
@@ -249,7 +248,7 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
         try:
             table = str(tomllib.loads(place.read_text("utf-8-sig")).get("heliostats", ""))
         except ValueError:
-            raise FormatError(place, "this is no plant file; write to another place") from None
+            raise FormatError(place, "not a plant file; write to another place") from None
     codes = {m.code for t in plant.targets for m in t.marks if m.kind == "picture"}
     for code in codes if folder is not None else ():
         source = Path(folder or "") / code
@@ -259,12 +258,12 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
 
 
 def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, FloatArray]:
-    """Return taught pictures (N, N) by their code, from beside their plant file.
+    """Return taught pictures (N, N) by their code, from the folder of the plant file.
 
     Raises
     ------
     FormatError
-        If one is missing or is no square picture.
+        If one is missing or not square.
     """
     from heliotrope.imaging.files import read_image
 
@@ -274,8 +273,8 @@ def read_pictures(folder: str | Path, targets: Sequence[Target]) -> dict[str, Fl
         if not file.is_file():
             raise FormatError(
                 file,
-                f"there is no such picture of mark {mark.name}; copy it beside the plant "
-                "file, or teach the mark again (heliotrope camera teach)",
+                f"the picture of mark {mark.name} is missing; copy it beside the plant file, or "
+                "teach the mark again (heliotrope camera teach)",
             )
         grey = read_image(file).grey
         if grey.shape[0] != grey.shape[1]:
@@ -304,21 +303,21 @@ def _check_points(
             )
     if len(given) < 4:
         raise InputError(
-            f"target {target.name}: {len(given)} points are given; four or more tell where the "
-            f"camera stands (it has {', '.join(known)})"
+            f"target {target.name}: {len(given)} points given; four or more are needed to locate "
+            f"the camera (it has {', '.join(known)})"
         )
     names = list(given)
     for k, name in enumerate(names):
         for other in names[:k]:
             if np.hypot(*np.subtract(given[name], given[other])) < 3.0:
-                raise InputError(f"points {other} and {name} are given at one place, {given[name]}")
+                raise InputError(f"points {other} and {name} are at the same place, {given[name]}")
     return {name: known[name] for name in names}
 
 
 def _homography(
     target: Target, plane: FloatArray, pixels: FloatArray, names: Sequence[str]
 ) -> FloatArray:
-    """Return H_pixel_plane (3, 3), if the points lie in the picture as on the target."""
+    """Return H_pixel_plane (3, 3) if the points are arranged as on the target."""
     import cv2
 
     what = f"target {target.name}: the points {', '.join(names)}"
@@ -327,17 +326,17 @@ def _homography(
     # None, where there is no solution, becomes a NaN.
     found = as_float(cv2.findHomography(plane, pixels)[0])
     if not np.isfinite(found).all():
-        raise InputError(f"{what} cannot be a view of it; are names exchanged?")
+        raise InputError(f"{what} cannot be a view of it; are names swapped?")
     depth = np.column_stack([plane, np.ones(len(plane))]) @ found[2]
     turned = [float(np.linalg.det(_scale(found, p))) for p in plane]
-    # Rows run downwards: a face seen from its front turns the other way round.
+    # Rows run downwards, so the determinant of a front view is negative.
     if (depth * depth[0] > 0.0).all() and min(turned) > 0.0:
-        raise InputError(f"{what} lie mirrored in the picture; are left and right exchanged?")
+        raise InputError(f"{what} are mirrored in the picture; are left and right swapped?")
     miss = _mapped(found, plane) - pixels
     if not ((depth * depth[0] > 0.0).all() and max(turned) < 0.0) or (
         np.sqrt(np.mean(miss**2)) > 0.05 * np.ptp(pixels, axis=0).max()
     ):
-        raise InputError(f"{what} do not lie in the picture as on the target; are two exchanged?")
+        raise InputError(f"{what} are not arranged as on the target; are two swapped?")
     return found
 
 
@@ -360,7 +359,7 @@ def _per_metre(H: FloatArray, place: FloatArray) -> float:
 
 
 def _drawing(name: str, point: FloatArray, wish: Wish, old: Mark | None) -> Mark | None:
-    """Return the drawn mark that should be there; None if a picture is to be taken."""
+    """Return the drawn mark expected at a point; None if a picture is to be taken."""
     if wish.kind is None and old is not None and old.kind != "picture":
         return old
     if wish.kind in (None, "picture") or wish.size is None:
@@ -375,7 +374,7 @@ def _drawing(name: str, point: FloatArray, wish: Wish, old: Mark | None) -> Mark
 def _refine(
     frame: Frame, here: TaughtPoint, mark: Mark, view: tuple[FloatArray, FloatArray], reach: float
 ) -> TaughtPoint:
-    """Lay a mark's drawing over the picture, at whichever quarter turn explains most."""
+    """Refine a point by the mark's drawing, at the quarter turn that explains most."""
     from heliotrope.imaging.targets.refinement import Refined, refine
 
     scale = _scale(*view)
@@ -386,7 +385,7 @@ def _refine(
     best: tuple[Refined, Mark] | None = None
     for trial in turned:
         found = refine(frame.grey, trial, here.pixel, scale, search)
-        # A drawing brighter than its surroundings is no mark.
+        # A mark is darker than its surroundings.
         if (
             found is not None
             and found.contrast <= CONTRAST
@@ -395,7 +394,7 @@ def _refine(
             best = found, trial
     if best is None or best[0].explained < EXPLAINED:
         share = "nothing" if best is None else f"{100 * max(best[0].explained, 0.0):.0f} %"
-        what = f"no {mark.kind} of {mark.size:g} m was recognised there: it explains {share}"
+        what = f"no {mark.kind} of {mark.size:g} m was recognised: its drawing explains {share}"
         return replace(here, note=what)
     found, trial = best
     return TaughtPoint(here.name, found.pixel, found.covariance, trial, refined=True)
@@ -410,18 +409,18 @@ def _picture(
     prefix: str,
     pictures: dict[str, npt.NDArray[np.uint8]],
 ) -> TaughtPoint:
-    """Take what the picture shows around a point, upright in the plane, as its mark."""
+    """Take the part of the picture around a point, upright in the plane, as its mark."""
     import cv2
 
     (H, place), side = view, size * _per_metre(*view)
     if side < SMALLEST:
-        return _nothing(here, f"a picture of {size:.2f} m has {side:.0f} px; {SMALLEST} are needed")
+        return _nothing(here, f"a picture of {size:.2f} m has {side:.0f} px, below {SMALLEST} px")
     # Odd, so that one pixel's centre is the point.
     count = min(int(side), LARGEST) // 2 * 2 + 1
     offset = (np.arange(count) - count // 2) * (size / count)
     right, up = np.meshgrid(offset, -offset)
     grid = place + np.stack([right, up], axis=-1).reshape(-1, 2)
-    # The hand says where the point is; the view, how the plane lies about it.
+    # The point is where the hand put it; the view gives the plane around it.
     spots = _mapped(H, grid) + here.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
@@ -432,7 +431,7 @@ def _picture(
     picture = np.asarray(patch, dtype=np.uint8)
     vague = _vagueness(picture) * side / count
     if not vague < VAGUE:
-        return _nothing(here, "there is only an edge, or nothing, to know it by")
+        return _nothing(here, "only an edge, or nothing, is visible there")
     code = _file_name(prefix, here.name, picture)
     pictures[code] = picture
     return replace(here, mark=Mark(here.name, "picture", point, size, code=code))
@@ -440,16 +439,16 @@ def _picture(
 
 def _nothing(here: TaughtPoint, why: str) -> TaughtPoint:
     before = f"{here.note}; " if here.note else ""
-    return replace(here, note=f"{before}{why}: it tells the camera's place, but is no mark")
+    return replace(here, note=f"{before}{why}: the point locates the camera but is no mark")
 
 
 def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
-    """Return the standard deviation, px, with which a picture can be found along its worst way.
+    """Return the standard deviation, px, with which a picture is located in its worst direction.
 
     From its structure tensor and its noise (Förstner and Gülch 1987).
     """
     p = picture.astype(np.float64)
-    # The noise: what a second difference along both axes leaves (Immerkær 1996).
+    # Noise from second differences along both axes (Immerkær 1996).
     rough = p[:-2] - 2.0 * p[1:-1] + p[2:]
     rough = rough[:, :-2] - 2.0 * rough[:, 1:-1] + rough[:, 2:]
     noise = max(1.4826 * float(np.median(np.abs(rough))) / 6.0, 1.0)
@@ -457,7 +456,7 @@ def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
     down = 0.5 * (p[2:, 1:-1] - p[:-2, 1:-1])
     tensor = np.array([[np.sum(a * b) for b in (right, down)] for a in (right, down)])
     least = float(np.linalg.eigvalsh(tensor)[0])
-    # Slopes of pure noise are slopes too.
+    # Noise alone has slopes too.
     return noise / np.sqrt(least) if least > 2.0 * right.size * noise**2 else float("inf")
 
 
@@ -500,7 +499,7 @@ def _fit(
 
 
 def _with_target(camera: Camera, target: str, known: Camera | None) -> Camera:
-    """Return the camera with the target among those that it sees."""
+    """Return the camera with the target added to its targets."""
     if known is None:
         return replace(camera, targets=(target,))
     seen = known.targets
@@ -518,7 +517,7 @@ def _with_marks(plant: Plant, target: Target, marks: Sequence[Mark], camera: Cam
 
 
 def with_camera(plant: Plant, camera: Camera) -> Plant:
-    """Return the plant with a camera, in the place of the one of that name if there is one."""
+    """Return the plant with a camera added, or replaced if one has its name."""
     names = [c.name for c in plant.cameras]
     if camera.name not in names:
         return replace(plant, cameras=(*plant.cameras, camera))
@@ -537,11 +536,12 @@ class SeenMarks:
     Attributes
     ----------
     points, pixels, covariances
-        For each frame with any: ENU metres (N, 3), pixels (N, 2), px² with the survey's (N, 2, 2).
+        For each frame with marks: ENU metres (N, 3), pixels (N, 2), px² including the survey
+        (N, 2, 2).
     targets
-        Whose marks they are.
+        Names of the targets found.
     reasons
-        What was not found, and why, in sentences.
+        Why targets were not found, in sentences.
     """
 
     points: tuple[FloatArray, ...]
@@ -554,7 +554,7 @@ class SeenMarks:
 def see_marks(
     plant: Plant, folder: str | Path, frames: Sequence[Frame], camera: Camera | None
 ) -> SeenMarks:
-    """Return the marks of a plant's targets in frames; taught pictures lie in ``folder``.
+    """Find the marks of a plant's targets in frames; taught pictures lie in ``folder``.
 
     Raises
     ------
@@ -568,8 +568,8 @@ def see_marks(
         targets = [t for t in targets if t.name in camera.targets]
     if not targets:
         raise InputError(
-            "no target that this camera sees has marks; teach them first (heliotrope camera "
-            "teach), or give a chessboard"
+            "no target of this camera has marks; teach them first (heliotrope camera teach), or "
+            "give a chessboard"
         )
     pictures = read_pictures(folder, targets)
     points, pixels, covariances, names, reasons = [], [], [], [], []
@@ -603,7 +603,7 @@ def see_marks(
 def fit_marks(
     size: tuple[int, int], seen: SeenMarks, known: Camera | None, name: str, anew: bool
 ) -> CameraFit:
-    """Return the camera that saw marks; of a known one only its place, unless ``anew``."""
+    """Return the camera that saw marks; a known lens is kept unless ``anew``."""
     if known is None or anew:
         return calibrate_marks(size, seen.points, seen.pixels, seen.covariances, name)
     parts = seen.points, seen.pixels, seen.covariances
@@ -613,7 +613,7 @@ def fit_marks(
 
 @dataclass(frozen=True)
 class Sight:
-    """How a camera sees a target.
+    """A camera's view of a target.
 
     Attributes
     ----------
@@ -622,13 +622,13 @@ class Sight:
     distance
         From the camera to its centre, m.
     metres_per_pixel
-        On it, at its centre: the root of the area that a pixel covers, m.
+        At its centre: the root of the area of a pixel, m.
     obliquity
         Between the line of sight and its normal, rad.
     share
-        Of a grid on it, what the frame holds.
+        Share of it in the frame.
     marks
-        How many of its marks the frame holds.
+        Number of its marks in the frame.
     """
 
     target: str
@@ -640,7 +640,7 @@ class Sight:
 
 
 def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
-    """Return how a camera sees the targets that it names, or any, if they face it in its frame."""
+    """Return the views of a camera's targets, or of all, that face it and are in its frame."""
     from heliotrope.field.camera import project
 
     if camera.position is None:
@@ -670,7 +670,7 @@ def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
 
 
 def _held(camera: Camera, pixels: FloatArray) -> npt.NDArray[np.bool_]:
-    """Whether the frame holds pixels (..., 2); it does not hold what is behind the camera."""
+    """Return whether pixels (..., 2) are in the frame; NaN, behind the camera, is not."""
     with np.errstate(invalid="ignore"):
         held = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
     return np.asarray(held.all(axis=-1))
