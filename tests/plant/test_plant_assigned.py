@@ -81,14 +81,14 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("{", "no assigned points; remove it, then aim anew"),
+        ("{", "no assigned points; remove it, then assign"),
         ('{"version": 7}', "no assigned points of version 1; remove it"),
-        ('{"version": 1, "AIM": 3}', "AIM: no points by name; remove it"),
+        ('{"version": 1, "AIM": 3}', "AIM: no points by name; remove the file"),
         (
             '{"version": 1, "AIM": {"A": [1.0, NaN, 0.0]}}',
             r"AIM of A: \[1.0, nan, 0.0\] is no point",
         ),
-        ('{"version": 1, "AIM": {"A": [1.0]}}', r"AIM of A: \[1.0\] is no point in ENU, m"),
+        ('{"version": 1, "AIM": {"A": [1.0]}}', r"AIM of A: \[1.0\] is not a point in ENU, m"),
     ],
 )
 def test_another_file_is_refused(tmp_path: Path, text: str, says: str) -> None:

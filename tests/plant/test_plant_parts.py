@@ -324,7 +324,7 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
 
     assert "status without names" in field.take("K", status(3), 10.0)[0]
     problems = field.take("K", status(3, ("B", "A", "C")), 10.0)
-    assert problems == ["cluster K: it reports C, which is not its own; correct a configuration"]
+    assert problems == ["cluster K: it reports C, which is not its own; correct its configuration"]
     assert field.of("A", 10.0).state == "TRACKING"
     assert field.of("B", 10.0).state == "IDLE"
     assert not field.of("C", 10.0).live

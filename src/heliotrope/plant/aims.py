@@ -1,4 +1,4 @@
-"""Which heliostat aims where, and whether its beam may go there."""
+"""Aim points for heliostats, and the proof that a beam may go to its point."""
 
 from collections.abc import Sequence
 
@@ -14,15 +14,15 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, Tracking, track
 from heliotrope.optics import Hazard, Mirrors, beams, crossing, find_entries, glare_at, sweep
 
-#: How far a beam that nothing stops is followed, m.
+#: Length over which a beam that nothing stops is followed, m.
 FAR = 3000.0
 
 
 def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
-    """Return an aim point for each heliostat, (N, 3): each point is given as often as any other.
+    """Return an aim point for each heliostat, (N, 3), with each point used equally often.
 
-    Neighbours in azimuth about the points get different ones, so that a cloud or a lost cluster
-    darkens all of them alike.
+    Neighbours in azimuth about the points get different points, so that a cloud or the loss of a
+    cluster darkens all of them alike.
 
     Parameters
     ----------
@@ -50,16 +50,16 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
 def default_aims(
     design: Plant, names: Sequence[str], vertices: FloatArray, points: npt.ArrayLike | None
 ) -> dict[str, FloatArray]:
-    """Return an aim for each heliostat: points spread over them, else the design's own.
+    """Return an aim for each heliostat: given points spread over them, or the design's aims.
 
     Parameters
     ----------
     design
-        Where a heliostat has no aim of its own, the centre of its first receiver is taken.
+        A heliostat without an aim of its own gets the centre of the first receiver.
     names, vertices
-        Heliostats, and where they are, ENU, m, (N, 3).
+        Heliostats and their places, ENU, m, (N, 3).
     points
-        Aim points, (P, 3), in place of the design's; None: the design's.
+        Aim points, (P, 3); None: those of the design.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def default_aims(
 
 
 class BeamCheck:
-    """Knows mirrors and keep-out volumes; says which beams may not go where they are wanted.
+    """Finds the beams that may not go where they are wanted, by mirrors and keep-out volumes.
 
     Parameters
     ----------
@@ -89,14 +89,14 @@ class BeamCheck:
     names
         Of the N heliostats, in the order of all arrays here.
     volumes
-        Where no beam may be; None: those of the design.
+        Keep-out volumes; None: those of the design.
     eyes
-        Places from where somebody may look into beams at rest, ENU, m, (P, 3); None: the design's.
+        Places from which people may look into resting beams, ENU, m, (P, 3); None: the design's.
 
     Raises
     ------
     InputError
-        Eyes that are no finite points.
+        Eyes that are not finite points.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class BeamCheck:
         self.mirrors = Mirrors.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
-        """Take a heliostat's new calibration: rows (18,) and (2, 19)."""
+        """Take the new calibration of a heliostat: rows (18,) and (2, 19)."""
         self.armature.table[row] = armature
         self.drives.table[row] = drives
 
@@ -132,8 +132,8 @@ class BeamCheck:
         sun: FloatArray,
         counts: FloatArray | None = None,
     ) -> Tracking:
-        """Return the poses for aims (K, 3) of heliostats (K,), the nearest to counts (K, 2)."""
-        # By night nothing moves; the pose for a sun overhead tells as much of the beam's way.
+        """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2)."""
+        # At night nothing moves; the pose for a sun overhead shows the beam's way as well.
         source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
         return track(
             Armature(self.armature.table[rows]),
@@ -152,7 +152,7 @@ class BeamCheck:
         start: FloatArray,
         stopped: bool,
     ) -> dict[str, str]:
-        """Return why heliostats may not aim at points, by name; empty if all may.
+        """Return why heliostats may not aim at points, by name; empty if they all may.
 
         Parameters
         ----------
@@ -163,11 +163,11 @@ class BeamCheck:
         sun
             Unit vector, (3,).
         start
-            Points where their beams are before, (K, 3), NaN where on no point: the sweep from
-            there is proven too.
+            Points where their beams are now, (K, 3), NaN where at none: the sweep from there is
+            proven as well.
         stopped
-            Whether something stands at the aim that stops the beam (receiver, target). What
-            comes to a standby point goes on beyond it.
+            A surface at the aim (receiver, target) stops the beam. A beam at a standby point goes
+            on beyond it.
         """
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -191,16 +191,17 @@ class BeamCheck:
     def glare(
         self, rows: npt.NDArray[np.intp], points: FloatArray, standbys: FloatArray, sun: FloatArray
     ) -> dict[str, str]:
-        """Return whose beams at rest would burn an eye, by name; empty if nobody's.
+        """Return the heliostats whose resting beams would burn an eye, with the reason.
 
-        All beams that rest count together; who is named shines into an eye that they burn.
+        All resting beams count together; a heliostat is named if it shines into an eye that they
+        burn.
 
         Parameters
         ----------
         rows, points
-            Heliostats (K,) that are given standby points, ENU, m, (K, 3).
+            Heliostats (K,) and their new standby points, ENU, m, (K, 3).
         standbys
-            Those of all, as they were, (N, 3); NaN where none was given.
+            Standby points of all heliostats before, (N, 3); NaN where there is none.
         sun
             Unit vector, (3,).
         """
@@ -230,14 +231,14 @@ class BeamCheck:
     def on_the_way(
         self, rows: npt.NDArray[np.intp], counts: FloatArray, aims: FloatArray, sun: FloatArray
     ) -> dict[str, str]:
-        """Return whose beams would enter a volume on the way to their aims, by name.
+        """Return the heliostats whose beams would enter a volume on the way to their aims, and why.
 
         Parameters
         ----------
         rows
             Of the heliostats, (K,).
         counts
-            Where their axes stand, (K, 2).
+            Step counts of their axes, (K, 2).
         aims, sun
             As of `problems`.
         """
@@ -258,14 +259,14 @@ class BeamCheck:
     def around(
         self, rows: npt.NDArray[np.intp], aims: FloatArray, radius: float, sun: FloatArray
     ) -> dict[str, str]:
-        """Return whose beams would enter a volume near their aims (K, 3), by name.
+        """Return the heliostats whose beams would enter a volume near their aims (K, 3), and why.
 
         Parameters
         ----------
         rows, aims, sun
             As of `problems`.
         radius
-            How far the beams move off their aims, rad. Nothing stops them there.
+            Angle by which the beams leave their aims, rad. Nothing stops them there.
         """
         found: dict[str, str] = {}
         if not (self.volumes and sun[2] > 0.0):
@@ -274,7 +275,7 @@ class BeamCheck:
         vertices = solved.chosen(solved.vertex)
         for k in np.flatnonzero(solved.chosen(solved.status) == Status.OK):
             part = _rows_of(self.mirrors, rows[k : k + 1])
-            # Beams beside each other overlap: none is narrower than the mirror.
+            # Neighbouring beams overlap, because no beam is narrower than the mirror.
             apart = 0.5 * float(np.hypot(part.width[0], part.height[0]))
             points = _disc(vertices[k], aims[k], radius, apart)
             many = Mirrors(**{name: np.repeat(v, len(points), 0) for name, v in vars(part).items()})
@@ -290,14 +291,14 @@ class BeamCheck:
     def moving(
         self, rows: npt.NDArray[np.intp], path: FloatArray, sun: FloatArray
     ) -> dict[str, str]:
-        """Return whose beams would enter a volume on a way of their axes, by name.
+        """Return the heliostats whose beams would enter a volume on a path of their axes, and why.
 
         Parameters
         ----------
         rows
             Of the heliostats, (K,).
         path
-            Angles that the axes go through, W of them, rad, (K, W, 2).
+            Angles that the axes pass, rad, (K, W, 2).
         sun
             As of `problems`.
         """
@@ -314,7 +315,7 @@ class BeamCheck:
         aims: FloatArray,
         sun: FloatArray,
     ) -> None:
-        """Add what is in the way from one point to another."""
+        """Add the volumes on the way from one point to another."""
         before = self.poses(rows, start, sun)
         counts = before.chosen(before.counts)
         after = self.poses(rows, aims, sun, counts)

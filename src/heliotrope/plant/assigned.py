@@ -1,9 +1,9 @@
-"""Where each heliostat aims and rests: assigned by persons, kept over a restart of the plant.
+"""Aims and standby points of heliostats, assigned by people and kept over a restart of the plant.
 
-A plant that has forgotten where its beams are cannot prove their ways. So points are on the disk
-before the commands that give them are sent. `Assigned` is what the plant needs of a store;
-`AssignedFile` is one small file, written beside and then renamed: the old one or the new one is
-there, whatever happens.
+A plant that has forgotten where its beams are cannot prove where they may go. So points are on the
+disk before the commands that assign them are sent. `Assigned` is what the plant needs of a store.
+`AssignedFile` is one small file, written beside and renamed, so that the old one or the new one is
+always there.
 """
 
 import json
@@ -27,18 +27,18 @@ VERSION = 1
 
 
 class AssignedError(HeliotropeError):
-    """Points that could not be kept."""
+    """Points that could not be stored."""
 
 
 class Assigned(Protocol):
-    """Where assigned points are kept."""
+    """A store of assigned points."""
 
     def read(self) -> dict[str, Places]:
-        """Return what is kept, by kind; empty if nothing is."""
+        """Return the stored points, by kind; empty if there are none."""
         ...
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Keep all points in place of those before; they are safe when this returns."""
+        """Store all points in place of those before; they are on the disk when this returns."""
         ...
 
 
@@ -48,14 +48,14 @@ class AssignedFile:
     Parameters
     ----------
     path
-        Made at the first assignment.
+        Created at the first assignment.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
 
     def read(self) -> dict[str, Places]:
-        """Return what is kept.
+        """Return the stored points.
 
         Raises
         ------
@@ -67,27 +67,35 @@ class AssignedFile:
         except FileNotFoundError:
             return {}
         except ValueError:
-            raise FormatError(self.path, "no assigned points; remove it, then aim anew") from None
+            raise FormatError(
+                self.path, "holds no assigned points; remove it, then assign the aims again"
+            ) from None
         if not isinstance(document, dict) or document.get("version") != VERSION:
-            raise FormatError(self.path, f"no assigned points of version {VERSION}; remove it")
+            raise FormatError(
+                self.path, f"holds no assigned points of version {VERSION}; remove it"
+            )
         return {kind: self._places(kind, document.get(kind)) for kind in KINDS}
 
     def _places(self, kind: str, rows: object) -> Places:
         if not isinstance(rows, dict):
-            raise FormatError(self.path, f"{kind}: no points by name; remove it, then aim anew")
+            raise FormatError(
+                self.path, f"{kind}: no points by name; remove the file, then assign the aims again"
+            )
         for name, point in rows.items():
             good = isinstance(point, list) and len(point) == 3
             if not good or not all(isinstance(x, float) and math.isfinite(x) for x in point):
-                raise FormatError(self.path, f"{kind} of {name}: {point!r} is no point in ENU, m")
+                raise FormatError(
+                    self.path, f"{kind} of {name}: {point!r} is not a point in ENU, m"
+                )
         return {name: tuple(point) for name, point in rows.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Keep all points in place of those before.
+        """Store all points in place of those before.
 
         Raises
         ------
         AssignedError
-            If they could not be written and synced; those of before are kept.
+            If they could not be written and synced; the earlier points stay stored.
         """
         data = json.dumps({"version": VERSION, **points}, allow_nan=False).encode()
         beside = self.path.with_name(self.path.name + ".new")
@@ -109,19 +117,19 @@ class AssignedFile:
 
 
 class Points:
-    """Assigned points of N heliostats, and where they are kept.
+    """Assigned points of N heliostats, and their store.
 
     Parameters
     ----------
     names
         Of the heliostats.
     store
-        None: they are kept nowhere.
+        None: the points do not outlive the plant.
 
     Attributes
     ----------
     aims, standbys
-        ENU, m, (N, 3); NaN before.
+        ENU, m, (N, 3); NaN where there is none.
     """
 
     def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
@@ -135,9 +143,9 @@ class Points:
                     self._arrays[kind][index[name]] = point
 
     def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> str:
-        """Assign points (K, 3) to heliostats (K,); return why they cannot be kept, "" if they are.
+        """Assign points (K, 3) to heliostats (K,); return why they cannot be stored, or "".
 
-        What cannot be kept is not assigned.
+        Points that cannot be stored are not assigned.
         """
         array = self._arrays[kind]
         before = array[rows]
@@ -156,7 +164,7 @@ class Points:
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:
-    """Take a point, ENU, m, as that of all who were assigned none: what their machines hold."""
+    """Give a standby point, ENU, m, to all heliostats without one: their machines store it."""
     if point is not None:
         standbys[~np.isfinite(standbys).all(axis=-1)] = point
 
@@ -167,7 +175,7 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
     Raises
     ------
     InputError
-        None; one that is no finite point; one beyond what the wire takes.
+        No points, one that is not finite, or one beyond the range of the wire.
     """
     if not points:
         raise InputError(f"{kind}: no points; give one for each heliostat")
@@ -179,7 +187,7 @@ def points_of(kind: str, points: Mapping[str, npt.ArrayLike]) -> FloatArray:
 
 
 def grouped(names: Sequence[str], points: FloatArray) -> dict[tuple[float, ...], list[str]]:
-    """Return the heliostats of each point (K, 3): what has one point goes into one command."""
+    """Return the heliostats of each point (K, 3), which share one command."""
     found: dict[tuple[float, ...], list[str]] = {}
     for name, point in zip(names, points, strict=True):
         found.setdefault(tuple(float(x) for x in point), []).append(name)

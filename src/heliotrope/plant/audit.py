@@ -1,12 +1,12 @@
-"""The audit: of every accepted command exactly one record of who, what, when and its result.
+"""The audit: exactly one record of every accepted command, with who, what, when and the result.
 
-A record is begun before a command is sent, and a command whose record cannot be begun is not
-accepted. DEFOCUS and STOW never wait: they are sent first, and their records follow, again and
-again until they are written. `Audit` is what the plant needs of a store; `JsonLines` is one file.
+A record is begun before its command is sent; a command whose record cannot be begun is not
+accepted. DEFOCUS and STOW never wait: they are sent first, and writing their records is tried until
+it succeeds. `Audit` is what the plant needs of a store; `JsonLines` is one file.
 
-A file holds two lines for each record, both appended and synced to the disk: "accepted" and
-"result". `read` puts them together. What a loss of power leaves torn at the end of a file is
-passed over and counted; records without a result are ended at the next start.
+The file holds two lines for each record, "accepted" and "result", both appended and synced to the
+disk. `read` puts them together. A line torn by a loss of power is skipped and counted; a record
+without a result is ended at the next start.
 
 ::
 
@@ -24,9 +24,9 @@ from typing import Any, Protocol
 
 from heliotrope.errors import FormatError, HeliotropeError, InputError
 
-#: Less than this left on the disk (bytes) counts as full: records must not end half-way.
+#: A disk with less free space than this (bytes) counts as full: no record may end half-way.
 LEAST_FREE = 1 << 20
-#: Result of records that were open when the plant stopped.
+#: Result of a record that was open when the plant stopped.
 STOPPED = "unknown: the plant stopped before the result was known"
 
 
@@ -44,18 +44,16 @@ class Record:
         Unique for all time.
     who, role
         The person, or the part of the plant, that gave it.
-    what
-        Name of the command.
-    values
-        Its numbers; for groups with different numbers see ``note``.
+    what, values
+        Name of the command and its numbers; where groups have different numbers, see ``note``.
     heliostats
         Names; () for all.
     at
         When it was accepted, UTC, ISO 8601.
     note
-        Reason, further details.
+        Reason or details.
     result, finished
-        What became of it and when; "" until that is known.
+        The result and when it was known; "" before.
     """
 
     identity: str
@@ -71,10 +69,10 @@ class Record:
 
 
 class Audit(Protocol):
-    """Where records are kept."""
+    """A store of records."""
 
     def begin(self, record: Record) -> None:
-        """Keep a record without result; it is safe when this returns."""
+        """Write a record without a result; it is on the disk when this returns."""
         ...
 
     def finish(self, identity: str, result: str, at: str) -> None:
@@ -82,23 +80,23 @@ class Audit(Protocol):
         ...
 
     def confirm(self) -> None:
-        """See that a record could be written now."""
+        """Check that a record could be written now."""
         ...
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         ...
 
 
 class JsonLines:
-    """An audit in one file, to which nothing but lines is ever appended.
+    """An audit in one file that only grows, line by line.
 
     Parameters
     ----------
     path
-        Made if it is not there. One process at a time has it.
+        Created if it does not exist. One process at a time may have it.
     started
-        UTC, for the records that are ended now since the plant stopped before.
+        UTC, written to records that are ended now because the plant had stopped.
 
     Raises
     ------
@@ -113,7 +111,7 @@ class JsonLines:
         try:
             self._file = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o640)
         except OSError as error:
-            raise AuditError(f"audit {self.path}: {error.strerror}; give a file to write") from None
+            raise AuditError(f"audit {self.path}: {error.strerror}; give a writable file") from None
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             records, torn = read(self.path)
@@ -127,22 +125,22 @@ class JsonLines:
             raise
         self._open = {record.identity for record in records if not record.result}
         self._known = {record.identity for record in records}
-        #: Lines that a loss of power tore, and whether the last one has no end yet: it must not
-        #: become part of the next.
+        #: Count of lines torn by a loss of power. If the last one has no end, the next line must
+        #: not continue it.
         self.torn = torn
         self._torn = not _ends_with_newline(self._file)
         for identity in sorted(self._open):
             self.finish(identity, STOPPED, started.isoformat())
 
     def begin(self, record: Record) -> None:
-        """Keep a record without result.
+        """Write a record without a result.
 
         Raises
         ------
         AuditError
             If it could not be written and synced.
         InputError
-            An identity that was used before.
+            An identity that another record has.
         """
         if record.identity in self._known:
             raise InputError(f"audit: a record {record.identity} exists; identities are unique")
@@ -160,7 +158,7 @@ class JsonLines:
         AuditError
             If it could not be written and synced.
         InputError
-            A record that was not begun, or has its result.
+            A record that was not begun, or has a result.
         """
         if identity not in self._open:
             raise InputError(f"audit: no record {identity} waits for a result")
@@ -169,7 +167,7 @@ class JsonLines:
         self._open.discard(identity)
 
     def confirm(self) -> None:
-        """See that a record could be written now: the disk takes it and has room.
+        """Check that a record could be written now: the disk syncs and has room.
 
         Raises
         ------
@@ -195,7 +193,7 @@ class JsonLines:
         line = json.dumps(fields, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
         data = (b"\n" if self._torn else b"") + line.encode() + b"\n"
         try:
-            # One write: with O_APPEND it lands whole behind whatever is there.
+            # One write: with O_APPEND it is appended as a whole.
             written = os.write(self._file, data)
             os.fsync(self._file)
         except OSError as error:
@@ -212,12 +210,12 @@ def _ends_with_newline(file: int) -> bool:
 
 
 def read(path: str | Path) -> tuple[list[Record], int]:
-    """Return all records of a file in the order of their beginning, and how many lines are torn.
+    """Return the records of a file in the order of their beginning, and the count of torn lines.
 
     Raises
     ------
     FormatError
-        Two beginnings or two results of one identity, or a result of a record that was not begun.
+        Two beginnings or two results of one identity, or a result without a beginning.
     """
     records: dict[str, Record] = {}
     torn = 0
@@ -233,12 +231,12 @@ def read(path: str | Path) -> tuple[list[Record], int]:
             continue
         known = records.get(identity)
         if (known is not None) == (event == "accepted") or (known is not None and known.result):
-            # The write of a line may have come through although its syncing failed.
+            # A line may have been written although its sync failed.
             if known is not None and _repeats(known, event, fields):
                 continue
             raise FormatError(
                 path,
-                f"{event!r} of record {identity} does not fit what stands before",
+                f"{event!r} of record {identity} contradicts the lines before it",
                 f"line {number}",
             )
         if known is None:
@@ -254,7 +252,7 @@ def read(path: str | Path) -> tuple[list[Record], int]:
 
 
 def _repeats(known: Record, event: str, fields: dict[str, Any]) -> bool:
-    """Whether a line says what is known already."""
+    """Whether a line repeats a known one."""
     if event == "result":
         return bool(known.result == fields["result"])
     names = ("who", "what", "at")

@@ -1,9 +1,8 @@
 """The state of the whole field in one table, each row with its age.
 
-Rows come from the clusters' `protocol.Status`. A row is as old as the answer of its local
-controller: what the cluster says of its age when it sent it, and the time since. A row that is
-older than the limit is stale, and its values are masked wherever they are asked for: what is
-not known is never shown as if it were (invariant 11).
+Rows come from the clusters' `Status` messages. The age of a row is the age that the cluster gave to
+the local controller's answer plus the time since. A row older than the limit is stale, and its
+values are masked: an unknown value is never shown as if it were known (invariant 11).
 """
 
 import math
@@ -20,7 +19,7 @@ from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
 from heliotrope.links.messages import NEVER, NODE, Status
 
-#: Age from which a row is stale, s: three polls were missed.
+#: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
 
 Mask = npt.NDArray[np.bool_]
@@ -33,15 +32,15 @@ class HeliostatState:
     Attributes
     ----------
     name, cluster
-        Whose.
+        Names.
     age
-        Of all the following, s; infinite if it was never heard.
+        Of everything below, s; infinite if it was never heard.
     live
-        Whether it is younger than the limit. If not, ``state`` is "" and nothing else counts.
+        The age is below the limit. If not, ``state`` is "" and the rest means nothing.
     state, fault, flags
         In words.
     counts, goals
-        Steps of the two axes, and where they go, (2,).
+        Steps of the two axes, and where they are going, (2,).
     """
 
     name: str
@@ -65,7 +64,7 @@ class HeliostatState:
 
 
 class FieldState:
-    """N heliostats of C clusters.
+    """The state of N heliostats in C clusters.
 
     Parameters
     ----------
@@ -77,17 +76,17 @@ class FieldState:
     Attributes
     ----------
     names, index
-        Names, N of them, and their rows.
+        Names, N, and their rows.
     clusters, members
         Names of the clusters, and of their heliostats.
     cluster
         Row of each heliostat's cluster, (N,).
     rows
-        Last known rows of dtype `NODE`, (N,): use `values`, which masks what is stale.
+        Last known rows of dtype `NODE`, (N,); use `values`, which masks stale rows.
     heard
-        When each row was true, monotonic s, (N,); minus infinity if never.
+        When each row was true, monotonic s, (N,); minus infinity if never heard.
     counted_at
-        The same of its step counts and goals.
+        When its step counts and goals were true.
 
     Raises
     ------
@@ -121,25 +120,25 @@ class FieldState:
         return len(self.names)
 
     def take(self, cluster: str, status: Status, at: float) -> list[str]:
-        """Take a status that came at ``at`` (monotonic s); return what is wrong with it.
+        """Take a status that arrived at ``at`` (monotonic s); return its problems.
 
         Raises
         ------
         ProtocolError
-            If its block is no whole number of rows.
+            If its block is not a whole number of rows.
         """
         nodes = status.nodes()
         if status.names:
             self.learn_order(cluster, status.names)
         known = self._places.get(cluster)
         if known is None:
-            return [f"cluster {cluster}: status without names; which rows it holds is not known"]
+            return [f"cluster {cluster}: status without names, so its rows are not known"]
         reported, places = known
         if len(nodes) != len(reported):
             return [f"cluster {cluster}: {len(nodes)} rows for {len(reported)} names"]
         self.status_at[cluster] = at
         problems = [
-            f"cluster {cluster}: it reports {name}, which is not its own; correct a configuration"
+            f"cluster {cluster}: it reports {name}, which is not its own; correct its configuration"
             for name, place in zip(reported, places, strict=True)
             if place < 0 and status.names
         ]
@@ -153,13 +152,13 @@ class FieldState:
         return problems
 
     def _rows_of(self, cluster: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
-        """Return the row of each name, -1 for what is not of this cluster."""
+        """Return the row of each name, -1 for a heliostat of another cluster."""
         c = self.clusters.index(cluster)
         rows = [self.index.get(name, -1) for name in names]
         return np.array([r if r >= 0 and self.cluster[r] == c else -1 for r in rows], np.intp)
 
     def _note_failures(self, mine: npt.NDArray[np.intp], new: npt.NDArray[Any], at: float) -> None:
-        """Note who failed: fell into FAULT, or fell silent while its cluster talks."""
+        """Note heliostats that failed: in FAULT, or silent while their cluster reports."""
         known = np.isfinite(self.heard[mine])
         before = self.rows["state"][mine] == states.FAULT
         faulty = known & ~before & (new["state"] == states.FAULT)
@@ -168,11 +167,11 @@ class FieldState:
         self.failed_at[mine[faulty | (known & silent & ~was_silent)]] = at
 
     def learn_order(self, cluster: str, names: tuple[str, ...]) -> None:
-        """Take the names of the rows that a cluster reports, in their order."""
+        """Take the names of a cluster's rows, in order."""
         self._places[cluster] = (names, self._rows_of(cluster, names))
 
     def knows_order(self, cluster: str) -> bool:
-        """Whether it is known which rows a cluster reports."""
+        """Whether the names of a cluster's rows are known."""
         return cluster in self._places
 
     def place(self, name: str) -> int:
@@ -181,7 +180,7 @@ class FieldState:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no such heliostat.
         """
         row = self.index.get(name)
         if row is None:
@@ -197,7 +196,7 @@ class FieldState:
         return np.asarray(self.age(now) <= self.limit)
 
     def values(self, field: str, now: float) -> "np.ma.MaskedArray[Any, Any]":
-        """Return one column of `NODE`, (N,), masked where it is stale.
+        """Return one column of `NODE`, (N,), masked where stale.
 
         Raises
         ------
@@ -213,7 +212,7 @@ class FieldState:
         return self._pairs(rows, "primary", "secondary")
 
     def goals(self, rows: npt.NDArray[np.intp]) -> FloatArray:
-        """Return where the step counts of heliostats (K,) were going, (K, 2)."""
+        """Return the goals of the step counts of heliostats (K,) as last heard, (K, 2)."""
         return self._pairs(rows, "primary_goal", "secondary_goal")
 
     def _pairs(self, rows: npt.NDArray[np.intp], *names: str) -> FloatArray:
@@ -224,7 +223,7 @@ class FieldState:
         return np.asarray(self.live(now) & np.isin(self.rows["state"], list(wanted)))
 
     def counted(self, now: float) -> dict[str, int]:
-        """Return how many heliostats are in each state; those not live under "stale"."""
+        """Return the number of heliostats in each state; those not live count as "stale"."""
         live = self.live(now)
         found = np.bincount(self.rows["state"][live], minlength=len(states.STATES))
         counts = {name: int(n) for name, n in zip(states.STATES, found, strict=True) if n}
@@ -241,7 +240,7 @@ class FieldState:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no such heliostat.
         """
         row = self.place(name)
         cluster = self.clusters[self.cluster[row]]

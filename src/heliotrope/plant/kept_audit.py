@@ -1,9 +1,9 @@
 """The audit and the assigned points in the plant's store.
 
 `KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both on a `store.Keeper`. A
-command's record is committed and synced before the command is sent. That stops the event loop for
-a commit, some milliseconds, and at most for `PATIENCE` or `POINTS_PATIENCE`: within every lease.
-Whether a record could be written is told without waiting, by what the store did last.
+command's record is committed and synced before the command is sent. The commit stops the event loop
+for some milliseconds, at most for `PATIENCE` or `POINTS_PATIENCE`, which is within every lease.
+`KeptAudit.confirm` does not wait: it goes by what the store did last.
 """
 
 import math
@@ -25,13 +25,13 @@ from heliotrope.store.records import AuditEntry, StoreError
 
 T = TypeVar("T")
 
-#: The loop waits no longer than this for a commit, s: of a record, and of points, which may be
-#: those of the whole field (10,000 of them take 0.1 s).
+#: Longest wait for a commit, s: of a record, and of points. Those of a whole field (10,000 points)
+#: take 0.1 s.
 PATIENCE = 1.0
 POINTS_PATIENCE = 2.0
-#: A store that has confirmed nothing for so long cannot be relied on, s.
+#: A store that has confirmed nothing for this time cannot be relied on, s.
 SILENCE = 5.0
-#: Between two questions whether it still writes, s.
+#: Pause between two probes of the store, s.
 ASKED = 1.0
 
 
@@ -41,22 +41,22 @@ class KeptAudit:
     Parameters
     ----------
     keeper
-        Open; it is not closed with the audit.
+        Open; it stays open when the audit is closed.
     clock
-        Of the machine, whose disk knows no other: its monotonic time decides how long the store may
-        be silent. (The plant's own clock runs faster where a simulated plant does.)
+        The machine's: its monotonic time decides how long the store may be silent. (The clock of
+        a simulated plant may run faster than the disk.)
     started
-        UTC, for the records that are ended now since the plant stopped before.
+        UTC, written to records that are ended now because the plant had stopped.
 
     Attributes
     ----------
     ended
-        How many these were.
+        Count of those records.
 
     Raises
     ------
     AuditError
-        If they could not be ended.
+        If those records could not be ended.
     """
 
     def __init__(self, keeper: Keeper, clock: Clock, started: datetime) -> None:
@@ -67,7 +67,7 @@ class KeptAudit:
         self._heard_at = clock.monotonic()
 
     def begin(self, record: Record) -> None:
-        """Keep a record without result; it is safe when this returns.
+        """Write a record without a result; it is on the disk when this returns.
 
         Raises
         ------
@@ -92,12 +92,12 @@ class KeptAudit:
         self._do(lambda c: audit.finish(c, identity, result, at))
 
     def confirm(self) -> None:
-        """See that a record could be written now, without waiting for the disk.
+        """Check that a record could be written now, without waiting for the disk.
 
         Raises
         ------
         AuditError
-            If the last attempt failed, the store has been silent for long, or the disk is full.
+            If the last write failed, the store has been silent for too long, or the disk is full.
         """
         now = self._clock.monotonic()
         self._hear(now)
@@ -111,7 +111,7 @@ class KeptAudit:
             )
 
     def _hear(self, now: float) -> None:
-        """Note when the store answered, and ask it anew."""
+        """Note when the store last answered, and probe it again."""
         asked = self._asked
         if asked is not None and asked.done():
             if asked.exception() is None:
@@ -125,7 +125,7 @@ class KeptAudit:
                 raise AuditError(f"audit: {error}") from None
 
     def close(self) -> None:
-        """End it: everything is in the store."""
+        """Do nothing: everything is in the store."""
 
     def _do(self, work: Callable[[Connection], T]) -> T:
         try:
@@ -135,12 +135,12 @@ class KeptAudit:
 
 
 class KeptPoints:
-    """Assigned points in a store; only what changes is written.
+    """Assigned points in a store; only changes are written.
 
     Parameters
     ----------
     keeper
-        Open; it is not closed with this.
+        Open; it stays open.
     """
 
     def __init__(self, keeper: Keeper) -> None:
@@ -148,7 +148,7 @@ class KeptPoints:
         self._kept: dict[str, Places] | None = None
 
     def read(self) -> dict[str, Places]:
-        """Return what is kept, by kind; empty if nothing is.
+        """Return the stored points, by kind; empty if there are none.
 
         Raises
         ------
@@ -160,12 +160,12 @@ class KeptPoints:
         return {kind: dict(places) for kind, places in self._kept.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Keep all points in place of those before; they are safe when this returns.
+        """Store all points in place of those before; they are on the disk when this returns.
 
         Raises
         ------
         AssignedError
-            If they could not be written and synced; those of before are kept.
+            If they could not be written and synced; the earlier points stay stored.
         """
         try:
             before = self.read() if self._kept is None else self._kept
@@ -176,14 +176,14 @@ class KeptPoints:
             gone = {kind: places.keys() - points.get(kind, {}) for kind, places in before.items()}
             self._keeper.writer.do(lambda c: audit.change_points(c, new, gone), POINTS_PATIENCE)
         except StoreError as error:
-            # It may have come through all the same: what is kept is looked up before the next.
+            # The commit may have succeeded all the same, so the store is read before the next one.
             self._kept = None
             raise AssignedError(f"assigned points: {error}") from None
         self._kept = {kind: dict(places) for kind, places in points.items()}
 
 
 def _room(keeper: Keeper) -> str:
-    """Return that the disk has no room, "" if it has."""
+    """Return why the disk has no room, "" if it has."""
     file = keeper.database.file
     if file is None:
         return ""

@@ -1,4 +1,4 @@
-"""Settings of a plant: its times and limits, and which heliostat hangs on which cluster."""
+"""Settings of a plant: its times and limits, and the heliostats of each cluster."""
 
 import math
 from collections import deque
@@ -16,27 +16,28 @@ class PlantSettings:
     Attributes
     ----------
     lease, autonomy
-        What the clusters are promised: that they hear the plant within ``lease`` s; and how
-        long they go on without it after that, s (see `safety.conditions`).
+        A cluster hears the plant within ``lease`` s, and may go on without it for ``autonomy`` s
+        after that (see `safety.conditions`).
     period, beat
-        Between leases; between looks at the safety table and the queues, s.
+        Pause between leases; between evaluations of the safety table and the queues, s.
     join_rate, join_burst
-        Mirrors that may join the receiver in a second, and at once after a rest.
+        Heliostats that may join the receiver in a second, and at once after a rest.
     join_wait
-        How long a mirror may wait to join, s.
+        Longest time that a heliostat may wait to join, s.
     join_life
-        Life of a command to join once its turn has come, s. What is held up on the way for longer
-        must not arrive together with those whose turn came later.
+        Life of a command to join once its turn has come, s: a delayed command must not arrive
+        together with those whose turn came later.
     lifetime, patience
-        Of a command until it is acknowledged, then until it is done, s.
+        Time allowed until a command is acknowledged, and from then until it is done, s.
     stale
-        Age from which a value is not shown as live, s.
+        Age from which a value is stale, s.
     authority
-        How long the command authority lasts without being kept up, s.
+        Life of the command authority without renewal, s.
     sensors
-        Readings of the safety table that are fed by `PlantController.put`.
+        Readings of the safety table that come from sensors, by `PlantController.put`.
     repeat
-        Between repetitions of an emergency order to those that have not acknowledged, s.
+        Pause between repetitions of an emergency order to heliostats that have not acknowledged
+        it, s.
     """
 
     lease: float = 3.0
@@ -69,7 +70,7 @@ class PlantSettings:
 
 @dataclass
 class Counters:
-    """Counts since the start: messages that were none, statuses, leases sent."""
+    """Counts since the start: refused messages, statuses, leases sent; and the last problems."""
 
     refused: int = 0
     statuses: int = 0
@@ -78,12 +79,12 @@ class Counters:
 
 
 def clusters_of(design: Plant) -> dict[str, tuple[str, ...]]:
-    """Return the heliostats of each cluster, as the design says.
+    """Return the heliostats of each cluster of a design.
 
     Raises
     ------
     InputError
-        A heliostat that hangs on no cluster.
+        A heliostat without a cluster.
     """
     found: dict[str, list[str]] = {}
     for group in design.groups.values():
@@ -91,7 +92,7 @@ def clusters_of(design: Plant) -> dict[str, tuple[str, ...]]:
             cluster = group.cluster[i] if group.cluster else ""
             if not cluster:
                 raise InputError(
-                    f"heliostat {name}: it hangs on no cluster; name one in the plant file"
+                    f"heliostat {name}: it belongs to no cluster; name one in the plant file"
                 )
             found.setdefault(cluster, []).append(name)
     return {cluster: tuple(names) for cluster, names in found.items()}

@@ -1,4 +1,4 @@
-"""How far an accepted command has come: heliostat by heliostat, to be awaited."""
+"""The progress of an accepted command, heliostat by heliostat; it can be awaited."""
 
 import asyncio
 import math
@@ -9,7 +9,7 @@ import numpy as np
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.messages import Stage
 
-#: Waiting in the plant, then the stages in their order; from FINAL on nothing changes any more.
+#: Waiting in the plant, then the stages in order; from FINAL on a stage is final.
 WAITING = 0
 RANK = {
     Stage.ACCEPTED: 1, Stage.SENT: 2, Stage.ACKNOWLEDGED: 3, Stage.DONE: 4, Stage.REFUSED: 5,
@@ -24,13 +24,13 @@ class Ticket:
     Attributes
     ----------
     identity
-        That of its record in the audit.
+        Of its record in the audit.
     name, heliostats
-        What, to whom.
+        The command and its heliostats.
     refusals
-        Why it was refused or failed, by heliostat.
+        Reasons why it was refused or failed, by heliostat.
     blocked
-        Of those, whose beams would have entered a keep-out volume.
+        Those of the reasons that are beams in keep-out volumes.
     accepted_at
         Monotonic s.
     """
@@ -45,7 +45,7 @@ class Ticket:
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
         self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)
-        #: When each one is given up at its present stage, monotonic s.
+        #: When each heliostat is given up at its present stage, monotonic s.
         self._until = np.full(len(self.heliostats), math.inf)
         self._patience = patience
         self._news = asyncio.Event()
@@ -54,7 +54,7 @@ class Ticket:
         return f"<Ticket {self.identity} {self.text}>"
 
     def advance(self, heliostats: Iterable[str], stage: Stage, text: str = "") -> None:
-        """Take a stage that heliostats have reached: never backwards, and nothing after the end."""
+        """Note a stage that heliostats have reached; it never goes back, and a final one stays."""
         rank = RANK[stage]
         rows = [self._row[name] for name in heliostats if name in self._row]
         if not rows:
@@ -71,18 +71,18 @@ class Ticket:
             self._news.set()
 
     def block(self, refusals: Mapping[str, str]) -> None:
-        """End it for heliostats whose beams may not do it."""
+        """End it for heliostats whose beams may not go there."""
         self.blocked.update(refusals)
         for name, text in refusals.items():
             self.advance((name,), Stage.FAILED, text)
 
     def expect(self, heliostats: Iterable[str], until: float) -> None:
-        """Say until when (monotonic s) heliostats must have acknowledged."""
+        """Set the time (monotonic s) by which heliostats must have acknowledged."""
         rows = [self._row[name] for name in heliostats if name in self._row]
         self._until[np.array(rows, dtype=np.intp)] = until
 
     def expire(self, now: float) -> None:
-        """End what was not answered in time."""
+        """End it for heliostats that have not answered in time."""
         late = np.flatnonzero((self._stage < FINAL) & (now >= self._until))
         for i in late:
             acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
@@ -94,13 +94,13 @@ class Ticket:
             self.advance([self.heliostats[i]], Stage.FAILED, text)
 
     def unacknowledged(self) -> tuple[str, ...]:
-        """Return the heliostats that have neither acknowledged it nor ended."""
+        """Return the heliostats that have neither acknowledged nor ended."""
         rows = np.flatnonzero(self._stage < RANK[Stage.ACKNOWLEDGED])
         return tuple(self.heliostats[i] for i in rows)
 
     @property
     def finished(self) -> bool:
-        """Whether every heliostat has come to an end."""
+        """Whether it has ended for every heliostat."""
         return bool((self._stage >= FINAL).all())
 
     @property
@@ -109,33 +109,33 @@ class Ticket:
         return bool((self._stage == FINAL).all())
 
     def stage(self, heliostat: str) -> Stage | None:
-        """Return how far it is for one heliostat; None while it waits in the plant."""
+        """Return the stage of one heliostat; None while it waits in the plant."""
         rank = int(self._stage[self._row[heliostat]])
         return next((stage for stage, value in RANK.items() if value == rank), None)
 
     def counted(self) -> dict[str, int]:
-        """Return how many heliostats are at each stage; "waiting" while in the plant."""
+        """Return the number of heliostats at each stage; "waiting" means in the plant."""
         found = np.bincount(self._stage, minlength=FINAL + 3)
         words = ("waiting", *(stage.value for stage in RANK))
         return {word: int(n) for word, n in zip(words, found, strict=True) if n}
 
     @property
     def text(self) -> str:
-        """One line: how many are where, and the first reasons."""
+        """One line: the number at each stage, and the first reasons."""
         parts = ", ".join(f"{n} {word}" for word, n in self.counted().items())
         why = "; ".join(f"{name}: {text}" for name, text in list(self.refusals.items())[:3])
         more = f"; and {len(self.refusals) - 3} more" if len(self.refusals) > 3 else ""
         return f"{self.name}: {parts}" + (f" ({why}{more})" if why else "")
 
     async def reached(self, stage: Stage, timeout: float = math.inf) -> bool:
-        """Wait until every heliostat is at a stage or has ended; False if one was refused.
+        """Wait until every heliostat is at a stage or has ended; False if one did not get there.
 
         Parameters
         ----------
         stage
             ACCEPTED to DONE.
         timeout
-            s, by the plant's clock; False when it is over.
+            s, by the plant's clock; False when it expires.
         """
         until = self._clock.monotonic() + timeout
         while not (self._stage >= RANK[stage]).all():
@@ -152,7 +152,7 @@ class Ticket:
 
 
 async def _within(clock: Clock, until: float, event: asyncio.Event) -> bool:
-    """Wait for an event up to an instant; False if that came first."""
+    """Wait for an event until an instant; False if the instant came first."""
     if clock.monotonic() >= until:
         return False
     try:
