@@ -58,11 +58,11 @@ def test_json_reads_back(learnt: learning.Learned, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d.update(kind="something"), "no calibration"),
+        (lambda d: d.update(kind="something"), "not a calibration"),
         (lambda d: d.update(version=9), "version: 9 is outside"),
         (lambda d: d["heliostats"]["H1"]["values"].pop(), "8 numbers for"),
         (lambda d: d["heliostats"]["H1"].update(covariance=[]), "0 rows for"),
-        (lambda d: d.update(time="yesterday"), "no ISO 8601 time"),
+        (lambda d: d.update(time="yesterday"), "not an ISO 8601 time"),
         (lambda d: d["heliostats"]["H2"]["values"].__setitem__(0, "x"), "expected a number"),
     ],
 )

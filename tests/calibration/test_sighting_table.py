@@ -364,15 +364,15 @@ BAD: list[tuple[str, int, str, str]] = [
     ("NaN", 6, "nan", "column source_north: 'nan' is not a finite number"),
     ("infinite", 10, "inf", "column destination_north: 'inf' is not a finite number"),
     ("neither", 8, "far", "column source_at_infinity: 'far' is neither true nor false"),
-    ("another kind's end", 8, "false", "column source_at_infinity: false, but of kind camera_t"),
-    ("another kind's end", 12, "1", "column destination_at_infinity: true, but of kind camera_"),
+    ("another kind's end", 8, "false", "column source_at_infinity: false, but for kind camera_t"),
+    ("another kind's end", 12, "1", "column destination_at_infinity: true, but for kind camera_"),
     ("far away", 9, "400000", "column destination_east: 400000 m is more than 50 km from the"),
     ("sigma 0", 13, "0", "column sigma_mrad: 0 mrad must be above 0"),
     ("sigma below", 13, "-1", "column sigma_mrad: -1 mrad must be above 0"),
     ("no sigma", 13, "", "column sigma_mrad: the cell is empty; give the ray's standard"),
     ("half a covariance", 15, "", "column destination_cov_en: the cell is empty; give m² of a"),
     ("no variance", 14, "-1e-4", "column destination_cov_ee to destination_cov_uu: [-0.0001, "),
-    ("not definite", 15, "2e-4", "is no covariance (not positive semidefinite); correct them"),
+    ("not definite", 15, "2e-4", "is not a covariance (not positive semidefinite); correct it"),
     ("covariance NaN", 16, "nan", "column destination_cov_eu: 'nan' is not a finite number"),
 ]  # fmt: skip
 
@@ -409,7 +409,7 @@ def test_all_bad_rows_together(tmp_path: Path) -> None:
     assert len(left_out) == len(BAD) + 3
     # One of the bad cells runs over two lines.
     after = len(BAD) + 4
-    nowhere = "column source_east: 0, 0, 0 has no direction; give one from the mirror"
+    nowhere = "column source_east: 0, 0, 0 is no direction; give the direction from the mirror"
     assert left_out[-3:] == [
         f"s.csv: line {after}, heliostat AA39, {nowhere}",
         f"s.csv: line {after + 1}, heliostat AA39, 2 cells under 20 columns; correct the line",
@@ -522,7 +522,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
         write_sightings(path, seen, NAMES[:2])
     with pytest.raises(InputError, match="A: the name occurs twice"):
         write_sightings(path, seen, ("A", "B", "A"))
-    with pytest.raises(InputError, match="1 kinds of 80 sightings"):
+    with pytest.raises(InputError, match="1 kinds for 80 sightings"):
         write_sightings(path, seen, NAMES, ["drone"])
     with pytest.raises(UnknownNameError, match="kind of sighting 'balloon'"):
         write_sightings(path, seen, NAMES, ["balloon", *kinds[1:]])
@@ -531,7 +531,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InputError, match="cannot be written"):
         write_sightings(tmp_path / "nowhere" / "s.csv", seen, NAMES)
     monkeypatch.setattr(sighting_table, "SIZE_LIMIT", 2**12)
-    with pytest.raises(InputError, match=r"more than the 0 MiB that are read again; write \.parq"):
+    with pytest.raises(InputError, match=r"exceed the 0 MiB that can be read; write \.parq"):
         write_sightings(path, seen, NAMES)
     assert path.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["s.csv"]

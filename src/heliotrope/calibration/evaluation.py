@@ -1,4 +1,4 @@
-"""How well parameters predict: errors of beam and normal, and splits of the sightings."""
+"""Errors of beam and normal under given parameters, and splits of sightings for testing."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -13,7 +13,7 @@ from heliotrope.geometry import FloatArray, angle_between, bisector, reflect
 from heliotrope.mechanism.chain import Mechanism
 
 Split = Literal["random", "chronological", "neighbour"]
-#: A neighbourhood that is held out together: this share of the sightings, at least three.
+#: Share of the sightings that a held-out neighbourhood has; at least three sightings.
 NEIGHBOURHOOD = 0.1
 
 
@@ -24,15 +24,15 @@ class BeamErrors:
     Attributes
     ----------
     beam
-        Angle between the reflected ray and the way to the destination, rad, (M,).
+        Angle between the reflected ray and the direction to the destination, rad, (M,).
     normal
         Angle between the normal and the bisector, rad, (M,).
     offset
-        The beam's error to the right of and above the destination as seen from the
-        mirror, rad, (M, 2).
+        Beam error to the right of and above the destination as seen from the mirror,
+        rad, (M, 2).
     plane
-        Where the reflected ray passes the destination, m to the right of and above it
-        as seen from the mirror, in the plane across the way, (M, 2); NaN at infinity.
+        Offset of the reflected ray to the right of and above the destination in the plane
+        across the beam, m, (M, 2); NaN for destinations at infinity.
     """
 
     beam: FloatArray
@@ -55,7 +55,7 @@ def beam_errors(mechanism: Mechanism, sightings: Sightings) -> BeamErrors:
     across = np.einsum("mck,mk->mc", frame(way), ray)
     plane = across * (distance / np.where(forward > 0, forward, np.nan))[:, None]
     beam = angle_between(ray, way)
-    # The same direction, with the angle's length: sines fold back beyond a right angle.
+    # Scaled to the length of the angle, because sines decrease again beyond a right angle.
     size = np.maximum(np.linalg.norm(across, axis=-1), 1e-300)
     return BeamErrors(
         beam=beam,
@@ -75,19 +75,18 @@ def split(
     sightings
         Of any number of heliostats.
     kind
-        "random"; "chronological" (the earliest are for training); or "neighbour": whole
-        neighbourhoods of source directions are held out, so that a held-out sighting's
-        nearest neighbours in the sky are held out with it. Time alone misleads: a random
-        choice leaves a sighting of ten minutes before in the training part.
+        "random"; "chronological" (the earliest are for training); or "neighbour" (whole
+        neighbourhoods of source directions are held out). A random choice flatters: it
+        leaves sightings of ten minutes earlier in the training part.
     fraction
         Between 0 and 1.
     seed
-        Of the random choice.
+        Seed of the random choice.
 
     Raises
     ------
     InputError
-        If the fraction or the kind is none.
+        If the fraction is out of range or the kind is unknown.
     """
     check_fraction(fraction)
     if kind not in ("random", "chronological", "neighbour"):
@@ -106,7 +105,7 @@ def split(
 
 
 def check_fraction(fraction: float) -> None:
-    """Refuse a share of the sightings that leaves nothing to learn from or to test.
+    """Refuse a training share that leaves nothing to learn from or nothing to test.
 
     Raises
     ------

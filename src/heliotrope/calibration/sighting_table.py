@@ -1,7 +1,7 @@
 """Tables of sightings: every kind in one CSV or Parquet file, and Malan's own CSV.
 
-One row is one sighting. A row that cannot be used is left out and named in one line
-(file, line, heliostat, column, value, what to do); a file that cannot be used raises.
+One row is one sighting. A row that cannot be used is left out and reported in one line (file, line,
+heliostat, column, value, remedy); a file that cannot be used raises an error.
 """
 
 import csv
@@ -28,7 +28,7 @@ from heliotrope.files.cells import (
 from heliotrope.files.text import SIZE_LIMIT, write_file
 from heliotrope.geometry import FloatArray, direction
 
-#: Kinds of sightings; whether their source and their destination are at infinity.
+#: Kinds of sightings, with whether source and destination are at infinity.
 KINDS = {
     "camera_target": (True, False),
     "drone": (False, False),
@@ -39,40 +39,40 @@ _ENDS = ("source", "destination")
 _AXES = ("east", "north", "up")
 #: Upper triangle of a symmetric matrix, by the initials of the axes.
 _PAIRS = {"ee": (0, 0), "en": (0, 1), "eu": (0, 2), "nn": (1, 1), "nu": (1, 2), "uu": (2, 2)}
-#: Farther from the plant's reference than this no lamp, camera or target stands, m.
+#: Largest plausible distance of a lamp, camera or target from the plant's reference, m.
 _FARTHEST = 50e3
 _MALAN = (
     "timestamp", "sun_azimuth_deg", "sun_elevation_deg", "horizontal_offset_m",
     "vertical_offset_m", "azimuth_counts", "elevation_counts",
 )  # fmt: skip
-#: A centroid farther from the aim point than this is in another unit, m.
+#: Largest plausible distance of a centroid from the aim point, m.
 _FARTHEST_OFFSET = 50.0
 
 
 def read_sightings(
     path: str | Path, names: Sequence[str]
 ) -> tuple[Sightings, tuple[str, ...], list[str]]:
-    """Return the sightings of a table, the kind of each, and what was left out and why.
+    """Return the sightings of a table, their kinds, and a line for each row left out.
 
     Parameters
     ----------
     path
         A file ``.csv`` (comma, semicolon or tab; with or without a byte-order mark) or
-        ``.parquet``, with the columns of :func:`write_sightings`. Columns ``time``,
-        ``kind`` and the covariances may be missing; ``sigma_mrad`` may stand for
-        ``sigma_rad``. A time that is not given is NaN. Further columns are not looked at.
+        ``.parquet``, with the columns of `write_sightings`. Columns ``time``, ``kind`` and
+        the covariances are optional; ``sigma_mrad`` may replace ``sigma_rad``. A missing time
+        is NaN. Other columns are ignored.
     names
-        Of the heliostats, (N,): the row of each is its place here.
+        Names of the heliostats in the order of their rows, (N,).
 
     Returns
     -------
-    The M sightings in the order of the file, their kinds ("" where not given), and one
-    line for each row that could not be used.
+    M sightings in the order of the file, their kinds ("" where not given), and one line for
+    each row that could not be used.
 
     Raises
     ------
     FormatError
-        If the file cannot be read, or a column is missing or known by a name like it.
+        If the file cannot be read, or a column is missing or misspelt.
     InputError
         If a name occurs twice.
     """
@@ -113,25 +113,25 @@ def write_sightings(
     names: Sequence[str],
     kinds: Sequence[str] | None = None,
 ) -> None:
-    """Write sightings so that :func:`read_sightings` gives the same doubles again.
+    """Write sightings so that `read_sightings` returns exactly the same numbers.
 
     Parameters
     ----------
     path
-        A file ``.csv`` or ``.parquet``; it is there whole or not at all.
+        A file ``.csv`` or ``.parquet``, written whole or not at all.
     sightings
-        M of them.
+        M sightings.
     names
-        Of the heliostats, (N,).
+        Names of the heliostats, (N,).
     kinds
-        Of each sighting: "camera_target", "drone", "sun_sensor", "field_camera" or "",
-        (M,).
+        Kind of each sighting, (M,): "camera_target", "drone", "sun_sensor", "field_camera"
+        or "".
 
     Raises
     ------
     InputError
-        If a name, a kind or a time cannot be written, the suffix is another one, a CSV
-        would exceed the 64 MiB that are read again, or the folder cannot be written to.
+        If a name, kind or time cannot be written, the suffix is unknown, a CSV would exceed
+        the 64 MiB that `read_sightings` accepts, or the folder cannot be written to.
     """
     file = Path(path)
     columns = _columns(sightings, names, kinds)
@@ -158,16 +158,16 @@ def read_malan(
         CSV (comma, semicolon or tab; with or without a byte-order mark) with the columns
         ``timestamp`` (ISO 8601 with a zone), ``sun_azimuth_deg`` (clockwise from north),
         ``sun_elevation_deg`` (apparent), ``horizontal_offset_m`` and
-        ``vertical_offset_m`` (of the centroid from the aim point, to the right as seen
-        from the heliostats, and up), ``azimuth_counts`` and ``elevation_counts``.
+        ``vertical_offset_m`` (of the centroid from the aim point, to the right as seen from
+        the heliostats, and up), ``azimuth_counts`` and ``elevation_counts``.
     heliostat
-        Name of the one that was measured.
+        Name of the heliostat measured.
     names
-        Of all heliostats, (N,).
+        Names of all heliostats, (N,).
     target
-        That the beam stood on.
+        Target with the beam.
     aim
-        The aim point, m to the right of and above the target's center.
+        Aim point, m to the right of and above the target's center.
     sigma
         Standard deviation of a centroid as seen from the mirror, rad of beam.
 
@@ -235,7 +235,7 @@ def _is_parquet(path: Path) -> bool:
 
 
 def _check_columns(rows: Rows) -> list[str]:
-    """Return the columns of counts; all that are needed are there, none is mistyped."""
+    """Return the columns of counts; refuse missing and misspelt columns."""
     ends = [f"{end}_{axis}" for end in _ENDS for axis in (*_AXES, "at_infinity")]
     rows.need(["heliostat", "count_1", *ends])
     there = list(rows.columns)
@@ -274,7 +274,7 @@ def _points(rows: Rows, end: str, far: npt.NDArray[np.bool_]) -> FloatArray:
             f" m is more than {_FARTHEST / 1e3:g} km from the plant; give ENU metres about it",
         )
     for i in np.flatnonzero(far & ~points.any(axis=-1)):
-        rows.refuse(i, names[0], "0, 0, 0 has no direction; give one from the mirror")
+        rows.refuse(i, names[0], "0, 0, 0 is no direction; give the direction from the mirror")
     return points
 
 
@@ -287,7 +287,7 @@ def _check_kinds(rows: Rows, kinds: Sequence[str], far: dict[str, npt.NDArray[np
                 rows.refuse(
                     i,
                     f"{end}_at_infinity",
-                    f"{str(bool(far[end][i])).lower()}, but of kind {kind} it is "
+                    f"{str(bool(far[end][i])).lower()}, but for kind {kind} it is "
                     f"{str(wanted).lower()}; correct one of them",
                 )
 
@@ -296,7 +296,7 @@ def _sigma(rows: Rows) -> FloatArray:
     name = "sigma_rad" if "sigma_rad" in rows.columns else "sigma_mrad"
     unit = name.removeprefix("sigma_")
     given = rows.numbers(name, f"the ray's standard deviation in {unit}")
-    # Dividing rounds once; 1e-3 is no double.
+    # Division rounds once; 1e-3 itself is not exact in binary.
     sigma = given if unit == "rad" else given / 1e3
     rows.check(name, ~(sigma > 0.0) & np.isfinite(sigma), given, f" {unit} must be above 0")
     return sigma
@@ -307,7 +307,7 @@ def _covariance(rows: Rows, end: str) -> FloatArray:
     if f"{end}_cov_ee" not in rows.columns:
         return matrices
     names = {pair: f"{end}_cov_{pair}" for pair in _PAIRS}
-    # All six empty are no covariance; a few of them are a mistake.
+    # All six cells empty: no covariance. Some of them empty: a mistake.
     filled = np.array([rows.filled(name) for name in names.values()])
     some = filled.any(axis=0)
     what = "m² of a point or rad² of a direction, or leave all six empty"
@@ -320,8 +320,8 @@ def _covariance(rows: Rows, end: str) -> FloatArray:
         rows.refuse(
             i,
             f"{end}_cov_ee to {end}_cov_uu",
-            f"{[float(matrices[i, a, b]) for a, b in _PAIRS.values()]} is no covariance (not "
-            "positive semidefinite); correct them or leave all six empty",
+            f"{[float(matrices[i, a, b]) for a, b in _PAIRS.values()]} is not a covariance (not "
+            "positive semidefinite); correct it or leave all six cells empty",
         )
     return matrices
 
@@ -337,7 +337,7 @@ def _columns(
         )
     given = [""] * len(s) if kinds is None else list(kinds)
     if len(given) != len(s):
-        raise InputError(f"sightings: {len(given)} kinds of {len(s)} sightings; give one of each")
+        raise InputError(f"sightings: {len(given)} kinds for {len(s)} sightings; give one for each")
     for kind in given:
         if kind and kind not in KINDS:
             raise UnknownNameError("kind of sighting", kind, KINDS)
@@ -365,7 +365,7 @@ def _write_csv(path: Path, columns: dict[str, list[Any]], stream: BinaryIO) -> N
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    # repr of a float is the shortest text that reads back the same.
+    # `repr` gives the shortest text that reads back as the same number.
     cells: Iterable[list[Any]] = (
         ["true" if c else "false" for c in column] if name.endswith("_at_infinity") else column
         for name, column in columns.items()
@@ -375,8 +375,8 @@ def _write_csv(path: Path, columns: dict[str, list[Any]], stream: BinaryIO) -> N
     text.detach()
     if stream.tell() > SIZE_LIMIT:
         raise InputError(
-            f"{path}: {stream.tell() / 2**20:.0f} MiB of CSV are more than the "
-            f"{SIZE_LIMIT / 2**20:.0f} MiB that are read again; write .parquet"
+            f"{path}: {stream.tell() / 2**20:.0f} MiB of CSV exceed the "
+            f"{SIZE_LIMIT / 2**20:.0f} MiB that can be read; write .parquet"
         )
 
 

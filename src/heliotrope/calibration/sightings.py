@@ -1,9 +1,9 @@
-"""Sightings: light seen to go from a source by way of a mirror to a destination.
+"""Sightings: light observed to go from a source over a mirror to a destination.
 
-Every measurement of where a mirror points is one record: heliostat, time, drive
-counts, source and destination (each a direction at infinity or a point), and how well
-the ray between them is known. A photograph of the beam on a target, a reflection seen
-by a drone, a sun sensor and a camera in the field differ in nothing else.
+Every measurement of where a mirror points is one record: heliostat, time, drive counts, source and
+destination (each a direction at infinity or a point), and the uncertainty of the ray between them.
+A photograph of the beam on a target, a reflection seen by a drone, a sun sensor and a camera in the
+field all give this record.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from heliotrope.field.formats.measurements import Measurements
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, normalize
 
-#: Of a unit vector that was normalised: its length is off by a few roundings.
+#: Largest deviation from 1 of the length of a normalised vector: a few roundings.
 _UNIT = 2e-15
 
 
@@ -28,7 +28,7 @@ class Sightings:
     Attributes
     ----------
     heliostat
-        Row of the heliostat, 0 … N − 1, (M,).
+        Row of the heliostat, 0 to N − 1, (M,).
     time
         Unix seconds (UTC), (M,).
     counts
@@ -41,8 +41,8 @@ class Sightings:
         Standard deviation of the ray's direction (source and destination together) in
         each of two directions across it, rad of beam, (M,).
     source_covariance, destination_covariance
-        What is known of each end beyond that, ENU, (M, 3, 3): of a point m², of a
-        direction rad². Of a direction only what lies across it counts. Added to sigma.
+        Further covariance of each end, ENU, (M, 3, 3): m² for a point, rad² for a
+        direction, of which only the part across the direction counts.
     """
 
     heliostat: npt.NDArray[np.intp]
@@ -62,7 +62,7 @@ class Sightings:
     def take(self, rows: npt.ArrayLike) -> "Sightings":
         """Return the sightings at ``rows`` (indices or a mask), in that order."""
         index = np.asarray(rows)
-        # An empty list is an array of floats to NumPy.
+        # NumPy makes an array of floats of an empty list.
         index = index if index.size else index.astype(np.intp)
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
 
@@ -94,7 +94,7 @@ def sightings(
     counts
         Drive counts, (M, D).
     source, destination
-        Directions (any length) or points (m), ENU, (M, 3). A direction of length 1 is
+        Directions (of any length) or points (m), ENU, (M, 3). A direction of length 1 is
         kept to the last bit.
     time
         Unix seconds, (M,).
@@ -103,8 +103,8 @@ def sightings(
     sigma
         Standard deviation of the ray's direction, rad of beam, (M,).
     source_covariance, destination_covariance
-        Of the ends, in addition to sigma, m² of a point and rad² of a direction: a
-        variance, the same in every direction, () or (M,), or matrices (3, 3) or (M, 3, 3).
+        Of the ends, in addition to sigma; m² for a point and rad² for a direction: a
+        variance equal in every direction, () or (M,), or matrices, (3, 3) or (M, 3, 3).
 
     Raises
     ------
@@ -179,10 +179,10 @@ def _covariances(given: npt.ArrayLike, rows: int, name: str) -> FloatArray:
 def is_covariance(matrices: FloatArray) -> npt.NDArray[np.bool_]:
     """Return which matrices (M, 3, 3) are finite, symmetric and positive semidefinite.
 
-    Rounding is forgiven: 1e-9 of the largest entry. Beyond 1e100 nothing is finite.
+    Tolerance: 1e-9 of the largest entry. Entries above 1e100 count as infinite.
     """
     largest = np.abs(matrices).max(axis=(-1, -2))
-    # Most are zero, and need no eigenvalues.
+    # Most matrices are zero and need no eigenvalues.
     good = largest == 0.0
     rows = np.flatnonzero(~good & (largest < 1e100))
     scaled = matrices[rows] / largest[rows, None, None]
@@ -216,10 +216,10 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
 
     With s and t the unit vectors to both ends and v their bisector, to first order
 
-    .. math:: δv = (I - v v^T)(δs + δt) / |s + t|
+    $$ δv = (I - v v^T)(δs + δt) / |s + t| $$
 
-    where a point at distance d that moves by δp turns its direction by
-    :math:`δs = (I - s s^T) δp / d`. Both ends are taken as independent.
+    where a shift δp of a point at distance d turns its direction by
+    $δs = (I - s s^T) δp / d$. The two ends are taken as independent.
 
     Parameters
     ----------
@@ -234,8 +234,8 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
     ways = ray_directions(s, m)
     size = np.linalg.norm(ways[0] + ways[1], axis=-1)
     across = as_float(axes) / size[:, None, None]
-    # A turn of the ray t by ε moves the bisector by its part across the normal over
-    # |s + t|: the whole of it across the plane of incidence, cos i of it within.
+    # A turn ε of the ray t turns the bisector by the part of ε across the normal over |s + t|:
+    # all of it across the plane of incidence, cos i of it within the plane.
     turn = np.eye(3) - ways[1][:, :, None] * ways[1][:, None, :]
     covariance = across @ turn @ np.swapaxes(across, -1, -2) * s.sigma[:, None, None] ** 2
     for way, points, far, given in (
@@ -255,14 +255,14 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
 def of_measurements(
     measurements: Measurements, heliostats: Heliostats, sigma: float = 5e-4
 ) -> tuple[Sightings, list[str]]:
-    """Return sightings of camera-target measurements, and what was left out and why.
+    """Return sightings of camera-target measurements, and a line for each name left out.
 
     Parameters
     ----------
     measurements
         As read from files.
     heliostats
-        Those that the names refer to.
+        With the names in the measurements.
     sigma
         Standard deviation of a centroid as seen from the mirror, rad of beam.
     """
@@ -298,13 +298,13 @@ def camera_target(
     Parameters
     ----------
     heliostat, counts, time, sigma
-        As :func:`sightings`.
+        As for `sightings`.
     sun
         Directions to the apparent sun, ENU, (M, 3).
     centroid
-        Of the image on the target, ENU metres, (M, 3).
+        Centroid of the image on the target, ENU metres, (M, 3).
     sun_covariance, centroid_covariance
-        rad² and m², as :func:`sightings`.
+        rad² and m², as for `sightings`.
     """
     return sightings(
         heliostat,
@@ -329,18 +329,18 @@ def drone(
     led_covariance: npt.ArrayLike = 0.0,
     camera_covariance: npt.ArrayLike = 0.0,
 ) -> Sightings:
-    """Return sightings of a lamp's reflection from the air (HelioPoint): LED to camera.
+    """Return sightings of a lamp's reflection from the air (HelioPoint): lamp to camera.
 
     Parameters
     ----------
     heliostat, counts, time, sigma
-        As :func:`sightings`.
+        As for `sightings`.
     led, camera
-        The lamp and the camera's centre of projection, ENU metres, (M, 3).
+        Lamp, and centre of projection of the camera, ENU metres, (M, 3).
     led_covariance, camera_covariance
-        m², as :func:`sightings`. Both are taken as independent. Where the lamp hangs beside
-        the camera, an error of the drone's position moves both: give it to one of them,
-        four-fold, and leave the other 0.
+        m², as for `sightings`. The two are taken as independent. Where the lamp is mounted
+        beside the camera, an error of the drone's position moves both: give four times its
+        variance to one of them and 0 to the other.
     """
     return sightings(
         heliostat,
@@ -369,14 +369,14 @@ def sun_sensor(
     Parameters
     ----------
     heliostat, counts, time
-        As :func:`sightings`.
+        As for `sightings`.
     sun
-        Directions to the apparent sun when the loop was closed, ENU, (M, 3).
+        Directions to the apparent sun while the loop was closed, ENU, (M, 3).
     normal_sigma
-        Standard deviation of the mirror's normal, rad, (M,); a ray turns by twice that.
+        Standard deviation of the mirror's normal, rad, (M,); the ray turns by twice that.
     normal_covariance
-        Of the normal, rad², as :func:`sightings`. Source and destination are the same
-        measurement, so all of it is the destination's, four-fold.
+        Covariance of the normal, rad². Source and destination are one measurement, so four
+        times this covariance is given to the destination.
     """
     return sightings(
         heliostat,
@@ -406,15 +406,15 @@ def field_camera(
     Parameters
     ----------
     heliostat, counts, time, sigma
-        As :func:`sightings`.
+        As for `sightings`.
     sun
         Directions to the apparent sun, ENU, (M, 3).
     camera
         Its centre of projection, ENU metres, (M, 3).
     sun_covariance, camera_covariance
-        rad² and m², as :func:`sightings`.
+        rad² and m², as for `sightings`.
     """
-    # To the law a camera is a target: the sun's light came to this point.
+    # For the law of reflection a camera is a target: sunlight reached this point.
     return camera_target(
         heliostat,
         counts,

@@ -1,4 +1,4 @@
-"""The command line: ``heliotrope COMMAND``. Each command is a thin shell over the library.
+"""The command line, ``heliotrope COMMAND``: each command is a thin shell over the library.
 
 Heavy libraries are imported inside the commands, so that help appears at once.
 """
@@ -75,7 +75,7 @@ app.command()(demo)
 
 
 def main() -> None:
-    """Run the command line; bad input ends in one line and exit code 2."""
+    """Run the command line; bad input ends with one line on standard error and exit code 2."""
     try:
         app()
     except HeliotropeError as error:

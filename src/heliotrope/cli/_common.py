@@ -1,4 +1,4 @@
-"""What the commands share: arguments to values, values to the screen."""
+"""Shared by the commands: arguments to values, values to the screen."""
 
 import json
 import math
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def parse_time(text: str) -> datetime:
-    """Return a time with its zone from ISO 8601, or the present for "now"."""
+    """Return a time with time zone from ISO 8601; "now" is the present."""
     from datetime import UTC
 
     if text == "now":
@@ -60,17 +60,18 @@ def open_plant(path: Path) -> "Plant":
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON document; what is not a number becomes null."""
+    """Print one JSON document; NaN and infinity become null."""
     print(json.dumps(plain(value), ensure_ascii=False, indent=1))
 
 
 def plain(value: Any) -> Any:
-    """Return what JSON can hold; what is not a number becomes None."""
+    """Return a value that JSON can hold; NaN and infinity become None."""
     if isinstance(value, dict):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
-    if hasattr(value, "tolist"):
+    # Arrays and numbers of NumPy, which need not be imported for this.
+    if type(value).__module__ == "numpy":
         return plain(value.tolist())
     if isinstance(value, datetime):
         return value.isoformat()
@@ -80,7 +81,7 @@ def plain(value: Any) -> Any:
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str = "") -> None:
-    """Print a table, the first column to the left and the others to the right."""
+    """Print a table, the first column aligned left and the others right."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -92,6 +93,6 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]], title: str
         table.add_row(*row)
     console = Console()
     if not console.is_terminal:
-        # A file or a pipe has no width: never cut a number.
+        # A file or a pipe has no width, and numbers must not be cut.
         console = Console(width=1000)
     console.print(table)

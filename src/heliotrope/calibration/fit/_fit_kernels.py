@@ -1,9 +1,9 @@
 """Compiled: the maximum a posteriori fit of one heliostat after another.
 
-Levenberg-Marquardt in parameters scaled by their priors, y = x / σ, so that the prior
-is the unit matrix and the damping means the same for a metre and a milliradian:
-minimise Σ ρ(|r|²) + |y|², r the two whitened components of normal minus bisector.
-A trial is evaluated with its derivatives, because nearly every one is taken.
+Levenberg-Marquardt minimises Σ ρ(|r|²) + |y|², with r the two whitened components of normal minus
+bisector, in parameters scaled by their priors, y = x / σ: then the prior is the unit matrix and the
+damping means the same for a metre and a milliradian. Trials are evaluated with their derivatives,
+because nearly every one is accepted.
 """
 
 import math
@@ -29,19 +29,19 @@ SQUARE = 0
 HUBER = 1
 CAUCHY = 2
 
-#: Where Huber and Cauchy leave the square, in standard deviations; 95 % efficient
-#: for Gaussian noise in one dimension.
+#: Widths of the Huber and Cauchy losses in standard deviations: 95 % efficient for Gaussian noise
+#: in one dimension.
 HUBER_WIDTH, CAUCHY_WIDTH = 1.345, 2.385
-#: Degrees of freedom that the sightings' stated sigma is worth when the scale is found.
+#: Weight of the sightings' stated sigma in the estimate of the scale, degrees of freedom.
 PRIOR_FREEDOM = 5.0
-#: Distance to the minimum, as the quadratic model sees it, that is not walked any more: no
-#: parameter is farther off than this many of its standard deviations.
+#: Converged when the quadratic model puts the minimum nearer than this, in standard deviations of
+#: the parameters.
 NEAR = 1e-7
-#: The same while the scale is still to be found.
+#: The same while the scale is still being estimated.
 ROUGHLY = 1e-6
-#: A step that promises to gain less is taken unseen: the cost's rounding hides its gain.
+#: A step with a smaller predicted gain is accepted unchecked: rounding of the cost hides the gain.
 UNSEEN = 1e-9
-#: Damping after a first refusal, its growth, and how often it grows.
+#: Damping after the first refused step, its growth, and the most refusals.
 DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 
 
@@ -49,8 +49,8 @@ DAMPING, HARDER, REFUSALS = 1e-3, 8.0, 25
 def loss_and_weights(square, loss):
     """Loss ρ(s), its derivative ρ', and what the curvature 2 ρ'' adds along the residual.
 
-    A far outlier's loss is concave along the residual; there the curvature is taken as 0,
-    which keeps the step's matrix positive definite.
+    Far out the loss is concave along the residual; there the curvature is taken as 0, which
+    keeps the matrix of the step positive definite.
     """
     if loss == HUBER and square > HUBER_WIDTH * HUBER_WIDTH:
         size = math.sqrt(square)
@@ -68,7 +68,7 @@ def loss_and_weights(square, loss):
 
 @njit(**OPTIONS)
 def cholesky_solve(matrix, right, factor, out):
-    """Solve matrix · out = right for a positive definite matrix; returns whether it is."""
+    """Solve matrix · out = right; returns False if the matrix is not positive definite."""
     size = matrix.shape[0]
     for i in range(size):
         for j in range(i + 1):
@@ -196,7 +196,7 @@ def _minimise(problem, y, loss, scale, near, arrays, limit):
             damping = max(HARDER * damping, DAMPING)
             new = np.nan
         if math.isnan(new):
-            # Rounding is all that is left to gain.
+            # Only rounding is left to gain.
             _normal_equations(problem, y, loss, scale, True, hessian, gradient)
             return cost, iteration + 1, True
         for p in range(size):
@@ -223,7 +223,7 @@ def _median_scale(squares, keep, rows):
 
 @njit(**OPTIONS)
 def _covariance(hessian, sigma, gradient, factor, step, out):
-    """Covariance of x = y σ (P, P); ``out`` stays as it is where there is none."""
+    """Covariance of x = y σ, (P, P); ``out`` is unchanged if the matrix is singular."""
     if cholesky_solve(hessian, gradient, factor, step):
         inverse_from(factor, out)
         for p in range(sigma.shape[0]):
@@ -254,14 +254,14 @@ def fit_block(
 ):
     """Fit heliostats ``start`` to ``stop``.
 
-    ``offsets`` (N + 1,) are the sightings of each, ``rounds`` how often the scale of the
-    residuals is estimated anew (0: it stays 1).
+    ``offsets`` (N + 1,) delimit the sightings of each; ``rounds`` is the number of estimates of
+    the scale of the residuals (0: it stays 1).
     """
     size, joints = codes.shape[0], arrays[2].shape[1]
     drives = arrays[6].shape[0]
     scratch = scratch_mechanism(joints, drives, arrays[5].shape[2], size)
     wrenches, jacobian = np.zeros((3, 2, 6)), np.empty((2, size))
-    # The matrices of the last step and of its trial change places when the trial is taken.
+    # Matrices of the present point and of the trial; they swap when the trial is accepted.
     solver = (
         np.empty((2, size, size)), np.empty((2, size)), np.empty((size, size)),
         np.zeros((size, size)), np.empty(size), np.empty(size),
@@ -288,7 +288,7 @@ def fit_block(
                 cost, steps, converged = _minimise(problem, y, kind, scale, near, solver, limit)
                 total += steps
                 if turn < rounds:
-                    # Few sightings fit themselves: the stated sigma counts as some more.
+                    # Few sightings fit themselves too well, so the stated sigma counts too.
                     free = max(0.0, 2.0 * kept - size)
                     new = _median_scale(squares, keep, rows)
                     total_square = PRIOR_FREEDOM + 2.0 * kept * new * new * (free > 0.0)

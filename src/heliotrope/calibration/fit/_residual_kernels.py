@@ -4,11 +4,11 @@ With n the normal, b the bisector, f_k the whitened axes and r_k = f_k·(n − b
 
     dr_k = f_k·dn − g_k·dm,   g_k = (∂b/∂m)ᵀ f_k.
 
-A parameter moves all beyond its joint as a rigid body, dn = w × n and dm = w × m + d with
-a twist (w, d), or shifts it, w = 0. Hence dr_k = w·q_k − d·g_k with q_k = n × f_k − m × g_k:
-one product of a twist, which is the heliostat's, and a wrench (q_k, g_k), the sighting's.
-Twists are those at zero joint angles. Beyond a driven joint they would turn with it;
-the wrench is turned back instead, so that three wrenches serve all parameters.
+A parameter moves everything beyond its joint as a rigid body, dn = w × n and dm = w × m + d with a
+twist (w, d), or shifts it, w = 0. Hence dr_k = w·q_k − d·g_k with q_k = n × f_k − m × g_k:
+one product of a twist (of the heliostat) and a wrench (q_k, g_k) (of the sighting). Twists are
+taken at zero joint angles. Beyond a driven joint they would turn with it; instead the wrench is
+turned back, so that three wrenches serve all parameters.
 """
 
 import math
@@ -61,8 +61,8 @@ def apply_parameters(codes, x, position, origins, angles, drives, vertex, normal
 def scratch_mechanism(joints, drives, slots, size):
     """Arrays for one moved mechanism, its pose at zero joint angles, and P twists.
 
-    A twist is (w, d); its place says how many driven joints lie before it, and of which
-    drive (−1: none) and slot it is.
+    A twist is (w, d); its place holds the number of driven joints before it, its drive (−1: none)
+    and its slot.
     """
     moved = (
         np.empty(3), np.empty((joints, 3)), np.empty(joints), np.empty((1, drives, slots)),
@@ -97,7 +97,7 @@ def _row(table, i):
 
 @njit(**OPTIONS)
 def place_mechanism(base, codes, sigma, y, scratch):
-    """Move a mechanism by y σ, fill drives and twists by y; return its armature."""
+    """Move a mechanism by y σ, fill drives and twists; return its armature."""
     orientation, axes, driven, normal = base[1], base[2], base[6], base[8]
     moved, pose, twists, places = scratch
     position_, origins_, angles_, drives_, vertex_, x = moved
@@ -174,7 +174,7 @@ def turns(drives, counts, i):
 
 @njit(**INLINED)
 def _way(ends, far, i, m):
-    """Unit vector from m to an end, and 1 / its distance: 0 for a direction."""
+    """Unit vector from m to an end, and 1 / distance (0 for a direction)."""
     end = _row(ends, i)
     if far[i]:
         return end, 0.0
@@ -196,7 +196,7 @@ def _gap_axes(data, i, inverse):
 
 @njit(**INLINED)
 def _pull(f, v, s, near_s, t, near_t, inverse):
-    """Return g = (∂b/∂m)ᵀ f, with ``inverse`` = 1 / |s + t|; ends far away do not count."""
+    """Return g = (∂b/∂m)ᵀ f, with ``inverse`` = 1 / |s + t|; ends at infinity do not contribute."""
     h = across(f, v)
     h = add(times(near_s, across(h, s)), times(near_t, across(h, t)))
     return times(-inverse, h)
@@ -212,7 +212,7 @@ def _store(wrenches, k, q_0, g_0, q_1, g_1):
 
 @njit(**INLINED)
 def _turn_back(axis, point, sine, cosine, q, g):
-    """A wrench seen from before a turn about the line through ``point``."""
+    """Turn a wrench back about the line through ``point``."""
     q = about(axis, -sine, cosine, add(q, cross(point, g)))
     g = about(axis, -sine, cosine, g)
     return minus(q, cross(point, g)), g

@@ -2,11 +2,11 @@ r"""The estimator: maximum a posteriori parameters of every heliostat.
 
 For each heliostat the deviations x of the model's parameters minimise
 
-.. math:: \sum_i ρ(|W_i\,(n_i(x) - b_i(x))|^2 / s^2) + \sum_p (x_p / σ_p)^2
+$$ \sum_i ρ(|W_i\,(n_i(x) - b_i(x))|^2 / s^2) + \sum_p (x_p / σ_p)^2 $$
 
-with n the mechanism's normal, b the bisector of source and destination as seen from its
-vertex, W the whitening by the sighting's standard deviation, s the scale of the
-residuals found from themselves, ρ a robust loss and σ the priors of the parameter table.
+with n the mechanism's normal, b the bisector of source and destination as seen from its vertex, W
+the whitening by the sighting's covariance, s the scale of the residuals (estimated from them), ρ a
+robust loss and σ the priors of the parameter table.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ from heliotrope.parallel import run_blocks
 Loss = Literal["square", "huber", "cauchy"]
 _LOSSES = {"square": kernels.SQUARE, "huber": kernels.HUBER, "cauchy": kernels.CAUCHY}
 
-#: A start is sought globally where the nominal mechanism misses by more than this, rad.
+#: The start is searched globally where the nominal mechanism misses by more than this, rad.
 FAR = 0.15
 
 
@@ -51,7 +51,7 @@ class FitOutcome(IntEnum):
 
     @property
     def text(self) -> str:
-        """One sentence on what it means."""
+        """One clause for people."""
         return _TEXTS[self]
 
 
@@ -65,7 +65,7 @@ _TEXTS = {
 
 @dataclass(frozen=True)
 class FieldFit:
-    """What was learnt of N heliostats in P parameters.
+    """Fitted parameters of N heliostats, P each.
 
     Attributes
     ----------
@@ -78,15 +78,15 @@ class FieldFit:
     prior
         Standard deviations of the priors, (N, P).
     scale
-        Noise found, in units of the sightings' sigma, (N,).
+        Estimated noise in units of the sightings' sigma, (N,).
     lengths
         Length of each sighting's whitened residual in units of ``scale``, (M,).
     count
-        Sightings used of each heliostat, (N,).
+        Number of sightings used, (N,).
     iterations, outcome
-        (N,); :class:`Outcome` as integers.
+        (N,); `FitOutcome` as integers.
     centre
-        Where the priors stand: zero, or a far start, (N, P).
+        Centre of the priors: zero, or a far start, (N, P).
     """
 
     names: tuple[str, ...]
@@ -137,18 +137,18 @@ def fit(
     loss
         "square", "huber" or "cauchy".
     adapt_scale
-        Find the noise from the residuals; otherwise the sightings' sigma is believed.
+        Estimate the noise from the residuals; otherwise the sightings' sigma is used.
     keep
         Mask of the sightings to use, (M,).
     max_iterations
-        Of Levenberg-Marquardt for each heliostat and round of the scale.
+        Of Levenberg-Marquardt, for each heliostat and each estimate of the scale.
 
     Raises
     ------
     InputError
-        If the sightings name heliostats that are not there, or a prior is not above 0.
+        If a sighting is of a heliostat that is not there, or a prior is not above 0.
     UnknownNameError
-        If the model or one of its parameters is not known.
+        If the model or one of its parameters is unknown.
     """
     _check_rows(mechanism, sightings)
     count, rows = len(mechanism), len(sightings)
@@ -204,8 +204,8 @@ def fit(
         count,
         minimum_rows=2,
     )
-    # The prior stands around the start: a zero that is off by a radian is a wrong entry,
-    # not an improbable installation.
+    # The prior is centred on the start: a zero that is off by a radian is a wrong entry in the
+    # plant file, not an improbable installation.
     result.values[:] += begin
     result.lengths[order] = np.sqrt(squares) / result.scale[ordered.heliostat]
     return result
@@ -236,12 +236,12 @@ def _priors(
 
 
 def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
-    """Return the rows heliostat by heliostat, within one in an order that is not the rows'."""
+    """Return the rows sorted by heliostat, then in an order that does not depend on their order."""
     first = (s.counts[:, -1], s.time, s.heliostat)
     order = np.lexsort(first)
     alike = np.ones(max(len(order) - 1, 0), dtype=np.bool_)
     for key in first:
-        # Unknown times are alike.
+        # Unknown times count as equal.
         alike &= ~(key[order[1:]] != key[order[:-1]]) | np.isnan(key[order[1:]].astype(float))
     if alike.any():
         more = (
@@ -254,7 +254,7 @@ def canonical_order(s: Sightings) -> npt.NDArray[np.intp]:
 
 
 def _data(s: Sightings, vertex: FloatArray, keep: npt.NDArray[np.bool_]) -> tuple[np.ndarray, ...]:
-    """The sightings as the kernels read them; axes and whitening are those of the start."""
+    """The sightings as the kernels read them, with axes and whitening at the start."""
     axes, whiten = np.zeros((len(s), 2, 3)), np.zeros((len(s), 2, 2))
     if len(s):
         axes, whiten = whitening(s, vertex)
@@ -277,12 +277,12 @@ def _far_starts(
     pose: Pose,
     names: tuple[str, ...],
 ) -> FloatArray:
-    """Starting values: zero, but zeros and strokes where the nominal ones are far off.
+    """Starting values: 0, except for drive zeros and strokes where the nominal ones are far off.
 
-    Each sighting says at which joint angles the nominal axes would produce it. Against
-    the drives' own angles that is one regression a joint: a zero, which is the median of
-    the differences, and for a jack its length at 0 counts, which is tried over all that
-    its triangle allows. A start is taken where it explains the sightings far better.
+    Each sighting gives the joint angles at which the nominal axes would produce it. Comparing
+    them with the drives' own angles is one regression for each joint: the zero is the median of
+    the differences; for a jack the length at 0 counts is tried over the range that its triangle
+    allows. A start is used only where it explains the sightings far better.
     """
     begin = np.zeros((len(mechanism), len(names)))
     places = [_start_parameters(mechanism, names, d) for d in range(len(mechanism.driven))]
@@ -309,7 +309,7 @@ def _far_starts(
             ]
             for branch in (0, 1)
         ]
-        # Both joints are on the same branch; the wrong one is off by half a turn.
+        # Both joints are on the same branch; on the wrong one the zeros are off by half a turn.
         scores = [sum(f[0] * (1.0 + abs(f[1])) for f in both) for both in found]
         for (zero, stroke), (_, shift, longer) in zip(
             places, found[int(np.argmin(scores))], strict=True
@@ -324,7 +324,7 @@ def _far_starts(
 def _regress(
     drive: Drive, counts: FloatArray, wanted: FloatArray, jack: bool
 ) -> tuple[float, float, float]:
-    """Return (spread of the rest, shift of the zero, longer stroke) of one drive."""
+    """Return (spread of the residuals, shift of the zero, added stroke) of one drive."""
     trials = [0.0]
     if jack:
         row = drive.table
@@ -341,12 +341,12 @@ def _regress(
     for longer in trials:
         moved = drive if longer == 0.0 else drive.replace(stroke_offset=stroke + longer)
         gaps = wrap_signed(wanted - moved.angles(counts))
-        # Differences are cut open opposite to their mean direction: then a median is one.
+        # A median of angles is defined once they are cut open opposite to their mean direction.
         centre = np.arctan2(np.sin(gaps).sum(), np.cos(gaps).sum())
         rest = wrap_signed(gaps - centre)
         shift = float(wrap_signed(centre + np.median(rest)))
         spread = float(np.median(np.abs(rest - np.median(rest))))
-        # A longer stroke must pay: two parameters always fit better than one.
+        # A change of stroke must halve the spread: two parameters always fit better than one.
         if spread < (0.5 if best[2] == 0.0 and longer != 0.0 else 1.0) * best[0]:
             best = (spread, shift, float(longer))
     return best
@@ -355,7 +355,7 @@ def _regress(
 def _start_parameters(
     mechanism: Mechanism, names: tuple[str, ...], drive: int
 ) -> tuple[int | None, int | None]:
-    """Places among the names of a drive's zero and of its stroke, None if not there."""
+    """Indices of a drive's zero and stroke among the names; None if absent."""
     joint = mechanism.joints[mechanism.driven[drive]]
 
     def place(*suffixes: str) -> int | None:

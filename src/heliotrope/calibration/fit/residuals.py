@@ -1,4 +1,4 @@
-"""Whitened residuals of sightings and their derivatives, for every row at once."""
+"""Whitened residuals of sightings and their derivatives, all rows at once."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from heliotrope.mechanism.chain import Mechanism
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals of M sightings at given mechanisms, and how they change.
+    """Residuals of M sightings at given mechanisms, and their derivatives.
 
     Attributes
     ----------
@@ -19,10 +19,10 @@ class Linearised:
         Normal minus bisector in the tangent plane, whitened by the sightings'
         covariance, (M, 2).
     jacobian
-        By the named parameters, (M, 2, P).
+        Derivative of the residual by the named parameters, (M, 2, P).
     beam
-        Turns a whitened residual into the beam's error to the right of and above the
-        destination, as seen from the mirror, rad, (M, 2, 2).
+        Matrices that turn a whitened residual into the beam error to the right of and above
+        the destination as seen from the mirror, rad, (M, 2, 2).
     """
 
     residual: FloatArray
@@ -36,7 +36,7 @@ def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Lin
     Parameters
     ----------
     mechanism
-        One a sighting, batch shape (M,).
+        One for each sighting, batch shape (M,).
     s
         M sightings.
     names
@@ -69,14 +69,14 @@ def linearise(mechanism: Mechanism, s: Sightings, names: tuple[str, ...]) -> Lin
 
 
 def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return axes of the tangent plane (M, 2, 3) and what whitens a residual along them.
+    """Return axes of the tangent plane (M, 2, 3) and the matrices that whiten along them.
 
     Parameters
     ----------
     s
         M sightings.
     vertex
-        Where the mirrors are, (M, 3).
+        Of the mirrors, ENU metres, (M, 3).
 
     Returns
     -------
@@ -91,7 +91,7 @@ def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def frame(way: FloatArray) -> FloatArray:
-    """Return unit vectors to the right of and above ways (M, 3), seen along them, (M, 2, 3)."""
+    """Return unit vectors to the right and up as seen along directions (M, 3), (M, 2, 3)."""
     right = np.stack([way[:, 1], -way[:, 0], np.zeros(len(way))], axis=-1)
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-12)
     return np.stack([right, np.cross(right, way)], axis=1)

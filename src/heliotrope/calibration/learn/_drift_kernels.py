@@ -1,4 +1,4 @@
-"""Compiled: covariances of sightings whose parameters wander in time, and what follows.
+"""Compiled: covariances of sightings whose parameters drift in time, and their consequences.
 
 The whitened residual of sighting i is −Σ_p J_ip x_p(t_i) + noise. Each x_p is a constant
 with a variance, plus an offset that lasts as long as a regime, plus Ornstein-Uhlenbeck
@@ -7,8 +7,8 @@ processes of some amplitude and time; so two sightings share
     K_ij = Σ_p J_ip J_jpᵀ (σ_p² + ρ_p² [same regime] + δ_p² min(e_i, e_j)
                             + Σ_c a_c² exp(−|t_i − t_j| / τ_c))
 
-with e the number of steps that the zeros have taken before. A time that is not known
-(NaN) shares nothing with any other.
+with e the number of steps of the zeros before the sighting. A sighting at an unknown time (NaN)
+shares no drift with any other.
 """
 
 import math
@@ -40,7 +40,7 @@ def gram(
     """K (2 n, 2 m) of sightings with Jacobians (n, 2, P) and (m, 2, P).
 
     ``part`` (C,) is the parameter of each process, ``amplitude`` and ``tau`` (C,) theirs;
-    ``same`` says that both are the same rows, so that i = j shares even an unknown time.
+    ``same``: both are the same rows, so that i = j shares its drift even at an unknown time.
     """
     n, m, size = first.shape[0], second.shape[0], first.shape[2]
     out = np.empty((2 * n, 2 * m))
@@ -75,10 +75,10 @@ def gram(
 def _decaying_gram(
     jacobian, time, label, epoch, static, regime, step, part, group, amplitude, tau, decay
 ):
-    """As `gram` of the same rows, half of it mirrored; fills ``decay`` (n, n, G) up to i = j.
+    """As `gram` of the same rows, by symmetry; fills the lower half of ``decay`` (n, n, G).
 
-    Processes of one group have one time, so that one exponential serves them all. What shares
-    nothing, because a time is not known, decays to 0.
+    Processes of one group have one time constant, so that one exponential serves them all. With
+    unknown times the decay is 0.
     """
     n, size = jacobian.shape[0], jacobian.shape[2]
     out = np.empty((2 * n, 2 * n))
@@ -199,7 +199,7 @@ def pooled_block(
 
 @njit(**OPTIONS)
 def left_out(inverse, alpha, n):
-    """Squared distance of each sighting from what all the others say, and its variance.
+    """Squared distance of each sighting from the prediction of all others, and its variance.
 
     ``inverse`` is K⁻¹ (2 n, 2 n), ``alpha`` K⁻¹ r. Returns (z² (n,), error (n, 2),
     covariance (n, 2, 2)); z² is χ² with two degrees of freedom. (Rasmussen & Williams,
@@ -220,7 +220,7 @@ def left_out(inverse, alpha, n):
 
 @njit(**OPTIONS)
 def remove_farthest(inverse, residual, most):
-    """Take away the sighting farthest from the others, again and again.
+    """Remove the sighting farthest from the others repeatedly.
 
     Returns (which (most,), their z² (most,)) in the order of removal.
     """
@@ -250,7 +250,7 @@ def remove_farthest(inverse, residual, most):
 
 @njit(**OPTIONS)
 def step_gains(inverse, alpha, slope, variance):
-    """Gain in log evidence by a step of the zeros before each sighting, in order of time, (n,).
+    """Gain in log evidence by a step of the zeros before each sighting, sorted by time, (n,).
 
     ``slope`` (n, 2, Z) are the derivatives by the Z zeros, ``variance`` (Z,) of the step.
     With U the derivatives of the rows from k on, the gain is

@@ -7,12 +7,11 @@ from numba import njit
 
 from heliotrope.jit import OPTIONS
 
-#: A squared residual counts no more than this, in units of the noise: one bad sighting
-#: does not make a regime.
+#: Largest squared residual that counts, units of the noise: one bad sighting makes no regime.
 TRUNCATION = 16.0
-#: What new zeros must gain beyond the price of a cut (about 2 parameters in BIC, doubled).
+#: Gain that new zeros need (twice the BIC of 2 parameters), and the price of a cut.
 PRICE, CUT = 16.0, 8.0
-#: Fewest sightings of a regime: two could be two mistakes.
+#: Fewest sightings of a regime; two could be two mistakes.
 FEWEST = 3
 
 
@@ -22,7 +21,7 @@ def _segment(residual, jacobian, start, stop, shift):
     n = stop - start
     values = np.empty((2, n))
     for i in range(n):
-        # A sighting's own zeros, to start from where most of them agree.
+        # The zeros that each sighting alone would give; the search starts from their median.
         a, b = jacobian[start + i, 0, 0], jacobian[start + i, 0, 1]
         c, d = jacobian[start + i, 1, 0], jacobian[start + i, 1, 1]
         determinant = a * d - b * c
@@ -73,7 +72,7 @@ def partition(residual, jacobian, places, smallest):
             cost = before + plain[stop] - plain[start]
             if cost < best[k]:
                 best[k], come[k], own[k] = cost, j, False
-            # Zeros of its own must pay even if they explained everything.
+            # Skip where own zeros would not pay even if they explained everything.
             if stop - start < FEWEST or before + PRICE >= best[k]:
                 continue
             if plain[stop] - plain[start] < PRICE:

@@ -1,4 +1,4 @@
-"""How well a field was learnt: figures on the sightings that were held out."""
+"""How well a field was learnt: errors of the held-out sightings."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from heliotrope.calibration.sightings import ray_directions
 from heliotrope.geometry import FloatArray, azimuth_elevation, bisector
 from heliotrope.mechanism.guo import AxisAccuracy, axis_accuracy
 
-#: Heliostats with fewer sightings are shown but do not enter the overall figures.
+#: Heliostats with fewer sightings are listed but do not enter the overall figures.
 ENOUGH = 20
 
 
@@ -23,20 +23,20 @@ class HeliostatFigures:
     Attributes
     ----------
     name
-        Of the heliostat.
+        Name of the heliostat.
     count
-        Sightings, learnt from and held out together.
+        Number of sightings, training and held out together.
     beam, normal
-        Errors of the held-out ones, rad.
+        Errors of the held-out sightings, rad.
     mean
-        Of the held-out beam errors, rad.
+        Mean beam error of the held-out sightings, rad.
     coverage
-        Share of the held-out ones within their 90 % ellipse.
+        Share of the held-out sightings within their 90 % ellipse.
     axes
-        Zeros and scatter of azimuth and elevation of the normal (Guo (43)-(47)); None
-        with fewer than two held out.
+        Zeros and scatter of azimuth and elevation of the normal (Guo (43)-(47)); None with fewer
+        than two held-out sightings.
     outliers, regimes, steps
-        Number of them in the training part.
+        Numbers in the training part.
     """
 
     name: str
@@ -82,19 +82,19 @@ class Assessment:
     Attributes
     ----------
     heliostats
-        Those with sightings.
+        Heliostats with sightings.
     median_of_medians, mean_of_means
-        Beam errors over the heliostats with :data:`ENOUGH` sightings, rad.
+        Beam errors over the heliostats with `ENOUGH` sightings, rad.
     coverage
-        Of all their held-out sightings.
+        Share of all their held-out sightings within the 90 % ellipse.
     beam
-        Of all their held-out sightings together, rad.
+        Errors of all their held-out sightings, rad.
     fewest
-        Sightings that a heliostat needed to enter the figures over all: :data:`ENOUGH`,
-        or 0 if none has so many.
+        Fewest sightings of a heliostat in the overall figures: `ENOUGH`, or 0 if no heliostat
+        has that many.
     blunders
-        Held-out sightings more than ``BLUNDER`` standard deviations away, whatever the
-        cause: they enter every figure.
+        Number of held-out sightings more than `BLUNDER` standard deviations away; they enter
+        every figure.
     """
 
     heliostats: tuple[HeliostatFigures, ...]
@@ -120,19 +120,19 @@ class Assessment:
         }
 
 
-#: Standard deviations beyond which no Gaussian goes in a million sightings, as a distance.
+#: Distance beyond which a Gaussian puts fewer than one sighting in a million, standard deviations.
 BLUNDER = 5.3
 
 
 def assess(names: tuple[str, ...], learned: Learned) -> Assessment:
-    """Return the figures of what was not learnt from.
+    """Return the errors of the sightings that were not used in learning.
 
     Parameters
     ----------
     names
-        Of the N heliostats.
+        Names of the N heliostats.
     learned
-        With some of its sightings not used.
+        Learnt from a part of its sightings.
     """
     rows = np.flatnonzero(~learned.used)
     seen = learned.sightings.take(rows)

@@ -1,15 +1,15 @@
-r"""Parameters that wander: how a zero creeps and a normal quivers, learnt from a field.
+r"""Drift of parameters in time, learnt from a field: creep of the zeros, motion of the normal.
 
 The parameters of a heliostat at time t are
 
-.. math:: x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t)
+$$ x_p(t) = μ_p + s_p + ρ_p[\text{regime}(t)] + \sum_c d_{pc}(t) $$
 
-a population mean μ and a deviation s of variance τ², both of the field; an offset of the
-two zeros in each regime, and after each step; and Ornstein-Uhlenbeck processes d: the zeros
-creep over months (*slow*), if wanted over *weeks*, and the mirror's normal moves within hours
-(*hours*: warmth, wind, the direction of approach). Linear in x and Gaussian, so everything
-follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for Machine
-Learning, (2.23)-(2.24), (5.8)-(5.12)).
+with μ the mean of the field, s the deviation of the heliostat (variance τ², learnt from the field),
+ρ an offset of the two zeros in each regime and after each step, and d Ornstein-Uhlenbeck processes:
+the zeros creep over months (*slow*) and optionally over *weeks*, the mirror's normal moves within
+*hours* (temperature, wind, direction of approach). All is linear in x and Gaussian, so everything
+follows in closed form (Rasmussen & Williams 2006, Gaussian Processes for Machine Learning,
+(2.23)-(2.24), (5.8)-(5.12)).
 """
 
 from collections.abc import Sequence
@@ -27,38 +27,37 @@ from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import run_blocks
 
 DAY = 86400.0
-#: Names of the times of the processes.
+#: Names of the time scales of the processes.
 GROUPS = ("slow", "weeks", "hours")
-#: Where the search for them starts, and how far (in the logarithm) they may stray from there.
+#: Start values of the search, and the standard deviation of their logarithms.
 START_DAYS = {"slow": 300.0, "weeks": 5.0, "hours": 0.1}
 START_RAD = {"slow": 1e-3, "weeks": 1e-3, "hours": 2.5e-4}
 START_NOISE = 0.5
 STRAY = 0.7
-#: How far one heliostat's own may stray from the field's; its times only half as far.
+#: Standard deviation of one heliostat's own logarithms from the field's; half of it for times.
 OWN_STRAY = 0.4
-#: With fewer sightings there is no telling which of them is wrong.
+#: Fewest sightings among which an outlier can be found.
 FEWEST = 4
-#: Share of the heliostats that teach the field.
+#: Share of the heliostats that the hyperparameters are learnt from.
 TYPICAL = 0.85
-#: Where a far start had to be found, the prior is this many times the table's.
+#: Factor on the table's prior where a far start was needed.
 WIDE = 10.0
 #: Standard deviation of a zero after a re-reference or repair, rad.
 REGIME_RAD = 0.020
 #: Standard deviation of a step, rad: a jack that slipped, a limit switch that moved.
 STEP_RAD = 0.001
-#: Gain in log evidence that a step must bring, beyond the logarithm of the places tried,
-#: and fewest sightings that must follow it.
+#: Gain in log evidence that a step needs beyond the logarithm of the number of places tried, and
+#: fewest sightings before and after it.
 STEP_GAIN, AFTER_STEP = 4.0, 3
-#: A step is looked for between sightings so far apart, days: a mirror that is being measured
-#: all the while does not step.
+#: Least time between two sightings with a step between them, days.
 STEP_GAP = 1.0 / 24.0
-#: No heliostat has more.
+#: Most steps of one heliostat.
 MOST_STEPS = 12
 
 
 @dataclass(frozen=True)
 class Process:
-    """One Ornstein-Uhlenbeck process: the parameter that it moves and the group of its time."""
+    """One Ornstein-Uhlenbeck process: its parameter, and its time scale (one of `GROUPS`)."""
 
     parameter: str
     group: str
@@ -74,10 +73,10 @@ def zeros(mechanism: Mechanism) -> tuple[str, ...]:
 
 
 def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
-    """Return the processes of a kind of mechanism: zeros that creep, a normal that quivers.
+    """Return the usual processes of a kind of mechanism: creep of the zeros, motion of the normal.
 
-    A further wandering over weeks can be asked for; on the measurements of Jülich it brings
-    nothing on top of the steps.
+    A process over weeks is possible too; on the measurements of Jülich it improves nothing
+    beyond the steps.
     """
     found = [Process(name, "slow") for name in zeros(mechanism)]
     normal = [n for n in ("canting", "canting_secondary") if n in mechanism.parameters]
@@ -86,34 +85,33 @@ def default_processes(mechanism: Mechanism) -> tuple[Process, ...]:
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """What is common to a field (or, refined, one heliostat's own).
+    """Hyperparameters of a field or, refined, of one heliostat.
 
     Attributes
     ----------
     names
-        The P parameters, those that only wander included.
+        The P parameters, including those that only drift.
     processes
-        C of them.
+        C processes.
     mean, spread
         Population mean and standard deviation of the constant part, in the parameters'
         units, (P,).
     regime
-        Standard deviation of a regime's offset, (P,).
+        Standard deviation of the offset in a regime, (P,).
     step
         Standard deviation of a step of the zeros, (P,).
     wide
-        Standard deviation of a constant whose nominal value was a mistake, (P,).
+        Standard deviation of a constant whose nominal value was wrong, (P,).
     amplitude
         Standard deviation of each process, (C,).
     tau
-        Days, one for each of the groups in use, (G,).
+        Time constants of the groups in use, days, (G,).
     noise
         Of a sighting, in units of its sigma.
     rate
-        Steps a day.
+        Steps per day.
     heavy
-        By how much the noise's variance is larger than a Gaussian's for 90 of 100 to lie
-        within the 90 % ellipse: the tails.
+        Factor on the noise variance that puts 90 % of the sightings into their 90 % ellipse.
     """
 
     names: tuple[str, ...]
@@ -136,22 +134,22 @@ class Hyperparameters:
 
     @property
     def part(self) -> npt.NDArray[np.int64]:
-        """Place of each process' parameter among the names, (C,)."""
+        """Index of each process's parameter among the names, (C,)."""
         return np.array([self.names.index(p.parameter) for p in self.processes], dtype=np.int64)
 
     @property
     def group(self) -> npt.NDArray[np.int64]:
-        """Place of each process' time in ``tau``, (C,)."""
+        """Index of each process's time constant in ``tau``, (C,)."""
         groups = self.groups
         return np.array([groups.index(p.group) for p in self.processes], dtype=np.int64)
 
     @property
     def vector(self) -> FloatArray:
-        """Logarithms of noise, amplitudes and times: what is searched."""
+        """Logarithms of noise, amplitudes and time constants, the variables of the search."""
         return np.asarray(np.log(np.concatenate([[self.noise], self.amplitude, self.tau])))
 
     def with_vector(self, vector: FloatArray) -> "Hyperparameters":
-        """Return these with noise, amplitudes and times from their logarithms."""
+        """Return these with noise, amplitudes and time constants from their logarithms."""
         values = np.exp(vector)
         c = len(self.processes)
         return replace(
@@ -165,18 +163,18 @@ def start(
     processes: tuple[Process, ...] | None = None,
     priors: FloatArray | None = None,
 ) -> Hyperparameters:
-    """Return what is believed before any measurement.
+    """Return the hyperparameters before any measurement.
 
     Parameters
     ----------
     mechanism
-        Any of the field.
+        One or more of the field.
     model
-        Parameters that are constant but unknown.
+        Constant parameters to be estimated.
     processes
-        What wanders, by default :func:`default_processes`; ``()`` for nothing.
+        Default: `default_processes`; ``()`` for none.
     priors
-        Standard deviations of the model's parameters, by default the table's.
+        Standard deviations of the model's parameters; default: the table's.
     """
     moving = default_processes(mechanism) if processes is None else processes
     extra = [p.parameter for p in moving] + list(zeros(mechanism))
@@ -211,19 +209,19 @@ class Linear:
     jacobian
         (n, 2, P), whitened.
     value
-        y, (n, 2): what the parameters' deviations from ``centre`` must explain.
+        y, to be explained by the parameters' deviations from ``centre``, (n, 2).
     time
         Days, (n,).
     regime
         (n,).
     centre
-        Where the prior stands, (P,).
+        Centre of the prior, (P,).
     own
-        Where the centre is a far start and no population mean holds, (P,).
+        Whether the centre is a far start, for which no population mean holds, (P,).
     steps
-        When the zeros have taken a step, days, ascending, (K,).
+        Times of the steps of the zeros, days, ascending, (K,).
     suspect
-        Far from the robust fit: believed only if the others agree, (n,).
+        Whether it is far from the robust fit and is used only if the others agree, (n,).
     """
 
     jacobian: FloatArray
@@ -268,15 +266,15 @@ class Linear:
         )
 
     def mean(self, hyper: Hyperparameters) -> FloatArray:
-        """Population mean that holds here, (P,)."""
+        """Population mean that applies to this heliostat, (P,)."""
         return np.where(self.own, 0.0, hyper.mean)
 
     def spread(self, hyper: Hyperparameters) -> FloatArray:
-        """Standard deviation of the constants that holds here, (P,)."""
+        """Standard deviation of the constants that applies to this heliostat, (P,)."""
         return np.where(self.own, hyper.wide, hyper.spread)
 
     def rest(self, hyper: Hyperparameters) -> FloatArray:
-        """Value without what the population's mean explains, (n, 2)."""
+        """Value less the part that the population mean explains, (n, 2)."""
         return np.ascontiguousarray(self.value - self.jacobian @ self.mean(hyper))
 
 
@@ -311,17 +309,19 @@ def covariance(hyper: Hyperparameters, data: Linear) -> FloatArray:
 def fit_hyperparameters(
     hyper: Hyperparameters, field: Sequence[Linear], iterations: int = 25
 ) -> tuple[Hyperparameters, float]:
-    """Return the field's most probable noise, amplitudes and times, and the negative log evidence.
+    """Return the most probable noise, amplitudes and times, and the negative log evidence.
+
+    A weak prior of standard deviation ``STRAY`` around the logarithms of the start values keeps
+    what the data do not determine.
 
     Parameters
     ----------
     hyper
-        Where to start; its logarithms are the centre of a weak prior of standard
-        deviation ``STRAY``, so that what the data do not show stays as it is.
+        Start of the search.
     field
         Heliostats to learn from.
     iterations
-        Of L-BFGS.
+        Most iterations of L-BFGS.
     """
     centre = start_vector(hyper)
     return _search(hyper, field, centre, np.full(len(centre), STRAY), iterations)
@@ -330,9 +330,9 @@ def fit_hyperparameters(
 def typical(
     hyper: Hyperparameters, field: Sequence[Linear], share: float = TYPICAL
 ) -> list[Linear]:
-    """Return the ``share`` of heliostats that ``hyper`` explains best, sighting by sighting.
+    """Return the ``share`` of heliostats that ``hyper`` explains best per sighting.
 
-    Trimmed likelihood: one heliostat full of mistakes must not teach the field to wander.
+    A trimmed likelihood keeps one heliostat full of mistakes from increasing the drift of all.
     """
     rows = [d for d in field if len(d)]
     if len(rows) < 4:
@@ -343,14 +343,14 @@ def typical(
 
 
 def start_vector(hyper: Hyperparameters) -> FloatArray:
-    """Return the centre of the weak prior: the values that a search starts from."""
+    """Return the centre of the weak prior: the start values of a search."""
     amplitudes = [START_RAD[p.group] for p in hyper.processes]
     times = [START_DAYS[g] for g in hyper.groups]
     return np.asarray(np.log(np.array([START_NOISE, *amplitudes, *times])))
 
 
 def refine(hyper: Hyperparameters, data: Linear, iterations: int = 30) -> Hyperparameters:
-    """Return one heliostat's own hyperparameters: near the field's unless its data say else."""
+    """Return one heliostat's own hyperparameters, near the field's unless its data differ."""
     spread = np.full(len(hyper.vector), OWN_STRAY)
     spread[1 + len(hyper.processes) :] = 0.5 * OWN_STRAY
     return _search(hyper, [data], hyper.vector, spread, iterations)[0]
@@ -416,10 +416,11 @@ def _search(
 
 
 def _no_less_than_nothing(found: FloatArray, before: FloatArray) -> FloatArray:
-    """Covariances (m, P, P) without what rounding made negative.
+    """Covariances (m, P, P) without negative eigenvalues from rounding.
 
-    What the data know almost exactly is a difference of equals; in units of the standard
-    deviations before (variances (m, P)) no direction is known better than to 1e-6.
+    Directions that the data determine almost exactly are differences of nearly equal numbers. In
+    units of the prior standard deviations (variances ``before``, (m, P)) no direction is taken as
+    known better than to 1e-6.
     """
     scale = np.sqrt(before)
     both = scale[:, :, None] * scale[:, None, :]
@@ -431,10 +432,10 @@ def _no_less_than_nothing(found: FloatArray, before: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Posterior:
-    """What the sightings of one heliostat say about its parameters at any time.
+    """Posterior of one heliostat's parameters at any time, given its sightings.
 
-    Made by :func:`posterior`; ``inverse`` is that of the covariance of ``data``'s values
-    and ``alpha`` its product with them.
+    Made by `posterior`; ``inverse`` is the inverse covariance of the values of ``data``, and
+    ``alpha`` its product with them.
     """
 
     hyper: Hyperparameters
@@ -450,11 +451,11 @@ class Posterior:
         Parameters
         ----------
         time
-            Days, (m,); NaN: no knowledge of when.
+            Days, (m,); NaN: at an unknown time.
         regime
             (m,).
         wander
-            Whether the processes are in; else the constant part and the regime alone.
+            Whether the processes are included; otherwise the constant part and regime only.
         """
         h, data = self.hyper, self.data
         m, size = len(time), len(h.names)
@@ -464,7 +465,7 @@ class Posterior:
         share = np.broadcast_to(constant, (m, len(data), size)).copy()
         epoch = data.epoch_at(time)
         if wander:
-            # Away from all sightings a step may have been taken that nobody saw.
+            # Far from all sightings there may have been steps that no sighting shows.
             own = own + (h.rate * data.gap(time))[:, None] * h.step**2
         own = own + epoch[:, None] * h.step**2
         share += np.minimum(epoch[:, None], data.epoch)[:, :, None] * h.step**2
@@ -485,20 +486,20 @@ class Posterior:
         return values, _no_less_than_nothing(found, own)
 
     def left_out(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return (z² (n,), error (n, 2), covariance (n, 2, 2)) of each, seen from the others."""
+        """Return z² (n,), error (n, 2), covariance (n, 2, 2) of each as the others predict it."""
         found: tuple[FloatArray, FloatArray, FloatArray] = kernels.left_out(
             self.inverse, self.alpha, len(self.data)
         )
         return found
 
     def log_predictive(self) -> FloatArray:
-        """Return the logarithm of each sighting's probability density given the others, (n,)."""
+        """Return the log probability density of each sighting given the others, (n,)."""
         square, _, spread = self.left_out()
         half_log = 0.5 * np.log(np.linalg.det(spread)) if len(square) else np.empty(0)
         return np.asarray(-0.5 * square - half_log - np.log(2.0 * np.pi))
 
     def log_evidence(self) -> float:
-        """Return the logarithm of the probability density of all of them."""
+        """Return the log probability density of all sightings."""
         value = self.data.rest(self.hyper).ravel()
         _, log_inverse = np.linalg.slogdet(self.inverse)
         fit = float(value @ self.alpha)
@@ -510,8 +511,8 @@ def find_outliers(
 ) -> npt.NDArray[np.bool_]:
     """Return the mask of outliers: suspects that the others contradict, then generalised ESD.
 
-    Taken alone, the test takes away one sighting after the other from a fit that the bad
-    ones have bent; with a third of them bad it goes for good ones.
+    The test alone starts from a fit that bad sightings have bent; with a third of them bad it
+    would remove good ones.
     """
     mask = np.zeros(len(data), dtype=np.bool_)
     if len(data) < FEWEST:
@@ -532,7 +533,7 @@ def find_outliers(
 
 
 def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
-    """Return what ``data`` say under ``hyper``."""
+    """Return the posterior of ``data`` under ``hyper``."""
     if not len(data):
         return Posterior(hyper, data, np.zeros((0, 0)), np.zeros(0))
     inverse = np.linalg.inv(covariance(hyper, data))
@@ -541,9 +542,9 @@ def posterior(hyper: Hyperparameters, data: Linear) -> Posterior:
 
 
 def permissive(hyper: Hyperparameters) -> Hyperparameters:
-    """Return ``hyper`` with zeros that may be anywhere a step could bring them, day by day.
+    """Return ``hyper`` with zeros that may move within days as far as a step moves them.
 
-    What is an outlier even then is no sign of a step.
+    A sighting that is an outlier even then does not indicate a step.
     """
     moving = [n for n, size in zip(hyper.names, hyper.step, strict=True) if size > 0]
     if not moving or "weeks" in hyper.groups:
@@ -561,10 +562,10 @@ def permissive(hyper: Hyperparameters) -> Hyperparameters:
 
 
 def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
-    """Return the times (days) of steps of the zeros that the evidence asks for.
+    """Return the times (days) of steps of the zeros that the evidence supports.
 
-    The best place is found in closed form, then the next one given it, as long as the
-    logarithm of the evidence gains enough.
+    The best place is found in closed form, then the next one given the first, as long as the log
+    evidence grows enough.
     """
     moving = np.flatnonzero(hyper.step > 0)
     order = np.argsort(data.time, kind="stable")
@@ -590,7 +591,7 @@ def find_steps(hyper: Hyperparameters, data: Linear) -> FloatArray:
 
 
 def step_rate(members: Sequence["Posterior"]) -> float:
-    """Return steps a day over the members' spans; as if one more had been seen in three years."""
+    """Return steps per day over the members' spans, with one more step in three years as prior."""
     days, steps = 1000.0, 1.0
     for member in members:
         known = member.data.time[np.isfinite(member.data.time)]
@@ -600,23 +601,23 @@ def step_rate(members: Sequence["Posterior"]) -> float:
     return steps / days
 
 
-#: What the table's priors are worth, in heliostats, when the population is learnt.
+#: Weight of the table's priors in the population, heliostats.
 TABLE_WORTH = 2.0
-#: Degrees of freedom of the population: one heliostat set up wrongly does not widen it.
+#: Degrees of freedom of the population, so that one wrongly installed heliostat does not widen it.
 POPULATION_FREEDOM = 4.0
 
 
 def fit_population(
     hyper: Hyperparameters, table: FloatArray, members: Sequence[Posterior]
 ) -> Hyperparameters:
-    """Return ``hyper`` with the population's mean and spread anew (a step of EM).
+    """Return ``hyper`` with new mean and spread of the population (one step of EM).
 
     Parameters
     ----------
     hyper
-        With the mean and spread that the members were calculated with.
+        With the mean and spread under which the members were computed.
     table
-        Standard deviations of the parameter table, (P,); 0 where a parameter only wanders.
+        Standard deviations of the parameter table, (P,); 0 where a parameter only drifts.
     members
         Heliostats.
     """
@@ -647,9 +648,9 @@ def fit_population(
 
 
 def heavy_tails(members: Sequence[Posterior], outliers: int) -> float:
-    """Return the factor on the noise's variance that puts 90 of 100 left-out sightings in.
+    """Return the factor (at least 1) on the noise variance that gives the ellipses 90 % coverage.
 
-    ``outliers`` more lie outside, however large it is. Never below 1.
+    Judged by left-out sightings; ``outliers`` further sightings count as outside.
     """
     parts = [m.left_out() for m in members if len(m.data) > 3]
     if not parts:

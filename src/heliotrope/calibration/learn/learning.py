@@ -1,12 +1,12 @@
 """Learning a field: from sightings to parameters that predict, with their uncertainty.
 
-1. A robust maximum a posteriori fit of each heliostat (:mod:`.estimator`).
-2. Regimes in time (:mod:`.regimes`), and the fit again on the common one.
-3. From a sample of the field: the population of the parameters, the processes by which
-   they wander and the noise (:mod:`.drift`), without the outliers (:mod:`.outliers`).
-4. For each heliostat what its own sightings say under that.
+1. A robust maximum a posteriori fit of each heliostat (`fit.estimator`).
+2. Regimes in time (`regimes`), and the fit again on the common one.
+3. From a sample of the field: the population of the parameters, their drift and the noise
+   (`drift`), without the outliers (`outliers`).
+4. For each heliostat the posterior of its own sightings under these hyperparameters.
 
-Steps 1, 2 and 4 treat every heliostat by itself; only step 3 looks at several.
+Steps 1, 2 and 4 treat every heliostat by itself; only step 3 needs several.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,19 +30,19 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.parallel import threads
 
-#: Heliostats with fewer sightings teach nothing about the field.
+#: Fewest sightings of a heliostat from which the hyperparameters are learnt.
 FEWEST = 8
-#: No more heliostats than this are looked at for what is common to the field.
+#: The hyperparameters are learnt from this many heliostats at most.
 SAMPLE = 60
-#: A start this many standard deviations of the prior away was a mistake in the plant's data.
+#: A start this many prior standard deviations away is a mistake in the plant's data.
 MISTAKE = 5.0
 #: Residuals of the robust fit longer than this, in units of its scale, are suspect.
 SUSPECT = 8.0
-#: Times that the sightings are linearised anew; at Jülich a second time changes nothing.
+#: Number of new linearisations; at Jülich a second one changes nothing.
 LINEARISED = 1
-#: Times that regimes and the fit on the common one are found anew.
+#: Most repetitions of regimes and the fit on the common one.
 TURNS = 4
-#: What a model leaves is about so many times what repeats within a day.
+#: Ratio of the residuals of a model to their repeatability within a day.
 REPEATS = 3.0
 #: Rounds of expectation and maximisation over the population.
 ROUNDS = 6
@@ -52,20 +52,20 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where M beams are expected, against where they were seen.
+    """Predicted against measured positions of M beams.
 
     Attributes
     ----------
     errors
-        Of the predicted against the seen, (M,).
+        Predicted against measured, (M,).
     plane
-        Predicted minus seen, rad of beam to the right of and above the destination, (M, 2).
+        Predicted minus measured, rad of beam to the right of and above the destination, (M, 2).
     covariance
-        Of ``plane`` as predicted: parameters, wandering and noise, rad², (M, 2, 2).
+        Predicted covariance of ``plane``: parameters, drift and noise, rad², (M, 2, 2).
     inside
         Whether the error lies in the 90 % ellipse, (M,).
     beam
-        Turns a whitened residual into ``plane``, (M, 2, 2).
+        Matrices that turn a whitened residual into ``plane``, (M, 2, 2).
     """
 
     errors: BeamErrors
@@ -84,24 +84,24 @@ class Learned:
     mechanism
         Nominal, (N,).
     sightings
-        All that were given.
+        All sightings given.
     model
-        Parameters that are constant but unknown.
+        The constant parameters.
     used
-        Sightings to learn from, as asked, (M,).
+        Mask of the sightings to learn from, (M,).
     static
         The robust fit of step 2.
     hyper
-        What is common to the field.
+        Hyperparameters of the field.
     members
-        What is known of each heliostat.
+        Posterior of each heliostat.
     regime
-        Of each sighting; −1 if not used, (M,).
+        Regime of each sighting; −1 if not used, (M,).
     outlier
-        (M,); ``used`` ones only.
+        Mask of the outliers among the sightings used, (M,).
     rows
-        For each heliostat the sightings it was learnt from, outliers among them, in the
-        order of its member's.
+        For each heliostat the rows of its sightings, outliers included, in the order of its
+        member.
     """
 
     mechanism: Mechanism
@@ -117,7 +117,7 @@ class Learned:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The P parameters, those that only wander included."""
+        """The P parameters, including those that only drift."""
         return self.hyper.names
 
     def regimes(self, heliostat: int, when: FloatArray) -> npt.NDArray[np.int64]:
@@ -135,7 +135,7 @@ class Learned:
         heliostat
             Rows, (M,).
         time
-            Unix seconds, (M,); NaN: at no known time.
+            Unix seconds, (M,); NaN: at an unknown time.
         """
         rows = np.asarray(heliostat, dtype=np.intp)
         when = np.broadcast_to(np.asarray(time, dtype=np.float64), rows.shape)
@@ -145,20 +145,20 @@ class Learned:
             order = np.argsort(rows, kind="stable")
             each, first = np.unique(rows[order], return_index=True)
             for i, part in zip(each, np.split(order, first[1:]), strict=True):
-                # Many at once would need much memory: sightings × times × parameters.
+                # In parts, because memory grows with sightings × times × parameters.
                 for some in np.array_split(part, 1 + len(part) // 500):
                     label = self.regimes(int(i), when[some])
                     values[some], spread[some] = self.members[i].at(when[some] / DAY, label)
         return values, spread
 
     def mechanism_at(self, heliostat: npt.ArrayLike, time: npt.ArrayLike) -> Mechanism:
-        """Return the mechanisms of ``heliostat`` (M,) as they are expected at ``time`` (M,)."""
+        """Return the mechanisms expected of ``heliostat`` (M,) at ``time`` (M,)."""
         values, _ = self.parameters_at(heliostat, time)
         return _moved(self.mechanism, heliostat, self.names, values)
 
 
 def predict(learned: Learned, sightings: Sightings) -> Prediction:
-    """Return the beams expected of sightings, and how far off they were.
+    """Return the predicted beams of sightings against the measured ones.
 
     Parameters
     ----------
@@ -191,10 +191,10 @@ def _moved(
 
 
 def left_out_errors(learned: Learned) -> FloatArray:
-    """Return each sighting's beam error as seen from all the others of its heliostat, rad, (M, 2).
+    """Return each beam error as predicted from the other sightings of its heliostat, (M, 2).
 
-    To the right of and above the destination, predicted minus seen. Outliers and what was
-    not used are seen from all that was.
+    Predicted minus measured, rad to the right of and above the destination. Outliers and
+    sightings that were not used are predicted from all that were.
     """
     known = predict(learned, learned.sightings)
     found = known.plane.copy()
@@ -207,7 +207,7 @@ def left_out_errors(learned: Learned) -> FloatArray:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Steps 1 and 2 for some heliostats."""
+    """Result of steps 1 and 2 for some heliostats."""
 
     static: FieldFit
     regime: npt.NDArray[np.int64]
@@ -232,7 +232,7 @@ def prepare(
     static = fit(mechanism, sightings, model, keep=used, priors=priors, loss=loss)
     for turn in range(TURNS):
         moved = mechanism.with_parameters(static.parameters)
-        # No row of a single zero has a pair of them to be shifted.
+        # Regimes shift a pair of zeros; a mechanism with one drive has none.
         if len(zeros) != 2:
             break
         new = regime.copy()
@@ -253,7 +253,7 @@ def prepare(
     at = np.zeros((len(mechanism), len(names)))
     centre = np.zeros_like(at)
     at[:, : len(model)], centre[:, : len(model)] = static.values, static.centre
-    # A start only a little off was a help to the search; the prior stays with the nominal.
+    # A start near the nominal only helped the search; the prior stays centred on the nominal.
     centre[(np.abs(static.centre) < MISTAKE * static.prior).all(axis=1)] = 0.0
     field, rows = [], []
     for i in range(len(mechanism)):
@@ -278,10 +278,10 @@ def prepare(
 def relinearise(
     mechanism: Mechanism, sightings: Sightings, prepared: Prepared, members: Sequence[Posterior]
 ) -> Prepared:
-    """Linearise each sighting anew about what is believed of its heliostat at its time.
+    """Linearise each sighting anew about the posterior of its heliostat at its time.
 
-    Gauss-Newton on the whole history: the robust fit may lie far from where population,
-    regimes and wandering bring a mirror, and a jack's law is not straight.
+    A Gauss-Newton step on the whole history: the robust fit may lie far from the posterior with
+    population, regimes and drift, and the law of a jack is not linear.
     """
     names = members[0].hyper.names
     rows = np.concatenate(prepared.rows)
@@ -303,9 +303,10 @@ def relinearise(
 
 
 def repeatability(time: FloatArray, residual: FloatArray) -> float:
-    """Return how well one heliostat's residuals repeat within a day, thrice; inf if unknown.
+    """Return `REPEATS` times the repeatability of residuals within a day; inf if unknown.
 
-    Where regimes are mixed the scale of the whole says nothing; neighbours in time still do.
+    With mixed regimes the scale of all residuals is meaningless, but neighbours in time still
+    show the noise.
     """
     order = np.argsort(time, kind="stable")
     order = order[np.isfinite(time[order])]
@@ -313,14 +314,14 @@ def repeatability(time: FloatArray, residual: FloatArray) -> float:
     if near.sum() < FEWEST:
         return float("inf")
     steps = np.linalg.norm(np.diff(residual[order], axis=0)[near], axis=1)
-    # Differences of two Rayleigh lengths: the median is 1.1774 √2 σ.
+    # The length of a difference of two residuals is Rayleigh with √2 σ; its median 1.1774 √2 σ.
     return float(REPEATS * np.median(steps) / (1.1774 * np.sqrt(2.0)))
 
 
 def _by_heliostat(
     s: Sightings, used: npt.NDArray[np.bool_], count: int
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Offsets (N + 1,) and the used rows by heliostat, in an order not that of the rows."""
+    """Offsets (N + 1,) and the used rows by heliostat, in an order independent of the input."""
     order = canonical_order(s)
     order = order[used[order]]
     return np.searchsorted(s.heliostat[order], np.arange(count + 1)), order
@@ -333,12 +334,12 @@ def learn_field(
     prepared: Prepared,
     rounds: int = ROUNDS,
 ) -> Hyperparameters:
-    """Return what is common to the field, from prepared heliostats (step 3)."""
+    """Return the hyperparameters of the field from prepared heliostats (step 3)."""
     table = np.where(hyper.spread > 0, hyper.spread, 0.0)
     teachers = [k for k, d in enumerate(prepared.field) if len(d) >= FEWEST]
     if not teachers:
         return hyper
-    # Of the field, not of each: a heliostat full of mistakes has a large noise of its own.
+    # The field's, because a heliostat full of mistakes has a large noise of its own.
     usual = max(float(np.median(prepared.static.scale[teachers])), hyper.noise)
     for _ in range(LINEARISED):
         known = [finish(replace(hyper, noise=usual), d, own=False)[0] for d in prepared.field]
@@ -364,9 +365,9 @@ def _without_outliers(hyper: Hyperparameters, data: Linear) -> Linear:
 def finish(
     hyper: Hyperparameters, data: Linear, own: bool = True
 ) -> tuple[Posterior, npt.NDArray[np.bool_]]:
-    """Return what one heliostat's sightings say under the field's ``hyper``, and its outliers.
+    """Return one heliostat's posterior under the field's ``hyper``, and the mask of its outliers.
 
-    ``own`` lets its noise and wandering differ from the field's.
+    With ``own`` its noise and drift may differ from the field's.
     """
     if len(data) >= FEWEST and hyper.processes:
         outlier = drift.find_outliers(drift.permissive(hyper), data)
@@ -393,7 +394,7 @@ def learn(
     chunk: int = 100,
     progress: Progress | None = None,
 ) -> Learned:
-    """Learn parameters, regimes, wandering and noise of every heliostat.
+    """Learn parameters, regimes, drift and noise of every heliostat.
 
     Parameters
     ----------
@@ -408,26 +409,25 @@ def learn(
     priors
         Standard deviations that replace the table's, by name.
     processes
-        What wanders; ``()`` for nothing.
+        Processes of the drift; ``()`` for none. Default: `drift.default_processes`.
     hyper
-        What is common to the field, if it is known already.
+        Hyperparameters of the field, if known already.
     loss
         Of the robust fit.
     own
-        Whether each heliostat's noise and wandering may differ from the field's.
+        Whether each heliostat's noise and drift may differ from the field's.
     rounds
-        Of expectation and maximisation over the population.
+        Rounds of expectation and maximisation over the population.
     runner, chunk
-        Who learns chunks of so many heliostats, for example
-        :func:`heliotrope.calibration.learn.on_dask.runner`; by default this process, with the
-        same results bit for bit.
+        Learns chunks of this many heliostats elsewhere, for example
+        `heliotrope.calibration.learn.on_dask.runner`. The results are the same bit for bit.
     progress
         Called with (done, all) heliostats.
 
     Raises
     ------
     InputError
-        As of :func:`heliotrope.calibration.fit.estimator.fit`.
+        As for `heliotrope.calibration.fit.fit`.
     """
     constant = (
         parameter_table.model(model, mechanism.parameters) if isinstance(model, str) else model
@@ -450,7 +450,7 @@ def learn(
 
 @dataclass(frozen=True)
 class Task:
-    """What to learn and how, the same for every heliostat."""
+    """Model and options of learning, the same for every heliostat."""
 
     model: tuple[str, ...]
     priors: dict[str, npt.ArrayLike]
@@ -458,7 +458,7 @@ class Task:
     own: bool = True
 
     def of(self, rows: npt.NDArray[np.intp], count: int) -> "Task":
-        """Return the task of some heliostats: priors given one by one are cut with them."""
+        """Return the task of some heliostats, with their part of the priors."""
         cut = {
             n: as_float(v)[rows] if as_float(v).shape == (count,) else v
             for n, v in self.priors.items()
@@ -468,14 +468,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Part:
-    """What was learnt of some heliostats; rows count within their sightings."""
+    """Result for some heliostats; rows count within their sightings."""
 
     prepared: Prepared
     members: tuple[Posterior, ...]
     outlier: npt.NDArray[np.bool_]
 
 
-#: Learns a list of (mechanism, sightings, used, task, hyper), on whatever machines.
+#: Learns a list of (mechanism, sightings, used, task, hyper), here or elsewhere.
 Runner = Callable[
     [
         list[tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, Hyperparameters]],
@@ -493,7 +493,7 @@ def learn_part(
     hyper: Hyperparameters,
     progress: Progress | None = None,
 ) -> Part:
-    """Return what some heliostats' sightings say under the field's ``hyper``: steps 1, 2 and 4."""
+    """Learn some heliostats under the field's ``hyper``: steps 1, 2 and 4."""
     with threadpool_limits(1, "blas"):
         prepared = prepare(
             mechanism, sightings, task.model, hyper.names, used, priors=task.priors, loss=task.loss
@@ -512,7 +512,7 @@ def _cut(
     task: Task,
     rows: npt.NDArray[np.intp],
 ) -> tuple[Mechanism, Sightings, npt.NDArray[np.bool_], Task, npt.NDArray[np.intp]]:
-    """The part of a field with heliostats ``rows``, renumbered, and its sightings' places."""
+    """The part of a field with heliostats ``rows``, renumbered, and the rows of its sightings."""
     place = np.full(len(mechanism), -1)
     place[rows] = np.arange(len(rows))
     mine = np.flatnonzero(place[sightings.heliostat] >= 0)
@@ -560,7 +560,7 @@ def field_of(
     processes: tuple[drift.Process, ...] | None = None,
     rounds: int = ROUNDS,
 ) -> Hyperparameters:
-    """Return what is common to a field, from at most ``SAMPLE`` of its heliostats."""
+    """Return the hyperparameters of a field from at most ``SAMPLE`` of its heliostats."""
     counts = np.bincount(sightings.heliostat[used], minlength=len(mechanism))
     able = np.flatnonzero(counts >= FEWEST)
     if len(able) > SAMPLE:
@@ -578,7 +578,7 @@ def field_of(
 def _prior_row(
     model: tuple[str, ...], mechanism: Mechanism, given: Mapping[str, npt.ArrayLike] | None
 ) -> FloatArray:
-    """One standard deviation a parameter: the median where a field overrides them one by one."""
+    """One standard deviation for each parameter: the median where heliostats have their own."""
     table = [as_float((given or {}).get(n, mechanism.parameter(n).prior)) for n in model]
     return np.array([np.median(t) for t in table], dtype=np.float64)
 

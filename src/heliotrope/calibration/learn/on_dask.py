@@ -1,4 +1,4 @@
-"""Learning on many machines: chunks of heliostats on dask.distributed."""
+"""Learns chunks of heliostats on several machines with dask.distributed."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,8 @@ def connect(scheduler: str) -> "Client":
     Parameters
     ----------
     scheduler
-        Address of a scheduler as ``tcp://10.0.0.1:8786``; or ``local`` or ``local:N`` for
-        N processes on this machine.
+        Address of a scheduler such as ``tcp://10.0.0.1:8786``, or ``local`` or ``local:N``
+        for N processes on this machine.
 
     Raises
     ------
@@ -42,13 +42,13 @@ def connect(scheduler: str) -> "Client":
         return Client(scheduler, timeout="5s")  # type: ignore[no-untyped-call]
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
-            f"scheduler {scheduler!r}: nobody answers there ({str(error).splitlines()[0]}); give "
+            f"scheduler {scheduler!r}: no answer ({str(error).splitlines()[0]}); give "
             "tcp://HOST:PORT of a running dask scheduler, or local:N"
         ) from None
 
 
 def runner(client: "Client") -> Runner:
-    """Return what learns chunks on the workers of ``client``, as many at once as there are."""
+    """Return a runner that learns chunks on the workers of ``client``, all at once."""
 
     def run(tasks: list[Any], progress: Progress | None) -> list[Part]:
         from distributed import as_completed
@@ -66,7 +66,7 @@ def runner(client: "Client") -> Runner:
 
 
 def disconnect(client: "Client") -> None:
-    """Leave the scheduler; one that :func:`connect` started here ends with it."""
+    """Leave the scheduler; stop it if `connect` started it on this machine."""
     machines = client.cluster
     client.close()  # type: ignore[no-untyped-call]
     if machines is not None:

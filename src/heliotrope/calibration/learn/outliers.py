@@ -1,9 +1,9 @@
 """Outliers by the generalised extreme Studentized deviate test (Rosner 1983, Technometrics 25).
 
-The sighting farthest from what the others say is taken away, again and again; the
-outliers are all up to the last one that was farther than chance allows, so that two
-alike do not hide each other. What is measured is a squared distance in two components,
-χ² with two degrees of freedom: the largest of n exceeds 2 ln(n / α) with probability α.
+The sighting farthest from the prediction of the others is removed repeatedly; all up to the last
+one that was farther than chance allows are outliers, so that two similar ones do not hide each
+other. The squared distance in two components is χ² with two degrees of freedom: the largest of n
+exceeds 2 ln(n / α) with probability α.
 """
 
 import numpy as np
@@ -13,9 +13,9 @@ from heliotrope.calibration.learn import _drift_kernels as kernels
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray
 
-#: Probability of calling one good sighting of a heliostat an outlier.
+#: Probability of a false outlier among the sightings of a heliostat.
 ALPHA = 1e-3
-#: No more than this share of the sightings can be outliers.
+#: Largest share of outliers.
 SHARE = 0.25
 
 
@@ -31,11 +31,11 @@ def generalised_esd(
     Parameters
     ----------
     residual
-        (n, 2), of expectation zero.
+        (n, 2), with expectation zero.
     covariance
-        Of all of them together, noise included, (2 n, 2 n).
+        Joint covariance, noise included, (2 n, 2 n).
     alpha
-        Probability of a false alarm for the whole set.
+        Probability of a false outlier in the whole set.
     share
         Largest share of outliers.
 

@@ -1,11 +1,10 @@
-"""Regimes: after a repair or a new reference a heliostat's zeros are elsewhere.
+"""Regimes: spans of time in which a heliostat's zeros are shifted, as after a repair.
 
-The times of a heliostat's sightings are cut into segments, each either on the common
-zeros or on zeros of its own, so that the truncated squares of the residuals plus a
-price for each cut and each new pair of zeros are least (optimal partitioning: Jackson et
-al. 2005, IEEE Signal Processing Letters 12; truncated loss: Fearnhead & Rigaill 2019, J.
-Am. Stat. Assoc. 114). Slow creep is not for here: it is a process of its own
-(:mod:`heliotrope.calibration.learn.drift`).
+The time of a heliostat's sightings is cut into segments, each on the common zeros or on zeros of
+its own, so that the truncated squares of the residuals plus a price for each cut and each new pair
+of zeros are least (optimal partitioning: Jackson et al. 2005, IEEE Signal Processing Letters 12;
+truncated loss: Fearnhead & Rigaill 2019, J. Am. Stat. Assoc. 114). Slow creep is modelled in
+`drift`.
 """
 
 import numpy as np
@@ -14,25 +13,25 @@ import numpy.typing as npt
 from heliotrope.calibration.learn._regime_kernels import FEWEST, partition
 from heliotrope.geometry import FloatArray
 
-#: Cuts are looked for at no more places than this: the longest gaps.
+#: Cuts are tried at this many places at most, the longest gaps.
 PLACES = 300
 
 
 def find_regimes(
     time: npt.ArrayLike, residual: npt.ArrayLike, jacobian: npt.ArrayLike, smallest: float = 6.0
 ) -> npt.NDArray[np.int64]:
-    """Return the regime of each sighting of one heliostat: 0 on the common zeros, else 1, 2, ….
+    """Return the regime of each sighting of one heliostat: 0 on the common zeros, else from 1.
 
     Parameters
     ----------
     time
-        Seconds, (n,); a NaN belongs to regime 0.
+        Seconds, (n,); sightings at NaN are in regime 0.
     residual
         Residuals under the common zeros, in units of the noise, (n, 2).
     jacobian
         Their derivative by the two zeros, (n, 2, 2).
     smallest
-        Mean length of the shift (units of the noise) below which it is left to drift.
+        Least mean length of the shift, units of the noise; smaller shifts count as drift.
     """
     times = np.asarray(time, dtype=np.float64)
     rest, slope = np.asarray(residual, dtype=np.float64), np.asarray(jacobian, dtype=np.float64)
@@ -53,10 +52,7 @@ def find_regimes(
 def regime_at(
     time: FloatArray, label: npt.NDArray[np.int64], when: FloatArray
 ) -> npt.NDArray[np.int64]:
-    """Return the regime at times ``when`` (m,), of the sighting nearest in time.
-
-    After the last sighting it is the latest regime.
-    """
+    """Return the regime at times ``when`` (m,): that of the sighting nearest in time."""
     known = np.flatnonzero(np.isfinite(time))
     if not len(known):
         return np.zeros(len(when), dtype=np.int64)

@@ -1,9 +1,8 @@
-"""Results of a calibration in files: JSON with everything, Parquet for tables, a plant.
+"""Results of a calibration in files: a JSON with everything, a Parquet table, a plant file.
 
-The JSON holds for each heliostat its parameters with their covariance at one moment, its
-regimes, steps and outliers, and what is common to the field. The Parquet table holds one
-heliostat a row. The plant is the field's own with the parameters in it, and is read like
-any other.
+The JSON holds for each heliostat its parameters with their covariance at one moment, its regimes,
+steps and outliers, and the hyperparameters of the field. The Parquet table has one row for each
+heliostat. The plant is the given one with the calibrated parameters.
 """
 
 import json
@@ -37,19 +36,19 @@ class FieldParameters:
     Attributes
     ----------
     model
-        Names of the constant parameters.
+        The constant parameters.
     names
-        The P parameters, those that only wander included.
+        The P parameters, including those that only drift.
     heliostats
         Names, (N,).
     time
-        The moment, Unix seconds; NaN: at no known time.
+        The moment, Unix seconds; NaN: unknown.
     values, covariance
         Deviations (N, P) and their covariance (N, P, P), rad, m or 1.
     noise
         Of a sighting, in units of its sigma, (N,).
     used
-        Sightings of each, (N,).
+        Number of sightings used, (N,).
     """
 
     model: tuple[str, ...]
@@ -67,7 +66,7 @@ class FieldParameters:
         return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
 
     def apply(self, heliostats: Heliostats) -> Heliostats:
-        """Return heliostats with these parameters; those that are not here keep theirs.
+        """Return heliostats with these parameters; heliostats without any keep their own.
 
         Raises
         ------
@@ -86,7 +85,7 @@ class FieldParameters:
 def at_moment(
     names: tuple[str, ...], learned: Learned, time: float | None = None
 ) -> FieldParameters:
-    """Return the parameters at Unix ``time``, by default that of the last sighting used."""
+    """Return the parameters at Unix ``time``; default: the time of the last sighting used."""
     known = learned.sightings.time[learned.used & np.isfinite(learned.sightings.time)]
     when = float(known.max()) if time is None and len(known) else np.nan
     if time is not None:
@@ -119,13 +118,13 @@ def write_json(
     path
         The file.
     names
-        Of the N heliostats.
+        Names of the N heliostats.
     learned
-        The calibration.
+        The learnt field.
     results
         Its parameters at one moment.
     ids
-        Name of each of the M sightings, for the list of outliers.
+        Names of the M sightings, for the list of outliers.
     """
     h = learned.hyper
     document = {
@@ -192,17 +191,17 @@ def _moment(seconds: float) -> str | None:
 
 
 def read_json(path: str | Path) -> FieldParameters:
-    """Return the parameters of a file of :func:`write_json`.
+    """Return the parameters of a file that `write_json` wrote.
 
     Raises
     ------
     FormatError
-        If it is no such file; the text says what is wrong and where.
+        If it is not such a file; the text says what is wrong and where.
     """
     root = _json.read_json(path, "a calibration")
     if not root.has("kind") or root["kind"].text() != KIND:
         raise root.fail(
-            f"no calibration: kind must be {KIND!r}; give a file of heliotrope calibrate"
+            f"not a calibration: kind must be {KIND!r}; give a file that heliotrope calibrate wrote"
         )
     root["version"].number(VERSION, VERSION)
     names = tuple(node.text() for node in root["parameters"].elements())
@@ -240,11 +239,11 @@ def _seconds(node: _json.Node) -> float:
     try:
         return datetime.fromisoformat(node.text()).timestamp()
     except ValueError:
-        raise node.fail(f"{node.value!r} is no ISO 8601 time") from None
+        raise node.fail(f"{node.value!r} is not an ISO 8601 time") from None
 
 
 def write_parquet(path: Path, mechanism_units: dict[str, str], results: FieldParameters) -> None:
-    """Write one heliostat a row: parameters and standard deviations with their unit."""
+    """Write one row for each heliostat: parameters and standard deviations with their unit."""
     import pandas as pd
 
     columns: dict[str, Any] = {"name": results.heliostats, "sightings": results.used}
