@@ -12,7 +12,7 @@ import pytest
 
 from heliotrope.cli.cluster import _link
 from heliotrope.cluster import timekeeping
-from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Node, rows
+from heliotrope.cluster._nodes import NODE, STATUS, STEPS, Nodes
 from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
 from heliotrope.cluster.config_file import TABLES, read_cluster
 from heliotrope.cluster.memory import Kept
@@ -268,16 +268,17 @@ def test_the_quick_reading_takes_nothing_else() -> None:
 
 
 def test_rows_tell_what_was_heard_and_how_old_it_is() -> None:
-    nodes = [Node(Member("A", 9), 0), Node(Member("B", 10), 1)]
+    members = (Member("A", 9), Member("B", 10))
+    nodes = Nodes(ClusterConfig("K", SITE, members))
     nodes[0].status, nodes[0].steps = STATUS_VALUES, (1, -2, 3, -4)
     nodes[0].counts.asked = 7
     nodes[0].status_at = 99.0
     nodes[0].answered(100.2, 0.01)  # an ACK, which says nothing of its state
-    table = np.frombuffer(rows(nodes, 100.5), dtype=NODE)
+    table = np.frombuffer(nodes.rows(100.5), dtype=NODE)
     assert table["heard_ms"][0] == 1500
     assert table["heard_ms"][1] == 2**32 - 1
     nodes[0].steps_at = 98.0
-    assert np.frombuffer(rows(nodes, 100.5), dtype=NODE)["steps_ms"].tolist() == [2500, 2**32 - 1]
+    assert np.frombuffer(nodes.rows(100.5), dtype=NODE)["steps_ms"].tolist() == [2500, 2**32 - 1]
     first = table[0]
     named = (
         "state",

@@ -1,31 +1,30 @@
-"""Who is on the bus: by serial number, in halves where answers collide.
+"""Discovery of local controllers by serial number, in halves where answers collide.
 
-All whose serial number lies in a range answer in slots drawn by chance. Where two spoke at once,
-what comes is damaged: the range is asked in two halves. A range is done when it came clean twice in
-a row with nobody new.
+All controllers with a serial number in a range answer in slots drawn at random. Where two answer at
+once, the bytes are damaged, and the range is asked in two halves. A range is done when it came
+clean twice in a row without a new answer.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._nodes import Nodes
 from heliotrope.lcu import messages, wire
 from heliotrope.lcu.node import HERE_SLOT_MS, HERE_SLOTS
 
-#: All slots, and the last answer.
+#: Duration of all slots and the last answer, s.
 SPAN = 1e-3 * HERE_SLOTS * HERE_SLOT_MS + 0.06
 _LARGEST = 0xFFFFFFFF
 _HERE = messages.NUMBER_OF["HERE"]
 _CLEAN = 2
-#: One serial number alone that is still garbled after so many questions is noise.
+#: A single serial number still garbled after this many questions is noise.
 _GARBLED = 4
 
 
 @dataclass(frozen=True)
 class Here:
-    """Who answered."""
+    """An answer."""
 
     serial: int
     firmware: int
@@ -41,9 +40,9 @@ class _Range:
 
 
 def heard(data: bytes, sequence: int) -> tuple[list[Here], bool]:
-    """Return who answered a question, and whether anything came that is no answer to it."""
+    """Return the answers to a question, and whether anything else came."""
     reader = wire.Reader()
-    # A zero ends what was cut off.
+    # A zero ends a frame that was cut off.
     frames = reader.feed(data + b"\0")
     found = []
     for frame in frames:
@@ -60,17 +59,17 @@ class Discovery:
     Parameters
     ----------
     nodes
-        As configured: where they are expected, the search begins.
+        The configured ones; the search begins with their serial numbers.
     exchange
         The bus.
 
     Attributes
     ----------
     questions
-        Asked so far.
+        Count so far.
     """
 
-    def __init__(self, nodes: Sequence[Node], exchange: Exchange) -> None:
+    def __init__(self, nodes: Nodes, exchange: Exchange) -> None:
         self._nodes, self._exchange = nodes, exchange
         self._found: dict[int, Here] = {}
         self._garbled: list[int] = []
@@ -109,7 +108,7 @@ class Discovery:
                 self._ranges.pop()
 
     def result(self) -> dict[str, Any]:
-        """Return what was found: each with its name, if it has one, and the address it should have.
+        """Return the controllers found, each with its name, if it has one, and expected address.
 
         ``missing`` names configured heliostats that did not answer; ``garbled`` lists serial
         numbers whose answers were always damaged (two with the same number).

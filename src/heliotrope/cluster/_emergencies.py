@@ -1,28 +1,29 @@
-"""DEFOCUS and STOW: called to everybody three times, then confirmed node by node.
+"""DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
 They come from the operator, from anyone, or from the safety table. Nothing else goes on the bus
-before them; who has not acknowledged is asked again in every second, and named, until it has.
+before them. A heliostat that has not acknowledged is named, and asked again each second until it
+has.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._goals import Goals
-from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._nodes import Node, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.links.messages import Stage
 from heliotrope.safety import ORDER_BUDGET, alarms
 
 NAMES = ("DEFOCUS", "STOW")
 _CALLS = 3
-#: For asking again in each second after the first, s: polling and the sun go on besides.
+#: Time for asking again in each second after the first, s: polling and the sun go on.
 _SHARE = 0.3
-#: In the first round a node is asked so often.
+#: Tries for a node in the first round.
 _ROUNDS = 3
-#: Not heard so often: asked after all others.
+#: A node that missed this many questions in a row is asked after all others.
 _SILENT = 3
-#: Not acknowledged for so long: given up as far as the plant is told; it is asked all the same.
+#: Reported to the plant as failed after this, s; it is asked again all the same.
 _PATIENCE = 30.0
 
 
@@ -33,19 +34,19 @@ class _Order:
         self.calls = _CALLS if everybody else 0
         self.waiting = deque(sorted(nodes, key=lambda node: node.missed >= _SILENT))
         self.tries = {node.index: 0 for node in nodes}
-        self.sent: set[int] = set()  # who of them was called or asked
+        self.sent: set[int] = set()  # nodes that were called or asked
         self.new = True
         self.given_up = False
 
 
 def _rank(order: _Order) -> tuple[bool, bool, bool]:
-    """Who is served first: False before True."""
+    """Sort key of the orders, the first to be served first."""
     silent = all(node.missed >= _SILENT for node in order.waiting)
     return bool(order.sent), silent, not order.new
 
 
-class Urgent:
-    """All emergencies of a cluster that are not yet acknowledged.
+class Emergencies:
+    """Emergencies that are not yet acknowledged by all.
 
     Attributes
     ----------
@@ -55,7 +56,7 @@ class Urgent:
 
     def __init__(
         self,
-        nodes: Sequence[Node],
+        nodes: Nodes,
         exchange: Exchange,
         goals: Goals,
         reports: Reports,
@@ -69,13 +70,13 @@ class Urgent:
         self.pressing = False
 
     def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
-        """Take an emergency, for some heliostats or for all; one that is repeated counts once."""
+        """Take an emergency for some heliostats or all; a repeated one counts once."""
         if identity and any(order.identity == identity for order in self._orders):
             return
         everybody = len(nodes) == len(self._nodes)
         if name == "STOW" and everybody:
             for older in self._orders:
-                # Who has not defocused yet goes to stow at once.
+                # A heliostat that has not defocused yet goes to stow at once.
                 older.name = name
         self._orders.append(_Order(identity, name, nodes, everybody, self._clock()))
         for node in nodes:
@@ -85,9 +86,9 @@ class Urgent:
     async def serve(self) -> None:
         """Call and ask until every order has had its round.
 
-        What has not been on the bus at all goes first, and of that what is for someone who answers.
-        Once this has gone on for the budget of an order, who is silent waits for the next second,
-        so that many orders on a dead bus take no longer than a few.
+        Orders not yet sent at all go first, and of these the ones for heliostats that answer. Once
+        this has gone on for the budget of an order, silent heliostats wait for the next second, so
+        that many orders on a dead bus take no longer than a few.
         """
         self._serving = self._clock()
         self._asked.clear()
@@ -99,11 +100,11 @@ class Urgent:
                 await self._round(order)
                 if self.pressing:
                     break
-        self._exchange.hurry = False
+        self._exchange.resume()
         self._orders = [order for order in self._orders if order.waiting or order.calls]
 
     def second(self) -> None:
-        """Begin a second: ask again who has not acknowledged, and name them."""
+        """Begin a second: name the heliostats that have not acknowledged, and ask them again."""
         now = self._clock()
         for order in self._orders:
             self._name(order, now)
@@ -127,7 +128,7 @@ class Urgent:
                 self._reports.add(order.identity, Stage.SENT, node.name)
 
     async def _round(self, order: _Order) -> None:
-        """Ask each that has not acknowledged."""
+        """Ask each node that has not acknowledged."""
         begin = self._clock()
         for number in range(_ROUNDS if order.new else 1):
             if number and self._clock() - begin > ORDER_BUDGET:
@@ -150,7 +151,7 @@ class Urgent:
             return True  # polling finds it when it comes back
         if node.missed < _SILENT:
             return False
-        # Others may have asked it for the same.
+        # Another order may have asked it for the same.
         if order.new:
             enough = order.tries[node.index] > number
         else:
@@ -161,7 +162,7 @@ class Urgent:
         begin = self._clock()
         answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
         self._asked.add((order.name, node.index))
-        # An order that came when this was on its way already is asked for itself.
+        # An order that came later than this frame is asked for by itself.
         same = [
             other
             for other in self._orders
@@ -174,7 +175,7 @@ class Urgent:
             one.tries[node.index] += 1
             self._sent(one, [node])
         if answer is None:
-            node.counts.retries += 1
+            node.retried()
             order.waiting.append(node)
             return
         self._reports.clear(alarms.ORDER_UNACKNOWLEDGED.ended(node.name))
@@ -189,7 +190,7 @@ class Urgent:
             self._goals.begin(order.identity, order.name, node, self._clock())
 
     def _name(self, order: _Order, now: float) -> None:
-        """Tell of those that have not acknowledged in time."""
+        """Report the nodes that have not acknowledged in time."""
         age = now - order.began
         if age <= ORDER_BUDGET:
             return

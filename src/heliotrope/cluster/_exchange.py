@@ -1,4 +1,4 @@
-"""Questions and commands of a cluster over its bus, counted by node; one thing at a time."""
+"""Questions and commands over the bus, counted for each local controller; one at a time."""
 
 import asyncio
 import hashlib
@@ -13,7 +13,7 @@ from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, Outcome
 
-#: The share of bad frames is taken over so many seconds.
+#: The share of bad frames is taken over this many seconds.
 _WINDOW = 10
 
 
@@ -23,7 +23,7 @@ def sha256(data: bytes) -> bytes:
 
 
 class Answer(NamedTuple):
-    """Name and values of an answer, and how often the question had gone out in vain before."""
+    """An answer: name, values, and how often the question had gone out in vain before."""
 
     name: str
     values: tuple[Any, ...]
@@ -35,27 +35,26 @@ class Exchange:
 
     Parameters
     ----------
-    bus, clock
-        See `Bus`; its time is this clock's.
-    epoch
-        Of this run; see `lcu.wire`.
-    answer
-        Longest time to a whole answer, in s.
+    bus
+        The port, run by its owner.
+    clock
+        Clock of the bus's expiries.
+    answer, stored_answer
+        Longest time to a whole answer, s; the same where flash is written before it.
 
     Attributes
     ----------
     sender
-        Numbers what is sent.
-    hurry
-        Something urgent waits: nothing is repeated.
+        Makes and numbers the frames.
     now
         When the last poll ended, monotonic s.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, epoch: int, answer: float) -> None:
-        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
-        self._bus, self._clock, self._answer = bus, clock, answer
-        self.hurry = False
+    def __init__(self, bus: Bus, clock: Clock, answer: float, stored_answer: float) -> None:
+        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, 0, sha256)
+        self._bus, self._clock = bus, clock
+        self._answer, self._stored_answer = answer, stored_answer
+        self._hurry = False
         self.now = clock.monotonic()
         self._gathering: asyncio.Timeout | None = None
         self._asked = self._bad = self._answered = 0
@@ -66,10 +65,14 @@ class Exchange:
         """Whether the port is open."""
         return self._bus.connected
 
-    def token(self, token: int) -> int:
-        """Return the token of the wire for that of the authority.
+    def begin_epoch(self, epoch: int) -> None:
+        """Number frames anew, in an epoch above all before (see `lcu.wire`)."""
+        self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
 
-        It changes with the epoch, so that commands of before a restart, which nodes may hear late,
+    def token(self, token: int) -> int:
+        """Return the token of the wire for that of the command authority.
+
+        It changes with the epoch, so that commands from before a restart, which may be heard late,
         are void although the same authority still commands.
         """
         if token == 0:
@@ -79,13 +82,17 @@ class Exchange:
     async def broadcast(
         self, name: str, *values: Any, life: float = 0.5, urgent: bool = False
     ) -> bool:
-        """Send a message to everybody within ``life`` s, and return whether it went out."""
+        """Send a message to all within ``life`` s, and return whether it went out."""
         return await self.transmit(
             self.sender.frame(wire.BROADCAST, name, *values), life=life, urgent=urgent
         )
 
+    async def broadcast_session(self, token: int) -> None:
+        """Tell all which authority commands."""
+        await self.transmit(self.sender.session(self.token(token)))
+
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
-        """Send a frame that nobody answers within ``life`` s; whether it went out."""
+        """Send a frame that is not answered, within ``life`` s; return whether it went out."""
         expires = self._clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
         return outcome is Outcome.SENT
@@ -93,8 +100,8 @@ class Exchange:
     async def poll(
         self, node: Node, question: Question, sequence: int, begin: float
     ) -> tuple[Any, ...] | None:
-        """Ask a node at ``begin``, and return the values of its answer or None; see ``now``."""
-        node.counts.asked += 1
+        """Ask a node at ``begin``, and return its answer's values or None; sets ``now``."""
+        node.asked()
         self._asked += 1
         data = await self._bus.transact(question.frame(node.address, sequence), self._answer)
         values = question.read(data, node.address, sequence)
@@ -117,11 +124,13 @@ class Exchange:
         key: bytes = b"",
         expires: float,
         numbers: tuple[str, ...] = ("ACK",),
-        timeout: float | None = None,
+        stored: bool = False,
         tries: int = 1,
         urgent: bool = False,
     ) -> Answer | None:
         """Send a message to a node, the same frame again if nothing comes, and return the answer.
+
+        ``stored``: flash is written before the answer.
 
         A frame that is repeated before any other is made acts once: if the node has taken it
         before, it answers "duplicate".
@@ -131,16 +140,15 @@ class Exchange:
         wanted = tuple(messages.NUMBER_OF[number] for number in numbers)
         for attempt in range(tries):
             begin = self._clock.monotonic()
-            if begin >= expires or (attempt and self.hurry):
+            if begin >= expires or (attempt and self._hurry):
                 break
-            node.counts.asked += 1
-            node.counts.retries += attempt > 0
+            node.asked(again=attempt > 0)
             self._asked += 1
             data: bytes | None
-            if timeout is None:
-                data = await self._bus.transact(frame, self._answer, expires=expires, urgent=urgent)
+            if stored:
+                data = await self._patiently(frame, self._stored_answer, expires, None)
             else:
-                data = await self._patiently(frame, timeout, expires, None)
+                data = await self._bus.transact(frame, self._answer, expires=expires, urgent=urgent)
             if data is None:
                 break
             answer = answer_in(data, node.address, sequence, wanted) if data else None
@@ -159,12 +167,15 @@ class Exchange:
         *values: Any,
         span: float,
         key: bytes = b"",
+        stored: bool = False,
         complete: Callable[[bytes], bool] = lambda _: False,
     ) -> tuple[bytes | None, int]:
-        """Ask everybody, and return all that comes within a time in s, and the sequence.
+        """Ask all, and return what comes within ``span`` s, and the sequence.
 
-        None instead of the bytes if `interrupt` was called meanwhile.
+        None in place of the bytes if `interrupt` was called meanwhile. ``stored``: flash is
+        written before the answer.
         """
+        span += self._stored_answer if stored else 0.0
         frame = self.sender.frame(wire.BROADCAST, name, *values, key=key)
         sequence = self.sender.count & 0xFFFF
         return await self._patiently(frame, span, None, complete), sequence
@@ -176,7 +187,7 @@ class Exchange:
         expires: float | None,
         complete: Callable[[bytes], bool] | None,
     ) -> bytes | None:
-        """Do a transaction that may take long; None if `interrupt` was called meanwhile."""
+        """Make a transaction that may take long; None if `interrupt` was called meanwhile."""
         try:
             async with asyncio.timeout(None) as self._gathering:
                 return await self._bus.transact(frame, timeout, expires=expires, complete=complete)
@@ -186,10 +197,14 @@ class Exchange:
             self._gathering = None
 
     def interrupt(self) -> None:
-        """Give up what may take long, and repeat nothing, until `Urgent` has been served."""
-        self.hurry = True
+        """Give up what takes long, and repeat nothing, until `resume`: an emergency waits."""
+        self._hurry = True
         if self._gathering is not None:
             self._gathering.reschedule(asyncio.get_running_loop().time())
+
+    def resume(self) -> None:
+        """End the hurry of `interrupt`."""
+        self._hurry = False
 
     def _spoilt(self, node: Node, data: bytes, now: float) -> None:
         node.spoilt(data)
@@ -198,7 +213,7 @@ class Exchange:
             self._bad += 1
 
     def second(self) -> float:
-        """End a second, and return the share of bad frames of the last ten."""
+        """End a second, and return the share of bad frames in the last ten seconds."""
         if not self.connected:
             self._seconds.clear()
             self._asked = self._bad = self._answered = 0

@@ -1,14 +1,14 @@
-"""What a command is to bring about at a heliostat, and whether it has.
+"""Goals of commands: the state that a command asks for, and whether it has been reached.
 
 A command is acknowledged when the local controller has taken it, and done when STATUS shows the
-state that it asks for. Commands that are not in the table are done when they are acknowledged.
+state that it asks for. A command without a goal here is done when it is acknowledged.
 """
 
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._nodes import Node, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.lcu import names, states
 from heliotrope.lcu.states import (
@@ -25,18 +25,18 @@ from heliotrope.links.messages import Stage
 from heliotrope.safety import DEFOCUS_BUDGET, STOW_BUDGET
 
 _ALL = frozenset(range(len(states.STATES)))
-#: States in which a beam may be on the receiver, on its standby point, or under way to them.
+#: States in which a beam may be on the receiver, at standby, or on the way there.
 BEAM_OUT = frozenset({APPROACHING, IDLE, TRACKING, SEARCHING})
 
 _MOVING = 1 << names.FLAGS.index("MOVING")
 _AT_STOW = 1 << names.FLAGS.index("AT_STOW")
 _DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
-#: A STATUS asked for sooner after the ACK may not show the motion yet, s: a few ticks of a board.
+#: A STATUS requested earlier after the ACK may not show the motion yet, s: a few ticks of a board.
 _SETTLE = 0.2
-#: Of the step counts from where they are going: a few ticks' worth of the sun.
+#: Step counts this close to their goal have reached it: the sun moves as much in a few ticks.
 _NEAR = 20
-#: For the longest way from stow to standby, s.
+#: Limit of the longest way, from stow to standby, s.
 _LONGEST = 900.0
 
 
@@ -51,14 +51,13 @@ class Goal:
     clear, needed
         Flags that must be clear, and set, in one of ``there``; until then it is on its way.
     near
-        The step counts must be near their goal: a mirror that is defocused goes on with the sun,
-        beside the receiver, so that it never stands still.
+        Whether the step counts must be near their goal. A defocused mirror follows the sun beside
+        the receiver, so it never stands still.
     told
-        For a goal that looks like what was before: where the answer was lost, one of these states
-        or flags must have been seen, or nobody knows whether the command was taken; None: the goal
-        itself shows it.
+        States and flags, one of which shows that the command was taken where the goal looks like
+        the state before it and the answer was lost. None: the goal itself shows it.
     limit
-        For getting there, s.
+        Time to get there, s.
     """
 
     there: frozenset[int]
@@ -70,9 +69,9 @@ class Goal:
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
-        """Return True if it is there, None if it is on its way, False if it is neither.
+        """Return True if it is there, None if it is on its way, False if neither.
 
-        ``off`` is how far the step counts are from where they are going.
+        ``off`` is the distance of the step counts from their goal.
         """
         if state in self.there:
             clear = not flags & self.clear and (not self.near or off <= _NEAR)
@@ -80,11 +79,11 @@ class Goal:
         return None if state in self.on_way else False
 
     def shown(self, state: int, flags: int) -> bool:
-        """Whether state and flags are none that would be there without the command."""
+        """Whether state and flags show that the command was taken."""
         return self.told is None or state in self.told[0] or bool(flags & self.told[1])
 
 
-#: Nothing that is told shows whether it was taken.
+#: Neither states nor flags show whether it was taken.
 _NOTHING: tuple[frozenset[int], int] = (frozenset(), 0)
 GOALS = {
     "APPROACH": Goal(frozenset({IDLE}), frozenset({APPROACHING})),
@@ -109,14 +108,14 @@ assert STOWING in GOALS["STOW"].there
 
 @dataclass(frozen=True)
 class Shift:
-    """What a command changes of where the step counts of an axis go.
+    """Change of one axis's goal by a command.
 
     Attributes
     ----------
     axis
         0 or 1.
     origin, steps
-        Where they went before, and by how many steps that changes.
+        Goal before the command, and its change, steps.
     """
 
     axis: int
@@ -124,9 +123,9 @@ class Shift:
     steps: int
 
     def shown(self, goals: tuple[int, int]) -> bool:
-        """Whether where the counts go now can only be due to the command."""
+        """Whether the goals can only be due to the command."""
         off = abs(goals[self.axis] - self.origin - self.steps)
-        # The sun moves them as well, until the command ends that.
+        # The sun moves the goals as well, until the command ends that.
         return off == 0 or (off <= _NEAR and abs(self.steps) > 2 * _NEAR)
 
 
@@ -140,7 +139,7 @@ class _Watch:
 
 
 class Goals:
-    """Who is to reach what; told of every STATUS."""
+    """Goals that are not yet reached, judged by every STATUS."""
 
     def __init__(self, reports: Reports) -> None:
         self._reports = reports
@@ -156,9 +155,9 @@ class Goals:
         sure: bool = True,
         shift: Shift | None = None,
     ) -> None:
-        """Note that a node has acknowledged a command; goals of other commands are void.
+        """Begin the goal of a command that a node has acknowledged; goals of others are void.
 
-        Not ``sure``: it may have, its answer was lost; ``shift``, if known, tells whether it has.
+        Not ``sure``: the answer was lost, and ``shift``, if known, shows whether it was taken.
         """
         if name not in GOALS:
             self._reports.add(identity, Stage.DONE, node.name)
@@ -169,7 +168,7 @@ class Goals:
         self._watches[node.index] = [*same, _Watch(identity, name, now, sure, shift)]
 
     def waits(self, node: Node) -> bool:
-        """Whether a node is to reach something."""
+        """Whether a node has a goal."""
         return node.index in self._watches
 
     def end(self, node: Node, why: str) -> None:
@@ -178,14 +177,14 @@ class Goals:
             self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
 
     def heard(self, node: Node, asked_at: float) -> None:
-        """Judge STATUS and STEPS, the first of which was asked for at an instant."""
+        """Judge a node's STATUS and STEPS; the former was requested at ``asked_at``."""
         watches = self._watches.get(node.index)
         if watches is None:
             return
         self._judge(node, lambda watch: self._verdict(node, watch, asked_at))
 
-    def second(self, nodes: list[Node], now: float) -> None:
-        """Give up what takes too long."""
+    def second(self, nodes: Nodes, now: float) -> None:
+        """Give up goals that take too long."""
         for index in list(self._watches):
             self._judge(nodes[index], functools.partial(_late, nodes[index], now))
 
@@ -205,7 +204,7 @@ class Goals:
             self._watches.pop(node.index, None)
 
     def _verdict(self, node: Node, watch: _Watch, asked_at: float) -> str | None:
-        """Return "" if it is done, a text if it cannot be any more, None if neither."""
+        """Return "" if it is done, a text if it has failed, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
         goal = GOALS[watch.name]
@@ -218,7 +217,7 @@ class Goals:
             watch.sure = watch.sure or watch.shift.shown((primary_goal, secondary_goal))
         off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
         reached = goal.reached(node.state, node.flags, off)
-        # What nothing will show later need not be waited for.
+        # Nothing later would show it either.
         ended = not watch.sure and goal.told is _NOTHING
         if reached is None and not ended:
             return None

@@ -1,32 +1,37 @@
-"""The local controllers of a cluster as the cluster knows them, and a quick way to read them.
+"""The local controllers of a cluster as the cluster knows them, and a quick reading of answers.
 
-Every second each is asked once or twice, so the frames of the questions are made once, and an
-answer of the right size is read with one call of ``struct``. Whatever is not exactly the answer
-that was asked for goes through `wire.Reader`, which decides; the quick way accepts nothing that
-it would not. An answer carries the sequence of its question, and each question to a node has
-another: one that comes late, from a serial server in the network by many seconds, is not taken for
-that of a later question.
+Each is asked once or twice a second, so the frames of the questions are made once, and an answer
+of the right size is read with one call of ``struct``. Anything else goes through `wire.Reader`,
+which decides; the quick reading accepts nothing that it would refuse. An answer carries the
+sequence of its question, and consecutive questions to a node have different ones: an answer that
+comes late (by many seconds, from a serial server in the network) is not taken for that of a later
+question.
 """
 
 import math
 import struct
 from binascii import crc32
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from heliotrope.cluster.config import Member
+from heliotrope.cluster.config import ClusterConfig, Member
 from heliotrope.lcu import messages, states, wire
 from heliotrope.links.messages import NEVER, NODE
 
 _ROW = struct.Struct("<BBIIiiiiIHbHIIII")
 assert _ROW.size == NODE.itemsize
 
-#: Questions to a node go out under as many sequences in turn: four minutes of them.
+#: Questions to a node go out under this many sequences in turn: four minutes of them.
 SEQUENCES = 256
 
 _NO_STATUS = (states.UNCONFIGURED, 0, 0, 0, NEVER, 0, 0, 0, 0)
 _NO_STEPS = (0, 0, 0, 0)
 _UNSTUFFED_MOST = 254
+
+
+class Refusal(Exception):  # noqa: N818 (an answer, not a failure)
+    """A command that is not taken; the text says why."""
 
 
 class Question:
@@ -41,7 +46,7 @@ class Question:
 
     def frame(self, address: int, sequence: int) -> bytes:
         """Return the question to an address."""
-        # Kept for all clusters of a process, whose addresses are the same.
+        # Shared by all clusters of a process, which use the same addresses.
         key = address << 16 | sequence
         frame = self._frames.get(key)
         if frame is None:
@@ -91,13 +96,13 @@ class Counts:
     Attributes
     ----------
     asked, answered
-        Frames that wanted an answer; of those, how many got it.
+        Questions; answers.
     late, corrupt, silent
-        Instead of it came: one to another question; damage; nothing.
+        Questions answered by something else: an answer to another question; damage; nothing.
     retries
-        Frames that were sent again.
+        Frames sent again.
     round_trip, longest
-        From the question to the whole answer, in s: the last, and the longest.
+        Time from question to whole answer, s: the last, and the longest.
     """
 
     asked: int = 0
@@ -126,9 +131,9 @@ class Node:
     heard_at
         When it last answered anything, monotonic s; -inf: never.
     follow_until
-        Its step counts are asked for each second until then, monotonic s.
+        Until when its step counts are asked for each second, monotonic s.
     missed
-        How many questions in a row it has not answered.
+        Consecutive questions without an answer.
     """
 
     def __init__(self, member: Member, index: int) -> None:
@@ -143,29 +148,50 @@ class Node:
         self._sequence = 0
 
     def next_sequence(self) -> int:
-        """Return the sequence of the next questions to it."""
+        """Return the sequence of the next questions."""
         self._sequence = self._sequence % SEQUENCES + 1
         return self._sequence
 
     @property
     def known(self) -> bool:
-        """Whether it has told its state since the start; if not, ``state`` means nothing."""
+        """Whether its state was heard since the start; if not, ``state`` means nothing."""
         return self.status_at > -math.inf
 
     @property
     def state(self) -> int:
-        """Of `lcu.states`, as last heard."""
+        """State as last heard, of `lcu.states`."""
         return int(self.status[0])
 
     @property
     def flags(self) -> int:
-        """Bits of `lcu.names.FLAGS`, as last heard."""
+        """Flags as last heard, bits of `lcu.names.FLAGS`."""
         return int(self.status[1])
 
     @property
     def fault(self) -> int:
-        """Of `lcu.names.FAULTS`, as last heard."""
+        """Fault as last heard, of `lcu.names.FAULTS`."""
         return int(self.status[2])
+
+    def take_status(self, status: tuple[Any, ...]) -> None:
+        """Take the values of a STATUS that has just come."""
+        self.status, self.status_at = status, self.heard_at
+
+    def take_steps(self, steps: tuple[Any, ...]) -> None:
+        """Take the values of a STEPS that has just come."""
+        self.steps, self.steps_at = steps, self.heard_at
+
+    def follow(self, until: float) -> None:
+        """Have its step counts asked for each second until a monotonic time."""
+        self.follow_until = max(self.follow_until, until)
+
+    def asked(self, *, again: bool = False) -> None:
+        """Count a question; ``again``: its frame was sent before."""
+        self.counts.asked += 1
+        self.counts.retries += again
+
+    def retried(self) -> None:
+        """Count a question that will be sent again."""
+        self.counts.retries += 1
 
     def answered(self, now: float, took: float) -> None:
         """Count an answer."""
@@ -177,7 +203,7 @@ class Node:
         self.missed = 0
 
     def spoilt(self, data: bytes) -> None:
-        """Count what came instead of an answer."""
+        """Count what came in place of an answer."""
         self.missed += 1
         if not data.strip(b"\0"):
             self.counts.silent += 1
@@ -187,9 +213,9 @@ class Node:
             self.counts.corrupt += 1
 
     def pack_into(self, block: bytearray, now: float) -> None:
-        """Write its row of `protocol.NODE`."""
+        """Write its row of `messages.NODE`."""
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
-        # An ACK shows that it is there, not what state it is in.
+        # An ACK shows that it is there, not its state: the row is as old as its STATUS.
         _ROW.pack_into(
             block,
             self.index * _ROW.size,
@@ -214,18 +240,51 @@ def _age(seconds: float) -> int:
     return int(age) if age < NEVER else NEVER
 
 
-def rows(nodes: list[Node], now: float) -> bytes:
-    """Return the rows of all nodes, as in `protocol.Status`."""
-    block = bytearray(_ROW.size * len(nodes))
-    for node in nodes:
-        node.pack_into(block, now)
-    return bytes(block)
+class Nodes:
+    """The local controllers of a cluster, in the order of its configuration."""
+
+    def __init__(self, config: ClusterConfig) -> None:
+        self._cluster = config.name
+        self._nodes = [Node(member, index) for index, member in enumerate(config.heliostats)]
+        self._by_name = {node.name: node for node in self._nodes}
+
+    def __iter__(self) -> Iterator[Node]:
+        return iter(self._nodes)
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def __getitem__(self, index: int) -> Node:
+        return self._nodes[index]
+
+    def chosen(self, wanted: Iterable[str]) -> list[Node]:
+        """Return heliostats by name, all if none is named.
+
+        Raises
+        ------
+        Refusal
+            A name that is not of this cluster.
+        """
+        found = []
+        for name in dict.fromkeys(wanted):
+            node = self._by_name.get(name)
+            if node is None:
+                raise Refusal(f"cluster {self._cluster} has no heliostat {name!r}")
+            found.append(node)
+        return found or list(self._nodes)
+
+    def rows(self, now: float) -> bytes:
+        """Return a row of `messages.NODE` for each, at a monotonic time."""
+        block = bytearray(_ROW.size * len(self._nodes))
+        for node in self._nodes:
+            node.pack_into(block, now)
+        return bytes(block)
 
 
 def answer_in(
     data: bytes, address: int, sequence: int, numbers: tuple[int, ...]
 ) -> wire.Frame | None:
-    """Return the answer to a question among what came, None if it is not there."""
+    """Return the answer to a question from the bytes that came, None if it is not there."""
     for frame in wire.Reader().feed(data):
         if (
             frame.to == wire.CLUSTER_ADDRESS

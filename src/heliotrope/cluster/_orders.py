@@ -1,9 +1,10 @@
-"""Commands and parameters on their way to the heliostats: sent, tried again, judged, reported.
+"""Commands and parameters on their way to the heliostats: sent, retried, judged, reported.
 
 A command that is not answered is sent again as the same frame, which acts once, and in the next
 second as a new one, until it expires. If the answer to an earlier frame was lost, "duplicate" or
-"not in this state" may mean that the command was taken: then the state decides. What must not act
-twice (JOG) is not sent as a new frame; whether it was taken shows in where the step counts go.
+"not in this state" may mean that the command was taken: then the state decides. A command that must
+not act twice (JOG) is not sent as a new frame; the goals of the step counts show whether it was
+taken.
 """
 
 import re
@@ -15,39 +16,40 @@ from dataclasses import dataclass
 from typing import Any
 
 from heliotrope.cluster._discovery import SPAN, heard
+from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._goals import GOALS, Goals, Shift
-from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._nodes import Node, Nodes, Refusal
 from heliotrope.cluster._reports import Reports
-from heliotrope.cluster.config import ClusterConfig
+from heliotrope.cluster._watch import Watch
 from heliotrope.cluster.memory import Kept
 from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
 from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
 
-#: The same frame is sent so often before others get their turn.
+#: The same frame is sent this often before others get their turn.
 TRIES = 3
-#: Refused for a moment: the node has not heard of the time, the session or the authority yet.
+#: Refused for the moment: the node has not heard the time, session or authority yet.
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
-#: May mean that an earlier frame was taken whose answer was lost.
+#: May mean that an earlier frame was taken and its answer lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
-#: The goal looks like what was before: "duplicate" leaves open what the first answer was, a new
+#: The goal looks like the state before: "duplicate" leaves open what the first answer was. A new
 #: frame tells, and does no harm if the first was taken.
 _ANEW = ("GOTO", "SEARCH", "DIAGNOSE")
-#: Would act twice.
+#: A second frame would act again.
 _RELATIVE = ("JOG",)
-#: For all heliostats together; the bus does about a hundred in a second.
+#: Limit for all heliostats together; the bus does about a hundred a second.
 _MOST_JOBS = 2048
-#: Who is commanded alone or with so few others, is followed: its step counts are asked for in each
-#: second for so long, s.
+#: Heliostats commanded by so few at a time are followed: their step counts are asked for each
+#: second for this long, s.
 _FEW, FOLLOWED = 4, 60.0
 #: Written to flash before they are acknowledged.
 _STORED = ("STANDBY",)
-#: Moves a mirror, or may: refused while a safety row forbids new motion.
+#: May move a mirror: refused while a row of the safety table forbids motion.
 MOTIONS = frozenset(
     {"APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "STANDBY", "JOG", "GOTO", "SEARCH", "DIAGNOSE"}
 )
-#: A command's life on the wire is shorter than what a local controller takes, by its clock.
+#: A command's life on the wire, s: less than a local controller accepts by its clock.
 _WIRE_LIFE = wire.HORIZON_S - 2.0
 _ITEM_NUMBER = {row[0]: number for number, row in enumerate(ITEMS, 1)}
 #: The message that sets an item, and the axis where it is one of two.
@@ -58,13 +60,9 @@ _MESSAGE_OF = {
 }
 
 
-class Refusal(Exception):  # noqa: N818 (it is an answer, not a failure)
-    """A command that is not taken; the text says why."""
-
-
 @dataclass(frozen=True)
 class Step:
-    """One message of an order, or, if ``item`` is given, the check of what is stored."""
+    """One message of an order or, if ``item`` is given, the check of a stored item."""
 
     name: str
     values: tuple[Any, ...] = ()
@@ -91,18 +89,18 @@ class Job:
         self.place = 0
         self.told_sent = False
         self.unanswered = False  # an earlier frame of this step may have been taken
-        self.edition = -1  # that the node holds; not known yet
-        self.last = ""  # why it is tried again
-        self.void = ""  # why it is given up as soon as its frame has been answered
-        self.origin: tuple[int, int] | None = None  # where the counts went before it, if asked
+        self.edition = -1  # of the node's journal; -1: not known yet
+        self.last = ""  # reason of the last retry
+        self.void = ""  # reason to give it up once its frame is answered
+        self.origin: tuple[int, int] | None = None  # goals of the counts before it, if known
 
     @property
     def step(self) -> Step:
-        """What is to be done now."""
+        """The present step."""
         return self.order.steps[self.place]
 
     def shift(self) -> Shift | None:
-        """What a JOG changes; None if that is not known."""
+        """The change that a JOG makes; None: not known."""
         if self.origin is None:
             return None
         axis, steps = self.step.values
@@ -114,7 +112,7 @@ class Orders:
 
     Parameters
     ----------
-    config, nodes, exchange, goals, reports, kept
+    nodes, exchange, goals, reports, watch, epoch, kept
         Parts of the cluster.
     clock
         Returns monotonic s.
@@ -122,36 +120,27 @@ class Orders:
         Returns the GPS time of the local controllers in s, None if they have none.
     look
         Asks a node for its state.
-
-    Attributes
-    ----------
-    token
-        Of the one authority, 0 if nobody has it.
-    out_of_step
-        Commands in a row that were answered "duplicate" for no known reason.
     """
 
     def __init__(
         self,
-        config: ClusterConfig,
-        nodes: Sequence[Node],
+        nodes: Nodes,
         exchange: Exchange,
         goals: Goals,
         reports: Reports,
+        watch: Watch,
+        epoch: Epoch,
         kept: Kept,
         clock: Callable[[], float],
         gps: Callable[[], float | None],
         look: Callable[[Node], Awaitable[None]],
     ) -> None:
-        self._config, self._nodes, self._exchange = config, nodes, exchange
-        self._goals, self._reports, self._kept = goals, reports, kept
+        self._nodes, self._exchange, self._goals, self._reports = nodes, exchange, goals, reports
+        self._watch, self._epoch, self._kept = watch, epoch, kept
         self._clock, self._gps, self._look = clock, gps, look
-        self._by_name = {node.name: node for node in nodes}
         self._ready: deque[Job] = deque()
         self._later: list[Job] = []
         self._at_work: Job | None = None
-        self.token = 0
-        self.out_of_step = 0
 
     @property
     def ready(self) -> bool:
@@ -160,27 +149,11 @@ class Orders:
 
     # -- accepting -------------------------------------------------------------------------
 
-    def chosen(self, wanted: Iterable[str]) -> list[Node]:
-        """Return heliostats by name, all if none is named.
-
-        Raises
-        ------
-        Refusal
-            A name that is not of this cluster.
-        """
-        found = []
-        for name in dict.fromkeys(wanted):
-            node = self._by_name.get(name)
-            if node is None:
-                raise Refusal(f"cluster {self._config.name} has no heliostat {name!r}")
-            found.append(node)
-        return found or list(self._nodes)
-
-    def accept(self, command: Command, forbidden: str) -> None:
-        """Take a command, or refuse it; ``forbidden`` says why nothing may move, "" if it may."""
+    def accept(self, command: Command) -> None:
+        """Take a command, or refuse it."""
         try:
-            nodes = self.chosen(command.heliostats)
-            steps = self._steps_of(command, nodes, forbidden)
+            nodes = self._nodes.chosen(command.heliostats)
+            steps = self._steps_of(command, nodes)
             self._may(command.token, command.lifetime, len(nodes))
         except Refusal as refusal:
             for name in command.heliostats or ("",):
@@ -190,46 +163,52 @@ class Orders:
         deadline = now + command.lifetime
         for node, own in zip(nodes, steps, strict=True):
             if len(nodes) <= _FEW:
-                node.follow_until = now + FOLLOWED
+                node.follow(now + FOLLOWED)
             order = Order(command.identity, command.name, (own,), deadline, command.token)
             self._begin(order, node)
 
-    def _steps_of(self, command: Command, nodes: list[Node], forbidden: str) -> list[Step]:
+    def _steps_of(self, command: Command, nodes: list[Node]) -> list[Step]:
         number = messages.NUMBER_OF.get(command.name)
         who = -1 if number is None else messages.who_of(number)
         if number is None or who not in (messages.AUTHORITY, messages.KEY):
-            raise Refusal(f"{command.name!r} is no command of the wire")
-        if command.name in MOTIONS and forbidden:
-            raise Refusal(forbidden)
+            raise Refusal(f"{command.name!r} is not a command for local controllers")
+        if command.name in MOTIONS and self._watch.verdict.forbidden:
+            raise Refusal(self._watch.verdict.forbidden)
         steps = []
         for node in nodes:
             values = command.values
             if command.name == "SET_ADDRESS" and not values:
                 if node.member.serial is None:
-                    raise Refusal(f"{node.name}: no serial number is configured; add it")
+                    raise Refusal(
+                        f"{node.name}: no serial number is configured; add it to the cluster file"
+                    )
                 values = node.member.serial, node.address
             if who == messages.KEY and not node.member.key:
-                raise Refusal(f"{node.name}: no key is configured; add it, then it can be stored")
+                raise Refusal(f"{node.name}: no key is configured; add it to the file of keys")
             steps.append(Step(command.name, _typed(number, values)))
         return steps
 
     def _may(self, token: int, lifetime: float, jobs: int) -> None:
-        if self.token == 0:
-            raise Refusal("nobody has the authority: the lease of the plant is over")
-        if token != self.token:
-            raise Refusal("not the authority: the token is another one's; take the authority first")
+        authority = self._authority()
+        if authority == 0:
+            raise Refusal("nobody has command authority: the plant's lease is over")
+        if token != authority:
+            raise Refusal("no command authority: the token is not the present one; take it first")
         if not 0.0 < lifetime <= 3600.0:
             raise Refusal(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
         waiting = len(self._ready) + len(self._later)
         if waiting + jobs > _MOST_JOBS:
-            raise Refusal(f"{waiting} orders wait already; at most {_MOST_JOBS}: give it later")
+            raise Refusal(f"{waiting} orders wait already; at most {_MOST_JOBS}: try again later")
         if self._gps() is None:
-            raise Refusal("the local controllers have no time yet; nothing could expire there")
+            raise Refusal("the local controllers have no time yet, so no command could expire")
+
+    def _authority(self) -> int:
+        return self._watch.authority(self._clock())
 
     def accept_parameters(self, message: Parameters) -> None:
         """Take items for the journal of a heliostat, or refuse them."""
         try:
-            (node,) = self.chosen((message.heliostat,))
+            (node,) = self._nodes.chosen((message.heliostat,))
             steps = _steps_of_items(node, message)
             self._may(message.token, message.lifetime, 1)
         except Refusal as refusal:
@@ -245,12 +224,12 @@ class Orders:
     # -- time ------------------------------------------------------------------------------
 
     def second(self) -> None:
-        """Give what is to be tried again its turn."""
+        """Give jobs that are to be retried their turn."""
         self._ready.extend(self._later)
         self._later.clear()
 
     def cancel(self, nodes: Iterable[Node], why: str) -> None:
-        """Give up what was not acknowledged yet, and what is on its way, for some heliostats."""
+        """Give up jobs not acknowledged, and goals not reached, for some heliostats."""
         chosen = {node.index for node in nodes}
         for job in [*self._ready, *self._later]:
             if job.node.index in chosen:
@@ -265,14 +244,14 @@ class Orders:
     # -- sending ---------------------------------------------------------------------------
 
     async def serve(self) -> None:
-        """Do one step of one order."""
+        """Do one step of one job."""
         self._at_work = self._ready.popleft()
         await self._work(self._at_work)
         self._at_work = None
 
     async def _work(self, job: Job) -> None:
-        if job.order.token != self.token:
-            return self._fail(job, "the authority has changed or its lease is over")
+        if job.order.token != self._authority():
+            return self._fail(job, "command authority has changed, or the plant's lease is over")
         if self._clock() >= job.order.deadline:
             return self._fail(job, job.last or "not acknowledged before it expired")
         if not job.told_sent:
@@ -280,7 +259,7 @@ class Orders:
             if job.step.name in _RELATIVE:
                 await self._note_origin(job)
             elif self._goals.waits(job.node):
-                # What it has reached since it was last asked would be forgotten.
+                # A goal reached since the last poll would be given up.
                 await self._look(job.node)
             self._reports.add(job.order.identity, Stage.SENT, job.node.name)
         if job.step.item:
@@ -288,9 +267,9 @@ class Orders:
         return await self._set(job)
 
     async def _note_origin(self, job: Job) -> None:
-        """Ask where the step counts go now: if its answer is lost, that tells what was done."""
+        """Ask for the goals of the counts: if the answer is lost, they show what was done."""
         node, asked_at = job.node, self._clock()
-        node.follow_until = max(node.follow_until, asked_at + FOLLOWED)
+        node.follow(asked_at + FOLLOWED)
         await self._look(node)
         if node.steps_at >= asked_at:
             job.origin = node.steps[2], node.steps[3]
@@ -320,7 +299,7 @@ class Orders:
             key=key,
             expires=order.deadline,
             tries=TRIES,
-            timeout=self._config.stored_answer if slow else None,
+            stored=slow,
         )
         if answer is not None:
             return self._judge(job, answer.values[2], lost=job.unanswered or answer.attempt > 0)
@@ -330,7 +309,7 @@ class Orders:
         return self._again(job, f"no answer to {step.name} before it expired")
 
     async def _give_address(self, job: Job, head: tuple[int, ...], key: bytes) -> None:
-        """Tell everybody, since nobody knows where it is now; then ask it by its serial number."""
+        """Tell all, since its present address is unknown; then ask it by its serial number."""
         serial, address = job.step.values
         frame = self._exchange.sender.frame(
             wire.BROADCAST, "SET_ADDRESS", *head, serial, address, key=key
@@ -340,17 +319,18 @@ class Orders:
             "DISCOVER",
             serial,
             serial,
-            span=SPAN + self._config.stored_answer,
+            span=SPAN,
+            stored=True,
             complete=lambda data: data.endswith(b"\0") and bool(data.strip(b"\0")),
         )
         found = [] if data is None else heard(data, sequence)[0]
         if not found:
-            return self._again(job, f"no answer of serial number {serial} before it expired")
+            return self._again(job, f"no answer from serial number {serial} before it expired")
         if found[0].address != address:
             return self._again(
                 job,
                 f"serial number {serial} stays at address {found[0].address}: its key or "
-                "edition is another, or its state forbids it",
+                "edition differs, or its state forbids it",
             )
         return self._advance(job)
 
@@ -359,7 +339,7 @@ class Orders:
         return int(gps + life) & 0xFFFFFFFF
 
     async def _knows_edition(self, job: Job) -> bool:
-        """Ask for the edition that the node holds: its journal may have been written by another."""
+        """Ask for the edition of the node's journal: another cluster may have written it."""
         if job.edition < 0:
             data = await self._stored(job, "edition")
             if data is None:
@@ -371,7 +351,7 @@ class Orders:
         return await stored(self._exchange, job.node, item, job.order.deadline)
 
     async def _check(self, job: Job) -> None:
-        """Compare what is stored, and the checksum that STATUS tells."""
+        """Compare the stored item, and the checksum in STATUS."""
         step, node = job.step, job.node
         data = await self._stored(job, step.item)
         if data is None:
@@ -385,15 +365,15 @@ class Orders:
             same = node.status[7] == crc32(data)
         if not same:
             return self._fail(
-                job, f"{step.item}: what is stored differs from what was sent; send it again"
+                job, f"{step.item}: the stored item differs from the one sent; send it again"
             )
         return self._advance(job)
 
     def _judge(self, job: Job, result: int, *, lost: bool) -> None:
-        """Go on after an ACK; ``lost``: an earlier answer may have been lost."""
+        """Continue after an ACK; ``lost``: an earlier answer may have been lost."""
         name = job.step.name
         if result == messages.DONE:
-            self.out_of_step = 0
+            self._epoch.taken()
             return self._advance(job)
         text = f"{name}: {self._why(job.node, result)}"
         if lost and result == messages.DUPLICATE and name in _ANEW:
@@ -402,7 +382,8 @@ class Orders:
         if lost and result in _MAYBE and name in GOALS:
             return self._advance(job, sure=False)
         if result in _AGAIN:
-            self.out_of_step += result == messages.DUPLICATE and not lost
+            if result == messages.DUPLICATE and not lost:
+                self._epoch.duplicate()
             return self._again(job, text)
         self._reports.add(job.order.identity, Stage.REFUSED, job.node.name, text)
         return None
@@ -415,7 +396,7 @@ class Orders:
         return text
 
     def _advance(self, job: Job, *, sure: bool = True) -> None:
-        """Go on after a step that was done; not ``sure``: its goal shows whether it was."""
+        """Continue after a step; not ``sure``: the goal shows whether it was taken."""
         if job.void:
             return self._fail(job, job.void)
         order, node, done = job.order, job.node, job.step
@@ -446,7 +427,7 @@ class Orders:
 
 
 async def stored(exchange: Exchange, node: Node, item: str, expires: float) -> bytes | None:
-    """Return what a node has stored of an item, b"" if nothing; None if it does not answer."""
+    """Return a node's stored item, b"" if it has none; None if it does not answer."""
     answer = await exchange.ask(
         node,
         "QUERY_STORED",
@@ -462,12 +443,12 @@ async def stored(exchange: Exchange, node: Node, item: str, expires: float) -> b
 
 
 def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
-    """Return numbers as the wire's codes want them.
+    """Return numbers in the types of the wire's codes.
 
     Raises
     ------
     Refusal
-        Too many, too few, or what a code cannot hold.
+        Too many, too few, or a number that its code cannot hold.
     """
     name = messages.name_of(number)
     head = len(messages.HEADS[messages.who_of(number)][0])
@@ -488,7 +469,7 @@ def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
 
 
 def _steps_of_items(node: Node, message: Parameters) -> tuple[Step, ...]:
-    """Return the messages that store items, then the checks.
+    """Return the messages that store items, then their checks.
 
     Raises
     ------
@@ -500,7 +481,7 @@ def _steps_of_items(node: Node, message: Parameters) -> tuple[Step, ...]:
     except ProtocolError as error:
         raise Refusal(str(error)) from None
     if not node.member.key:
-        raise Refusal(f"{node.name}: no key is configured; add it, then it can be stored")
+        raise Refusal(f"{node.name}: no key is configured; add it to the file of keys")
     if not items:
         raise Refusal("no items; name at least one")
     sets, checks = [], []

@@ -1,28 +1,27 @@
-"""Questions of the plant: checksums, what is stored, statistics, and who is on the bus."""
+"""Questions of the plant: checksums, stored items, statistics, and discovery."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 from heliotrope.cluster._discovery import Discovery
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._nodes import Node
+from heliotrope.cluster._nodes import Node, Nodes, Refusal
 from heliotrope.cluster._orders import stored
 from heliotrope.cluster._reports import Reports
-from heliotrope.cluster.config import ClusterConfig
 from heliotrope.lcu.journal import ITEMS
 from heliotrope.links.messages import Answer, Ask
 
-_SECRET = "key_id"  # noqa: S105 (the name of an item that is never told)
+_SECRET = "key_id"  # noqa: S105 (the name of an item that is never revealed)
 _PATIENCE = 5.0
-#: A node that does not answer is asked again in the next second, so often in all.
+#: Tries for a node that does not answer, one a second.
 _TRIES = 3
 _STORED = tuple(name for name, _ in ITEMS if name != _SECRET)
 
 
 class _Recall:
-    """The question what a node has stored, item by item."""
+    """The question for a node's stored items, one by one."""
 
     def __init__(self, ask: Ask, node: Node) -> None:
         self.ask, self.node = ask, node
@@ -35,18 +34,17 @@ class _Recall:
         return _STORED[len(self.found)]
 
 
-class Asked:
-    """Answers the plant's questions when nothing else is to be done."""
+class Questions:
+    """Answers the plant's questions when the bus is free."""
 
     def __init__(
         self,
-        config: ClusterConfig,
-        nodes: Sequence[Node],
+        nodes: Nodes,
         exchange: Exchange,
         reports: Reports,
         clock: Callable[[], float],
     ) -> None:
-        self._config, self._nodes, self._exchange = config, nodes, exchange
+        self._nodes, self._exchange = nodes, exchange
         self._reports, self._clock = reports, clock
         self._waiting: deque[Ask | _Recall] = deque(maxlen=64)
         self._later: list[_Recall] = []
@@ -82,12 +80,12 @@ class Asked:
         }
 
     def second(self) -> None:
-        """Give what is to be tried again its turn."""
+        """Give questions to be tried again their turn."""
         self._waiting.extend(self._later)
         self._later.clear()
 
     async def serve(self) -> None:
-        """Do one step of the first question that waits."""
+        """Do one step of the first question."""
         first = self._waiting[0]
         if isinstance(first, _Recall):
             self._waiting.popleft()
@@ -105,14 +103,15 @@ class Asked:
             self._discovery = None
 
     def _take_stored(self, ask: Ask) -> None:
-        node = next((each for each in self._nodes if each.name == ask.heliostat), None)
-        if node is None:
-            self._error(ask, f"cluster {self._config.name} has no heliostat {ask.heliostat!r}")
+        try:
+            (node,) = self._nodes.chosen((ask.heliostat,))
+        except Refusal as refusal:
+            self._error(ask, str(refusal))
         else:
             self._waiting.append(_Recall(ask, node))
 
     async def _recall(self, recall: _Recall) -> None:
-        """Ask for one item; those that came are not asked for again."""
+        """Ask for one item; items that came are not asked for again."""
         ask, node, found = recall.ask, recall.node, recall.found
         data = await stored(self._exchange, node, recall.item, self._clock() + _PATIENCE)
         if data is None:

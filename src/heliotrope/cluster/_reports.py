@@ -1,20 +1,21 @@
-"""What is to be told to the plant: stages of commands, alarms, answers; bounded, and in order."""
+"""Reports to the plant: stages of commands, alarms, answers and the status; bounded, in order."""
 
+import asyncio
 from collections import deque
 from dataclasses import replace
 
 from heliotrope.links.messages import Answer, Message, Progress, Stage, Status
 from heliotrope.safety import Alarm
 
-#: Messages that wait; the oldest are dropped first. A status waits alone: only the newest counts.
+#: Messages waiting; the oldest are dropped first. Of the status only the newest is kept.
 _CAPACITY = 256
 
 
 class Reports:
     """An outbox.
 
-    Stages of one command that follow each other are told of in one message for all its heliostats.
-    Alarms are told of when they change, and all that are active to each new connection.
+    The same stage of one command at several heliostats is one message. An alarm is reported when
+    it changes, and to each new connection while it is active.
     """
 
     def __init__(self) -> None:
@@ -22,18 +23,19 @@ class Reports:
         self._out: deque[Message] = deque(maxlen=_CAPACITY)
         self._status: Status | None = None
         self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._published = asyncio.Event()
 
     def add(self, identity: str, stage: Stage, heliostat: str = "", text: str = "") -> None:
-        """Note a stage of a command; one without identity is the cluster's own."""
+        """Report a stage of a command; one without identity is the cluster's own."""
         if identity:
             self._groups.setdefault((identity, stage, text), []).append(heliostat)
 
     def answer(self, answer: Answer) -> None:
-        """Note an answer."""
+        """Report an answer."""
         self._out.append(answer)
 
     def status(self, status: Status) -> None:
-        """Note the status, in place of the one before."""
+        """Report the status, in place of the previous one."""
         self._status = status
 
     def alarm(self, alarm: Alarm) -> None:
@@ -56,21 +58,28 @@ class Reports:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """What is wrong now."""
+        """Alarms that are active."""
         return tuple(self._alarms.values())
 
     def greet(self) -> None:
-        """Tell a new connection what is wrong."""
+        """Report all active alarms to a new connection."""
         waiting = {id(message) for message in self._out}
         self._out.extend(alarm for alarm in self._alarms.values() if id(alarm) not in waiting)
 
-    @property
-    def waiting(self) -> bool:
-        """Whether there is something to tell."""
-        return bool(self._groups or self._out or self._status)
+    # -- to the sender ---------------------------------------------------------------------
+
+    def publish(self) -> None:
+        """Let the sender take what has been reported, if anything has."""
+        if self._groups or self._out or self._status:
+            self._published.set()
+
+    async def published(self) -> None:
+        """Wait for `publish`."""
+        await self._published.wait()
+        self._published.clear()
 
     def take(self) -> list[Message]:
-        """Return all that is to be told, and forget it."""
+        """Return all that was reported, and forget it."""
         messages = list(self._out)
         self._out.clear()
         for (identity, stage, text), names in self._groups.items():

@@ -1,4 +1,4 @@
-"""What a cluster watches: its rows of the safety table, and the plant's lease."""
+"""The watch of a cluster: its rows of the safety table, and the plant's lease."""
 
 import math
 from collections.abc import Callable
@@ -26,28 +26,28 @@ from heliotrope.safety import (
 )
 
 _LINE = "emergency_line"
-#: The row of the plant's silence trips after so long, autonomy apart; a lease may be no longer.
+#: The row of the plant's silence trips after this, autonomy apart; no lease may be longer. s.
 _PLANT_LEASE = 3.0
-#: A row that has tripped releases below 2 s of silence: a shorter lease would never release it.
+#: A row that has tripped releases below 2 s of silence; a shorter lease would never release it.
 _SHORTEST_LEASE = 1.0
-#: Stands for a time without a bound, s.
+#: Stands for an unknown error of the time, s.
 _UNBOUNDED = 1e9
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the safety table demands.
+    """Demands of the safety table.
 
     Attributes
     ----------
     act
-        The strongest, None if nothing is wrong.
+        The strongest; None: nothing is wrong.
     new
-        DEFOCUS or STOW if it has just become due, else None.
+        DEFOCUS or STOW if it has just become due; None otherwise.
     acts
-        For the status: "DEFOCUS plant_link_lost".
+        All, for the status: "DEFOCUS plant_link_lost".
     forbidden
-        Why nothing may be moved, "" if it may.
+        Why motion is forbidden, "" if it is allowed.
     """
 
     act: Act | None = None
@@ -57,7 +57,7 @@ class Verdict:
 
     @property
     def dark(self) -> bool:
-        """Whether no sun is to be sent."""
+        """Whether the sun must not be sent."""
         return self.act is not None and self.act >= Act.DEFOCUS
 
 
@@ -69,18 +69,20 @@ class Watch:
     cluster
         Its name.
     longest_autonomy
-        Most that the plant may grant, s.
+        Longest autonomy that the plant may grant, s.
     reports
         Where alarms go.
     now
-        Monotonic s.
+        Monotonic time, s.
     line
         Returns whether current flows in the emergency line; None: there is no line.
 
     Attributes
     ----------
     token
-        Of the authority, as the last lease says.
+        Token of the command authority, as of the last lease; 0: nobody has it.
+    verdict
+        Demands of the safety table in this second.
     """
 
     def __init__(
@@ -108,9 +110,12 @@ class Watch:
     # -- the lease -------------------------------------------------------------------------
 
     def take(self, lease: Lease, now: float) -> str:
-        """Take a lease that has just come; returns why it is refused, "" if it is taken."""
+        """Take a lease that has just come; return why it is refused, "" if it is taken."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
-            return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
+            return (
+                f"lease of {lease.lifetime:g} s is outside {_SHORTEST_LEASE:g} to "
+                f"{_PLANT_LEASE:g} s"
+            )
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
             return f"lease with token {lease.token} and autonomy {lease.autonomy:g} s: out of range"
         autonomy = min(lease.autonomy, self._longest)
@@ -131,17 +136,21 @@ class Watch:
         return ""
 
     def lease_left(self, now: float) -> float:
-        """Return what is left of the plant's lease, s, autonomy apart; below 0 if it is over."""
+        """Return the remaining time of the plant's lease without autonomy, s; below 0: over."""
         return max(self._over - now, -_UNBOUNDED)
 
     def alone(self, now: float) -> bool:
         """Whether lease and autonomy are over."""
         return now >= self._over + self._autonomy
 
+    def authority(self, now: float) -> int:
+        """Return the token of the command authority, 0 once lease and autonomy are over."""
+        return 0 if self.alone(now) else self.token
+
     # -- the table -------------------------------------------------------------------------
 
     def second(self, time: Time, bus_errors: float, now: float) -> Verdict:
-        """Feed the table, and return what it demands."""
+        """Feed the table, and return its verdict."""
         readings = {
             ("bus_errors", ""): Reading(bus_errors, now),
             ("clock_step", ""): Reading(self._step(time, now), now),
@@ -178,7 +187,7 @@ class Watch:
         return self.verdict
 
     def _step(self, time: Time, now: float) -> float:
-        """Return by how much the time stepped against the monotonic clock, s."""
+        """Return the step of the time against the monotonic clock, s."""
         if time.quality == "none":
             self._offset = None
             return 0.0
@@ -198,6 +207,6 @@ class Watch:
             )
 
     def acknowledge(self, condition: str, who: str, role: Role) -> str:
-        """Acknowledge a row that latches; returns why that is refused, "" if it is not."""
+        """Acknowledge a row that latches; return why that is refused, "" if it is not."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

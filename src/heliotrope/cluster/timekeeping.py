@@ -75,6 +75,11 @@ class Time:
     jumped: bool
     note: str = ""
 
+    @property
+    def usable(self) -> bool:
+        """Whether it may be sent: it is known within 1 s."""
+        return self.quality != "none" and self.error < LARGEST_ERROR
+
 
 class TimeKeeper(Protocol):
     """Where a cluster has its time from.

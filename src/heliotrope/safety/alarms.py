@@ -171,7 +171,7 @@ ORDER_UNACKNOWLEDGED = AlarmKind(
     _CLUSTER,
     Severity.EMERGENCY,
     "A heliostat has not acknowledged DEFOCUS or STOW within a second.",
-    "{subject} has not acknowledged {order}; where its beam is, is not known",
+    "{subject} has not acknowledged {order}; the place of its beam is unknown",
     "The cluster repeats the order until it is acknowledged.",
     "Keep people away from its beam and inspect the heliostat.",
     over="{subject} has acknowledged",

@@ -1,0 +1,65 @@
+"""The epoch of a cluster: renewed where frames of before must be void."""
+
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster.memory import Kept
+from heliotrope.cluster.timekeeping import Time
+from heliotrope.safety import alarms
+
+#: Consecutive commands answered "duplicate" for no known reason that begin a new epoch.
+_OUT_OF_STEP = 3
+
+
+class Epoch:
+    """Begins epochs, and judges by the answers of local controllers when one is needed.
+
+    Parameters
+    ----------
+    kept
+        Where the epoch outlasts a restart.
+    exchange
+        Sends under the epoch.
+    reports
+        Where alarms go.
+    present
+        The time at the start. Without a state file it alone makes the epoch higher than that of
+        any run before.
+
+    Raises
+    ------
+    OSError
+        If the first epoch cannot be kept.
+    """
+
+    def __init__(self, kept: Kept, exchange: Exchange, reports: Reports, present: Time) -> None:
+        self._kept, self._exchange, self._reports = kept, exchange, reports
+        self._of_time = present.usable
+        self._duplicates = 0
+        exchange.begin_epoch(kept.start(int(present.gps_s) if self._of_time else 0))
+
+    def taken(self) -> None:
+        """Note that a local controller has taken a command: it is in step."""
+        self._duplicates = 0
+
+    def duplicate(self) -> None:
+        """Note that a new command was answered "duplicate"."""
+        self._duplicates += 1
+
+    def second(self) -> None:
+        """Begin an epoch if the local controllers are out of step."""
+        if self._duplicates >= _OUT_OF_STEP:
+            self._begin(0)
+
+    def time_known(self, present: Time) -> None:
+        """Begin an epoch from the time, as soon as it is known."""
+        if not self._of_time:
+            self._begin(int(present.gps_s))
+            self._of_time = True
+
+    def _begin(self, at_least: int) -> None:
+        self._duplicates = 0
+        try:
+            self._exchange.begin_epoch(self._kept.start(at_least))
+            self._reports.clear(alarms.STATE_UNWRITABLE.ended())
+        except OSError as error:
+            self._reports.alarm(alarms.STATE_UNWRITABLE.raised(problem=error))

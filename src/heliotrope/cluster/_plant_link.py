@@ -1,0 +1,160 @@
+"""The cluster's end of the link to the plant: takes its messages, sends reports and the status."""
+
+import contextlib
+from collections.abc import Callable
+
+from heliotrope.cluster._nodes import Nodes
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster._watch import Watch
+from heliotrope.cluster._work import Work
+from heliotrope.cluster.timekeeping import Time
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link, LinkClosedError, Outcome
+from heliotrope.links.link import messages as received
+from heliotrope.links.messages import (
+    Acknowledge,
+    Answer,
+    Ask,
+    Command,
+    Emergency,
+    Lease,
+    Message,
+    Parameters,
+    Progress,
+    ProtocolError,
+    Stage,
+    Status,
+    decode,
+    encode,
+)
+from heliotrope.safety import Alarm, Role, alarms
+
+#: Life of a message to the plant, s.
+_NEWS_LIFE = 5.0
+_STATUS_LIFE = 1.0
+#: The names of the rows are repeated after this many statuses: one may have been lost.
+_NAMES_EVERY = 10
+#: Stands for an unknown error of the time, s.
+_UNBOUNDED = 1e9
+
+
+class PlantLink:
+    """Listens to the plant and reports to it.
+
+    Parameters
+    ----------
+    cluster
+        Its name.
+    link, clock, nodes, watch, work, reports
+        Parts of the cluster.
+    wake
+        Called when something has come: it may be urgent.
+    """
+
+    def __init__(
+        self,
+        cluster: str,
+        link: Link,
+        clock: Clock,
+        nodes: Nodes,
+        watch: Watch,
+        work: Work,
+        reports: Reports,
+        wake: Callable[[], None],
+    ) -> None:
+        self._cluster, self._link, self._clock, self._nodes = cluster, link, clock, nodes
+        self._watch, self._work, self._reports, self._wake = watch, work, reports, wake
+        self._names = tuple(node.name for node in nodes)
+        self._opened = -1
+        self._was_connected = False
+        self._number = 0  # of the status
+        self._told_names = 0  # in which status
+
+    @property
+    def connected(self) -> bool:
+        """Whether the plant is there."""
+        return self._link.connected
+
+    # -- from the plant --------------------------------------------------------------------
+
+    async def listen(self) -> None:
+        """Take messages until the link is closed."""
+        async for data in received(self._link):
+            try:
+                message = decode(data)
+            except ProtocolError as error:
+                self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=error))
+            else:
+                self._take(message)
+                self._wake()
+            self._reports.publish()
+
+    def _take(self, message: Message) -> None:
+        if isinstance(message, Lease):
+            refusal = self._watch.take(message, self._clock.monotonic())
+            if refusal:
+                self._reports.alarm(alarms.LEASE_REFUSED.raised(problem=refusal))
+            else:
+                self._reports.clear(alarms.LEASE_REFUSED.ended())
+        elif isinstance(message, Emergency | Command | Parameters | Ask):
+            self._work.take(message)
+        elif isinstance(message, Acknowledge):
+            self._take_acknowledgement(message)
+        elif isinstance(message, Status | Progress | Alarm | Answer):
+            text = f"a {message.kind} came from the plant; only clusters send it"
+            self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=text))
+
+    def _take_acknowledgement(self, message: Acknowledge) -> None:
+        try:
+            role = Role[message.role.upper()]
+        except KeyError:
+            known = " or ".join(each.name.lower() for each in Role)
+            refusal = f"role {message.role!r} is not known; give {known}"
+        else:
+            refusal = self._watch.acknowledge(message.condition, message.who, role)
+        stage = Stage.REFUSED if refusal else Stage.DONE
+        self._reports.add(message.identity, stage, text=refusal)
+
+    # -- to the plant ----------------------------------------------------------------------
+
+    def report(self, present: Time, begin: float) -> None:
+        """Report the status of the second that began at a monotonic time."""
+        self._number += 1
+        connected, opened = self._link.connected, self._link.statistics.opened
+        if connected and (opened != self._opened or not self._was_connected):
+            self._opened, self._told_names = opened, self._number
+            self._reports.greet()
+        self._was_connected = connected
+        now = self._clock.monotonic()
+        told = (self._number - self._told_names) % _NAMES_EVERY == 0
+        self._reports.status(
+            Status(
+                cluster=self._cluster,
+                count=len(self._nodes),
+                utc_s=present.utc_s,
+                time_quality=present.quality,
+                time_error_s=min(present.error, _UNBOUNDED),
+                lease_left=self._watch.lease_left(now),
+                cycle_s=now - begin,
+                acts=self._watch.verdict.acts,
+                names=self._names if told else (),
+                block=self._nodes.rows(now),
+            )
+        )
+        self._reports.publish()
+
+    async def tell(self) -> None:
+        """Send what is reported while the plant is there, until the link is closed."""
+        with contextlib.suppress(LinkClosedError):
+            while True:
+                if self._link.connected:
+                    for message in self._reports.take():
+                        await self._send(message)
+                await self._reports.published()
+
+    async def _send(self, message: Message) -> None:
+        status = isinstance(message, Status)
+        expires = self._clock.monotonic() + (_STATUS_LIFE if status else _NEWS_LIFE)
+        outcome = await self._link.send(encode(message), expires=expires)
+        if status and outcome is not Outcome.SENT:
+            self._opened = -1  # the names may not have arrived

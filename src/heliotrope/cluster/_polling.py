@@ -1,0 +1,155 @@
+"""Polling: each heliostat is asked for its state once a second, in the order of addresses.
+
+Commands are sent in between. The answers are checked, faults and silence are reported, and the
+goals of commands are judged.
+"""
+
+import asyncio
+from typing import Any
+
+from heliotrope.cluster._emergencies import Emergencies
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._goals import BEAM_OUT, Goals
+from heliotrope.cluster._nodes import STATUS, STEPS, Node, Nodes
+from heliotrope.cluster._reports import Reports
+from heliotrope.cluster._watch import Watch
+from heliotrope.cluster._work import Work
+from heliotrope.cluster.config import ClusterConfig
+from heliotrope.lcu import names, states
+from heliotrope.links.clock import Clock
+from heliotrope.safety import alarms
+
+#: A node that missed this many questions in a row is asked in every fifth second only.
+_ABSENT, _PROBE = 3, 5
+
+
+class Polling:
+    """Polls the local controllers.
+
+    Attributes
+    ----------
+    overruns
+        Rounds that did not end within their second.
+    """
+
+    def __init__(
+        self,
+        config: ClusterConfig,
+        nodes: Nodes,
+        exchange: Exchange,
+        goals: Goals,
+        reports: Reports,
+        watch: Watch,
+        emergencies: Emergencies,
+        clock: Clock,
+    ) -> None:
+        self._config, self._nodes, self._exchange = config, nodes, exchange
+        self._goals, self._reports, self._watch = goals, reports, watch
+        self._emergencies, self._clock = emergencies, clock
+        self._by_address = sorted(nodes, key=lambda node: node.address)
+        self._started = clock.monotonic()
+        self._number = 0  # of the second
+        self._next = 0  # the place at which the last round was cut off
+        self._silent: set[int] = set()
+        self._strange: set[int] = set()
+        self.overruns = 0
+
+    @property
+    def silent(self) -> int:
+        """How many heliostats are silent."""
+        return len(self._silent)
+
+    def begin_second(self) -> None:
+        """Count a second."""
+        self._number += 1
+
+    async def round(self, until: float, work: Work, closing: asyncio.Event) -> None:
+        """Ask every node once, and do in between what is ordered."""
+        nodes, count = self._by_address, len(self._nodes)
+        first, self._next = self._next, 0
+        now = self._clock.monotonic()
+        for place in range(first, first + count):
+            if now >= until or closing.is_set():
+                self._next = place % count
+                self.overruns += 1
+                return
+            node = nodes[place % count]
+            if node.missed < _ABSENT or (self._number + node.index) % _PROBE == 0:
+                now = await self._poll(node, now)
+            if work.ready(patient=False):
+                await work.serve()
+                now = self._clock.monotonic()
+
+    async def look(self, node: Node) -> None:
+        """Ask a node for its state, between two rounds."""
+        await self._poll(node, self._clock.monotonic())
+
+    async def _poll(self, node: Node, now: float) -> float:
+        """Ask a node for state and step counts at ``now``, and return the time afterwards."""
+        exchange, sequence = self._exchange, node.next_sequence()
+        status = await exchange.poll(node, STATUS, sequence, now)
+        if status is None or not self._believes(node, status):
+            return exchange.now
+        waits = self._goals.waits(node)
+        due = (self._number + node.index) % self._config.steps_every == 0
+        if waits or due or now < node.follow_until:
+            steps = await exchange.poll(node, STEPS, sequence, exchange.now)
+            if steps is not None:
+                node.take_steps(steps)
+        if waits:
+            self._goals.heard(node, now)
+        return exchange.now
+
+    def _believes(self, node: Node, status: tuple[Any, ...]) -> bool:
+        """Take a STATUS; False if its firmware has states unknown here."""
+        if status[0] >= len(states.STATES):
+            self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
+            self._strange.add(node.index)
+            return False
+        if node.index in self._strange:
+            self._strange.remove(node.index)
+            self._reports.clear(alarms.NODE_UNINTELLIGIBLE.ended(node.name))
+        before = node.fault
+        node.take_status(status)
+        if node.fault != before:
+            self._report_fault(node)
+        if (
+            self._watch.verdict.dark
+            and node.state in BEAM_OUT
+            and not self._emergencies.waits(node)
+        ):
+            # It missed the call, or has just come back.
+            self._emergencies.begin("", "DEFOCUS", [node])
+        return True
+
+    def _report_fault(self, node: Node) -> None:
+        if node.fault:
+            known = node.fault < len(names.FAULTS)
+            text = names.FAULTS[node.fault] if known else f"fault {node.fault}"
+            self._reports.alarm(alarms.NODE_FAULT.raised(node.name, fault=text))
+        else:
+            self._reports.clear(alarms.NODE_FAULT.ended(node.name))
+
+    def end_second(self, now: float) -> None:
+        """Give up goals that take too long, and report silent heliostats."""
+        self._goals.second(self._nodes, now)
+        limit = self._config.silence
+        for node in self._nodes:
+            silent = now - max(node.heard_at, self._started) > limit
+            if silent and node.index not in self._silent:
+                self._silent.add(node.index)
+                self._report_silence(node, limit)
+            elif not silent and node.index in self._silent:
+                self._silent.remove(node.index)
+                self._reports.clear(alarms.NODE_SILENT.ended(node.name))
+
+    def _report_silence(self, node: Node, limit: float) -> None:
+        out = node.known and node.state in BEAM_OUT
+        if not node.known:
+            last = "never heard" if node.heard_at < self._started else "its state was never heard"
+        else:
+            last = f"its last state was {states.STATES[node.state]}"
+            last += "; the place of its beam is unknown" if out else ""
+        self._reports.alarm(
+            alarms.NODE_SILENT.raised(node.name, worse=out, silence=limit, last=last)
+        )

@@ -1,0 +1,88 @@
+"""Work for the bus: emergencies first, then commands and parameters, then questions."""
+
+from collections.abc import Sequence
+
+from heliotrope.cluster._emergencies import NAMES, Emergencies
+from heliotrope.cluster._epoch import Epoch
+from heliotrope.cluster._exchange import Exchange
+from heliotrope.cluster._nodes import Nodes, Refusal
+from heliotrope.cluster._orders import Orders
+from heliotrope.cluster._questions import Questions
+from heliotrope.cluster._reports import Reports
+from heliotrope.links.messages import Ask, Command, Emergency, Parameters, Stage
+
+
+class Work:
+    """Takes what is ordered, and does it piece by piece, the most urgent first."""
+
+    def __init__(
+        self,
+        nodes: Nodes,
+        exchange: Exchange,
+        emergencies: Emergencies,
+        orders: Orders,
+        questions: Questions,
+        reports: Reports,
+        epoch: Epoch,
+    ) -> None:
+        self._nodes, self._exchange, self._emergencies = nodes, exchange, emergencies
+        self._orders, self._questions, self._reports = orders, questions, reports
+        self._epoch = epoch
+
+    def take(self, message: Emergency | Command | Parameters | Ask) -> None:
+        """Take an order or a question of the plant."""
+        if isinstance(message, Emergency):
+            self._take_emergency(message.identity, message.name, message.heliostats)
+        elif isinstance(message, Parameters):
+            self._orders.accept_parameters(message)
+        elif isinstance(message, Ask):
+            self._questions.take(message)
+        elif message.name in NAMES:
+            self._take_emergency(message.identity, message.name, message.heliostats)
+        else:
+            self._orders.accept(message)
+
+    def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:
+        try:
+            if name not in NAMES:
+                raise Refusal(f"{name!r} is no emergency; give DEFOCUS or STOW")
+            nodes = self._nodes.chosen(heliostats)
+        except Refusal as refusal:
+            self._reports.add(identity, Stage.REFUSED, text=str(refusal))
+            return
+        self._orders.cancel(nodes, f"{name} came before it")
+        self._emergencies.begin(identity, name, nodes)
+        self._exchange.interrupt()
+
+    def obey(self, name: str, why: str) -> None:
+        """Obey the safety table: DEFOCUS or STOW for all; what was ordered before is void."""
+        self._orders.cancel(self._nodes, f"overruled: {why}")
+        self._emergencies.begin("", name, list(self._nodes))
+
+    def ready(self, *, patient: bool = True) -> bool:
+        """Whether something can be done; not ``patient``: questions wait."""
+        return self._exchange.connected and (
+            self._emergencies.pressing or self._orders.ready or (patient and self._questions.ready)
+        )
+
+    async def serve(self) -> None:
+        """Do one piece of work."""
+        if self._emergencies.pressing:
+            await self._emergencies.serve()
+        elif self._orders.ready:
+            await self._orders.serve()
+        else:
+            await self._questions.serve()
+        self._reports.publish()
+
+    async def begin_second(self) -> None:
+        """Ask again for what is not acknowledged, emergencies at once."""
+        self._questions.second()
+        self._epoch.second()
+        self._emergencies.second()
+        if self._emergencies.pressing and self._exchange.connected:
+            await self._emergencies.serve()
+
+    def resume(self) -> None:
+        """Give orders that are to be tried again their turn."""
+        self._orders.second()
