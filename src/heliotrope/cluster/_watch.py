@@ -112,10 +112,7 @@ class Watch:
     def take(self, lease: Lease, now: float) -> str:
         """Take a lease that has just come; return why it is refused, "" if it is taken."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
-            return (
-                f"lease of {lease.lifetime:g} s is outside {_SHORTEST_LEASE:g} to "
-                f"{_PLANT_LEASE:g} s"
-            )
+            return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
             return f"lease with token {lease.token} and autonomy {lease.autonomy:g} s: out of range"
         autonomy = min(lease.autonomy, self._longest)
