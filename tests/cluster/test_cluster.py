@@ -457,8 +457,10 @@ def test_a_cluster_runs_once() -> None:
 
 
 def test_the_bus_may_be_closed_first() -> None:
+    boards = boards_in("IDLE")
+
     async def main(clock: VirtualClock) -> None:
-        field = Field(clock, boards=boards_in("IDLE"))
+        field = Field(clock, boards=boards)
         async with running(field.cluster, field.link):
             async with running(field.bus):
                 await asyncio.sleep(2.2)

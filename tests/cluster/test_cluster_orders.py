@@ -256,7 +256,7 @@ def test_the_authority_that_changes_voids_what_waits() -> None:
         await asyncio.sleep(1.5)
         field.plant.token = 77
         assert await final(field, "aim") is Stage.FAILED
-        assert "the authority has changed" in field.plant.text("aim")
+        assert "command authority has changed" in field.plant.text("aim")
 
     run(main)
 
@@ -504,8 +504,10 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
         for board in field.boards:
             board.on = False
         command = Command("c", "AIM", AIM, token=TOKEN, lifetime=20.0)
-        for _ in range(1030):
+        for k in range(1030):
             await field.plant.send(command)
+            if k % 100 == 0:
+                await asyncio.sleep(0.02)  # what is not taken from a link in time is dropped
         await asyncio.sleep(1.5)
         assert "2048 orders wait already; at most 2048" in field.plant.text("c")
 

@@ -26,7 +26,7 @@ from heliotrope.links.link import (
     LinkSettings,
     Outcome,
     Statistics,
-    messages,
+    received,
     running,
 )
 from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
@@ -446,7 +446,7 @@ def test_messages_can_be_looped_over_until_the_link_is_closed() -> None:
         got: list[bytes] = []
 
         async def listen() -> None:
-            async for message in messages(cluster):
+            async for message in received(cluster):
                 got.append(message)  # noqa: PERF401 (seen while it goes on)
 
         async with asyncio.TaskGroup() as group, running(plant, cluster):
@@ -475,7 +475,7 @@ async def _storm(clock: VirtualClock, seed: int) -> dict[str, int]:
     got: list[int] = []
 
     async def listen() -> None:
-        async for message in messages(cluster):
+        async for message in received(cluster):
             number = int.from_bytes(message, "little")
             assert clock.monotonic() < sent[number], "delivered after its expiry"
             got.append(number)

@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from heliotrope.links.clock import SystemClock
-from heliotrope.links.link import Link, messages
+from heliotrope.links.link import Link, received
 from heliotrope.links.messages import (
     Lease,
     Message,
@@ -89,7 +89,7 @@ class Plant:
         self.heard: list[Message] = []
 
     async def listen(self) -> None:
-        async for data in messages(self.link):
+        async for data in received(self.link):
             self.heard.append(decode(data))
 
     async def lease(self) -> None:

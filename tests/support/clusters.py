@@ -19,7 +19,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import memory_pair
-from heliotrope.links.link import Bus, messages, running
+from heliotrope.links.link import Bus, received, running
 from heliotrope.links.messages import (
     Command,
     Emergency,
@@ -139,7 +139,7 @@ class Plant:
         self.autonomy = 0.0
 
     async def listen(self) -> None:
-        async for data in messages(self.link):
+        async for data in received(self.link):
             self.heard.append(decode(data))
 
     async def lease(self) -> None:

@@ -14,7 +14,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, sleep_until
 from heliotrope.links.in_process import Faults, MemoryLine, memory_pair
-from heliotrope.links.link import Link, LinkClosedError, messages
+from heliotrope.links.link import Link, LinkClosedError, received
 from heliotrope.links.messages import (
     NEVER,
     NODE,
@@ -96,7 +96,7 @@ class ScriptedCluster:
         async with asyncio.TaskGroup() as group:
             running = group.create_task(self.link.run())
             telling = group.create_task(self._tell())
-            async for data in messages(self.link):
+            async for data in received(self.link):
                 await self._take(decode(data))
             telling.cancel()
             await running

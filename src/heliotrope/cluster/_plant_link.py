@@ -9,8 +9,7 @@ from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, LinkClosedError, Outcome
-from heliotrope.links.link import messages as received
+from heliotrope.links.link import Link, LinkClosedError, Outcome, received
 from heliotrope.links.messages import (
     Acknowledge,
     Answer,

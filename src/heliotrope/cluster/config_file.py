@@ -1,12 +1,6 @@
-"""The file that a cluster controller starts from (TOML), and its keys beside it.
+"""The cluster file (TOML), from which a cluster controller starts; its keys stand in another."""
 
-Addresses, sites and limits may be shared and kept under version control; keys may not: they stand
-in a file of their own that nobody else may read.
-"""
-
-import string
 from dataclasses import dataclass
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
@@ -18,14 +12,9 @@ from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
+from heliotrope.links.addresses import Keys, url_parts
 from heliotrope.sun import Site
 
-_SHORTEST_KEY, _LONGEST_KEY = 16, 64
-_OTHERS = 0o077
-_MISSING = {
-    "heliostats": "the cluster has no such heliostat",
-    "clusters": "the plant has no such cluster",
-}
 _CHRONY = "the computer's clock is kept by chronyd now"
 #: Keys of ``[time]`` up to the first edition, and what to do instead.
 _OLD_TIME = {
@@ -39,7 +28,6 @@ _OLD_TIME = {
     "ntp": "the kernel is asked unless error_s is stated; remove the key",
     "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
 }
-_PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
 class Table(BaseModel):
@@ -236,7 +224,7 @@ def _refuse_old(path: Path) -> None:
             raise FormatError(path, _OLD_TIME[key], f"time.{key}")
 
 
-def _install(path: Path, document: ClusterDocument, secrets: "Keys") -> Installation:
+def _install(path: Path, document: ClusterDocument, secrets: Keys) -> Installation:
     site, bus, polling = document.site, document.bus, document.polling
     names = [each.name for each in document.heliostats]
     secrets.check(names)
@@ -294,100 +282,3 @@ def _gpsd_at(path: Path, text: str) -> tuple[str, int] | None:
     if not host or parts.path:
         raise FormatError(path, f"{text!r}: give host or host:port of gpsd", "time.gpsd")
     return host, port
-
-
-def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
-    """Return scheme, host, port and prefix of a link's URL, which stands in a file at a place.
-
-    Raises
-    ------
-    FormatError
-        If it is none, or lacks a part.
-    """
-    try:
-        parts = urlsplit(url)
-        port = parts.port
-    except ValueError:
-        raise FormatError(path, f"{url!r} is no URL; give tcp://host:port", where) from None
-    if parts.scheme not in _PORTS or not parts.hostname:
-        raise FormatError(
-            path,
-            f"{url!r}: give tcp://host:port, mqtt://host/prefix or mqtts://host/prefix",
-            where,
-        )
-    port = port or _PORTS[parts.scheme]
-    prefix = parts.path.strip("/")
-    if port is None or (parts.scheme != "tcp" and not prefix):
-        missing = "port: tcp://host:port" if port is None else "prefix: mqtt://host/prefix"
-        raise FormatError(path, f"{url!r} has no {missing}", where)
-    return parts.scheme, parts.hostname, port, prefix
-
-
-class Keys:
-    """A keys' file: ``plant``, ``password`` and a table of keys, all in hexadecimal.
-
-    Parameters
-    ----------
-    path
-        None: there is none, and no key.
-    table
-        Name of the table: "heliostats" of a cluster, "clusters" of a plant.
-
-    Attributes
-    ----------
-    plant, password
-        b"" and "" if they are not given.
-    members
-        Keys of the table by name.
-
-    Raises
-    ------
-    FormatError
-        A file that others may read, or that holds what is no key.
-    """
-
-    def __init__(self, path: Path | None, table: str) -> None:
-        self._path, self._table = path, table
-        self.plant, self.password = b"", ""
-        self.members: dict[str, bytes] = {}
-        if path is None:
-            return
-        # An empty one has no keys; who lacks theirs is named later.
-        empty = path.is_file() and path.stat().st_size == 0
-        raw = {} if empty else read_toml(path, "a file of keys")
-        if path.stat().st_mode & _OTHERS:
-            mode = path.stat().st_mode & 0o777
-            raise FormatError(path, f"others may read it (mode {mode:o}); say chmod 600")
-        for key in raw:
-            if key not in ("plant", "password", table):
-                raise FormatError(path, f"{key!r} is not known; give plant, password, {table}")
-        if "plant" in raw:
-            self.plant = self._key("plant", raw["plant"])
-        password, keys = raw.get("password", ""), raw.get(table, {})
-        if not isinstance(password, str) or not isinstance(keys, dict):
-            raise FormatError(path, f"password must be a text, and {table} a table of keys")
-        self.password = password
-        self.members = {name: self._key(name, value) for name, value in keys.items()}
-
-    def _key(self, name: str, value: object) -> bytes:
-        text = value if isinstance(value, str) else ""
-        good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
-        if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
-            # The value itself is not told: it would stand in a log.
-            raise FormatError(
-                self._path,
-                f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "
-                f"{_LONGEST_KEY} bytes in hexadecimal, as of: openssl rand -hex 32",
-                name,
-            )
-        return bytes.fromhex(text)
-
-    def check(self, names: list[str]) -> None:
-        """Refuse keys of those that are not there."""
-        for name in self.members:
-            if name not in names:
-                close = get_close_matches(name, names, n=1)
-                hint = f"; did you mean {close[0]!r}?" if close else "; remove it"
-                raise FormatError(
-                    self._path, f"{_MISSING[self._table]}{hint}", f"{self._table}.{name}"
-                )

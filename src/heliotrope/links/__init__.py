@@ -1,1 +1,117 @@
-"""Links between the plant and its clusters: messages, envelopes, connections and their carriers."""
+"""Links between the plant and its clusters: messages that arrive fresh or not at all.
+
+`Link` is the protocol of one end; `link` says what it promises. `CarriedLink` is its one
+implementation, over a `Carrier`: within a process (`memory_pair`), TCP (`tcp_link`, `TcpServer`) or
+an MQTT broker (module ``mqtt``, which needs the extra ``control``). `Conversation` seals each
+message in an envelope that proves its age without a common clock.
+
+`encode` and `decode` turn messages (`Lease`, `Command`, `Status`, …) into bytes and back.
+`Clock` measures every limit; `run_virtual` runs a program in virtual time.
+
+Begin with `Link` and `memory_pair`.
+"""
+
+from heliotrope.links.addresses import Keys, url_parts
+from heliotrope.links.clock import (
+    Clock,
+    SystemClock,
+    VirtualClock,
+    VirtualLoop,
+    gps_seconds,
+    gps_week,
+    leap_seconds,
+    run_virtual,
+    sleep_until,
+    utc_of_gps,
+    utc_of_week,
+)
+from heliotrope.links.connection import CarriedLink, Carrier
+from heliotrope.links.envelope import Conversation
+from heliotrope.links.in_process import Faults, MemoryLine, memory_pair
+from heliotrope.links.link import (
+    Backoff,
+    Bus,
+    Heartbeat,
+    Inbox,
+    Link,
+    LinkClosedError,
+    LinkError,
+    LinkLostError,
+    LinkSettings,
+    Outcome,
+    Statistics,
+    received,
+    running,
+    until_closed,
+)
+from heliotrope.links.messages import (
+    Acknowledge,
+    Answer,
+    Ask,
+    Command,
+    Emergency,
+    Lease,
+    Message,
+    Parameters,
+    Progress,
+    ProtocolError,
+    Stage,
+    Status,
+    decode,
+    encode,
+)
+from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
+
+__all__ = [
+    "Acknowledge",
+    "Answer",
+    "Ask",
+    "Backoff",
+    "Bus",
+    "CarriedLink",
+    "Carrier",
+    "Clock",
+    "Command",
+    "Conversation",
+    "Emergency",
+    "Faults",
+    "Heartbeat",
+    "Inbox",
+    "Keys",
+    "Lease",
+    "Link",
+    "LinkClosedError",
+    "LinkError",
+    "LinkLostError",
+    "LinkSettings",
+    "MemoryLine",
+    "Message",
+    "Outcome",
+    "Parameters",
+    "Progress",
+    "ProtocolError",
+    "Stage",
+    "Statistics",
+    "Status",
+    "SystemClock",
+    "TcpServer",
+    "VirtualClock",
+    "VirtualLoop",
+    "client_tls",
+    "decode",
+    "encode",
+    "gps_seconds",
+    "gps_week",
+    "leap_seconds",
+    "memory_pair",
+    "received",
+    "run_virtual",
+    "running",
+    "server_tls",
+    "sleep_until",
+    "tcp_link",
+    "until_closed",
+    "url_parts",
+    "utc_of_gps",
+    "utc_of_week",
+]

@@ -380,7 +380,7 @@ class Inbox:
 # -- running ---------------------------------------------------------------------------
 
 
-async def messages(link: Link) -> AsyncIterator[bytes]:
+async def received(link: Link) -> AsyncIterator[bytes]:
     """Give a link's messages one after the other, until it is closed."""
     with contextlib.suppress(LinkClosedError):
         while True:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.links.link import Link, LinkClosedError, Outcome, messages
+from heliotrope.links.link import Link, LinkClosedError, Outcome, received
 from heliotrope.links.messages import (
     Answer,
     Ask,
@@ -154,7 +154,7 @@ class Clusters:
         self, end: ClusterEnd, take: Callable[[ClusterEnd, Message, float], None]
     ) -> None:
         """Hand on each message of a cluster, until its link is closed."""
-        async for data in messages(end.link):
+        async for data in received(end.link):
             now = self._clock.monotonic()
             try:
                 take(end, decode(data), now)

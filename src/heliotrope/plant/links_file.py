@@ -14,10 +14,11 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from heliotrope.cluster.config_file import Keys, Table, url_parts
+from heliotrope.cluster.config_file import Table
 from heliotrope.cluster.program import LocalCluster
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
+from heliotrope.links.addresses import Keys, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link

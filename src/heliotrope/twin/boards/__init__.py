@@ -1,1 +1,32 @@
-"""Simulated local controllers, true to the firmware, and their bus."""
+"""Simulated local controllers, their clocks, flash and motors, and the bus they share.
+
+`Board` runs the firmware's own code (`heliotrope.lcu`) on a simulated machine; `TwinBus` carries
+frames to its stations and can damage them (`BusFaults`); `SimulatedTime`, `DriftingClock`: the
+times of a cluster with faults. Begin with `Board`.
+"""
+
+from heliotrope.twin.boards.board import Board, Witness
+from heliotrope.twin.boards.bus import BusFaults, Station, Tap, TwinBus
+from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
+from heliotrope.twin.boards.flash import NorFlash, PowerCutError
+from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.outfit import Outfit, items_of, mechanisms, outfits
+
+__all__ = [
+    "Axis",
+    "Board",
+    "BusFaults",
+    "DriftingClock",
+    "NorFlash",
+    "Outfit",
+    "PowerCutError",
+    "SimulatedTime",
+    "Station",
+    "Tap",
+    "TickCounter",
+    "TwinBus",
+    "Witness",
+    "items_of",
+    "mechanisms",
+    "outfits",
+]
