@@ -19,12 +19,24 @@ if TYPE_CHECKING:
     from heliotrope import geometry as geometry
     from heliotrope import optics as optics
     from heliotrope import sun as sun
-    from heliotrope.calibration.evaluation import beam_errors, split, summarise
-    from heliotrope.calibration.fit.estimator import fit
-    from heliotrope.calibration.learn.learning import Learned, learn, predict
-    from heliotrope.calibration.sighting_table import read_sightings, write_sightings
-    from heliotrope.calibration.sightings import Sightings, camera_target, sightings
-    from heliotrope.calibration.workflow import evaluate
+    from heliotrope.calibration import (
+        Learned,
+        Sightings,
+        beam_errors,
+        calibrate,
+        camera_target,
+        evaluate,
+        predict,
+        read_field_sightings,
+        read_sightings,
+        split,
+        summarise,
+        write_report,
+        write_sightings,
+    )
+    from heliotrope.calibration.fit import fit
+    from heliotrope.calibration.learn import learn
+    from heliotrope.calibration.sightings import sightings
     from heliotrope.field import Heliostats, Plant, Receiver, Target, prototype, roughly_installed
     from heliotrope.field.formats import open_plant
     from heliotrope.field.formats.plant_file import read_plant, write_plant
@@ -35,36 +47,39 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-#: Where each name is: a module, and a name in it if it differs.
+#: The module of each name.
 _HOMES = {
     "Heliostats": "heliotrope.field",
-    "Learned": "heliotrope.calibration.learn.learning",
+    "Learned": "heliotrope.calibration",
     "Mechanism": "heliotrope.mechanism",
     "Plant": "heliotrope.field",
     "Receiver": "heliotrope.field",
-    "Sightings": "heliotrope.calibration.sightings",
+    "Sightings": "heliotrope.calibration",
     "Site": "heliotrope.sun",
     "Target": "heliotrope.field",
     "Tracking": "heliotrope.mechanism",
-    "beam_errors": "heliotrope.calibration.evaluation",
-    "camera_target": "heliotrope.calibration.sightings",
-    "evaluate": "heliotrope.calibration.workflow",
-    "fit": "heliotrope.calibration.fit.estimator",
+    "beam_errors": "heliotrope.calibration",
+    "calibrate": "heliotrope.calibration",
+    "camera_target": "heliotrope.calibration",
+    "evaluate": "heliotrope.calibration",
+    "fit": "heliotrope.calibration.fit",
     "image_offsets": "heliotrope.optics",
-    "learn": "heliotrope.calibration.learn.learning",
+    "learn": "heliotrope.calibration.learn",
     "open_plant": "heliotrope.field.formats",
-    "predict": "heliotrope.calibration.learn.learning",
+    "predict": "heliotrope.calibration",
     "predict_flux": "heliotrope.optics",
     "prototype": "heliotrope.field",
+    "read_field_sightings": "heliotrope.calibration",
     "read_plant": "heliotrope.field.formats.plant_file",
-    "read_sightings": "heliotrope.calibration.sighting_table",
+    "read_sightings": "heliotrope.calibration",
     "roughly_installed": "heliotrope.field",
     "sightings": "heliotrope.calibration.sightings",
-    "split": "heliotrope.calibration.evaluation",
-    "summarise": "heliotrope.calibration.evaluation",
+    "split": "heliotrope.calibration",
+    "summarise": "heliotrope.calibration",
     "track": "heliotrope.mechanism",
     "write_plant": "heliotrope.field.formats.plant_file",
-    "write_sightings": "heliotrope.calibration.sighting_table",
+    "write_report": "heliotrope.calibration",
+    "write_sightings": "heliotrope.calibration",
 }
 #: Modules that are used as such.
 _MODULES = {
@@ -86,6 +101,7 @@ __all__ = [
     "Tracking",
     "__version__",
     "beam_errors",
+    "calibrate",
     "camera_target",
     "evaluate",
     "fit",
@@ -98,6 +114,7 @@ __all__ = [
     "predict",
     "predict_flux",
     "prototype",
+    "read_field_sightings",
     "read_plant",
     "read_sightings",
     "roughly_installed",
@@ -107,6 +124,7 @@ __all__ = [
     "sun",
     "track",
     "write_plant",
+    "write_report",
     "write_sightings",
 ]
 
@@ -118,8 +136,7 @@ if not TYPE_CHECKING:
         if name in _MODULES:
             found = import_module(_MODULES[name])
         elif name in _HOMES:
-            module, _, own = _HOMES[name].partition(":")
-            found = getattr(import_module(module), own or name)
+            found = getattr(import_module(_HOMES[name]), name)
         else:
             raise AttributeError(f"module 'heliotrope' has no attribute {name!r}")
         globals()[name] = found

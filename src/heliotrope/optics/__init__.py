@@ -5,7 +5,8 @@
 - `offsets`: where an imperfect heliostat throws its beam (Malan's error model as a forward model).
 - `intercept` and `flux`: the share of a beam, and the flux of a field, on a receiver.
 - `mirror_image`: the flux of one heliostat on a target, for photographs and their simulation.
-- `coverage`: the share of a grid's cells that polygons cover.
+- `coverage`: the share of a grid's cells that polygons cover (a function of the same name, so it
+  stays there).
 - `keep_out` and `glare`: beams that enter forbidden volumes, and the hazard to eyes.
 
 Begin with `image_offsets` for a tracking error, `predict_flux` for a receiver.
@@ -27,7 +28,6 @@ from heliotrope.optics.beam import (
     crossing,
     mean_concentration,
 )
-from heliotrope.optics.coverage import coverage
 from heliotrope.optics.flux import CELLS, FluxView, air_loss, predict_flux
 from heliotrope.optics.glare import (
     DAYLIGHT,
@@ -90,7 +90,6 @@ __all__ = [
     "beams",
     "clearance",
     "concentration",
-    "coverage",
     "crossing",
     "equal_facets",
     "find_entries",
