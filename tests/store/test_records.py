@@ -20,7 +20,9 @@ from heliotrope.calibration.sightings import Sightings, camera_target
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.example import prototype
 from heliotrope.geometry import normalize, reflect
+from heliotrope.links.messages import decode, encode
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.safety import Alarm, Severity
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import (
     CampaignEntry,
@@ -286,6 +288,19 @@ class TestSchedule:
 
 
 class TestEventsAndAlarms:
+    @pytest.mark.parametrize("upper", [False, True], ids=["now", "of an older cluster"])
+    def test_every_alarm_of_a_cluster_is_kept(self, keeper: Keeper, upper: bool) -> None:
+        raised = Alarm("node_silent", "A1", Severity.WARNING, "no answer for 10 s")
+        line = encode(raised)
+        heard = decode(line.replace(b'"warning"', b'"WARNING"') if upper else line)
+        assert isinstance(heard, Alarm)
+        keeper.record_alarm(
+            heard.condition, heard.subject, heard.severity, heard.text, 5.0, active=True
+        )
+        confirm(keeper)
+        (kept,) = keeper.alarms()
+        assert (kept.condition, kept.subject, kept.severity) == ("node_silent", "A1", "warning")
+
     def test_events(self, keeper: Keeper) -> None:
         for i, severity in enumerate(("info", "warning", "alarm", "info")):
             keeper.record_event(

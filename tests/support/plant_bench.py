@@ -1,4 +1,4 @@
-"""A plant with scripted clusters in virtual time: what they do is told by the test."""
+"""A plant with scripted clusters in virtual time; the test tells them what to do."""
 
 import asyncio
 import contextlib
@@ -39,27 +39,32 @@ from heliotrope.plant.settings import PlantSettings
 OPERATOR = Person("Olga", Role.OPERATOR)
 ENGINEER = Person("Egon", Role.ENGINEER)
 VIEWER = Person("Vera", Role.VIEWER)
-#: Where a command leads at once.
+#: State to which a command leads at once.
 LEADS = {
-    "APPROACH": states.IDLE, "IDLE": states.IDLE, "TRACK": states.TRACKING,
-    "REFOCUS": states.TRACKING, "LOCK": states.LOCKED, "DEFOCUS": states.DEFOCUSED,
-    "STOW": states.STOWED, "SEARCH": states.SEARCHING,
-}  # fmt: skip
+    "APPROACH": states.IDLE,
+    "IDLE": states.IDLE,
+    "TRACK": states.TRACKING,
+    "REFOCUS": states.TRACKING,
+    "LOCK": states.LOCKED,
+    "DEFOCUS": states.DEFOCUSED,
+    "STOW": states.STOWED,
+    "SEARCH": states.SEARCHING,
+}
 
 
 class ScriptedCluster:
-    """The other end of a link: obeys at once, except as it is told.
+    """The cluster at the other end of a link: it obeys at once, except as the test tells it.
 
     Attributes
     ----------
     deaf, stubborn
         Heliostats that acknowledge nothing, and that refuse all commands.
     mute
-        Whether it sends no status.
+        It sends no status.
     taken
-        Messages as they came, with their time.
+        Messages in the order of arrival, with their times.
     rows, age_ms
-        What it reports, and how old each row is beside that.
+        Its status, and the age of each row.
     stored
         Items of each heliostat's journal.
     """
@@ -160,11 +165,11 @@ class ScriptedCluster:
         return Answer(ask.identity, {"error": f"{ask.heliostat} does not answer"})
 
     async def _obey(self, identity: str, name: str, heliostats: tuple[str, ...]) -> None:
-        whom = heliostats or self.names
+        named = heliostats or self.names
         await self.send(Progress(identity, Stage.ACCEPTED, ()))
-        await self.send(Progress(identity, Stage.SENT, whom))
-        refused = tuple(n for n in whom if n in self.stubborn and name not in ("DEFOCUS", "STOW"))
-        good = tuple(n for n in whom if n not in self.deaf and n not in refused)
+        await self.send(Progress(identity, Stage.SENT, named))
+        refused = tuple(n for n in named if n in self.stubborn and name not in ("DEFOCUS", "STOW"))
+        good = tuple(n for n in named if n not in self.deaf and n not in refused)
         if refused:
             await self.send(Progress(identity, Stage.REFUSED, refused, "not in this state"))
         if not good:

@@ -1,4 +1,4 @@
-"""Defects to plant in the code of the plant, which the simulation runs: for `twin_defects`."""
+"""Defects to plant in the plant's code while the simulation runs it: for `twin_defects`."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -31,7 +31,7 @@ def record_doubled(patch: pytest.MonkeyPatch) -> None:
 
 
 def record_missing(patch: pytest.MonkeyPatch) -> None:
-    """If the disk is full it is done without a record."""
+    """On a full disk the command is carried out without a record."""
     accept = PlantOrders.accept
 
     def careless(self: Any, record: Any, *given: Any, **more: Any) -> Ticket:
@@ -44,7 +44,7 @@ def record_missing(patch: pytest.MonkeyPatch) -> None:
 
 
 def safe_not_recorded(patch: pytest.MonkeyPatch) -> None:
-    """What may be recorded later is forgotten."""
+    """Records that may be written later are forgotten."""
     patch.setattr(PlantOrders, "pay", lambda self: setattr(self, "_owed", []))
 
 
@@ -56,7 +56,7 @@ def stale_as_live(patch: pytest.MonkeyPatch) -> None:
 
 
 def authority_of_anybody(patch: pytest.MonkeyPatch) -> None:
-    """Whoever has a role is believed to have the authority too."""
+    """Everybody with a role counts as holder of the authority."""
 
     def trusting(self: Any, person: Any, token: int, command: str) -> None:
         if person.role < authority.Role.OPERATOR:
@@ -69,10 +69,10 @@ def broken_by_anybody(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(authority.Authority, "seize", lambda self, person, reason: self._give(person))
 
 
-#: Invariants by which it may be found, name, defect, faults to draw from, pause between them, and
-#: the seed that found it.
+#: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed
+#: that found it.
 ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...] = (
-    ((10,), "nobody bounds who joins", join_limiter_off, ("line_drop",), 60.0, 0),
+    ((10,), "joining is not bounded", join_limiter_off, ("line_drop",), 60.0, 0),
     ((11,), "audit record doubled", record_doubled, ("line_drop",), 60.0, 0),
     ((11,), "audit record missing on a full disk", record_missing, ("audit_full",), 10.0, 0),
     ((11,), "orders to everybody are not recorded", safe_not_recorded, ("line_drop",), 60.0, 0),

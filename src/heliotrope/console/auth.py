@@ -23,7 +23,8 @@ from heliotrope.console.live import Stream
 from heliotrope.console.people import person_of
 from heliotrope.console.settings import ConsoleSettings
 from heliotrope.console.tickets import Tickets
-from heliotrope.plant.authority import Person, RefusedError, Role
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.store.people import Account, ApiToken, People, Session
 from heliotrope.store.records import StoreError
@@ -264,9 +265,9 @@ def token_of(console: Console, person: Person) -> int:
     """
     grant = console.operations.plant.authority.grant
     if grant is None:
-        raise RefusedError(f"command authority: nobody has it; {person.name} must take it first")
+        raise refusals.NO_AUTHORITY.error(person=person.name)
     if grant.holder != person:
-        raise RefusedError(f"command authority: {grant.holder.name} has it; take it first")
+        raise refusals.OTHER_AUTHORITY.error(holder=grant.holder.name, person=person.name)
     return grant.token
 
 

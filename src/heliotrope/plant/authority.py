@@ -176,7 +176,7 @@ class Authority:
             For a viewer, or if another person has it.
         """
         grant = self.grant
-        person.must_be(Role.OPERATOR, "authority")
+        person.must_be(Role.OPERATOR, "command authority")
         if grant is None:
             return self._give(person)
         if grant.holder != person:
@@ -193,7 +193,7 @@ class Authority:
             For a viewer, without a reason, or if the holder has a higher role.
         """
         grant = self.grant
-        person.must_be(Role.OPERATOR, "authority")
+        person.must_be(Role.OPERATOR, "command authority")
         if not reason.strip():
             raise refusals.REASON_MISSING.error(what="breaking the command authority")
         if grant is not None and grant.holder.role > person.role:

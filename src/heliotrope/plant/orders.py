@@ -115,8 +115,8 @@ class PlantOrders:
         self._number += 1
         who, role, what = record
         identity = f"{self._prefix}-{self._number}"
-        whom = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
-        entry = Record(identity, who, role, what, self._utc(), tuple(values), whom, note)
+        named = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
+        entry = Record(identity, who, role, what, self._utc(), tuple(values), named, note)
         if late:
             self._owed.append(lambda: self._audit.begin(entry))
         else:
@@ -158,8 +158,8 @@ class PlantOrders:
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
-            whom = () if len(part) == len(end.members) else part
-            message = Command(identity, name, values, whom, token, life)
+            named = () if len(part) == len(end.members) else part
+            message = Command(identity, name, values, named, token, life)
             end.post(message, life, self._told(identity))
 
     def emergency(
@@ -174,8 +174,8 @@ class PlantOrders:
         self._sent_at[ticket.identity] = self._clock.monotonic()
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part, again=again)
-            whom = () if len(part) == len(end.members) else part
-            end.post(Emergency(identity, act.name, whom), None, self._told(identity), urgent=True)
+            named = () if len(part) == len(end.members) else part
+            end.post(Emergency(identity, act.name, named), None, self._told(identity), urgent=True)
 
     def repeat(self, ticket: Ticket, act: Act, heliostats: Sequence[str]) -> None:
         """Send DEFOCUS or STOW again to those heliostats whose clusters are connected."""

@@ -53,25 +53,25 @@ ROLE_TOO_LOW = Refusal(
 NO_AUTHORITY = Refusal(
     "no command authority",
     "Nobody has the command authority, or it has expired.",
-    "authority: nobody has it; {person} must take it first",
+    "command authority: nobody has it; {person} must take it first",
     "Take command, then give the command again.",
 )
 OTHER_AUTHORITY = Refusal(
     "another's command authority",
     "Another person has the command authority, or the token is of an earlier grant.",
-    "authority: {holder} has it, not {person} with this token; take it anew",
+    "command authority: {holder} has it, not {person} with this token; take it first",
     "Ask the holder to give it back, or break it with a reason.",
 )
 AUTHORITY_HELD = Refusal(
     "command authority held",
     "A person takes the command authority while another holds it.",
-    "authority: {holder} has it and renewed it {age:.0f} s ago; ask for it, or break it",
+    "command authority: {holder} has it and renewed it {age:.0f} s ago; ask for it, or break it",
     "Ask the holder to give it back, or break it with a reason.",
 )
 HOLDER_OUTRANKS = Refusal(
     "holder's role higher",
     "A person breaks the command authority of a holder with a higher role.",
-    "authority: {holder} has it as {holder_role}; {person} as {role} cannot break it; "
+    "command authority: {holder} has it as {holder_role}; {person} as {role} cannot break it; "
     "DEFOCUS and STOW need no authority",
     "Ask the holder. DEFOCUS, STOW and EMERGENCY remain open to everybody.",
 )
@@ -104,6 +104,12 @@ NOT_ACKNOWLEDGED = Refusal(
     "The row is not tripped, its cause has not gone, or it needs another role.",
     "{reason}",
     "Remove the cause that the text names, then acknowledge again.",
+)
+ONE_HELIOSTAT = Refusal(
+    "one heliostat",
+    "A command that can only be right for one heliostat is given to several.",
+    "{what}: {count} heliostats; what is true of one is not true of another, give one heliostat",
+    "Repeat the command for each heliostat.",
 )
 NOT_TOLD = Refusal(
     "no answer",

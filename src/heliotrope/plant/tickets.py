@@ -12,9 +12,13 @@ from heliotrope.links.messages import Stage
 #: Waiting in the plant, then the stages in order; from FINAL on a stage is final.
 WAITING = 0
 RANK = {
-    Stage.ACCEPTED: 1, Stage.SENT: 2, Stage.ACKNOWLEDGED: 3, Stage.DONE: 4, Stage.REFUSED: 5,
+    Stage.ACCEPTED: 1,
+    Stage.SENT: 2,
+    Stage.ACKNOWLEDGED: 3,
+    Stage.DONE: 4,
+    Stage.REFUSED: 5,
     Stage.FAILED: 6,
-}  # fmt: skip
+}
 FINAL = RANK[Stage.DONE]
 
 

@@ -21,7 +21,8 @@ from heliotrope.errors import UnknownNameError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.optics import FluxView, predict_flux
-from heliotrope.plant.authority import Grant, Person, RefusedError, Role
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
@@ -323,7 +324,7 @@ class Operations:
         """
         _operator(person, "hold")
         if not reason.strip():
-            raise RefusedError("hold: a reason is needed; give one")
+            raise refusals.REASON_MISSING.error(what="hold")
         self.automatic.hold(person.name, heliostats, reason)
         self._tell(person, f"{len(heliostats)} heliostats held: {reason}")
 
@@ -531,5 +532,4 @@ def _act(name: str) -> Act:
 
 
 def _operator(person: Person, what: str) -> None:
-    if person.role < Role.OPERATOR:
-        raise RefusedError(f"{what}: {person.name} is viewer; it needs operator")
+    person.must_be(Role.OPERATOR, what)

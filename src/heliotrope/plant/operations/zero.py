@@ -2,7 +2,8 @@
 
 from collections.abc import Sequence
 
-from heliotrope.plant.authority import Person, RefusedError
+from heliotrope.plant import refusals
+from heliotrope.plant.authority import Person
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 
@@ -40,8 +41,5 @@ def zero(
         If there is no such heliostat.
     """
     if len(heliostats) != 1:
-        raise RefusedError(
-            f"ZERO: {len(heliostats) or 'all'} heliostats; the counts of one are not those of "
-            "another, give one heliostat"
-        )
+        raise refusals.ONE_HELIOSTAT.error(what="ZERO", count=len(heliostats) or "all")
     return plant.zero(person, token, heliostats[0], values)
