@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from heliotrope.airborne.evaluate.budget import Budget, Noise, lever
+from heliotrope.airborne.evaluate.budget import Budget, lever
 from heliotrope.airborne.evaluate.orientation import (
     Orientations,
     differences,
@@ -193,11 +193,10 @@ def test_the_papers_systematic_budget() -> None:
     s = trial_mirror(SHAPE, EXACT, 1)
     found = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex, budget=budget)
     np.testing.assert_allclose(found.systematic, budget.systematic(150.0), rtol=1e-3)
-    assert Noise(0.008, 0.0).of_a_point(0.015, 150.0) == pytest.approx(np.hypot(15, 8) / 150 * MRAD)
     with pytest.raises(InputError, match="rtk -1"):
         Budget(rtk=-1.0)
-    with pytest.raises(InputError, match="slope nan"):
-        Noise(slope=float("nan"))
+    with pytest.raises(InputError, match="lamp nan"):
+        Budget(lamp=float("nan"))
 
 
 WIDE = TrialConditions(columns=13, rows=10, reflection=0.020)

@@ -8,12 +8,17 @@ import pytest
 
 from heliotrope.airborne.plan import flight
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
+from heliotrope.airborne.plan.calibration_points import PointSelection
 from heliotrope.airborne.plan.clusters import clusters
 from heliotrope.airborne.plan.flight import APART, REST, Craft, camera_target, grouped, timeline
 from heliotrope.airborne.plan.flight_map import flight_map
-from heliotrope.airborne.plan.flight_plan import FlightPlan, Wishes, _check_patterns, plan_flight
+from heliotrope.airborne.plan.flight_plan import (
+    FlightPlan,
+    PlanSettings,
+    _check_patterns,
+    plan_flight,
+)
 from heliotrope.airborne.plan.hover import mirrors
-from heliotrope.airborne.plan.look_points import Choosing
 from heliotrope.errors import InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
@@ -31,10 +36,10 @@ def plant() -> Plant:
 
 @pytest.fixture(scope="module")
 def flown(plant: Plant) -> FlightPlan:
-    wishes = Wishes(
-        size=60.0, choosing=Choosing(points=9), craft=CRAFT, airspace=Airspace(tower(plant))
+    wanted = PlanSettings(
+        size=60.0, selection=PointSelection(points=9), craft=CRAFT, airspace=Airspace(tower(plant))
     )
-    return plan_flight(plant, wishes)
+    return plan_flight(plant, wanted)
 
 
 def test_every_hover_point_is_photographed_once(flown: FlightPlan) -> None:
@@ -77,13 +82,13 @@ def test_mirrors_are_at_rest(flown: FlightPlan) -> None:
 def test_mirror_travel_from_the_drives(flown: FlightPlan) -> None:
     """20,000 counts a second, and the slowest mirror counts."""
     station = flown.stations[4]
-    counts = flown.look[station.cluster].facing.counts
+    counts = flown.points[station.cluster].facing.counts
     slowest = np.abs(counts[4] - counts[3]).max() / 2.0e4
     assert station.travel == pytest.approx(slowest, rel=1e-9)
 
 
 def test_drones_keep_away_from_all(flown: FlightPlan) -> None:
-    air = flown.wishes.airspace
+    air = flown.settings.airspace
     for drone in range(2):
         line = timeline(flown.sorties, flown.stations, CRAFT, drone)
         assert (np.diff(line.time) >= 0.0).all()
@@ -97,7 +102,7 @@ def test_drones_keep_away_from_all(flown: FlightPlan) -> None:
 def test_groups_hide_the_mirrors(flown: FlightPlan) -> None:
     """With slow mirrors it is faster to fly other clusters meanwhile than to wait."""
     slow = [replace(s, travel=200.0 if s.point else 0.0) for s in flown.stations]
-    air, home = flown.wishes.airspace, flown.homes[:1]
+    air, home = flown.settings.airspace, flown.homes[:1]
     order = list(range(len(flown.clusters)))
     one = Craft(endurance=1500.0)
     best = flight.fly(slow, order, air, home, one, flown.labels)
@@ -127,8 +132,8 @@ def test_a_narrow_lens_asks_for_small_clusters(flown: FlightPlan) -> None:
     """The farthest heliostat is half the field of view from the middle."""
     radius = 150.0 * np.tan(0.5 * np.radians(24.0))
     narrow = clusters(flown.plant.position, size=60.0, max_radius=radius)
-    wishes = replace(flown.wishes, view=float(np.radians(24.0)), craft=Craft())
-    found = plan_flight(flown.plant, wishes).clusters
+    wanted = replace(flown.settings, view=float(np.radians(24.0)), craft=Craft())
+    found = plan_flight(flown.plant, wanted).clusters
     assert found.radius.max() <= radius < flown.clusters.radius.max()
     assert len(found) == len(narrow)
 
@@ -170,15 +175,15 @@ def test_camera_target_on_a_polar_day_and_night() -> None:
 
 def test_refusals(plant: Plant) -> None:
     def made(**changes: object) -> FlightPlan:
-        wishes = Wishes(choosing=Choosing(points=9), airspace=Airspace(tower(plant)))
-        return plan_flight(plant, replace(wishes, **changes))  # type: ignore[arg-type]
+        wanted = PlanSettings(selection=PointSelection(points=9), airspace=Airspace(tower(plant)))
+        return plan_flight(plant, replace(wanted, **changes))  # type: ignore[arg-type]
 
     with pytest.raises(InputError, match="leave no time for a photograph in 30 s"):
         made(craft=Craft(endurance=30.0))
     with pytest.raises(InputError, match=r"home at 0.0 m east, 0.0 m north: it is in a keep-out"):
         made(home=np.zeros(3))
     with pytest.raises(InputError, match="model malan8 has 8 unknowns"):
-        made(choosing=Choosing(points=8))
+        made(selection=PointSelection(points=8))
     with pytest.raises(InputError, match="spread 60°: give more than 0°, up to 45°"):
         made(spread=float(np.radians(60.0)))
     with pytest.raises(InputError, match="view 0°: give more than 0°"):
@@ -186,7 +191,7 @@ def test_refusals(plant: Plant) -> None:
     with pytest.raises(InputError, match="0 hours a day"):
         made(hours_a_day=0.0)
     with pytest.raises(InputError, match="no heliostats"):
-        plan_flight(plant.with_groups({}), Wishes())
+        plan_flight(plant.with_groups({}), PlanSettings())
 
 
 def test_no_way_out(flown: FlightPlan) -> None:
@@ -254,8 +259,8 @@ def test_craft_refuses(change: dict[str, float], text: str) -> None:
 def test_ten_thousand_heliostats() -> None:
     """20 points each: hours of flight, beside years with camera and target."""
     large = staggered(10_000)
-    wishes = Wishes(airspace=Airspace(tower(large)), craft=Craft(count=2))
-    figures = plan_flight(large, wishes).summary()
+    wanted = PlanSettings(airspace=Airspace(tower(large)), craft=Craft(count=2))
+    figures = plan_flight(large, wanted).summary()
     assert figures["orientations"] == 200_000
     assert 40 <= figures["clusters"] <= 60
     assert figures["hours"] < 100.0

@@ -5,6 +5,12 @@ import pytest
 
 from heliotrope.airborne.mirror import ideal, orientation, reflection_points
 from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.calibration_points import (
+    CalibrationPoints,
+    PointSelection,
+    calibration_points,
+    directions,
+)
 from heliotrope.airborne.plan.hover import (
     Mirrors,
     Pattern,
@@ -14,7 +20,6 @@ from heliotrope.airborne.plan.hover import (
     pattern,
     spacing,
 )
-from heliotrope.airborne.plan.look_points import Choosing, LookPoints, directions, look_points
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.sightings import drone
 from heliotrope.calibration.uncertainty import precision, suns_of_year
@@ -181,10 +186,10 @@ def test_neighbours_in_the_way_of_a_pattern() -> None:
 # --- calibration points ---------------------------------------------------------------
 
 
-def _chosen(choosing: Choosing, airspace: Airspace | None = None) -> LookPoints:
+def _chosen(selection: PointSelection, airspace: Airspace | None = None) -> CalibrationPoints:
     plant = staggered(80)
     middle = plant.groups["azel"].calibrated[np.array([40])]
-    return look_points(
+    return calibration_points(
         mirrors(plant),
         np.arange(80),
         middle,
@@ -193,13 +198,15 @@ def _chosen(choosing: Choosing, airspace: Airspace | None = None) -> LookPoints:
         suns_of_year(plant.site, 2026),
         airspace or Airspace(ground=plant.position),
         Sampling(),
-        choosing,
+        selection,
         "C1",
     )
 
 
 def test_directions_are_apart_and_within_their_elevations() -> None:
-    found = directions(Choosing(min_elevation=np.radians(25.0), max_elevation=np.radians(80.0)))
+    found = directions(
+        PointSelection(min_elevation=np.radians(25.0), max_elevation=np.radians(80.0))
+    )
     elevation = np.degrees(np.arcsin(found[:, 2]))
     assert elevation.min() == pytest.approx(25.0)
     assert elevation.max() == pytest.approx(80.0)
@@ -208,15 +215,15 @@ def test_directions_are_apart_and_within_their_elevations() -> None:
 
 
 def test_choice_tells_more_than_chance() -> None:
-    choosing = Choosing(points=12)
-    best = _chosen(choosing)
+    selection = PointSelection(points=12)
+    best = _chosen(selection)
     assert len(best) == 12
     assert best.facing.able.all()
     plant = staggered(80)
     middle = plant.groups["azel"].calibrated[np.array([40])]
     known = precision(middle, NAMES)[0]
     rng = np.random.default_rng(3)
-    towards = directions(choosing)
+    towards = directions(selection)
     towards = towards[150.0 * towards[:, 2] < 105.0]
     centre = plant.position.mean(axis=0)
 
@@ -224,7 +231,7 @@ def test_choice_tells_more_than_chance() -> None:
         points = centre + 150.0 * rows
         facing = face(middle.armature, middle.drives, points[:, None])
         zero = np.zeros(len(rows), dtype=np.intp)
-        seen = drone(zero, facing.counts[:, 0], points, points, sigma=2.0 * choosing.sigma)
+        seen = drone(zero, facing.counts[:, 0], points, points, sigma=2.0 * selection.sigma)
         slope = linearise(middle[zero], seen, NAMES).jacobian
         total = known + np.einsum("map,maq->pq", slope, slope)
         return float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(known)[1])
@@ -237,7 +244,7 @@ def test_choice_tells_more_than_chance() -> None:
 
 
 def test_jacobian_of_candidates_against_finite_differences() -> None:
-    found = _chosen(Choosing(points=10)).plan.chosen
+    found = _chosen(PointSelection(points=10)).plan.chosen
     plant = staggered(80)
     middle = plant.groups["azel"].calibrated[np.array([40])]
     points = plant.position[:80].mean(axis=0) + np.array([0.0, 0.0, 0.0])
@@ -258,23 +265,23 @@ def test_jacobian_of_candidates_against_finite_differences() -> None:
 
 
 def test_more_points_than_unknowns() -> None:
-    Choosing(points=9).check(NAMES, "malan8")
+    PointSelection(points=9).check(NAMES, "malan8")
     with pytest.raises(InputError, match="has 8 unknowns; give 9 or more"):
-        Choosing(points=8).check(NAMES, "malan8")
+        PointSelection(points=8).check(NAMES, "malan8")
 
 
 def test_no_room_in_the_air() -> None:
     with pytest.raises(InputError, match="leave no place at 150 m"):
-        _chosen(Choosing(points=9), Airspace(max_height=30.0))
+        _chosen(PointSelection(points=9), Airspace(max_height=30.0))
     fence = np.array([[-300.0, -300.0], [300.0, -300.0], [300.0, 10.0], [-300.0, 10.0]])
     with pytest.raises(InputError, match=r"C1: \d+ directions are possible for 60 calibration"):
-        _chosen(Choosing(points=60), Airspace(fence=fence))
+        _chosen(PointSelection(points=60), Airspace(fence=fence))
 
 
 def test_pattern_keeps_off_the_limits() -> None:
     """Directions whose pattern would leave the permitted heights are not chosen."""
     air = Airspace(max_height=100.0, min_height=40.0)
-    found = _chosen(Choosing(points=10), air)
+    found = _chosen(PointSelection(points=10), air)
     plant = staggered(80)
     all_mirrors = mirrors(plant)
     for k in range(len(found)):
@@ -316,7 +323,7 @@ def test_sampling_refuses(change: dict[str, float], text: str) -> None:
 )
 def test_choosing_refuses(change: dict[str, float], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        Choosing(**change)
+        PointSelection(**change)
 
 
 def test_facets_of_the_case() -> None:

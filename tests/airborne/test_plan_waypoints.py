@@ -15,10 +15,10 @@ import pytest
 from lxml import etree
 
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
+from heliotrope.airborne.plan.calibration_points import PointSelection
 from heliotrope.airborne.plan.flight import Craft, Sortie
 from heliotrope.airborne.plan.flight_files import commands, document, fence, mission, write_plan
-from heliotrope.airborne.plan.flight_plan import FlightPlan, Wishes, plan_flight
-from heliotrope.airborne.plan.look_points import Choosing
+from heliotrope.airborne.plan.flight_plan import FlightPlan, PlanSettings, plan_flight
 from heliotrope.airborne.plan.waypoints import (
     Mission,
     litchi,
@@ -42,7 +42,10 @@ def plan() -> FlightPlan:
     mast = KeepOut("mast", as_float([[150.0, 150.0], [160.0, 150.0], [160.0, 160.0]]), top=40.0)
     air = Airspace((*tower(plant), mast), FENCE)
     return plan_flight(
-        plant, Wishes(choosing=Choosing(points=9), airspace=air, craft=Craft(endurance=1000.0))
+        plant,
+        PlanSettings(
+            selection=PointSelection(points=9), airspace=air, craft=Craft(endurance=1000.0)
+        ),
     )
 
 

@@ -119,10 +119,6 @@ class MirrorShape:
             np.repeat(np.arange(len(self)), 4), (signs * self.half_size[:, None]).reshape(-1, 2)
         ).reshape(-1, 4, 3)
 
-    def without_slopes(self) -> "MirrorShape":
-        """Return the mirror without its slope map."""
-        return replace(self, slope=None)
-
     def with_slopes(self, slope: npt.ArrayLike) -> "MirrorShape":
         """Return the mirror with slope deviations (F, H, W, 2), rad."""
         return replace(self, slope=as_float(slope))

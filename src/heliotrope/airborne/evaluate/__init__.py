@@ -5,7 +5,7 @@ docstring lists the stays. :func:`write_result` writes the result to files. Each
 by itself: :func:`read_many`, :func:`evaluate`, :func:`measure_field`, :func:`to_sightings`.
 """
 
-from heliotrope.airborne.evaluate.budget import Budget, Noise
+from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
 from heliotrope.airborne.evaluate.evaluation import Evaluation, evaluate
@@ -41,7 +41,6 @@ __all__ = [
     "FlightData",
     "FlightResult",
     "MeasuredFlight",
-    "Noise",
     "Orientation",
     "Orientations",
     "Priors",

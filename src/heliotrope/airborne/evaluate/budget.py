@@ -15,8 +15,9 @@ common to all points of a mirror turns its orientation by as much, however many 
 - the absolute position of the RTK base, unless the heliostats themselves revealed it,
 - the offset of the lamp from the camera, which moves one of the two lines only.
 
-Errors that differ from point to point average out: the detected position of the reflection on the
-mirror, each photograph's own RTK error, and the slope deviations if no map is known.
+Errors that differ from point to point average out, and show in the scatter of the differences: the
+detected position of the reflection on the mirror, each photograph's own RTK error, and the slope
+deviations if no map is known.
 """
 
 from dataclasses import dataclass, fields
@@ -96,46 +97,6 @@ class Budget:
         common = known if place is None else as_float(place)
         mean, half = both.mean(axis=0), lamp.mean(axis=0)
         return as_float(mean @ common @ mean.T + self.lamp**2 * half @ half.T)
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Standard deviations per axis of errors that differ from point to point.
-
-    Attributes
-    ----------
-    rtk
-        Position of one photograph, m.
-    slope
-        Slope deviations without a map, rad.
-    """
-
-    rtk: float = 0.008
-    slope: float = 0.8e-3
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = float(getattr(self, f.name))
-            if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"noise: {f.name} {value} must be 0 or more")
-
-    def of_a_point(
-        self, sigma: npt.ArrayLike, distance: npt.ArrayLike, focal: npt.ArrayLike = np.inf
-    ) -> FloatArray:
-        """Return the standard deviation of one difference, rad per axis, (...).
-
-        Parameters
-        ----------
-        sigma
-            Of the reflection's position on the mirror, m, (...). An error δ of it turns the
-            measured normal by δ over the distance and the expected one by δ / 2f: on a focusing
-            mirror the two partly cancel.
-        distance, focal
-            From mirror to drone, and of the facets, m, (...).
-        """
-        d = as_float(distance)
-        seen = as_float(sigma) * np.abs(1.0 / d - 0.5 / as_float(focal))
-        return as_float(np.sqrt(seen**2 + (self.rtk / d) ** 2 + self.slope**2))
 
 
 def lever(

@@ -1,17 +1,17 @@
 """Plans of a drone's campaign: clusters, poses, hover patterns, sorties and waypoint files.
 
-Begin with :func:`plan_flight`, which takes a plant and :class:`Wishes`, and write its plan with
-:func:`write_plan`. Waypoint files are read and written by
+Begin with :func:`plan_flight`, which takes a plant and :class:`PlanSettings`, and write its plan
+with :func:`write_plan`. Waypoint files are read and written by
 :mod:`heliotrope.airborne.plan.waypoints`; :mod:`heliotrope.airborne.plan.flight_map` draws a map.
 """
 
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
+from heliotrope.airborne.plan.calibration_points import PointSelection
 from heliotrope.airborne.plan.clusters import Clusters
 from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station, camera_target
 from heliotrope.airborne.plan.flight_files import FORMATS, read_airspace, write_plan
-from heliotrope.airborne.plan.flight_plan import FlightPlan, Wishes, plan_flight
+from heliotrope.airborne.plan.flight_plan import FlightPlan, PlanSettings, plan_flight
 from heliotrope.airborne.plan.hover import Sampling
-from heliotrope.airborne.plan.look_points import Choosing
 from heliotrope.airborne.plan.stations import PlannedStation, read_stations
 from heliotrope.airborne.plan.waypoints import AIRCRAFT, Mission
 
@@ -20,17 +20,17 @@ __all__ = [
     "FORMATS",
     "Airspace",
     "CameraTarget",
-    "Choosing",
     "Clusters",
     "Craft",
     "FlightPlan",
     "KeepOut",
     "Mission",
+    "PlanSettings",
     "PlannedStation",
+    "PointSelection",
     "Sampling",
     "Sortie",
     "Station",
-    "Wishes",
     "camera_target",
     "plan_flight",
     "read_airspace",

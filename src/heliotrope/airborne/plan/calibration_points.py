@@ -36,7 +36,7 @@ _SOME = 24
 
 
 @dataclass(frozen=True)
-class Choosing:
+class PointSelection:
     """How calibration points are chosen.
 
     Attributes
@@ -86,7 +86,7 @@ class Choosing:
 
 
 @dataclass(frozen=True)
-class LookPoints:
+class CalibrationPoints:
     """The K calibration points of one cluster of n mirrors, in the order of flight.
 
     Attributes
@@ -110,9 +110,9 @@ class LookPoints:
         return len(self.direction)
 
 
-def directions(choosing: Choosing) -> FloatArray:
+def directions(selection: PointSelection) -> FloatArray:
     """Return unit vectors about 12° apart, within the elevation limits, (M, 3)."""
-    low, high = choosing.min_elevation, choosing.max_elevation
+    low, high = selection.min_elevation, selection.max_elevation
     rings = max(2, int(np.ceil((high - low) / _STEP)) + 1)
     found = []
     for k, elevation in enumerate(np.linspace(low, high, rings)):
@@ -123,7 +123,7 @@ def directions(choosing: Choosing) -> FloatArray:
     return np.concatenate(found)
 
 
-def look_points(
+def calibration_points(
     mirrors: Mirrors,
     rows: npt.NDArray[np.intp],
     middle: Mechanism,
@@ -132,9 +132,9 @@ def look_points(
     suns: FloatArray,
     airspace: Airspace,
     sampling: Sampling,
-    choosing: Choosing,
+    selection: PointSelection,
     label: str = "cluster",
-) -> LookPoints:
+) -> CalibrationPoints:
     """Return the calibration points of one cluster.
 
     Parameters
@@ -149,7 +149,7 @@ def look_points(
         P parameters of its model.
     suns
         Of the year, (K, 3), see :func:`~heliotrope.calibration.information.suns_of_year`.
-    airspace, sampling, choosing
+    airspace, sampling, selection
         Limits and settings.
     label
         The cluster's name, for errors.
@@ -161,7 +161,7 @@ def look_points(
     """
     armature, drives = Armature(mirrors.armature.table[rows]), Drive(mirrors.drives.table[rows])
     centre = armature.origin_1.mean(axis=0)
-    towards = directions(choosing)
+    towards = directions(selection)
     points = centre + sampling.distance * towards
     free = _free(airspace, points, towards, mirrors, rows, sampling)
     if not free.any():
@@ -173,18 +173,20 @@ def look_points(
     # Neighbours can face almost the same directions: some of the mirrors represent all.
     some = np.unique(np.linspace(0, len(rows) - 1, _SOME).astype(np.intp))
     facing = face(Armature(armature.table[some]), Drive(drives.table[some]), points[:, None])
-    able = facing.able.mean(axis=1) >= choosing.share
+    able = facing.able.mean(axis=1) >= selection.share
     there, there_points = towards[able], points[able]
-    found = _candidates(middle, there, there_points, names, choosing.sigma)
-    if len(found) < choosing.points:
+    found = _candidates(middle, there, there_points, names, selection.sigma)
+    if len(found) < selection.points:
         raise InputError(
-            f"{label}: {len(found)} directions are possible for {choosing.points} calibration "
+            f"{label}: {len(found)} directions are possible for {selection.points} calibration "
             f"points; {len(towards)} of {len(free)} lie in free air, {int(able.sum())} of them "
             "within the stops; lower the distance, widen the elevations or ask for fewer points"
         )
-    information = precision(middle, names, priors=choosing.priors)[0]
+    information = precision(middle, names, priors=selection.priors)[0]
     form = error_form(middle, aim, suns, names)[0]
-    chosen = plan_sightings(found, choosing.points, information, form, criterion=choosing.criterion)
+    chosen = plan_sightings(
+        found, selection.points, information, form, criterion=selection.criterion
+    )
     index = chosen.chosen.time.astype(np.intp)
     # A short tour of the directions is short for mirrors and drone.
     south = np.array([0.0, -1.0, 0.0])
@@ -200,7 +202,7 @@ def look_points(
         vertex.append(step.vertex)
         ok.append(step.able)
     flown = Facing(np.stack(counts), np.stack(normal), np.stack(vertex), np.stack(ok))
-    return LookPoints(there[index], there_points[index], flown, chosen)
+    return CalibrationPoints(there[index], there_points[index], flown, chosen)
 
 
 def _free(

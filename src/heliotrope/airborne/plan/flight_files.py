@@ -48,7 +48,7 @@ def mission(plan: FlightPlan, sortie: Sortie, name: str) -> Mission:
         stay.extend(np.zeros(len(points)) if rests is None else rests)
         photo.extend([rests is not None] * len(points))
 
-    rest = plan.wishes.craft.photo
+    rest = plan.settings.craft.photo
     for visit in sortie.visits:
         station = plan.stations[visit.station]
         camera = station.pattern.camera[visit.first : visit.last]
@@ -70,9 +70,9 @@ def mission(plan: FlightPlan, sortie: Sortie, name: str) -> Mission:
         np.array(pitch),
         np.array(stay),
         np.array(photo, dtype=np.bool_),
-        plan.wishes.craft.speed,
+        plan.settings.craft.speed,
         (home[0], home[1], home[2]),
-        _return_height(plan.wishes.airspace, sortie),
+        _return_height(plan.settings.airspace, sortie),
     )
 
 
@@ -88,7 +88,7 @@ def _return_height(airspace: Airspace, sortie: Sortie) -> float:
 
 def fence(plan: FlightPlan) -> Fence:
     """Return the airspace for QGroundControl, with its margins."""
-    airspace, origin = plan.wishes.airspace, _origin(plan.plant.site)
+    airspace, origin = plan.settings.airspace, _origin(plan.plant.site)
 
     def geodetic(corners: FloatArray) -> FloatArray:
         lat, lon, _ = enu_to_geodetic(np.column_stack([corners, np.zeros(len(corners))]), origin)
@@ -183,7 +183,7 @@ def commands(plan: FlightPlan) -> str:
             "reachable",
         ]
     )
-    for k, look in enumerate(plan.look):
+    for k, look in enumerate(plan.points):
         names = [plan.mirrors.names[i] for i in plan.clusters.rows(k)]
         for point in range(len(look)):
             where = [f"{v:.4f}" for v in look.point[point]]
@@ -205,7 +205,7 @@ def commands(plan: FlightPlan) -> str:
 
 def document(plan: FlightPlan) -> dict[str, Any]:
     """Return the plan as plan.json holds it; names carry the units."""
-    wishes, air = plan.wishes, plan.wishes.airspace
+    settings, air = plan.settings, plan.settings.airspace
     timing = {v.station: [np.inf, 0.0] for s in plan.sorties for v in s.visits}
     for sortie in plan.sorties:
         for visit in sortie.visits:
@@ -221,11 +221,11 @@ def document(plan: FlightPlan) -> dict[str, Any]:
         },
         "summary": _finite(plan.summary()),
         "sampling": {
-            "distance_m": wishes.sampling.distance,
-            "pointing_mrad": 1e3 * wishes.sampling.pointing,
-            "samples": wishes.sampling.samples,
-            "facet_focal_m": _finite(wishes.sampling.focal),
-            "led_offset_m": list(wishes.sampling.led_offset),
+            "distance_m": settings.sampling.distance,
+            "pointing_mrad": 1e3 * settings.sampling.pointing,
+            "samples": settings.sampling.samples,
+            "facet_focal_m": _finite(settings.sampling.focal),
+            "led_offset_m": list(settings.sampling.led_offset),
         },
         "airspace": {
             "min_height_m": air.min_height,
@@ -258,7 +258,7 @@ def document(plan: FlightPlan) -> dict[str, Any]:
 
 def _station(plan: FlightPlan, row: int, timing: list[float]) -> dict[str, Any]:
     station = plan.stations[row]
-    look = plan.look[station.cluster]
+    look = plan.points[station.cluster]
     azimuth, elevation = np.degrees(azimuth_elevation(station.pattern.direction))
     return {
         "cluster": plan.labels[station.cluster],

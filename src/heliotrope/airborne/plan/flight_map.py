@@ -68,7 +68,7 @@ def _ways(ax: "Axes", plan: FlightPlan) -> None:
         colour = _COLOURS[drone % len(_COLOURS)]
         some = [s for s in plan.sorties if s.drone == drone][:2]
         if some:
-            line = timeline(some, plan.stations, plan.wishes.craft, drone)
+            line = timeline(some, plan.stations, plan.settings.craft, drone)
             ax.plot(
                 line.place[:, 0],
                 line.place[:, 1],
@@ -84,7 +84,7 @@ def _ways(ax: "Axes", plan: FlightPlan) -> None:
 def _limits(ax: "Axes", plan: FlightPlan) -> None:
     from matplotlib.patches import Circle, Polygon
 
-    airspace = plan.wishes.airspace
+    airspace = plan.settings.airspace
     for k, keep_out in enumerate(airspace.keep_outs):
         label = "keep-out" if k == 0 else ""
         style = {"fc": "#d55e0055", "ec": "#d55e00", "label": label}

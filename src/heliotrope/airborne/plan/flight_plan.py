@@ -9,10 +9,14 @@ import numpy.typing as npt
 
 from heliotrope.airborne.plan import flight
 from heliotrope.airborne.plan.airspace import Airspace
+from heliotrope.airborne.plan.calibration_points import (
+    CalibrationPoints,
+    PointSelection,
+    calibration_points,
+)
 from heliotrope.airborne.plan.clusters import Clusters, clusters, tour
 from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station
 from heliotrope.airborne.plan.hover import Mirrors, Sampling, mirrors, pattern
-from heliotrope.airborne.plan.look_points import Choosing, LookPoints, look_points
 from heliotrope.calibration.uncertainty import suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
@@ -28,7 +32,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class Wishes:
+class PlanSettings:
     """Settings of a campaign.
 
     Attributes
@@ -43,7 +47,7 @@ class Wishes:
         photograph.
     model
         Error model whose unknowns are to be found; "auto" takes jacks or malan8.
-    sampling, choosing, craft, airspace
+    sampling, selection, craft, airspace
         Patterns, calibration points, drones, and where they may fly.
     home
         Place of take-off, ENU metres, (3,); None for a point south of the field.
@@ -59,7 +63,7 @@ class Wishes:
     view: float = float(np.radians(56.0))
     model: str = "auto"
     sampling: Sampling = field(default_factory=Sampling)
-    choosing: Choosing = field(default_factory=Choosing)
+    selection: PointSelection = field(default_factory=PointSelection)
     craft: Craft = field(default_factory=Craft)
     airspace: Airspace = field(default_factory=Airspace)
     home: FloatArray | None = None
@@ -82,13 +86,13 @@ class FlightPlan:
 
     Attributes
     ----------
-    plant, wishes, mirrors
+    plant, settings, mirrors
         The field and the settings.
     clusters
         K of them.
     labels
         Their names, (K,).
-    look
+    points
         Calibration points of each, (K,).
     stations
         All clusters' poses, cluster by cluster.
@@ -103,11 +107,11 @@ class FlightPlan:
     """
 
     plant: Plant
-    wishes: Wishes
+    settings: PlanSettings
     mirrors: Mirrors
     clusters: Clusters
     labels: tuple[str, ...]
-    look: tuple[LookPoints, ...]
+    points: tuple[CalibrationPoints, ...]
     stations: tuple[Station, ...]
     sorties: tuple[Sortie, ...]
     homes: FloatArray
@@ -132,22 +136,22 @@ class FlightPlan:
     @property
     def poses(self) -> int:
         """Orientations to measure: heliostats times their reachable calibration points."""
-        return sum(int(k.facing.able.sum()) for k in self.look)
+        return sum(int(k.facing.able.sum()) for k in self.points)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of the campaign, for tables and JSON."""
         radius, able = self.clusters.radius, np.ones(len(self.mirrors), dtype=np.int64)
-        for k, look in enumerate(self.look):
+        for k, look in enumerate(self.points):
             able[self.clusters.rows(k)] = look.facing.able.sum(axis=0)
         patterns = [s.pattern for s in self.stations]
         hours = self.seconds / 3600.0
-        flown = [look.plan for look in self.look]
+        flown = [look.plan for look in self.points]
         return {
             "heliostats": len(self.mirrors),
             "clusters": len(self.clusters),
             "cluster_area_m2": float(self.clusters.area.mean()),
             "cluster_radius_m": [float(np.median(radius)), float(radius.max())],
-            "calibration_points": self.wishes.choosing.points,
+            "calibration_points": self.settings.selection.points,
             "fewest_points_of_a_heliostat": int(able.min()),
             "orientations": self.poses,
             "hover_points_of_a_pattern": [min(map(len, patterns)), max(map(len, patterns))],
@@ -160,7 +164,7 @@ class FlightPlan:
             "hours_in_the_air": self.airborne / 3600.0,
             "hours_waiting_in_the_air": sum(v.wait for s in self.sorties for v in s.visits)
             / 3600.0,
-            "working_days": hours / self.wishes.hours_a_day,
+            "working_days": hours / self.settings.hours_a_day,
             "separation_m": self.separation,
             "beam_error_before_mrad": 1e3 * float(np.median([p.before for p in flown])),
             "beam_error_after_mrad": 1e3 * float(np.median([p.error[-1] for p in flown])),
@@ -174,14 +178,16 @@ class FlightPlan:
         }
 
 
-def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) -> FlightPlan:
+def plan_flight(
+    plant: Plant, settings: PlanSettings, progress: Progress | None = None
+) -> FlightPlan:
     """Return the plan of a campaign over all heliostats of a plant.
 
     Parameters
     ----------
     plant
         With its calibrated mechanisms, if any.
-    wishes
+    settings
         Settings; if its airspace has no ground, that of the plant is used.
     progress
         Called with (done, all) clusters.
@@ -193,12 +199,12 @@ def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) 
         battery allow no flight.
     """
     all_mirrors = mirrors(plant)
-    airspace = wishes.airspace
+    airspace = settings.airspace
     if not len(airspace.ground):
         airspace = replace(airspace, ground=plant.position)
-    wishes = replace(wishes, airspace=airspace)
-    limit = wishes.sampling.distance * float(np.tan(min(wishes.spread, 0.5 * wishes.view)))
-    found = clusters(plant.position, size=wishes.size, max_radius=limit)
+    settings = replace(settings, airspace=airspace)
+    limit = settings.sampling.distance * float(np.tan(min(settings.spread, 0.5 * settings.view)))
+    found = clusters(plant.position, size=settings.size, max_radius=limit)
     digits = len(str(len(found)))
     labels = tuple(f"C{k + 1:0{digits}d}" for k in range(len(found)))
     suns = suns_of_year(plant.site, 2026)
@@ -207,18 +213,18 @@ def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) 
         if progress is not None:
             progress(k, len(found))
         rows = found.rows(k)
-        one = _look(plant, all_mirrors, found.center[k], rows, suns, wishes, labels[k])
+        one = _look(plant, all_mirrors, found.center[k], rows, suns, settings, labels[k])
         look.append(one)
-        stations += _stations(all_mirrors, rows, one, k, wishes)
+        stations += _stations(all_mirrors, rows, one, k, settings)
     _check_patterns(stations, labels, airspace)
-    start = _home(plant, wishes)
-    homes = flight.homes(start, wishes.craft.count)
+    start = _home(plant, settings)
+    homes = flight.homes(start, settings.craft.count)
     order = tour(found.center[:, :2], start[:2])
-    sorties = flight.fly(stations, order.tolist(), airspace, homes, wishes.craft, labels)
+    sorties = flight.fly(stations, order.tolist(), airspace, homes, settings.craft, labels)
     poses = sum(int(one.facing.able.sum()) for one in look)
     return FlightPlan(
         plant,
-        wishes,
+        settings,
         all_mirrors,
         found,
         labels,
@@ -226,13 +232,13 @@ def plan_flight(plant: Plant, wishes: Wishes, progress: Progress | None = None) 
         tuple(stations),
         tuple(sorties),
         homes,
-        flight.separation(sorties, stations, wishes.craft),
+        flight.separation(sorties, stations, settings.craft),
         flight.camera_target(
             plant.site,
             poses,
-            minutes=wishes.photo_minutes,
+            minutes=settings.photo_minutes,
             targets=max(1, len(plant.targets)),
-            clear=wishes.clear,
+            clear=settings.clear,
         ),
     )
 
@@ -243,16 +249,16 @@ def _look(
     center: FloatArray,
     rows: npt.NDArray[np.intp],
     suns: FloatArray,
-    wishes: Wishes,
+    settings: PlanSettings,
     label: str,
-) -> LookPoints:
+) -> CalibrationPoints:
     """Return the calibration points of one cluster, chosen for the heliostat in its middle."""
     away = np.linalg.norm(plant.position[rows] - center, axis=-1)
     group, row = plant.find(all_mirrors.names[int(rows[np.argmin(away)])])
     middle = group.calibrated[np.array([row])]
-    kind = _model(middle) if wishes.model == "auto" else wishes.model
+    kind = _model(middle) if settings.model == "auto" else settings.model
     names = model_names(kind, middle.parameters)
-    wishes.choosing.check(names, kind)
+    settings.selection.check(names, kind)
     if group.aim is not None and np.isfinite(group.aim[row]).all():
         aim = group.aim[row]
     else:
@@ -262,16 +268,16 @@ def _look(
                 "the plant has no receiver and no target to aim at; add one to the plant file"
             )
         aim = surfaces[0]
-    return look_points(
+    return calibration_points(
         all_mirrors,
         rows,
         middle,
         aim,
         names,
         suns,
-        wishes.airspace,
-        wishes.sampling,
-        wishes.choosing,
+        settings.airspace,
+        settings.sampling,
+        settings.selection,
         label,
     )
 
@@ -286,9 +292,9 @@ def _model(mechanism: Mechanism) -> str:
 def _stations(
     all_mirrors: Mirrors,
     rows: npt.NDArray[np.intp],
-    look: LookPoints,
+    look: CalibrationPoints,
     cluster: int,
-    wishes: Wishes,
+    settings: PlanSettings,
 ) -> list[Station]:
     speed = all_mirrors.drives.table[rows][..., SLOTS["speed"]]
     travel = flight.mirror_travel(look.facing.counts, speed)
@@ -303,7 +309,7 @@ def _stations(
                 all_mirrors.facet_area[rows],
                 look.point[k],
                 look.direction[k],
-                wishes.sampling,
+                settings.sampling,
             ),
             float(travel[k]),
         )
@@ -327,16 +333,16 @@ def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: 
         )
 
 
-def _home(plant: Plant, wishes: Wishes) -> FloatArray:
+def _home(plant: Plant, settings: PlanSettings) -> FloatArray:
     """Return the place of take-off: as given, or south of the middle of the field."""
-    if wishes.home is not None:
-        start = np.asarray(wishes.home, dtype=np.float64)
+    if settings.home is not None:
+        start = np.asarray(settings.home, dtype=np.float64)
     else:
         place = plant.position
         start = np.array([place[:, 0].mean(), place[:, 1].min() - _OUTSIDE, 0.0])
-        start[2] = wishes.airspace.ground_below(start[None])[0]
-    up = start + np.array([0.0, 0.0, wishes.airspace.min_height])
-    if not wishes.airspace.free_legs(start[None], up[None])[0]:
+        start[2] = settings.airspace.ground_below(start[None])[0]
+    up = start + np.array([0.0, 0.0, settings.airspace.min_height])
+    if not settings.airspace.free_legs(start[None], up[None])[0]:
         raise InputError(
             f"home at {start[0]:.1f} m east, {start[1]:.1f} m north: it is in a keep-out or "
             "outside the fence; give another with --home"

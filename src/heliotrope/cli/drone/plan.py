@@ -80,19 +80,19 @@ def plan(
     """Plan a drone's campaign: clusters, hover patterns, commands of the mirrors, sorties."""
     import numpy as np
 
+    from heliotrope.airborne.plan.calibration_points import PointSelection
     from heliotrope.airborne.plan.flight import Craft
     from heliotrope.airborne.plan.flight_files import write_plan
     from heliotrope.airborne.plan.flight_map import flight_map
-    from heliotrope.airborne.plan.flight_plan import Wishes, plan_flight
+    from heliotrope.airborne.plan.flight_plan import PlanSettings, plan_flight
     from heliotrope.airborne.plan.hover import Sampling
-    from heliotrope.airborne.plan.look_points import Choosing
     from heliotrope.calibration.plan.report import write_picture
 
     plant = open_plant(field)
     air, place = _airspace(plant, airspace, tower, (min_height, max_height))
     low, high = np.radians(_numbers(elevations, 2, "--elevations"))
     wanted = _formats(formats)
-    wishes = Wishes(
+    settings = PlanSettings(
         size=size,
         spread=float(np.radians(spread_deg)),
         view=float(np.radians(view_deg)),
@@ -105,7 +105,7 @@ def plan(
             led_offset=parse_point(led, "--led"),
             least_spacing=least_spacing,
         ),
-        choosing=Choosing(points, criterion, 1e-3 * sigma_mrad, float(low), float(high)),
+        selection=PointSelection(points, criterion, 1e-3 * sigma_mrad, float(low), float(high)),
         craft=Craft(
             drones,
             speed,
@@ -120,7 +120,7 @@ def plan(
     )
     _check_aircraft(aircraft)
     with progress("choosing directions", as_json) as step:
-        made = plan_flight(plant, wishes, step)
+        made = plan_flight(plant, settings, step)
     with progress("writing sorties", as_json) as step:
         written = write_plan(made, into, formats=wanted, aircraft=aircraft, progress=step)
     write_picture(into / "map.png", flight_map(made))
