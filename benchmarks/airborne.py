@@ -1,9 +1,9 @@
-"""Photographs of a drone beside their decoding: mirrors and lamp found, a second and a process.
+"""Reading a drone's photographs, relative to their decoding: mirrors and lamp found per second.
 
-A rendered flight over 72 mirrors with four facets, 12 megapixels as JPEG. What is timed is what
-`heliotrope drone evaluate` does with each photograph, on its own (from the decoded picture), and
-from the file with one process and with as many as there are cores. There is no budget in the
-design; the peer is the decoding in the same run. Memory is that of this process, rendering too.
+A rendered flight over 72 mirrors with four facets, 12 megapixels as JPEG. The time is that of the
+work of `heliotrope drone evaluate` on one photograph: from the decoded picture, and from the file
+with one process and with one for each core. The design sets no budget; the reference is the
+decoding in the same run. Memory is that of this process, including the rendering.
 """
 
 import os
@@ -69,7 +69,7 @@ def _photos(flight: Flight, folder: Path) -> list[Photo]:
     render_flight(flight, folder, ORIGIN, seed=1)
     return [
         Photo(p.name, p.time, p.position, p.rotation, p.sigma_position, folder / p.name)
-        for p in flight.told
+        for p in flight.recorded
     ]
 
 
@@ -82,7 +82,7 @@ def _work(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[int, int]:
 
 
 def _rate(processes: int, count: int, photo: Photo, camera: LedCamera, stand: Standing) -> float:
-    """Photographs a second with so many processes, their start not counted."""
+    """Return photographs a second with this many processes, without their start."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         warm = [pool.submit(_work, photo, camera, stand) for _ in range(2 * processes)]
         found = {future.result() for future in warm}
@@ -91,7 +91,7 @@ def _rate(processes: int, count: int, photo: Photo, camera: LedCamera, stand: St
         found |= {future.result() for future in futures}
         taken = time.perf_counter() - start
     if len(found) != 1:
-        raise BenchmarkError(f"{photo.name}: processes do not agree on what it shows: {found}")
+        raise BenchmarkError(f"{photo.name}: processes disagree on what it shows: {found}")
     return count / taken
 
 

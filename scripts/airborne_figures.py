@@ -1,8 +1,8 @@
 """The pictures of docs/tutorial/airborne.md and docs/explanation/airborne.md.
 
-``python scripts/airborne_figures.py [FOLDER]`` runs the tutorial up to the evaluation in a folder
-of its own and writes the plan's map, a photograph and one heliostat to FOLDER (default
-docs/images), and for the explanation a mirror of four facets under the paper's conditions.
+``python scripts/airborne_figures.py [FOLDER]`` runs the tutorial up to the evaluation in a
+temporary folder and writes the plan's map, a photograph and one heliostat to FOLDER (default
+docs/images), and for the explanation a mirror of four facets under HelioPoint's conditions.
 """
 
 import contextlib
@@ -25,14 +25,14 @@ from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, tri
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial" / "airborne.md"
 BLOCK = re.compile(r"```(?P<kind>python|console)\n(?P<body>.*?)^```", re.DOTALL | re.MULTILINE)
-#: Of the page, the heading behind which no picture comes from.
+#: Heading of the page after which there are no more pictures.
 LAST = "## All points"
-#: Photograph, its rows that show mirrors, and how much larger it is shown.
+#: Photograph, its rows that show mirrors, and its enlargement.
 SHOWN, ROWS, SCALE = "photographs/C1-8/DJI_0013.JPG", slice(110, 450), 1.5
 
 
 def run(text: str) -> dict[str, Any]:
-    """Run the blocks of a page here; returns the names that its Python has."""
+    """Run the blocks of a page here; returns the names that its Python defines."""
     names: dict[str, Any] = {"__name__": "__page__"}
     for block in BLOCK.finditer(text):
         if block["kind"] == "python":
@@ -71,7 +71,7 @@ def four() -> str:
     turns = np.zeros((4, 2))
     turns[3, 1] = 1.5e-3
     flown = trial_mirror(mirror.canted(turns), TrialConditions(columns=11, rows=9), 3)
-    found = measure(flown.reflections, mirror, flown.told_rotation, flown.told_vertex)
+    found = measure(flown.reflections, mirror, flown.expected_rotation, flown.expected_vertex)
     return heliostat_drawing("Four facets", found, mirror)
 
 

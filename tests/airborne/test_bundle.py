@@ -57,8 +57,8 @@ def run(flown: Flight, corners: Corners, survey: float, seed: int = 0) -> Adjust
     rng = np.random.default_rng(seed)
     turns = np.array([p.rotation @ turn(rng.normal(0.0, 1e-3, 3)) for p in flown.taken])
     return adjust(
-        np.array([p.position for p in flown.told]),
-        np.array([p.sigma_position for p in flown.told]),
+        np.array([p.position for p in flown.recorded]),
+        np.array([p.sigma_position for p in flown.recorded]),
         turns,
         standing(flown.heliostats, flown.counts),
         corners,
@@ -71,8 +71,8 @@ def test_derivatives_against_finite_differences() -> None:
     corners = corners_of(flown, 1)
     stand = standing(flown.heliostats, flown.counts)
     state = State(
-        np.array([p.position for p in flown.told]),
-        np.array([p.rotation for p in flown.told]),
+        np.array([p.position for p in flown.recorded]),
+        np.array([p.rotation for p in flown.recorded]),
         np.zeros((2, 3)),
         np.zeros(3),
         stand,
@@ -193,14 +193,14 @@ def several(
 
 def together(flown: list[Flight], survey: float, seed: int) -> Adjusted:
     """One adjustment of several flights over the same heliostats."""
-    count, photos = len(flown[0].truth), len(flown[0].told)
+    count, photos = len(flown[0].truth), len(flown[0].recorded)
     parts = [corners_of(f, seed + 100 * k) for k, f in enumerate(flown)]
     corners = Corners(
         np.concatenate([p.photo + photos * k for k, p in enumerate(parts)]),
         np.concatenate([p.mirror + count * k for k, p in enumerate(parts)]),
         *(np.concatenate([getattr(p, n) for p in parts]) for n in ("corner", "place", "sigma")),
     )
-    told = [p for f in flown for p in f.told]
+    told = [p for f in flown for p in f.recorded]
     return adjust(
         np.array([p.position for p in told]),
         np.array([p.sigma_position for p in told]),

@@ -42,7 +42,7 @@ def night() -> Night:
     scene = rendering.Scene(flown.truth, flown.shapes, 0.0, rendering.dark())
     stand = standing(flown.heliostats, flown.counts)
     seen = []
-    for k, (taken, told) in enumerate(zip(flown.taken, flown.told, strict=True)):
+    for k, (taken, told) in enumerate(zip(flown.taken, flown.recorded, strict=True)):
         lamp = exact.take(np.flatnonzero(exact.photo == k))
         picture = rendering.render(scene, flown.camera, taken, lamp, 5 + k)
         assert np.median(picture) < 5
@@ -68,7 +68,9 @@ def test_lights_are_told_by_where_they_are_expected(night: Night) -> None:
 
 def test_orientations_at_night_are_as_good_as_they_say(night: Night) -> None:
     flown = night.flown
-    found = evaluate(flown.told, night.seen, flown.camera, night.stand, night.shape, priors=PRIORS)
+    found = evaluate(
+        flown.recorded, night.seen, flown.camera, night.stand, night.shape, priors=PRIORS
+    )
     measured = measure_field(
         found.reflections,
         night.stand.names,
@@ -96,7 +98,7 @@ def test_orientations_at_night_are_as_good_as_they_say(night: Night) -> None:
 
 
 def test_feet_are_where_flat_mirrors_show_the_lamp(night: Night) -> None:
-    photo, lens, stand = night.flown.told[4], night.flown.camera, night.stand
+    photo, lens, stand = night.flown.recorded[4], night.flown.camera, night.stand
     feet, rows = expected_feet(photo, lens, stand)
     assert len(rows) > 10
     many = np.ones((len(rows), 1))
@@ -110,7 +112,7 @@ def test_a_dark_flight_stands_beside_the_others(night: Night) -> None:
     heliostats = np.arange(20)
     shapes = tuple(night.shape(row) for row in range(20))
     field = (flown.camera, night.stand, heliostats, flown.counts, shapes)
-    dark = FlightData("dark", flown.told, *field, seen=night.seen)
+    dark = FlightData("dark", flown.recorded, *field, seen=night.seen)
     broken = tuple(Seen(s.name, "nothing: at all") for s in night.seen)
     found = evaluate_campaign([dark, replace(dark, name="none", seen=broken)], PRIORS)
     assert found.flights[0] is not None
@@ -125,7 +127,7 @@ def test_too_few_lights_say_so(night: Night) -> None:
         for s in night.seen[:1]
     ]
     with pytest.raises(InputError, match="1 mirrors show the lamp; 4 are needed"):
-        evaluate(night.flown.told[:1], few, night.flown.camera, night.stand, night.shape)
+        evaluate(night.flown.recorded[:1], few, night.flown.camera, night.stand, night.shape)
     black = np.zeros((480, 640, 3), np.uint8)
-    one = look(black, night.flown.told[0], night.flown.camera, night.stand)
+    one = look(black, night.flown.recorded[0], night.flown.camera, night.stand)
     assert one.problem == "nothing: it is dark and shows 0 lights, 4 are needed"

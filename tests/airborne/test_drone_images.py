@@ -254,7 +254,7 @@ def test_rtk_scatter_is_found(case: Case) -> None:
         case.photos, case.seen, case.flown.camera, case.stand, Priors(position=0.001)
     )
     assert problems == ()
-    told = np.array([p.position for p in case.flown.told])
+    told = np.array([p.position for p in case.flown.recorded])
     true = np.array([p.position for p in case.flown.taken])
     # σ of 16 photographs, plus what photogrammetry adds itself.
     expected = np.hypot((told - true).std(axis=0, ddof=1), check.photogrammetry)
@@ -356,7 +356,7 @@ def test_a_few_mirrors_in_a_wide_frame() -> None:
     stand = standing(few, flown.counts)
     scene = rendering.Scene(flown.truth, flown.shapes)
     picture = rendering.render(scene, flown.camera, flown.taken[0], exact_reflections(flown), 1)
-    seen = look(picture, flown.told[0], flown.camera, stand)
+    seen = look(picture, flown.recorded[0], flown.camera, stand)
     assert seen.problem == ""
     assert seen.mirror.tolist() == list(range(6))
 

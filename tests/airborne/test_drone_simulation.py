@@ -54,7 +54,7 @@ def test_errors_come_out_as_large_as_given() -> None:
         rows=20,
         step=0.1,
     )
-    off = np.array([p.position for p in flown.told]) - [p.position for p in flown.taken]
+    off = np.array([p.position for p in flown.recorded]) - [p.position for p in flown.taken]
     np.testing.assert_allclose(off.mean(axis=0), offset, atol=0.004)
     np.testing.assert_allclose(off.std(axis=0), [0.01, 0.01, 0.02], rtol=0.15)
     corrected = reflections_of(flown, corrected=True)

@@ -47,8 +47,8 @@ def field() -> tuple[Orientations, np.ndarray]:
         own = replace(s.reflections, heliostat=s.reflections.heliostat + k)
         # Two spots that were taken for another's.
         own = replace(own, x=own.x + np.where(np.arange(len(own)) < 2 * k, 0.7, 0.0))
-        found.append(measure(own, SHAPE, s.told_rotation, s.told_vertex, budget=BUDGET))
-        places.append(s.told_vertex + [30.0 * k, 0.0, 0.0])
+        found.append(measure(own, SHAPE, s.expected_rotation, s.expected_vertex, budget=BUDGET))
+        places.append(s.expected_vertex + [30.0 * k, 0.0, 0.0])
     places.append(np.array([15.0, 140.0, 3.0]))
     left_out = {"C": "no reflection in any photograph"}
     return Orientations(NAMES, tuple(found), left_out), np.array(places)

@@ -47,11 +47,16 @@ def rms(values: np.ndarray) -> float:
 def test_the_truth_is_found_where_nothing_is_wrong(mean: str, slope: float) -> None:
     s = trial_mirror(SHAPE, replace(EXACT, slope=slope), 4)
     found = measure(
-        s.reflections, s.shape, s.told_rotation, s.told_vertex, mean=mean, budget=EXACT.budget
+        s.reflections,
+        s.shape,
+        s.expected_rotation,
+        s.expected_vertex,
+        mean=mean,
+        budget=EXACT.budget,
     )
     assert np.linalg.norm(rotation_between(s.rotation, found.rotation)) < 1e-4 * MRAD
     np.testing.assert_allclose(
-        found.correction, rotation_between(s.told_rotation, s.rotation)[:2], atol=1e-7
+        found.correction, rotation_between(s.expected_rotation, s.rotation)[:2], atol=1e-7
     )
     assert np.abs(found.difference).max() < 1e-3 * MRAD
     assert (found.systematic == 0.0).all()
@@ -65,7 +70,12 @@ def test_two_rounds_are_enough() -> None:
     error = []
     for rounds in (0, 1, 2):
         found = measure(
-            s.reflections, SHAPE, s.told_rotation, s.told_vertex, rounds=rounds, mean="plain"
+            s.reflections,
+            SHAPE,
+            s.expected_rotation,
+            s.expected_vertex,
+            rounds=rounds,
+            mean="plain",
         )
         error.append(float(np.linalg.norm(rotation_between(s.rotation, found.rotation)[:2])))
     assert error[0] > 100.0 * error[1]
@@ -76,11 +86,11 @@ def test_the_vertex_turns_about_the_pivot() -> None:
     """A vertex 0.4 m in front of its pivot moves by 0.4 m times the turn."""
     s = trial_mirror(SHAPE, EXACT, 4)
     pivot = np.array([0.0, 0.0, -0.4])
-    told_vertex = s.vertex + (s.rotation - s.told_rotation) @ pivot
-    found = measure(s.reflections, SHAPE, s.told_rotation, told_vertex, pivot=pivot)
+    expected_vertex = s.vertex + (s.rotation - s.expected_rotation) @ pivot
+    found = measure(s.reflections, SHAPE, s.expected_rotation, expected_vertex, pivot=pivot)
     np.testing.assert_allclose(found.vertex, s.vertex, atol=1e-6)
     assert np.linalg.norm(rotation_between(s.rotation, found.rotation)[:2]) < 1e-4 * MRAD
-    without = measure(s.reflections, SHAPE, s.told_rotation, told_vertex)
+    without = measure(s.reflections, SHAPE, s.expected_rotation, expected_vertex)
     assert np.linalg.norm(rotation_between(s.rotation, without.rotation)[:2]) > 5e-3 * MRAD
 
 
@@ -97,7 +107,7 @@ def test_gross_errors_are_left_out() -> None:
     x = s.reflections.x.copy()
     x[[5, 11]] += [1.1, 0.9]
     wrong = replace(s.reflections, x=np.clip(x, -1.6, 2.5))
-    found = measure(wrong, SHAPE, s.told_rotation, s.told_vertex)
+    found = measure(wrong, SHAPE, s.expected_rotation, s.expected_vertex)
     assert set(np.flatnonzero(found.outlier)) >= {5, 11}
     assert found.count == len(wrong) - found.outlier.sum()
     assert np.linalg.norm(rotation_between(s.rotation, found.rotation)[:2]) < 0.05 * MRAD
@@ -107,7 +117,7 @@ def test_a_canted_facet_is_named() -> None:
     turns = np.zeros((4, 2))
     turns[2] = [2.5 * MRAD, -2.0 * MRAD]
     s = trial_mirror(SHAPE.canted(turns), replace(EXACT, reflection=0.01, hover=0.05), 3)
-    found = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex)
+    found = measure(s.reflections, SHAPE, s.expected_rotation, s.expected_vertex)
     told = [w for w in found.warnings if "canted off by" in w]
     assert len(told) == 1
     assert told[0].startswith("facet 2 is canted off by +2.")
@@ -118,10 +128,10 @@ def test_a_canted_facet_is_named() -> None:
 def test_uneven_sampling_is_named() -> None:
     s = trial_mirror(SHAPE, replace(EXACT, reflection=0.01), 3)
     part = s.reflections.take(s.reflections.x > 0.0)
-    told = measure(part, SHAPE, s.told_rotation, s.told_vertex).warnings
+    told = measure(part, SHAPE, s.expected_rotation, s.expected_vertex).warnings
     assert any(w.startswith("unsymmetric sampling: the centre of the points is +0.") for w in told)
     assert sum("it may be canted off, dirty or shaded" in w for w in told) == 2
-    few = measure(s.reflections.take([3]), SHAPE, s.told_rotation, s.told_vertex)
+    few = measure(s.reflections.take([3]), SHAPE, s.expected_rotation, s.expected_vertex)
     assert few.warnings[0].startswith("only 1 reflections")
     assert np.isnan(few.sigma_mean).all()
 
@@ -131,7 +141,7 @@ def test_differences_that_are_not_normal_are_named() -> None:
     rng = np.random.default_rng(0)
     shift = 0.02 * rng.choice([-1.0, 1.0], len(s.reflections))
     odd = replace(s.reflections, x=s.reflections.x + shift)
-    told = measure(odd, SHAPE, s.told_rotation, s.told_vertex).warnings
+    told = measure(odd, SHAPE, s.expected_rotation, s.expected_vertex).warnings
     assert any("not normally distributed" in w for w in told)
 
 
@@ -144,8 +154,8 @@ def test_a_field_goes_on_where_one_heliostat_fails() -> None:
         both,
         ("A", "B", "C"),
         lambda _: SHAPE,
-        np.tile(s.told_rotation, (3, 1, 1)),
-        np.tile(s.told_vertex, (3, 1)),
+        np.tile(s.expected_rotation, (3, 1, 1)),
+        np.tile(s.expected_vertex, (3, 1)),
     )
     assert [o.heliostat for o in found.found] == [0]
     assert found.left_out["B"] == "no reflection in any photograph"
@@ -156,7 +166,7 @@ def test_a_field_goes_on_where_one_heliostat_fails() -> None:
 
 def test_what_cannot_be_measured_is_refused() -> None:
     s = trial_mirror(SHAPE, EXACT, 3)
-    pose = (SHAPE, s.told_rotation, s.told_vertex)
+    pose = (SHAPE, s.expected_rotation, s.expected_vertex)
     with pytest.raises(InputError, match="no reflections"):
         measure(s.reflections.take([]), *pose)
     two = join([s.reflections, replace(s.reflections, heliostat=s.reflections.heliostat + 1)])
@@ -191,7 +201,7 @@ def test_the_papers_systematic_budget() -> None:
     assert budget.systematic(150.0) == pytest.approx(0.21 * MRAD, abs=0.005 * MRAD)
     assert np.hypot(budget.systematic(150.0), 0.20 * MRAD) == pytest.approx(0.29e-3, abs=0.005e-3)
     s = trial_mirror(SHAPE, EXACT, 1)
-    found = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex, budget=budget)
+    found = measure(s.reflections, SHAPE, s.expected_rotation, s.expected_vertex, budget=budget)
     np.testing.assert_allclose(found.systematic, budget.systematic(150.0), rtol=1e-3)
     with pytest.raises(InputError, match="rtk -1"):
         Budget(rtk=-1.0)
@@ -388,7 +398,7 @@ def test_wrong_sightings_are_refused() -> None:
     with pytest.raises(InputError, match="per='photo'"):
         to_sightings(nothing, np.zeros((1, 2)), per="photo")  # type: ignore[arg-type]
     s = trial_mirror(SHAPE, EXACT, 3)
-    o = measure(s.reflections, SHAPE, s.told_rotation, s.told_vertex)
+    o = measure(s.reflections, SHAPE, s.expected_rotation, s.expected_vertex)
     with pytest.raises(InputError, match="counts of 2 heliostats for 1 names"):
         to_sightings(Orientations(("A",), (o,), {}), np.zeros((2, 2)))
 

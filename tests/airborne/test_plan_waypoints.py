@@ -334,7 +334,7 @@ def test_document_says_when_mirrors_move(plan: FlightPlan) -> None:
     [
         ("a.csv", read_litchi, "the header is not Litchi's"),
         ("a.kmz", read_wpml, "not a KMZ with wpmz/template.kml"),
-        ("a.plan", read_qgc, "no JSON"),
+        ("a.plan", read_qgc, "not valid JSON"),
     ],
 )
 def test_other_files_are_refused(tmp_path: Path, name: str, read: Read, text: str) -> None:

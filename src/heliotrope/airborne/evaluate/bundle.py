@@ -110,7 +110,7 @@ class State:
 
     Attributes
     ----------
-    told
+    recorded
         Recorded positions, ENU m, (P, 3).
     rotation
         Camera axes to ENU, (P, 3, 3).
@@ -124,7 +124,7 @@ class State:
         d of each heliostat's position, m, (H, 3); zeros if it was flown in one pose.
     """
 
-    told: FloatArray
+    recorded: FloatArray
     rotation: FloatArray
     error: FloatArray
     offset: FloatArray
@@ -134,7 +134,7 @@ class State:
     @property
     def position(self) -> FloatArray:
         """True positions of the photographs, ENU m, (P, 3)."""
-        return self.told - self.offset + self.error
+        return self.recorded - self.offset + self.error
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def residuals(
 
 
 def adjust(
-    told: npt.ArrayLike,
+    recorded: npt.ArrayLike,
     sigma: npt.ArrayLike,
     rotations: npt.ArrayLike,
     stand: Standing,
@@ -261,7 +261,7 @@ def adjust(
 
     Parameters
     ----------
-    told, sigma
+    recorded, sigma
         Recorded positions and their standard deviations without the common part, ENU m, (P, 3).
     rotations
         Starting attitudes, right to a few mrad, (P, 3, 3).
@@ -280,7 +280,7 @@ def adjust(
         If no corner was seen.
     """
     known = priors or Priors()
-    places, spreads = as_float(told), as_float(sigma)
+    places, spreads = as_float(recorded), as_float(sigma)
     if not len(corners):
         raise InputError("bundle: no corner of a mirror was seen in any photograph")
     layout = _Layout.of(len(places), len(stand), owner)

@@ -108,11 +108,11 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
             else:
                 problems[k] = (*problems[k], "no reflection on any mirror in its photographs")
     if all(one is None for one in found):
-        told = next(
+        first = next(
             (f"{f.name}: {line[-1]}" for f, line in zip(flights, problems, strict=True) if line),
             "there is no flight",
         )
-        raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {told}")
+        raise InputError(f"no flight of {len(flights)} gives a reflection; the first: {first}")
     offset, covariance = common_offset(done, (priors or Priors()).offset)
     return Campaign(tuple(found), tuple(problems), offset, covariance, len(done))
 
@@ -189,7 +189,7 @@ def _parts(flights: Sequence[FlightData], joint: Evaluation) -> list[Evaluation]
             replace(
                 joint,
                 photos=joint.photos[here],
-                told=joint.told[here],
+                recorded=joint.recorded[here],
                 seen=tuple(
                     replace(s, mirror=s.mirror - row, spot_mirror=s.spot_mirror - row)
                     for s in joint.seen[here]

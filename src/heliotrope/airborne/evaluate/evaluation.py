@@ -38,7 +38,7 @@ class Evaluation:
     ----------
     photos
         Those used, with the exterior orientation that was found.
-    told
+    recorded
         The same, as recorded by the drone.
     seen
         What each shows.
@@ -56,7 +56,7 @@ class Evaluation:
     """
 
     photos: tuple[Photo, ...]
-    told: tuple[Photo, ...]
+    recorded: tuple[Photo, ...]
     seen: tuple[Seen, ...]
     adjusted: Adjusted
     stand: Standing
@@ -109,13 +109,13 @@ def evaluate(
             return _evaluate_dark(*own, camera, stand, shape, known, lines)
         first = f"; the first: {problems[0]}" if problems else ""
         raise InputError(f"no photograph of {len(seen)} can be used{first}")
-    told, used = [photos[k] for k in good], [seen[k] for k in good]
+    recorded, used = [photos[k] for k in good], [seen[k] for k in good]
     corners = corners_of(used)
-    adjusted = adjust_photos(told, used, camera, stand, known, owner)
+    adjusted = adjust_photos(recorded, used, camera, stand, known, owner)
     state = adjusted.state
     places = [
         photo.moved(place, turned)
-        for photo, place, turned in zip(told, state.position, state.rotation, strict=True)
+        for photo, place, turned in zip(recorded, state.position, state.rotation, strict=True)
     ]
     shifts = _local_shifts(adjusted, corners, len(used), len(stand))
     found = spot_reflections(places, used, camera, state.stand, shape, shifts=shifts)
@@ -126,7 +126,7 @@ def evaluate(
         )
     return Evaluation(
         tuple(places),
-        tuple(told),
+        tuple(recorded),
         tuple(used),
         adjusted,
         state.stand,
@@ -137,7 +137,7 @@ def evaluate(
 
 
 def _evaluate_dark(
-    told: Sequence[Photo],
+    recorded: Sequence[Photo],
     seen: Sequence[Seen],
     camera: LedCamera,
     stand: Standing,
@@ -146,9 +146,9 @@ def _evaluate_dark(
     problems: tuple[str, ...],
 ) -> Evaluation:
     """Evaluate a dark flight: attitudes from the lights alone, positions from RTK."""
-    start = [p.moved(p.position, s.rotation) for p, s in zip(told, seen, strict=True)]
+    start = [p.moved(p.position, s.rotation) for p, s in zip(recorded, seen, strict=True)]
     found = turn_together(start, seen, camera, stand, shape)
-    position = as_float([p.position for p in told])
+    position = as_float([p.position for p in recorded])
     state = State(
         position,
         as_float([p.rotation for p in found.photos]),
@@ -172,7 +172,7 @@ def _evaluate_dark(
     )
     return Evaluation(
         found.photos,
-        tuple(told),
+        tuple(recorded),
         tuple(seen),
         adjusted,
         found.stand,
@@ -207,7 +207,7 @@ def corners_of(seen: Sequence[Seen]) -> Corners:
 
 
 def adjust_photos(
-    told: Sequence[Photo],
+    recorded: Sequence[Photo],
     seen: Sequence[Seen],
     camera: LedCamera,
     stand: Standing,
@@ -220,8 +220,8 @@ def adjust_photos(
     less than stated, the adjustment is repeated with their standard deviations rescaled.
     """
     corners = corners_of(seen)
-    places = as_float([p.position for p in told])
-    spreads = as_float([p.sigma_position for p in told])
+    places = as_float([p.position for p in recorded])
+    spreads = as_float([p.sigma_position for p in recorded])
     turns = as_float([s.rotation for s in seen])
     distance = float(np.median(np.linalg.norm(stand.vertex - places.mean(axis=0), axis=-1)))
     bias = EDGE_BIAS * distance / camera.focal

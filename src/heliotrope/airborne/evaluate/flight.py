@@ -212,8 +212,8 @@ def evaluate_flight(
     for flight, problems in zip(flights, campaign.problems, strict=True):
         lines += [(flight.name, line) for line in problems]
     not_used = (*unusable, *(f"{name}: {line}" if name else line for name, line in lines))
-    told = (*warnings, *campaign.warnings(priors.offset))
-    return CampaignResult(plant, tuple(flights), campaign, tuple(results), not_used, told)
+    all_warnings = (*warnings, *campaign.warnings(priors.offset))
+    return CampaignResult(plant, tuple(flights), campaign, tuple(results), not_used, all_warnings)
 
 
 def _read(

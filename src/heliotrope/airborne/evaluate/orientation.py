@@ -415,7 +415,7 @@ def _result(
     weight = np.zeros(len(own))
     weight[keep] = known.weights if mean == "area" else 1.0 / len(kept)
     shared = budget.covariance(point, part.camera, part.led, axes, place)
-    told = Orientation(
+    result = Orientation(
         heliostat=int(own.heliostat[0]),
         rotation=R,
         vertex=vertex,
@@ -434,7 +434,7 @@ def _result(
         distance=float(np.linalg.norm(part.camera - point, axis=-1).mean()),
         mean=mean,
     )
-    return replace(told, warnings=tuple(_warnings(told, shape, part.xy)))
+    return replace(result, warnings=tuple(_warnings(result, shape, part.xy)))
 
 
 def _facet_means(

@@ -400,9 +400,9 @@ def _digest(camera: LedCamera, stand: Standing) -> bytes:
 def _mark(photo: Photo, base: bytes) -> str:
     """Return a key for a photograph's file, position and attitude with this camera and field."""
     state = photo.path.stat() if photo.path is not None and photo.path.exists() else None
-    told = photo.position.tobytes() + photo.rotation.tobytes()
+    recorded = photo.position.tobytes() + photo.rotation.tobytes()
     file = "" if state is None else f"{photo.name} {state.st_size} {state.st_mtime_ns}"
-    return hashlib.sha256(base + told + file.encode()).hexdigest()[:32]
+    return hashlib.sha256(base + recorded + file.encode()).hexdigest()[:32]
 
 
 def _kept(path: Path) -> Seen | None:

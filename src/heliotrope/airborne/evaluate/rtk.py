@@ -70,9 +70,9 @@ def check_rtk(
     if len(good) < 3:
         first = f"; the first: {problems[0]}" if problems else ""
         raise InputError(f"{len(good)} photographs can be used, three are needed{first}")
-    told, used = [photos[k] for k in good], [seen[k] for k in good]
-    usual = adjust_photos(told, used, camera, stand, priors or Priors())
-    places, corners = as_float([p.position for p in told]), corners_of(used)
+    recorded, used = [photos[k] for k in good], [seen[k] for k in good]
+    usual = adjust_photos(recorded, used, camera, stand, priors or Priors())
+    places, corners = as_float([p.position for p in recorded]), corners_of(used)
     if disagrees(usual):
         corners = replace(corners, sigma=corners.sigma * max(usual.deviation, 0.1))
     free = adjust(
@@ -86,7 +86,7 @@ def check_rtk(
     )
     gap = places - free.state.position
     return RtkCheck(
-        tuple(p.name for p in told),
+        tuple(p.name for p in recorded),
         gap,
         usual.state.offset,
         np.sqrt(np.diag(usual.offset_covariance)),

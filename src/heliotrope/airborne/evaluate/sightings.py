@@ -208,15 +208,15 @@ def fit_together(
     turn, found = np.zeros((count, 2)), alone.parameters
     for _ in range(_ROUNDS):
         seen = join([others, _turned_back(known, mechanism.with_parameters(found), turn)])
-        told = fit(mechanism, seen, model, priors=priors, loss="square", adapt_scale=False)
-        found = told.parameters
-        step, covariance = _joint_step(mechanism, seen, len(others), told, turn, spread)
+        joint = fit(mechanism, seen, model, priors=priors, loss="square", adapt_scale=False)
+        found = joint.parameters
+        step, covariance = _joint_step(mechanism, seen, len(others), joint, turn, spread)
         turn = turn + step
         if np.abs(step).max(initial=0.0) < _SETTLED:
             break
-    p = len(told.names)
+    p = len(joint.names)
     return Together(
-        replace(told, covariance=covariance[:, :p, :p]), turn, covariance[:, p:, p:], noise
+        replace(joint, covariance=covariance[:, :p, :p]), turn, covariance[:, p:, p:], noise
     )
 
 
@@ -232,8 +232,8 @@ def _scatter(alone: FieldFit, flights: Sightings) -> FloatArray:
     count = len(alone.values)
     free = 2 * np.bincount(flights.heliostat, minlength=count) - len(alone.names)
     square = np.bincount(flights.heliostat, weights=alone.lengths**2, minlength=count)
-    told = np.clip(np.sqrt(square / np.maximum(free, 1)), _LEAST, None)
-    return np.where(free >= _ENOUGH, told, 1.0)
+    joint = np.clip(np.sqrt(square / np.maximum(free, 1)), _LEAST, None)
+    return np.where(free >= _ENOUGH, joint, 1.0)
 
 
 def _turned_back(flights: Sightings, mechanism: Mechanism, turn: FloatArray) -> Sightings:
@@ -252,18 +252,18 @@ def _joint_step(
     mechanism: Mechanism,
     seen: Sightings,
     first: int,
-    told: FieldFit,
+    joint: FieldFit,
     turn: FloatArray,
     spread: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the Gauss-Newton step of the turns (N, 2), and the covariance of all unknowns."""
-    fitted = mechanism.with_parameters(told.parameters)[seen.heliostat]
-    lines = linearise(fitted, seen, told.names)
+    fitted = mechanism.with_parameters(joint.parameters)[seen.heliostat]
+    lines = linearise(fitted, seen, joint.names)
     by_turn = _by_turn(fitted, seen)
     by_turn[:first] = 0.0
     J = np.concatenate([lines.jacobian, by_turn], axis=-1)
-    weight = np.concatenate([told.prior**-2, np.repeat(spread[:, None] ** -2, 2, axis=1)], axis=1)
-    off = np.concatenate([told.values - told.centre, turn], axis=1)
+    weight = np.concatenate([joint.prior**-2, np.repeat(spread[:, None] ** -2, 2, axis=1)], axis=1)
+    off = np.concatenate([joint.values - joint.centre, turn], axis=1)
     hessian, gradient = weight[:, :, None] * np.eye(weight.shape[1]), weight * off
     np.add.at(hessian, seen.heliostat, np.einsum("map,maq->mpq", J, J))
     np.add.at(gradient, seen.heliostat, np.einsum("map,ma->mp", J, lines.residual))

@@ -55,9 +55,9 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
         If it names other heliostats.
     """
     root = read_json(path, "a flight plan (plan.json)")
-    told = root["format"].text()
-    if told != "heliotrope flight plan 1":
-        raise root["format"].fail(f"{told!r} is not known; give 'heliotrope flight plan 1'")
+    version = root["format"].text()
+    if version != "heliotrope flight plan 1":
+        raise root["format"].fail(f"{version!r} is not known; give 'heliotrope flight plan 1'")
     index = {name: i for i, name in enumerate(names)}
     clusters: dict[str, tuple[npt.NDArray[np.intp], FloatArray]] = {}
     for node in root["clusters"].elements():

@@ -361,7 +361,7 @@ def _expose(image: Light, conditions: Conditions, seed: int) -> Picture:
 def write_photo(
     path: str | Path,
     picture: Picture,
-    told: Photo,
+    recorded: Photo,
     origin: tuple[float, float, float],
     quality: int = 95,
 ) -> None:
@@ -373,7 +373,7 @@ def write_photo(
         The file.
     picture
         Blue-green-red, (H, W, 3).
-    told
+    recorded
         Position, rotation and time as recorded.
     origin
         Latitude and longitude (degrees) and height (m) of ENU's origin.
@@ -382,19 +382,19 @@ def write_photo(
     """
     import cv2
 
-    latitude, longitude, height = enu_to_geodetic(told.position, origin)
-    yaw, pitch, roll = (math.degrees(a) for a in gimbal_of_rotation(told.rotation))
+    latitude, longitude, height = enu_to_geodetic(recorded.position, origin)
+    yaw, pitch, roll = (math.degrees(a) for a in gimbal_of_rotation(recorded.rotation))
     exif, xmp = exif_and_xmp(
         Metadata(
             (picture.shape[1], picture.shape[0]),
-            told.time,
+            recorded.time,
             float(latitude),
             float(longitude),
             float(height),
             yaw,
             pitch,
             roll,
-            told.sigma_position,
+            recorded.sigma_position,
         )
     )
     good, encoded = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])
@@ -442,10 +442,10 @@ def render_flight(
     scene = Scene(flight.truth, flight.shapes, ground, light)
     write_camera(place / "camera.toml", flight.camera)
     write_commands(place / "commands.csv", flight.heliostats.names, flight.counts)
-    for k, (taken, told) in enumerate(zip(flight.taken, flight.told, strict=True)):
+    for k, (taken, recorded) in enumerate(zip(flight.taken, flight.recorded, strict=True)):
         lamp = exact.take(np.flatnonzero(exact.photo == k))
         picture = render(scene, flight.camera, taken, lamp, seed + k)
-        write_photo(place / told.name, picture, told, origin, light.quality)
+        write_photo(place / recorded.name, picture, recorded, origin, light.quality)
         if progress is not None:
             progress(k + 1, len(flight.taken))
     return exact

@@ -1,7 +1,7 @@
 """A simulated flight with its truth: mirrors as they really stand, and what the drone records.
 
 A flight holds two versions of the same thing. *True*: mechanisms with imperfections, surveyed
-positions with errors, facets with slope errors, the real positions of the camera. *Told*: the
+positions with errors, facets with slope errors, the real positions of the camera. *Recorded*: the
 plant file, the commands, and for each photograph a position from RTK and the angles of a gimbal.
 :func:`fly` makes both; :func:`reflections_of` gives the reflections that an image evaluation would
 find, without images; :mod:`heliotrope.airborne.simulate.rendering` draws them.
@@ -86,7 +86,7 @@ class Flight:
         Their surfaces with slope deviations, N of them.
     taken
         Photographs with their true exterior orientation.
-    told
+    recorded
         The same, as recorded by the drone.
     """
 
@@ -96,7 +96,7 @@ class Flight:
     truth: Standing
     shapes: tuple[MirrorShape, ...]
     taken: tuple[Photo, ...]
-    told: tuple[Photo, ...]
+    recorded: tuple[Photo, ...]
 
 
 @dataclass(frozen=True)
@@ -345,10 +345,10 @@ def reflections_of(
     exact = exact_reflections(flight)
     rng = np.random.default_rng(seed)
     noisy = exact.xy + rng.normal(0.0, wrong.reflection, (len(exact), 2))
-    told = as_float([p.position for p in flight.told]).reshape(-1, 3)
+    recorded = as_float([p.position for p in flight.recorded]).reshape(-1, 3)
     true = as_float([p.position for p in flight.taken]).reshape(-1, 3)
-    off = (told - true).mean(axis=0) if corrected and len(told) else np.zeros(3)
-    camera = told[exact.photo] - off
+    off = (recorded - true).mean(axis=0) if corrected and len(recorded) else np.zeros(3)
+    camera = recorded[exact.photo] - off
     return replace(
         exact,
         x=noisy[:, 0],

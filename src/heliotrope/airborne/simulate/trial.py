@@ -76,7 +76,7 @@ class TrialMirror:
         With its true slopes.
     rotation, vertex
         True, (3, 3) and (3,).
-    told_rotation, told_vertex
+    expected_rotation, expected_vertex
         Expected.
     reflections
         As image evaluation would find them.
@@ -85,8 +85,8 @@ class TrialMirror:
     shape: MirrorShape
     rotation: FloatArray
     vertex: FloatArray
-    told_rotation: FloatArray
-    told_vertex: FloatArray
+    expected_rotation: FloatArray
+    expected_vertex: FloatArray
     reflections: Reflections
 
 
@@ -133,10 +133,11 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
         real = shape.with_slopes(smooth_slopes(shape, rng, c.slope, length=c.length))
     out = direction(rng.uniform(0.0, 2.0 * np.pi), np.radians(rng.uniform(35.0, 70.0)))
     right = normalize(np.cross((0.0, 0.0, 1.0), out))
-    told = np.stack([right, np.cross(out, right), out], axis=-1)
-    true = turned(told, c.pointing * rng.standard_normal(2))
-    told_vertex = np.array([0.0, 100.0, 3.0])
-    vertex = told_vertex + np.hypot(c.budget.position, c.budget.kinematics) * rng.standard_normal(3)
+    expected = np.stack([right, np.cross(out, right), out], axis=-1)
+    true = turned(expected, c.pointing * rng.standard_normal(2))
+    expected_vertex = np.array([0.0, 100.0, 3.0])
+    shift = np.hypot(c.budget.position, c.budget.kinematics) * rng.standard_normal(3)
+    vertex = expected_vertex + shift
     # The reflection moves over the mirror with the drone, less where the mirror focuses.
     corners = shape.corners[..., :2].reshape(-1, 2)
     narrow = abs(1.0 - c.distance / (2.0 * float(shape.focal.mean())))
@@ -146,7 +147,7 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
     places = places.reshape(-1, 2) + c.hover * rng.standard_normal((c.columns * c.rows, 2))
     own = np.concatenate([places, np.full((len(places), 1), c.distance)], axis=-1)
     # Roughly where the mirror really points, which a first photograph shows.
-    camera = told_vertex + own @ true.T
+    camera = expected_vertex + own @ true.T
     led = camera + c.lamp * right
     seen = reflection_points(real, true, vertex, camera, led)
     off = c.rtk * rng.standard_normal(camera.shape) + c.budget.rtk * rng.standard_normal(3)
@@ -161,7 +162,7 @@ def trial_mirror(shape: MirrorShape, conditions: TrialConditions, seed: int) -> 
         (led + off + lamp_off)[seen.position],
         max(c.reflection, 1e-6),
     )
-    return TrialMirror(real, true, vertex, told, told_vertex, found)
+    return TrialMirror(real, true, vertex, expected, expected_vertex, found)
 
 
 def trials(
@@ -199,23 +200,23 @@ def trials(
     for k in range(count):
         s = trial_mirror(ideal, conditions, seed + k)
         known = s.shape if map_known else ideal
-        alone = measure(s.reflections, known, s.told_rotation, s.vertex, budget=bare, mean=mean)
-        told = measure(
+        alone = measure(s.reflections, known, s.expected_rotation, s.vertex, budget=bare, mean=mean)
+        measured = measure(
             s.reflections,
             known,
-            s.told_rotation,
-            s.told_vertex,
+            s.expected_rotation,
+            s.expected_vertex,
             budget=conditions.budget,
             mean=mean,
         )
         rows.append(
             (
-                np.full(2, float(told.count)),
+                np.full(2, float(measured.count)),
                 rotation_between(s.rotation, alone.rotation)[:2],
-                rotation_between(s.rotation, told.rotation)[:2],
-                told.sigma_plain,
-                told.sigma_mean,
-                told.systematic,
+                rotation_between(s.rotation, measured.rotation)[:2],
+                measured.sigma_plain,
+                measured.sigma_mean,
+                measured.systematic,
             )
         )
     columns = np.array(rows)

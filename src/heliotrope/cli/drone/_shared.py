@@ -62,11 +62,11 @@ def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
     with ExitStack() as stack:
         bars: dict[str, Callable[[int, int], None]] = {}
 
-        def told(what: str, done: int, of: int) -> None:
+        def show(what: str, done: int, of: int) -> None:
             if what not in bars:
                 stack.close()
                 bars.clear()
                 bars[what] = stack.enter_context(calibration.progress(what, quiet))
             bars[what](done, of)
 
-        yield told
+        yield show
