@@ -72,9 +72,11 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     from heliotrope.field.layouts import malan_plant
     from heliotrope.links.clock import VirtualClock
     from heliotrope.links.link import running
+    from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+    from heliotrope.plant.operations.automatic import AutomaticSettings
     from heliotrope.store.keeper import Keeper
     from heliotrope.twin.field.field_bus import FieldBus
-    from heliotrope.twin.live.live import LiveOptions, LivePlant
+    from heliotrope.twin.live import CYCLE, World
 
     loop = asyncio.get_running_loop()
     keeper, heard = Keeper(folder / "store.sqlite"), Heard(heliostats)
@@ -83,16 +85,16 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     tokens = [
         people.add_token(NAME, f"load {i}", "operator", now)[1] for i in range(VIEWERS + OPERATORS)
     ]
-    live = LivePlant(
-        malan_plant(heliostats),
-        VirtualClock(loop.time),
-        LiveOptions(),
-        records=keeper,
-        extra=lambda: {"speed": 1.0},
+    design = malan_plant(heliostats)
+    world = World(design, VirtualClock(loop.time))
+    settings = AssemblySettings(
+        AutomaticSettings(wanted=True), cycle=CYCLE, machines=MachineTables.HELD
     )
-    for part in live._parts:
-        if isinstance(part, FieldBus):
-            part._took = heard.took
+    ports = world.ports(records=keeper, facts=lambda: {"speed": 1.0})
+    live = PlantAssembly(design, ports, settings)
+    for bus in world.buses.values():
+        if isinstance(bus, FieldBus):
+            bus._took = heard.took
     made: dict[int, float] = {}
     server = ConsoleServer(live.operations, people, ConsoleSettings(port=0))
     stream = server.app.state.console.stream
@@ -106,7 +108,7 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
     longest, acknowledged = _Longest(), _acknowledged(live.plant)
     async with live.running(), running(server), asyncio.TaskGroup() as group:
         watching = group.create_task(longest.run())
-        pipe.send((await server.address(), tokens, live.names))
+        pipe.send((await server.address(), tokens, world.names))
         while (question := await asyncio.to_thread(pipe.recv)) != "end":
             if question == "begin":
                 heard.begin()

@@ -12,7 +12,7 @@ import math
 import resource
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
 from heliotrope.sun import Site, broadcast_values, vector
 from heliotrope.twin.boards.clocks import SimulatedTime
-from heliotrope.twin.boards.outfit import LIMITS, RANGES, STEPS_PER_TURN, STOW
+from heliotrope.twin.boards.outfit import MACHINE, STEPS_PER_TURN
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus
 
@@ -147,7 +147,7 @@ def _field(count: int) -> Field:
     machine = kinds.azimuth_elevation(
         place, pivot_height=3.0, pivot_offset=0.3, drives=(rotary(**gear), rotary(**gear))
     )
-    return Field(machine, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY)
+    return Field(machine, replace(MACHINE, standby=STANDBY))
 
 
 def _on_receiver(field: Field, clock: VirtualClock) -> None:

@@ -18,11 +18,13 @@ from benchmarks._run import BenchmarkError, Result, Row
 from heliotrope.field.layouts import malan_plant
 from heliotrope.geometry import MRAD
 from heliotrope.links.clock import VirtualClock, VirtualLoop
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.schedule.plant_schedule import settings_for
 from heliotrope.plant.schedule.scheduler import Scheduler, Weather
 from heliotrope.sun import vector
 from heliotrope.twin.days import Days
-from heliotrope.twin.live.live import CYCLE, LiveOptions, LivePlant
+from heliotrope.twin.live import CYCLE, World, WorldOptions
 
 #: Midsummer, an hour after midnight, UTC.
 BEGIN = datetime(2026, 6, 21, 1, 0, tzinfo=UTC)
@@ -97,9 +99,13 @@ def _rms(error: np.ndarray) -> float:
 
 async def _live(count: int, minutes: float, looks: int) -> list[Row]:
     clock = VirtualClock(asyncio.get_running_loop().time, MORNING)
-    options = LiveOptions(rendered=False, threads=0)
     rows: list[Row] = []
-    live = LivePlant(malan_plant(count), clock, options)
+    design = malan_plant(count)
+    world = World(design, clock, WorldOptions(rendered=False, threads=0))
+    settings = AssemblySettings(
+        AutomaticSettings(wanted=True), cycle=CYCLE, machines=MachineTables.HELD
+    )
+    live = PlantAssembly(design, world.ports(), settings)
     async with live.running():
         before = time.process_time()
         for look in range(1, looks + 1):

@@ -19,9 +19,10 @@ from heliotrope.console.settings import ConsoleSettings
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.link import running
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.live.live import LiveOptions, LivePlant
-from heliotrope.twin.live.loop import PacedLoop
+from heliotrope.twin.live import CYCLE, PacedLoop, World
 
 NAME = "engineer"
 CHROMIUM = "/usr/bin/chromium"
@@ -56,13 +57,12 @@ class Shown:
         keeper.people.add(NAME, kept, "engineer", now)
         for name, role in (("desk-1", "operator"), ("desk-2", "operator"), ("visitors", "viewer")):
             keeper.people.add(name, kept, role, now)
-        live = LivePlant(
-            malan_plant(heliostats),
-            clock,
-            LiveOptions(),
-            records=keeper,
-            extra=lambda: {"speed": speed},
+        design = malan_plant(heliostats)
+        ports = World(design, clock).ports(records=keeper, facts=lambda: {"speed": speed})
+        settings = AssemblySettings(
+            AutomaticSettings(wanted=True), cycle=CYCLE, machines=MachineTables.HELD
         )
+        live = PlantAssembly(design, ports, settings)
         async with live.running():
             server = ConsoleServer(live.operations, keeper.people, ConsoleSettings(port=0))
             async with running(server):

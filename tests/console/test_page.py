@@ -12,7 +12,6 @@ import pytest
 from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.live._field import LiveBus
 from support.live_console import PASSWORD, LiveConsole
 
 CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
@@ -329,7 +328,7 @@ def test_a_page_that_hears_nothing_says_so(field: LiveConsole, enter: Callable[[
 # The last one: nodes that failed are counted for ten minutes, and commands refused meanwhile.
 def test_a_dead_cluster_is_shown_as_stale(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
-    buses = field.call(lambda: [x for x in field.live._parts if isinstance(x, LiveBus)])
+    buses = field.call(lambda: list(field.live.world.buses.values()))
     page.click(".hx-tabs >> text=Clusters")
     page.wait_for_selector(".hx-clusters tbody tr")
     field.call(lambda: setattr(buses[3], "plugged", False))

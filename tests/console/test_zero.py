@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.field.example import board_prototype
 from heliotrope.field.layouts import lay_out
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.authority import Person, RefusedError, Role
@@ -16,8 +17,8 @@ from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.zero import zero
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
-from heliotrope.twin.live._field import LiveField
-from heliotrope.twin.live.live import LiveOptions, LivePlant, prototype_plant
+from heliotrope.twin.field import Field, FieldBus
+from support.live import LiveOptions, LivePlant
 
 START = datetime(2026, 10, 21, 9, tzinfo=UTC)
 ENGINEER, OPERATOR = Person("engineer", Role.ENGINEER), Person("operator", Role.OPERATOR)
@@ -25,7 +26,7 @@ ENGINEER, OPERATOR = Person("engineer", Role.ENGINEER), Person("operator", Role.
 
 def _live(work: Callable[[LivePlant], Awaitable[None]], records: Keeper | None = None) -> None:
     """Run two boards that nobody wants to move."""
-    design = prototype_plant()
+    design = board_prototype()
     (group,) = design.groups.values()
     two = replace(design, groups={"azel": group.take([0, 1])})
     options = LiveOptions(
@@ -89,8 +90,8 @@ def test_buses_take_turns_in_an_emergency() -> None:
     async def main() -> None:
         clock = VirtualClock(asyncio.get_running_loop().time, START)
         field = LivePlant(lay_out("radial", 3), clock, LiveOptions(rendered=False)).field
-        assert isinstance(field, LiveField)
-        buses = {"a": field.bus(range(1)), "b": field.bus(range(1, 3))}
+        assert isinstance(field, Field)
+        buses = {"a": FieldBus(field, range(1)), "b": FieldBus(field, range(1, 3))}
         for urgent, expected in ((True, "ababab"), (False, "aaabbb")):
             order: list[str] = []
 

@@ -17,6 +17,7 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.sun import Site
 from support.data import juelich
@@ -253,6 +254,123 @@ max_count = 75000
     wanted = linear_paint(154166.6667, 0.0785, 0.335, 0.338, np.radians(-87.8), clockwise=0)
     assert (table[1, 0] == wanted.table).all()
     assert table[0, 1, SLOTS["max_count"]] == 75000
+
+
+MACHINE = """
+[groups.azel.machine]
+stow_deg = [90, 88]
+defocus_mrad = [100, 50]
+standby_m = [12, 0, 40]
+leaves_stow_first = "elevation"
+way_m = [[20, -25, 0], [12, 0, 5]]
+[groups.azel.machine.axes.azimuth]
+rate_steps_per_s = 8000
+acceleration_steps_per_s2 = 16000
+backlash_steps = 40
+min_steps = -222222
+max_steps = 222222
+[groups.azel.machine.axes.elevation]
+acceleration_steps_per_s2 = 9000
+backlash_steps = 0
+max_deg = 93.6
+"""
+GEAR = """
+kind = "rotary"
+steps_per_turn = 200
+microsteps = 4
+gear_ratio = 500
+speed_counts_per_s = 5000
+min_angle_deg = -3.6
+"""
+
+
+def with_machine(folder: Path, text: str = MACHINE, column: str = "", values: str = "") -> Path:
+    """A plant of two heliostats whose local controllers are to store what ``text`` says."""
+    more = [f",{word}" if word else "" for word in (column, *(values.split() or ["", ""]))]
+    rows = ("name,group,east_m,north_m,up_m", "A1,azel,0,-30,0", "A2,azel,10,-30,0")
+    table = "".join(f"{row}{end}\n" for row, end in zip(rows, more, strict=True))
+    (folder / "field.csv").write_text(table)
+    path = folder / "plant.toml"
+    path.write_text(
+        f"""
+format = "heliotrope-plant"
+version = 1
+heliostats = "field.csv"
+plant = {{name = "machines"}}
+site = {{latitude_deg = -33.9, longitude_deg = 18.9}}
+[groups.azel]
+kind = "azimuth_elevation"
+mirror_width_m = 2
+mirror_height_m = 1
+[groups.azel.drives.azimuth]{GEAR}[groups.azel.drives.elevation]{GEAR}{text}""",
+        encoding="utf-8",
+    )
+    return path
+
+
+def test_machine_of_a_group(tmp_path: Path) -> None:
+    plant = plant_file.read_plant(with_machine(tmp_path))
+    # 400,000 steps to a turn; the elevation has its rate and its lower stop from the drive.
+    machine = Machine(
+        (AxisLimits(-222222, 222222, 8000, 16000, 40), AxisLimits(-4000, 104000, 5000, 9000, 0)),
+        (100_000, 97_778),
+        (0.1, 0.05),
+        (12.0, 0.0, 40.0),
+        1,
+        ((20.0, -25.0, 0.0), (12.0, 0.0, 5.0)),
+    )
+    assert plant.groups["azel"].machines == (machine, machine)
+    assert plant.machine("A2") == machine
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    assert plant_file.read_plant(tmp_path / "again.toml").machine("A1") == machine
+
+
+def test_machine_of_each_heliostat(tmp_path: Path) -> None:
+    path = with_machine(tmp_path, column="machine.axes.azimuth.max_steps", values="200000 210000")
+    plant = plant_file.read_plant(path)
+    assert [plant.machine(name).axes[0].high for name in ("A1", "A2")] == [200_000, 210_000]
+    plant_file.write_plant(plant, tmp_path / "again.toml")
+    again = plant_file.read_plant(tmp_path / "again.toml")
+    assert again.groups["azel"].machines == plant.groups["azel"].machines
+    assert again.groups["azel"].take([1]).machines == (plant.machine("A2"),)
+
+
+def test_group_without_a_machine_reads_and_is_refused_where_one_is_needed(tmp_path: Path) -> None:
+    plant = plant_file.read_plant(with_machine(tmp_path, ""))
+    assert plant.groups["azel"].machines == ()
+    with pytest.raises(InputError, match=r"group azel: .* no table \[groups.azel.machine\]; add"):
+        plant.machine("A1")
+    with pytest.raises(FormatError, match=r"columns machine\.…; add it"):
+        plant_file.read_plant(with_machine(tmp_path, "", "machine.stow_steps.0", "1 2"))
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "text"),
+    [
+        ("stow_deg = [90, 88]", "", "give either stow_steps or stow_deg"),
+        ("stow_deg = [90, 88]", "stow_deg = [90, 100]", "stow at 111111 steps of the secondary"),
+        ("defocus_mrad", "defocus_rad", "defocus by 5.73e+03°; one axis must turn by 1.15°"),
+        ("defocus_mrad = [100, 50]", "", "give one of defocus_deg, defocus_mrad, defocus_rad"),
+        ("rate_steps_per_s = 8000", "rate_steps_per_s = 20000", "controller emits 10000 at most"),
+        ("backlash_steps = 40", "", "groups.azel.machine.axes.azimuth.backlash_steps"),
+        ("max_deg = 93.6", "", "missing in _steps and _deg, and the drive has no stop"),
+        ("max_steps = 222222", "max_steps = 222222\nmax_deg = 1", "in steps and in deg; keep one"),
+        ("max_steps = 222222", "max_steps = -222222", "the low end comes first"),
+        ("axes.elevation]", "axes.roll]", "axes of azimuth, roll; give those of azimuth and elev"),
+        ('"elevation"', '"roll"', "'roll' is no driven joint"),
+        ("standby_m = [12, 0, 40]", "standby_m = [12, 0]", "groups.azel.machine.standby_m"),
+    ],
+)
+def test_machine_that_cannot_be_is_one_line(
+    before: str, after: str, text: str, tmp_path: Path
+) -> None:
+    assert before in MACHINE
+    path = with_machine(tmp_path, MACHINE.replace(before, after, 1))
+    with pytest.raises(FormatError) as caught:
+        plant_file.read_plant(path)
+    assert text in str(caught.value)
+    assert "groups.azel" in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_warnings_of_check(tmp_path: Path) -> None:

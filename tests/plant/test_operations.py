@@ -27,7 +27,7 @@ from heliotrope.plant.visits.photographs import Shot, seen, spiral
 from heliotrope.plant.visits.settings import Centring
 from heliotrope.safety import Alarm, Severity
 from heliotrope.store.records import StoreError
-from heliotrope.twin.live.live import LiveOptions, LivePlant
+from support.live import LiveOptions, LivePlant
 
 MRAD = 1e-3
 ENGINEER, OPERATOR, VIEWER = (

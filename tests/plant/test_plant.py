@@ -27,7 +27,8 @@ from heliotrope.links.messages import (
     Status,
     encode,
 )
-from heliotrope.mechanism.board_items import Axis, Machine, Wanted, items_of
+from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.audit import AuditError, read
 from heliotrope.plant.authority import RefusedError
@@ -361,8 +362,8 @@ def test_whose_beam_would_sweep_through_a_volume_does_not_join(tmp_path: Path) -
 
 
 def test_what_is_stored_is_compared_and_pushed(tmp_path: Path) -> None:
-    axis = Axis(-100_000, 1_950_000, 8000, 16_000, 40)
-    machine = Machine((axis, axis), (480_000, 470_000), (12.0, 0.0, 10.0))
+    axis = AxisLimits(-100_000, 1_950_000, 8000, 16_000, 40)
+    machine = Machine((axis, axis), (480_000, 470_000), (0.1, 0.1), (12.0, 0.0, 10.0))
 
     async def scene(bench: Bench) -> None:
         plant = bench.plant

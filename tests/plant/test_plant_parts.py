@@ -17,8 +17,6 @@ from heliotrope.lcu.config import Config
 from heliotrope.links.clock import VirtualClock
 from heliotrope.links.messages import NODE, ProtocolError, Stage, Status
 from heliotrope.mechanism.board_items import (
-    Axis,
-    Machine,
     Wanted,
     checksums,
     differing,
@@ -26,6 +24,7 @@ from heliotrope.mechanism.board_items import (
     items_of,
     packed,
 )
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.plant.aims import spread
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
@@ -165,8 +164,9 @@ def test_records_that_contradict_each_other_are_refused(
 
 
 def test_items_are_those_that_local_controllers_are_tested_with() -> None:
-    axes = (Axis(-100_000, 1_950_000, 8000, 16_000, 40), Axis(-20_000, 500_000, 8000, 16_000, 40))
-    made = items_of(heliostat(), Machine(axes, STOW, STANDBY, (0.1, 0.05)))
+    limits = (8000, 16_000, 40)
+    axes = (AxisLimits(-100_000, 1_950_000, *limits), AxisLimits(-20_000, 500_000, *limits))
+    made = items_of(heliostat(), Machine(axes, STOW, (0.1, 0.05), STANDBY))
     known = items_of_heliostat(heliostat())
     assert {name: made[name] for name in known if name != "address"} == {
         name: data for name, data in known.items() if name != "address"
@@ -199,9 +199,6 @@ def test_what_no_controller_takes_is_refused() -> None:
         packed("biases", (1.0,))
     with pytest.raises(InputError, match="a local controller refuses"):
         packed("biases", (8.0, 0.0))
-    axis = Axis(0, 10_000, 5, 5)
-    with pytest.raises(InputError, match="way: 5 points; a controller keeps 4"):
-        items_of(heliostat(), Machine((axis, axis), (0, 0), way=((0.0, 0.0, 0.0),) * 5))
 
 
 def test_what_differs_is_found() -> None:

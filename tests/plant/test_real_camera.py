@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import FetchError, InputError
+from heliotrope.field.example import board_prototype
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import normalize
 from heliotrope.imaging.files import read_image, write_image
@@ -30,7 +31,6 @@ from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
 from heliotrope.safety import Alarm
 from heliotrope.twin.cameras import Mirror, Optics, RenderedCamera, Sight
-from heliotrope.twin.live.live import prototype_plant
 
 SUN = normalize(np.array([0.2, -0.7, 0.7]), "sun")
 OFF = 0.4
@@ -39,7 +39,7 @@ OFF = 0.4
 @pytest.fixture(scope="module")
 def plant() -> Plant:
     """The prototype's, with half as many pixels each way: quicker to draw and to read."""
-    found = prototype_plant()
+    found = board_prototype()
     (camera,) = found.cameras
     matrix = camera.matrix * [[0.5], [0.5], [1.0]]
     width, height = camera.size
@@ -81,6 +81,10 @@ class Scripted:
         return SimulatedSource(made, lambda: datetime.now(UTC), stop=stop)
 
 
+def unheard(alarm: Alarm) -> None:
+    """Nobody hears the alarm."""
+
+
 def looked(cameras: RealCameras, name: str) -> Any:
     return asyncio.run(cameras.look(name))
 
@@ -90,7 +94,7 @@ def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) 
     cameras = RealCameras(
         plant, tmp_path, SystemClock(), memory=tmp_path / "m", sources=Scripted(frame)
     )
-    cameras.start()
+    cameras.start(unheard)
     try:
         before = SystemClock().monotonic()
         shot = looked(cameras, target.name)
@@ -111,10 +115,9 @@ def test_a_beam_is_seen_where_it_is(plant: Plant, frame: Frame, tmp_path: Path) 
 def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: Frame) -> None:
     script, told = Scripted(frame), list[Alarm]()
     cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)
-    cameras.on_alarm = told.append
     script.alive = False
     name = plant.targets[0].name
-    cameras.start()
+    cameras.start(told.append)
     try:
         with pytest.raises(FetchError, match=r"camera camera: no frame for 0\.3 s; look at the"):
             looked(cameras, name)
@@ -133,7 +136,7 @@ def test_a_camera_that_falls_silent_is_told_and_left_alone(plant: Plant, frame: 
 def test_a_frame_from_before_is_no_photograph(plant: Plant, frame: Frame) -> None:
     script = Scripted(frame, late=60.0)
     cameras = RealCameras(plant, Path(), SystemClock(), patience=0.3, sources=script)
-    cameras.start()
+    cameras.start(unheard)
     try:
         with pytest.raises(FetchError, match="its clock"):
             looked(cameras, plant.targets[0].name)
@@ -145,7 +148,7 @@ def test_a_time_that_is_too_unsure_is_a_reason(plant: Plant, frame: Frame) -> No
     script = Scripted(frame, late=-3.0)
     script.deviation = 2.0
     cameras = RealCameras(plant, Path(), SystemClock(), sources=script)
-    cameras.start()
+    cameras.start(unheard)
     try:
         reasons = looked(cameras, plant.targets[0].name).reasons
     finally:

@@ -21,14 +21,12 @@ from heliotrope.imaging.sources import SimulatedSource, Source
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import exposed
 from heliotrope.links.clock import SystemClock
-from heliotrope.links.link import running
-from heliotrope.plant.assembly import RealPlant
+from heliotrope.plant.assembly import AssemblySettings, PlantAssembly
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.cameras import RealCameras
-from heliotrope.plant.links_file import PlantLinks
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.cameras import PEAK
-from heliotrope.twin.live.live import LiveOptions, LivePlant
+from heliotrope.twin.live import World
 
 #: Heliostats that must have learnt, and the time for it, s.
 LEARNT, PATIENCE = 2, 200.0
@@ -41,7 +39,7 @@ def at_noon() -> Plant:
     return replace(design, site=replace(design.site, longitude_deg=longitude))
 
 
-def drawn(world: LivePlant) -> Any:
+def drawn(world: World) -> Any:
     """Return what makes sources that draw what is on a target now, a frame a second."""
 
     def made(camera: Camera, folder: Path, stop: threading.Event) -> Source:
@@ -64,30 +62,23 @@ def drawn(world: LivePlant) -> Any:
 def test_a_real_plant_learns_from_its_cameras(tmp_path: Path) -> None:
     async def main() -> dict[str, tuple[float, float]]:
         clock, design = SystemClock(), at_noon()
-        world = LivePlant(design, clock, LiveOptions(seed=0))  # type: ignore[arg-type]
+        world = World(design, clock)
         cameras = RealCameras(design, tmp_path, clock, memory=tmp_path / "m", sources=drawn(world))
-        plant = RealPlant(
-            design,
-            PlantLinks(links=dict(world.links)),
-            clock,
-            JsonLines(tmp_path / "audit.jsonl", clock.utc()),
-            cameras=cameras,
-            work=AutomaticSettings(wanted=True),
-        )
-        async with asyncio.TaskGroup() as group:
-            turning = group.create_task(world._turn())
-            async with running(*world._parts), running(*world._clusters), plant.running():
-                before = world.errors()
-                async with asyncio.timeout(PATIENCE):
-                    while plant.operations.calibration().done < LEARNT:
-                        await asyncio.sleep(0.5)
-                after = world.errors()
-                rows = np.flatnonzero(np.isfinite(plant.operations.automatic.book.error))
-                found = {str(row): (float(before[row]), float(after[row])) for row in rows}
-                assert await plant.stowed()
-                assert plant.left() == ""
-                await plant.end()
-            turning.cancel()
+        # As in simulation, but for its cameras, and nobody knows the truth.
+        audit = JsonLines(tmp_path / "audit.jsonl", clock.utc())
+        ports = replace(world.ports(audit=audit), cameras=cameras, truth=None)
+        settings = AssemblySettings(AutomaticSettings(wanted=True))
+        async with PlantAssembly(design, ports, settings).running() as plant:
+            before = world.errors()
+            async with asyncio.timeout(PATIENCE):
+                while plant.operations.calibration().done < LEARNT:
+                    await asyncio.sleep(0.5)
+            after = world.errors()
+            rows = np.flatnonzero(np.isfinite(plant.operations.automatic.book.error))
+            found = {str(row): (float(before[row]), float(after[row])) for row in rows}
+            assert await plant.stowed()
+            assert plant.left() == ""
+            await plant.end()
         return found
 
     found = asyncio.run(main())

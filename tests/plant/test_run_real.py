@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -26,24 +27,28 @@ import numpy as np
 import pytest
 
 from heliotrope.cli import main
+from heliotrope.cluster.program import LocalCluster
 from heliotrope.console.client import Client
 from heliotrope.errors import FormatError
-from heliotrope.field.formats.plant_file import write_plant
+from heliotrope.field.formats.plant_file import read_plant, write_plant
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
-from heliotrope.lcu.journal import Journal
+from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.links.clock import SystemClock
 from heliotrope.mechanism import kinds
-from heliotrope.mechanism.board_items import Axis, Machine, items_of
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
-from heliotrope.plant.assembly import RealPlant
+from heliotrope.mechanism.machine import AxisLimits, Machine
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.links_file import LinksFile, read_links
+from heliotrope.plant.ports import Ports
 from heliotrope.plant.sensors import FED, SensorFiles
 from heliotrope.plant.settings import clusters_of
 from heliotrope.sun import Site
+from heliotrope.twin.live import near_pair
 from support.broker import Mosquitto, mosquitto_for
 from support.cluster_process import Line
 from support.clusters import Board, key_of
@@ -57,10 +62,10 @@ KEYS = {name: bytes([40 + i]) * 32 for i, name in enumerate(WAYS)}
 TURN = 16_000
 STOW = (TURN // 4, 3_916)
 MACHINE = Machine(
-    (Axis(-800, 16_240, 8000, 16_000, 2), Axis(-160, 4_160, 8000, 16_000, 2)),
+    (AxisLimits(-800, 16_240, 8000, 16_000, 2), AxisLimits(-160, 4_160, 8000, 16_000, 2)),
     STOW,
-    (12.0, 0.0, 40.0),
     (0.1, 0.05),
+    (12.0, 0.0, 40.0),
 )
 #: The machine may be busy, s.
 PATIENCE = 60.0
@@ -91,6 +96,7 @@ def design() -> Plant:
         np.full(count, 3.0),
         np.full(count, 2.0),
         cluster=homes,
+        machines=(MACHINE,) * count,
     )
     receiver = Receiver(
         "receiver", "planar", np.array([0.0, 0.0, 50.0]), np.array([0.0, 1.0, 0.0]), 4.0, 4.0
@@ -309,18 +315,23 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def read(folder: Path) -> LinksFile:
-    found = read_links(folder / "links.toml")
-    found.build(clusters_of(design()), SystemClock())
+def read(folder: Path, homes: dict[str, tuple[str, ...]] | None = None) -> LinksFile:
+    """Read the links file, and build what it says of a plant."""
+    found, clock = read_links(folder / "links.toml"), SystemClock()
+    members = homes or clusters_of(design())
+    for name, file in found.build(members, clock).local.items():
+        LocalCluster(file, name, members[name], clock)
     return found
 
 
 def test_each_cluster_gets_its_way(folder: Path) -> None:
     made = read_links(folder / "links.toml").build(clusters_of(design()), SystemClock())
-    assert set(made.links) == set(WAYS)
+    assert set(made.links) == {"K1", "K2", "K4"}
     assert made.server is not None
     assert set(made.server.links) == {"K1", "K4"}
-    assert [one.cluster.config.name for one in made.local] == ["K3"]
+    assert made.local == {"K3": folder / "K3.toml"}
+    local = LocalCluster(made.local["K3"], "K3", ("H5", "H6"), SystemClock())
+    assert local.cluster.config.name == "K3"
 
 
 @pytest.mark.parametrize(
@@ -358,7 +369,7 @@ def test_what_a_links_file_may_not_say(
 def test_a_bus_with_other_heliostats_is_refused(folder: Path) -> None:
     homes = {**clusters_of(design()), "K3": ("H5", "H9")}
     with pytest.raises(FormatError, match="H6 is a heliostat of K3 in this file only"):
-        read_links(folder / "links.toml").build(homes, SystemClock())
+        read(folder, homes)
 
 
 def test_keys_that_others_may_read_are_refused(folder: Path) -> None:
@@ -401,7 +412,7 @@ def test_files_are_checked_without_a_plant(folder: Path) -> None:
         (("plant.toml", "--clusters", "links.toml", "--speed", 2), "--speed, --start, --seed"),
         (("--check",), "need a real plant; give --clusters"),
         (("--configure",), "need a real plant; give --clusters"),
-        (("--prototype", "--heliostats", 5), "--prototype is a plant of its own"),
+        (("--prototype", "--heliostats", 5), "--prototype is a plant of its own; leave out"),
         (("plant.toml", "--heliostats", 5), "--heliostats is for the default plant"),
         (("--speed", 0), "--speed 0; give above 0 to 1000"),
         (("--minutes", 0), "--minutes 0; give above 0"),
@@ -410,7 +421,7 @@ def test_files_are_checked_without_a_plant(folder: Path) -> None:
         (("--port", 70_000), "port 70000; give 1 to 65535"),
         (("--certificate", "a.pem"), "TLS needs both files, --certificate and --key"),
         (("--certificate", "a.pem", "--key", "b.pem"), "a.pem and key b.pem cannot be used"),
-        (("--database", "mysql://x/y"), "no postgresql://user@host/name"),
+        (("--database", "mysql://x/y"), "--database must be postgresql://user@host/name"),
         (
             ("--heliostats", 32, "--no-console", "--database", "postgresql://x@127.0.0.1:1/y"),
             "Connection refused",
@@ -469,9 +480,17 @@ def test_what_is_wanted_and_who_is_left(folder: Path) -> None:
 
     async def main() -> tuple[bool, str]:
         clock = SystemClock()
+        # The cluster of the local bus does not run.
         links = read_links(folder / "links.toml").build(clusters_of(design()), clock)
         audit = JsonLines(folder / "audit.jsonl", clock.utc())
-        plant = RealPlant(design(), links, clock, audit, machine=MACHINE)
+        ports = Ports(
+            {**links.links, "K3": near_pair(clock, ("plant", "K3"))[0]},
+            clock,
+            audit,
+            sensors=links.sensors,
+        )
+        settings = AssemblySettings(machines=MachineTables.WRITTEN)
+        plant = PlantAssembly(design(), ports, settings)
         wanted = plant.plant.wanted.items
         assert set(wanted) == set(design().names)
         assert wanted["H3"] == items_of(mechanisms(8)[2], MACHINE)
@@ -484,6 +503,68 @@ def test_what_is_wanted_and_who_is_left(folder: Path) -> None:
     assert not stowed
     assert left.startswith("not in stow: H1 silent, H2 silent,")
     assert left.endswith("and 3 more")
+
+
+def two_groups(folder: Path) -> Plant:
+    """A plant file whose second half of heliostats has another machine, read again."""
+    whole = design()
+    (mirrors,) = whole.groups.values()
+    other = Machine(
+        (AxisLimits(-700, 16_000, 4000, 9000, 7), AxisLimits(-100, 4_000, 5000, 8000, 3)),
+        (3000, 3900),
+        (0.25, 0.0),
+        azimuth_axis=1,
+        way=((20.0, 0.0, 1.0), (12.0, 0.0, 5.0)),
+    )
+    groups = {
+        "first": mirrors.take(range(4)),
+        "second": replace(mirrors.take(range(4, 8)), machines=(other,) * 4),
+    }
+    write_plant(replace(whole, groups=groups), folder / "two.toml")
+    return read_plant(folder / "two.toml")
+
+
+def test_exactly_the_machine_table_of_the_plant_file_is_written(tmp_path: Path) -> None:
+    plant = two_groups(tmp_path)
+
+    async def main() -> PlantAssembly:
+        clock = SystemClock()
+        links = {name: near_pair(clock, ("plant", name))[0] for name in WAYS}
+        ports = Ports(links, clock, JsonLines(tmp_path / "audit.jsonl", clock.utc()))
+        return PlantAssembly(plant, ports, AssemblySettings(machines=MachineTables.WRITTEN))
+
+    made = asyncio.run(main())
+    items = made.plant.wanted.items
+    first = {name: struct.unpack(CODES_OF[name], data) for name, data in items["H1"].items()}
+    second = {name: struct.unpack(CODES_OF[name], data) for name, data in items["H8"].items()}
+    assert first["limits_primary"] == (-800, 16_240, 8000, 16_000, 2)
+    assert first["limits_secondary"] == (-160, 4_160, 8000, 16_000, 2)
+    assert first["stow"] == STOW
+    assert first["defocus"] == pytest.approx((0.1, 0.05))
+    assert first["standby"] == (12.0, 0.0, 40.0)
+    assert first["way"] == (0, 0, *(0.0,) * 12)
+    assert second["limits_primary"] == (-700, 16_000, 4000, 9000, 7)
+    assert second["limits_secondary"] == (-100, 4_000, 5000, 8000, 3)
+    assert second["stow"] == (3000, 3900)
+    assert second["defocus"] == pytest.approx((0.25, 0.0))
+    assert second["way"] == (1, 2, 20.0, 0.0, 1.0, 12.0, 0.0, 5.0, *(0.0,) * 6)
+    # No standby point: local controllers keep theirs, and the plant knows none.
+    assert "standby" not in second
+    assert np.isfinite(made.plant.standbys[:4]).all()
+    assert np.isnan(made.plant.standbys[4:]).all()
+
+
+def test_a_group_without_a_machine_is_told_and_not_configured(folder: Path) -> None:
+    whole = design()
+    bare = {name: replace(group, machines=()) for name, group in whole.groups.items()}
+    write_plant(replace(whole, groups=bare), folder / "plant.toml")
+    words = (folder / "plant.toml", "--clusters", folder / "links.toml", "--check")
+    code, out, _ = call(*words)
+    assert code == 0
+    assert out.endswith("no machine table, which --configure needs: group all\n")
+    code, _, err = call(*words, "--configure")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "group all: the plant file has no table [groups.all.machine]; add it" in err
 
 
 # -- sensors -------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.plant.schedule import PlantSchedule, Scheduler, Settings, settings_for
 from heliotrope.plant.visits import CycleSettings
-from heliotrope.twin.live.live import LiveOptions, LivePlant
+from support.live import LiveOptions, LivePlant
 
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
 DESIGN = malan_plant(12)
@@ -30,9 +30,7 @@ def test_a_plant_at_work_asks_its_schedule_and_tells_what_became_of_it() -> None
         options = LiveOptions(rendered=False, threads=0)
         async with LivePlant(DESIGN, clock, options).running() as live:
             try:
-                calibrating = live.operations.automatic._calibrating
-                assert calibrating is not None
-                schedule = calibrating._scheduler
+                schedule = live.assembly.schedule
                 assert isinstance(schedule, PlantSchedule)
                 await _visits(live, schedule)
                 _what_came_of_it(live, schedule)

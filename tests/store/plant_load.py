@@ -15,8 +15,8 @@ from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.records import Event
-from heliotrope.twin.live.live import LiveOptions, LivePlant
 from heliotrope.twin.live.loop import PacedLoop
+from support.live import LiveOptions, LivePlant
 
 START = datetime(2026, 6, 21, 8, tzinfo=UTC)
 COUNT = 6

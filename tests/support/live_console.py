@@ -19,8 +19,8 @@ from heliotrope.links.link import running
 from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.live.live import LiveOptions, LivePlant
 from heliotrope.twin.live.loop import PacedLoop
+from support.live import LiveOptions, LivePlant
 
 PASSWORD = "correct horse"
 ROLES = ("viewer", "operator", "engineer")

@@ -23,7 +23,7 @@ from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import Link, running
 from heliotrope.mechanism import kinds
-from heliotrope.mechanism.board_items import Axis, Machine, Wanted, items_of
+from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
 from heliotrope.plant.audit import JsonLines
@@ -38,11 +38,10 @@ from heliotrope.twin.boards.bus import TwinBus
 
 ENGINEER = Person("Egon", Role.ENGINEER)
 SITE = Site(37.09, -2.36, 500.0, name="Tabernas")
-_AXES = tuple(Axis(*limits, *outfit.LIMITS) for limits in outfit.RANGES)
 _CORNERS = ((3.0, 0.0, 43.0), (-3.0, 0.0, 43.0), (-3.0, 0.0, 37.0), (3.0, 0.0, 37.0))
 #: Without marks: for cameras that read no pixels.
 TARGET = Target("white", np.array(_CORNERS), np.array([0.0, 0.0, 40.0]))
-MACHINE = Machine((_AXES[0], _AXES[1]), outfit.STOW, outfit.STANDBY, outfit.DEFOCUS)
+MACHINE = outfit.MACHINE
 
 
 def nominal(count: int) -> Mechanism:

@@ -90,7 +90,7 @@ def test_a_rendered_camera_finds_the_beam_within_what_it_tells() -> None:
     async def main(clock: VirtualClock) -> None:
         there: list[Mirror] = []
         camera = RenderedCamera(Sight(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=2)
-        await camera.take_empty(TARGET)
+        await camera.look(TARGET.name)
         for place in [(0.6, -0.5), (-0.9, 0.4)]:
             there[:] = [mirror("A", *place)]
             shot = await camera.photograph(TARGET, "A")
@@ -110,7 +110,7 @@ def test_photographs_that_may_not_be_believed() -> None:
     async def main(clock: VirtualClock) -> None:
         there: list[Mirror] = []
         camera = RenderedCamera(Sight(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=1)
-        await camera.take_empty(TARGET)
+        await camera.look(TARGET.name)
         assert camera.taken == 1
         nothing = await camera.photograph(TARGET, "A")
         assert nothing.reasons[0].startswith("no spot: ")
@@ -123,7 +123,7 @@ def test_photographs_that_may_not_be_believed() -> None:
         cut = await camera.photograph(TARGET, "A")
         assert any(reason.startswith("cut at the edge: ") for reason in cut.reasons)
         with pytest.raises(InputError, match=r"target white: a beam is on it, .* take the empty"):
-            await camera.take_empty(TARGET)
+            await camera.look(TARGET.name)
         other = example_target(6.0, name="other")
         with pytest.raises(UnknownNameError, match="other"):
             await camera.photograph(other, "A")
@@ -155,7 +155,7 @@ def test_a_calibration_cycle_with_rendered_photographs(tmp_path: Path) -> None:
         camera = RenderedCamera(
             Sight(whole.clock, mirrors_of(whole.boards), plant.sun_vector), [SCENE], seed=1
         )
-        await camera.take_empty(TARGET)
+        await camera.look(TARGET.name)
         assert await plant.command(ENGINEER, token, "TRACK").end(30.0)
         await whole.wait(20.0)
 

@@ -16,13 +16,9 @@ from heliotrope.sun import broadcast_values, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import (
     CAUSES,
-    DEFOCUS,
-    LIMITS,
-    RANGES,
+    MACHINE,
     RECEIVER,
-    STANDBY,
     STEPS_PER_TURN,
-    STOW,
     outfits,
     sha256,
 )
@@ -34,15 +30,7 @@ TOKEN, COUNT = 0xF1E1D, 3
 
 
 def field_of(mechanism: Mechanism, **options: Any) -> Field:
-    return Field(
-        mechanism,
-        stow=STOW,
-        ranges=RANGES,
-        limits=LIMITS,
-        standby=STANDBY,
-        defocus=DEFOCUS,
-        **options,
-    )
+    return Field(mechanism, MACHINE, **options)
 
 
 class Both:

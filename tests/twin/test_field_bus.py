@@ -16,7 +16,7 @@ from heliotrope.links.messages import Command, Emergency, Lease, Stage, decode, 
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
 from heliotrope.twin.boards.clocks import SimulatedTime
-from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, STANDBY, STEPS_PER_TURN, STOW
+from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STEPS_PER_TURN, STOW
 from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus, _stuffed, _unstuffed
 from heliotrope.twin.world.simulation import SITE
@@ -30,7 +30,7 @@ def a_field() -> Field:
     machine = kinds.azimuth_elevation(
         place, pivot_height=2.0, pivot_offset=0.2, drives=(rotary(**gear), rotary(**gear))
     )
-    return Field(machine, stow=STOW, ranges=RANGES, limits=LIMITS, standby=STANDBY)
+    return Field(machine, MACHINE)
 
 
 def test_a_cluster_leads_rows_of_a_field() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from heliotrope.errors import InputError
+from heliotrope.field.example import board_prototype
 from heliotrope.field.layouts import lay_out, malan_plant
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
@@ -25,19 +26,12 @@ from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.cameras import Mirror, Sight
-from heliotrope.twin.live._boards import BoardField
-from heliotrope.twin.live._camera import LiveCamera, SeenExactly
-from heliotrope.twin.live._field import LiveField, near
-from heliotrope.twin.live._link import near_pair
-from heliotrope.twin.live.live import (
-    LiveOptions,
-    LivePlant,
-    machine_of,
-    prototype_plant,
-    standby_of,
-)
-from heliotrope.twin.live.loop import LATE, PacedLoop
+from heliotrope.twin.cameras import ExactCamera, Mirror, RenderedCamera, Sight, mirrors_near
+from heliotrope.twin.field import Field, FieldBus
+from heliotrope.twin.live import PacedLoop, WorldOptions, near_pair
+from heliotrope.twin.live.live import machine_of
+from heliotrope.twin.live.loop import LATE
+from support.live import LiveOptions, LivePlant
 
 MRAD = 1e-3
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
@@ -132,7 +126,8 @@ def test_mirrors_near_a_target_are_those_whose_rays_meet_it() -> None:
     facing = bisector(light, normalize(aims - vertex))
     sizes = np.ones((60, 2))
     middle = np.asarray(target.corners).mean(axis=0)
-    found = near((facing, vertex), light, middle, target.normal, 5.0, design.names, sizes)
+    reach = 5.0 / (0.5 * float(np.hypot(target.width, target.height)))
+    found = mirrors_near(target, light, (facing, vertex), design.names, sizes, reach)
     expected = set()
     for name, v, n in zip(design.names, vertex, facing, strict=True):
         ray = reflect(light, n)
@@ -143,16 +138,16 @@ def test_mirrors_near_a_target_are_those_whose_rays_meet_it() -> None:
     assert {mirror.heliostat for mirror in found} == expected
 
 
-def _field(count: int = 3) -> LiveField:
+def _field(count: int = 3) -> Field:
     design = lay_out("radial", count)
     (group,) = design.groups.values()
-    return LiveField(group.mechanism, group.mechanism, machine_of(design))
+    return Field(group.mechanism, machine_of(design))
 
 
-def _ask(field: LiveField, name: str, *values: object, key: bytes = b"") -> wire.Frame:
+def _ask(field: Field, name: str, *values: object, key: bytes = b"", to: int = 2) -> wire.Frame:
     sender = wire.Sender(wire.CLUSTER_ADDRESS, 1, lambda d: hashlib.sha256(d).digest())
-    bus = field.bus(range(3))
-    data = asyncio.run(bus.transact(sender.frame(2, name, *values, key=key), 0.1))
+    bus = FieldBus(field, range(3))
+    data = asyncio.run(bus.transact(sender.frame(to, name, *values, key=key), 0.1))
     (frame,) = wire.Reader().feed(data)
     return frame
 
@@ -174,13 +169,17 @@ def test_a_live_bus_tells_and_takes_what_is_stored() -> None:
     assert after[1] == wanted["armature"]
     status = _ask(field, "QUERY_STATUS").values()
     assert status is not None
-    assert status[7] == field.checksums[1]
+    assert status[7] == field.journals.checksums[1]
     # Nothing is stored in a mirror that tracks; the neighbours have not changed.
     field.state[1] = states.TRACKING
     refused = _ask(field, "SET_ARMATURE", 9, 9, 2, *numbers, key=b"k" * 32).values()
     assert refused is not None
     assert refused[2] == messages.REFUSED_STATE
-    assert set(field.stored) == {1}
+    first, third = (_ask(field, "QUERY_STORED", place, to=address).values() for address in (1, 3))
+    assert first is not None
+    assert third is not None
+    for row, told in ((0, first), (2, third)):
+        assert told[1] == items_of(field.mechanism[row])["armature"]
 
 
 def test_what_is_stored_is_what_the_mirror_then_does() -> None:
@@ -189,7 +188,7 @@ def test_what_is_stored_is_what_the_mirror_then_does() -> None:
     truth = group.mechanism.with_parameters(
         {"tilt_north": np.full(12, 9 * MRAD), "azimuth_bias": np.full(12, -4 * MRAD)}
     )
-    field = LiveField(truth, group.mechanism, machine_of(design))
+    field = Field(truth, machine_of(design), believed=group.mechanism)
     light = normalize(np.array([0.2, 0.6, 0.7]))
     aims = np.broadcast_to(design.receivers[0].center, (12, 3))
     assert np.median(field.errors(light, aims)) > 3 * MRAD
@@ -238,7 +237,7 @@ def test_step_counts_that_come_seldom_are_not_taken_for_new(
 class Strangers:
     """A camera on whose first photographs another's beam stands somewhere."""
 
-    def __init__(self, camera: SeenExactly, count: int) -> None:
+    def __init__(self, camera: ExactCamera, count: int) -> None:
         self._photograph, self.left = camera.photograph, count
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -253,7 +252,7 @@ class Strangers:
 @pytest.mark.parametrize("count", [1, 2])
 def test_anothers_beam_is_not_taken_for_its_own(count: int) -> None:
     async def work(plant: LivePlant) -> None:
-        assert isinstance(plant.cameras, SeenExactly)
+        assert isinstance(plant.cameras, ExactCamera)
         camera = Strangers(plant.cameras, count)
         plant.cameras.photograph = camera.photograph  # type: ignore[method-assign]
         await asyncio.sleep(150.0)
@@ -289,7 +288,7 @@ def test_heliostats_of_the_default_plant_fall_below_half_a_milliradian() -> None
 
 
 def test_boards_learn_as_a_vectorised_field_does() -> None:
-    design = prototype_plant()
+    design = board_prototype()
     (group,) = design.groups.values()
     few = replace(design, groups={"azel": group.take([0, 1, 2])})
 
@@ -347,9 +346,9 @@ def test_a_live_camera_shows_what_it_saw() -> None:
 
     async def main(clock: VirtualClock) -> None:
         sight = Sight(clock, lambda: tuple(there), lambda: light)
-        eye = LiveCamera(sight, [Scene(camera, (target,))], threads=0)
+        eye = RenderedCamera(sight, [Scene(camera, (target,))], threads=0)
         assert eye.view(target.name).version == 0
-        await eye.take_empty(target)
+        await eye.look(target.name)
         there.append(mirror)
         shot = await eye.photograph(target, "A")
         assert shot.reasons == ()
@@ -359,7 +358,7 @@ def test_a_live_camera_shows_what_it_saw() -> None:
         assert view.jpeg[:2] == b"\xff\xd8"
         assert view.centroid == pytest.approx((0.5, -0.3), abs=0.05)
         with pytest.raises(InputError, match="a beam is on it"):
-            await eye.take_empty(target)
+            await eye.look(target.name)
         eye.close()
 
     run_virtual(main)
@@ -371,19 +370,23 @@ def test_what_a_live_plant_refuses() -> None:
 
     async def main(clock: VirtualClock) -> None:
         halves = {"a": group.take([0, 1, 2]), "b": group.take([3, 4, 5])}
-        with pytest.raises(InputError, match="2 groups of heliostats; the twin takes one"):
+        with pytest.raises(InputError, match="2 groups of heliostats; the simulation takes one"):
             LivePlant(replace(design, groups=halves), clock, EXACT)
         mixed = replace(group, cluster=("A", "B", "A", "B", "A", "B"))
         with pytest.raises(InputError, match="cluster A do not stand together"):
             LivePlant(replace(design, groups={"a": mixed}), clock, EXACT)
         with pytest.raises(InputError, match="no camera with a known position"):
             LivePlant(replace(design, cameras=()), clock, LiveOptions(threads=0))
-        machine = replace(machine_of(design), stow=(1, 2))
-        with pytest.raises(InputError, match="stow at"):
-            BoardField(clock, group.names, group.mechanism, group.mechanism, machine)
+        with pytest.raises(InputError, match=r"no table \[groups.a.machine\]; add it"):
+            LivePlant(replace(design, groups={"a": replace(group, machines=())}), clock, EXACT)
+        slow = replace(group.machines[0], stow=(0, 0))
+        several = replace(group, machines=(slow, *group.machines[1:]))
+        with pytest.raises(InputError, match="2 different machines"):
+            LivePlant(replace(design, groups={"a": several}), clock, EXACT)
+        homeless = replace(group, machines=(replace(slow, standby=None),) * 6)
+        with pytest.raises(InputError, match="no standby point; give standby_m"):
+            LivePlant(replace(design, groups={"a": homeless}), clock, EXACT)
         with pytest.raises(InputError, match="-1 threads"):
-            LiveOptions(threads=-1)
+            WorldOptions(threads=-1)
 
     run_virtual(main)
-    with pytest.raises(InputError, match="no receiver"):
-        standby_of(replace(design, receivers=()))

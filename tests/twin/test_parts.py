@@ -147,5 +147,5 @@ def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
 
 
 def test_a_bus_carries_no_more() -> None:
-    with pytest.raises(InputError, match="33 heliostats on a bus; a cluster has 1 to 32"):
+    with pytest.raises(InputError, match="33 heliostats on a bus; give 1 to 32"):
         outfits(33)

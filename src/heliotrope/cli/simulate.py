@@ -1,4 +1,4 @@
-"""``heliotrope simulate``: a cluster in virtual time, everything that goes wrong, eleven checks."""
+"""``heliotrope simulate``: plant and clusters in virtual time, with faults and invariants."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -9,31 +9,29 @@ from heliotrope.cli._common import print_json, print_table
 
 
 def simulate(
-    seed: Annotated[
-        int, typer.Option(help="Of everything that is drawn; the first of --runs.")
-    ] = 0,
-    hours: Annotated[float, typer.Option(help="Simulated time of a run.")] = 0.1,
-    heliostats: Annotated[int, typer.Option(help="On the bus, 1 to 32.")] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of everything random; the first of --runs.")] = 0,
+    hours: Annotated[float, typer.Option(help="Simulated time of each run.")] = 0.1,
+    heliostats: Annotated[int, typer.Option(help="Number on the bus, 1 to 32.")] = 4,
     pause: Annotated[float, typer.Option(help="Mean time between two faults, s.")] = 12.0,
     only: Annotated[
-        list[str] | None, typer.Option(help="Only faults of this kind; may be given again.")
+        list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
     ] = None,
-    runs: Annotated[int, typer.Option(help="Runs, with seeds one after the other.")] = 1,
-    processes: Annotated[int, typer.Option(help="Runs at a time.")] = 1,
+    runs: Annotated[int, typer.Option(help="Number of runs, with consecutive seeds.")] = 1,
+    processes: Annotated[int, typer.Option(help="Runs in parallel.")] = 1,
     minutes: Annotated[
-        float | None, typer.Option(help="Begin no further run after this time.")
+        float | None, typer.Option(help="Time after which no further run begins.")
     ] = None,
     progress: Annotated[
-        Path | None, typer.Option(help="Keep what was run in this file, and go on from it.")
+        Path | None, typer.Option(help="File that records finished runs; continue from it.")
     ] = None,
     shrink: Annotated[
-        bool, typer.Option(help="Find fewer faults that still break a run that fails.")
+        bool, typer.Option(help="Reduce the faults of a failed run to those that still break it.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Run the real plant, clusters and local controllers in virtual time, with faults by a seed.
+    """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    The eleven safety invariants are checked at every step. The exit code is 1 if one is broken.
+    Eleven safety invariants are checked at every step; the exit code is 1 if one is broken.
     """
     from heliotrope.errors import InputError
     from heliotrope.twin.world.simulation import RunPlan
@@ -79,7 +77,7 @@ def _document(found: Any) -> dict[str, Any]:
 
 
 def _shrunk(plans: list[Any], found: Any) -> list[str]:
-    """Shrink the first run that failed."""
+    """Return the reduced faults of the first run that failed."""
     from heliotrope.twin.world.simulation import run, shrink
 
     for plan in plans:

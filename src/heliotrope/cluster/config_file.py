@@ -5,14 +5,14 @@ from pathlib import Path
 from typing import Literal
 from urllib.parse import urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member
 from heliotrope.cluster.gpsd import PORT
 from heliotrope.cluster.serial_bus import BusSettings
 from heliotrope.errors import FormatError, InputError
 from heliotrope.files.documents import read_document, read_toml
-from heliotrope.links.addresses import Keys, url_parts
+from heliotrope.links.addresses import Keys, Table, url_parts
 from heliotrope.sun import Site
 
 _CHRONY = "the computer's clock is kept by chronyd now"
@@ -28,12 +28,6 @@ _OLD_TIME = {
     "ntp": "the kernel is asked unless error_s is stated; remove the key",
     "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
 }
-
-
-class Table(BaseModel):
-    """A table of the file: unknown keys are refused."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class SiteTable(Table):

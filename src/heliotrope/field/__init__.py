@@ -9,6 +9,7 @@ from heliotrope.field.camera import (
     Camera,
 )
 from heliotrope.field.example import (
+    board_prototype,
     prototype,
     roughly_installed,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "Sphere",
     "Target",
     "Volume",
+    "board_prototype",
     "outline",
     "prototype",
     "roughly_installed",

@@ -6,9 +6,13 @@ above ground, and a target 13 m up. The other positions, the sizes of mirrors an
 and the gears are ours, chosen so that the field could be built.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
+from heliotrope.field import layouts
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.field.layout_tower import square_target, watching_camera
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, as_float, direction
@@ -59,6 +63,27 @@ def prototype() -> Plant:
                 1.5,
             ),
         ),
+    )
+
+
+def board_prototype() -> Plant:
+    """Return the example plant with the gears of a local controller: to be run.
+
+    Places and receiver are those of `prototype`; a turn of a joint has 400,000 steps, and the
+    target has marks and a camera.
+    """
+    like = prototype()
+    (group,) = like.groups.values()
+    mirror = layouts.Mirror(1.83, 1.22, pivot_height=_PIVOT_HEIGHT)
+    mechanism = layouts.stepped(group.position, mirror)
+    machines = (layouts.stepped_machine(mechanism, like.receivers[0]),) * len(group)
+    target = square_target("target", like.targets[0].center, 3.0, np.pi)
+    camera = watching_camera(target, "camera", 20.0, 2.0, 3.0)
+    return replace(
+        like,
+        groups={"azel": replace(group, mechanism=mechanism, machines=machines)},
+        targets=(target,),
+        cameras=(camera,),
     )
 
 

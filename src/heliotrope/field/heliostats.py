@@ -10,6 +10,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.machine import Machine
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,8 @@ class Heliostats:
         Aim points in operation, ENU metres, (N, 3); NaN where not given.
     cluster
         Name of each heliostat's cluster, "" if none.
+    machines
+        Motor limits and resting places of each, or () where the plant file gives none.
     """
 
     names: tuple[str, ...]
@@ -66,6 +69,7 @@ class Heliostats:
     parameters: Mapping[str, FloatArray] = field(default_factory=dict)
     aim: FloatArray | None = None
     cluster: tuple[str, ...] = ()
+    machines: tuple[Machine, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.names)
@@ -100,6 +104,8 @@ class Heliostats:
         object.__setattr__(self, "parameters", clean)
         if self.cluster and len(self.cluster) != count:
             raise InputError(f"heliostats: {len(self.cluster)} cluster names for {count}")
+        if self.machines and len(self.machines) != count:
+            raise InputError(f"heliostats: {len(self.machines)} machines for {count}")
         if self.aim is not None and self.aim.shape != (count, 3):
             raise InputError(f"heliostats: aim of shape {self.aim.shape}; it must be ({count}, 3)")
         if self.facets is not None and len(self.facets.center) != count:
@@ -154,6 +160,7 @@ class Heliostats:
             parameters={name: values[index] for name, values in self.parameters.items()},
             aim=None if self.aim is None else self.aim[index],
             cluster=tuple(self.cluster[i] for i in index) if self.cluster else (),
+            machines=tuple(self.machines[i] for i in index) if self.machines else (),
         )
 
     def with_parameters(self, parameters: Mapping[str, npt.ArrayLike]) -> "Heliostats":

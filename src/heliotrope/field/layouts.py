@@ -23,7 +23,9 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.drives import rotary
+from heliotrope.mechanism.drives import Drive, rotary
+from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.sun import Site
 
 #: Heliostats of one cluster controller, at most.
@@ -36,6 +38,11 @@ MOST = 1_000_000
 FREE = 6.0
 #: Steps of a turn of a joint; steps/s of its motor.
 _STEPS, _RATE = 400_000, 8000.0
+#: Final approach from below, steps; angles by which both axes turn away at a defocus, rad;
+#: elevation at stow, rad.
+_BACKLASH, _DEFOCUS, _STOW = 40, (0.1, 0.05), float(np.radians(88.0))
+#: Distance of the standby point from the receiver: in widths of the receiver, and at least, m.
+_ASIDE, _LEAST_ASIDE = 3.0, 8.0
 _SITE = Site(-28.5, 21.2, 830.0, name="Northern Cape")
 
 
@@ -358,6 +365,35 @@ def stepped(position: FloatArray, mirror: Mirror) -> Mechanism:
     )
 
 
+def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
+    """Return limits and resting places of azimuth-elevation mechanisms that are all alike.
+
+    Limits are the stops of the drives, the rate is that of the drives, and the acceleration
+    reaches it in half a second. At stow the azimuth is in the middle of its stops and the mirror
+    looks up. The standby point is beside the receiver, at the height of its centre.
+
+    Parameters
+    ----------
+    mechanism
+        Nominal, (N,); its drives have a speed and stops.
+    receiver
+        Where beams go in operation.
+    """
+    drives = Drive(np.reshape(mechanism.drives.table, (-1, 2, slot.DRIVE_SLOTS))[0])
+    ends = [drives.counts(drives.table[:, end]) for end in (slot.MIN_ANGLE, slot.MAX_ANGLE)]
+    ranges = np.sort(np.round(np.stack(ends, axis=-1)), axis=-1).astype(np.int64)
+    axes = []
+    for (low, high), speed in zip(ranges.tolist(), drives.table[:, slot.SPEED], strict=True):
+        axes.append(AxisLimits(low, high, int(speed), 2 * int(speed), _BACKLASH))
+    up = round(float(drives.counts(np.array([0.0, _STOW]))[1]))
+    level = np.array([-receiver.normal[1], receiver.normal[0], 0.0])
+    level = level / max(float(np.linalg.norm(level)), 1e-9)
+    aside = max(_ASIDE * receiver.width, _LEAST_ASIDE) * level
+    east, north, height = (receiver.center + aside).tolist()
+    stow = (int(ranges[0].mean()), up)
+    return Machine((axes[0], axes[1]), stow, _DEFOCUS, (east, north, height))
+
+
 def malan_plant(heliostats: int = 10_000) -> Plant:
     """Return a plant of the size of Malan's: 5 MWe, 10,000 heliostats of 5 m² in 313 clusters.
 
@@ -430,16 +466,18 @@ def lay_out(
             f"layout {kind}: two mirrors would overlap by {-gap:.2f} m; raise the clearance"
         )
     count = len(places)
+    mechanism = stepped(places.position, size)
     return Plant(
         name or kind,
         site,
         {
             "azel": Heliostats(
                 places.names,
-                stepped(places.position, size),
+                mechanism,
                 np.full(count, size.width),
                 np.full(count, size.height),
                 cluster=clusters(count),
+                machines=(stepped_machine(mechanism, receiver),) * count,
             )
         },
         targets,

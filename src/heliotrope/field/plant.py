@@ -16,6 +16,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.machine import Machine
 from heliotrope.sun import Site
 
 Surface = TypeVar("Surface", Target, Receiver, Camera)
@@ -115,6 +116,25 @@ class Plant:
         """Return the calibrated mechanism of one heliostat, batch shape ()."""
         group, row = self.find(name)
         return group.calibrated[row]
+
+    def machine(self, name: str) -> Machine:
+        """Return motor limits and resting places of one heliostat.
+
+        Raises
+        ------
+        InputError
+            The heliostat's group has none.
+        UnknownNameError
+            There is no heliostat of that name.
+        """
+        heliostats, row = self.find(name)
+        if not heliostats.machines:
+            group, _ = self._place[name]
+            raise InputError(
+                f"group {group}: the plant file has no table [groups.{group}.machine]; add it "
+                "(rates, limits, backlash, defocus, stow), as docs/reference/plant-format.md says"
+            )
+        return heliostats.machines[row]
 
     def target(self, name: str) -> Target:
         """Return a target by name."""

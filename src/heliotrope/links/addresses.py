@@ -1,4 +1,4 @@
-"""URLs of links and files of keys, as the files of plants and clusters give them.
+"""Strict tables, URLs of links and files of keys, as the files of plants and clusters have them.
 
 Addresses and limits may be shared and kept under version control; keys may not. They stand in a
 file of their own that nobody else may read.
@@ -8,6 +8,8 @@ import string
 from difflib import get_close_matches
 from pathlib import Path
 from urllib.parse import urlsplit
+
+from pydantic import BaseModel, ConfigDict
 
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_toml
@@ -19,6 +21,12 @@ _MISSING = {
     "clusters": "the plant has no such cluster",
 }
 _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
+
+
+class Table(BaseModel):
+    """A table of a file: unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:

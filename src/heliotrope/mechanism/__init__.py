@@ -3,12 +3,13 @@
 A mechanism is data: a chain of joints from the ground to the mirror, two of them driven. Build one
 with `azimuth_elevation`, `two_jacks`, … (`kinds`), give it drives (`rotary`, `linear_paint`, …),
 set its imperfections with `Mechanism.with_parameters`, and point it with `track`.
+`Machine` holds the limits and resting places of its motors.
 
 The names of these modules are used through the module:
 
 - `guo`: Guo's closed form for azimuth-elevation heliostats, a cross-check of `track`.
 - `parameters`: the parameter table and the models.
-- `board_items`: the bytes that a local controller stores of a mechanism.
+- `board_items`: the bytes that a local controller stores of a mechanism and its machine.
 - `kernels`: the compiled code.
 """
 
@@ -40,6 +41,10 @@ from heliotrope.mechanism.kinds import (
     two_axis,
     two_jacks,
 )
+from heliotrope.mechanism.machine import (
+    AxisLimits,
+    Machine,
+)
 from heliotrope.mechanism.parameters import (
     MODELS,
     Parameter,
@@ -55,9 +60,11 @@ __all__ = [
     "MODELS",
     "SLOTS",
     "Armature",
+    "AxisLimits",
     "Branch",
     "Drive",
     "Jacobian",
+    "Machine",
     "Mechanism",
     "Parameter",
     "Pose",

@@ -1,14 +1,15 @@
-"""A real plant at work: clusters over their links, cameras over their sources, no twin.
+"""A plant put together from its design, its ports and its settings, and run.
 
-It has the shape of `twin.live.LivePlant`: `RealPlant.running` runs it all beside a block, `stowed`
-stows it, `end` ends it. A cluster that does not answer, or a camera that gives no frame, is an
-alarm; the plant goes on with the others.
+The same assembly runs a real plant and a simulated one: what differs is passed in as `Ports`.
+A cluster that does not answer or a camera that gives no frame raises an alarm; the plant goes on
+with the others.
 """
 
 import asyncio
 import contextlib
-from collections.abc import AsyncIterator, Mapping
-from typing import Any
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -16,172 +17,195 @@ import numpy.typing as npt
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.plant import Plant
 from heliotrope.lcu import states
-from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
-from heliotrope.mechanism.board_items import Machine, items_of
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.parameters import MODELS
-from heliotrope.plant.assigned import Assigned, rest_on
-from heliotrope.plant.audit import Audit
-from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.controller import PlantController
-from heliotrope.plant.links_file import PlantLinks
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.operations import Operations
 from heliotrope.plant.operations.views import CalibrationEntry, Planned
+from heliotrope.plant.ports import Cameras, Ports, Sensors
 from heliotrope.plant.schedule.plant_schedule import PlantSchedule, settings_for
 from heliotrope.plant.schedule.scheduler import Scheduler
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
-from heliotrope.store.records import Records
 
-#: Of calibrations: what a quick installation leaves, and what a photograph is worth.
+#: A calibration that removes what a quick installation leaves.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"))
-#: Who was not heard for so long is not waited for at the end, s.
+#: Age from which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
-#: Files of sensors are looked at so often, s.
+#: Period of reading the sensors, s.
 _SENSED = 0.5
-#: In these states a heliostat does not go to stow by an order: people have to see to it.
+#: States that no order leads to stow from: people have to see to the heliostat.
 _STUCK = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
 
 
-class RealPlant:
-    """A plant with what it is connected to.
+class MachineTables(Enum):
+    """What the local controllers hold of the machine tables of the plant file."""
+
+    #: Nobody knows; they keep what they hold, and the plant assumes nothing.
+    UNKNOWN = "unknown"
+    #: They hold them already, as simulated boards do.
+    HELD = "held"
+    #: They are compared, and those that hold others are written.
+    WRITTEN = "written"
+
+
+@dataclass(frozen=True)
+class AssemblySettings:
+    """How a plant is to work.
+
+    Attributes
+    ----------
+    work
+        Automatic control.
+    plant
+        Times and limits; the readings of the sensor port are added.
+    cycle
+        Calibration.
+    machines
+        What local controllers hold of the plant file's machine tables.
+    """
+
+    work: AutomaticSettings = field(default_factory=AutomaticSettings)
+    plant: PlantSettings = field(default_factory=PlantSettings)
+    cycle: CycleSettings = CYCLE
+    machines: MachineTables = MachineTables.UNKNOWN
+
+
+class PlantAssembly:
+    """A plant with everything that it is connected to.
 
     Parameters
     ----------
     design
         Site, heliostats with their clusters, receivers, targets, cameras.
-    links
-        To its clusters.
-    clock
-        Of this machine.
-    audit, records, assigned
-        See `PlantController` and `Operations`.
-    cameras
-        Of its targets; None: nothing is calibrated.
-    machine
-        Limits, stow and standby point that every local controller is to hold, besides its axes;
-        None: local controllers keep what they hold.
-    work, plant
-        Settings.
-    cycle
-        Settings of the calibration.
+    ports
+        What it is connected to.
+    settings
+        How it is to work.
 
     Attributes
     ----------
     plant, operations, logbook
         See their classes.
+    schedule
+        Says which heliostat is calibrated next; None: nothing is calibrated.
 
     Raises
     ------
     InputError
-        Links that do not fit the design.
+        Links that do not fit the design, or a group without the machine table that ``settings``
+        asks for.
     """
 
     def __init__(
-        self,
-        design: Plant,
-        links: PlantLinks,
-        clock: SystemClock,
-        audit: Audit,
-        *,
-        records: Records | None = None,
-        assigned: Assigned | None = None,
-        cameras: RealCameras | None = None,
-        machine: Machine | None = None,
-        work: AutomaticSettings | None = None,
-        plant: PlantSettings | None = None,
-        cycle: CycleSettings = CYCLE,
+        self, design: Plant, ports: Ports, settings: AssemblySettings | None = None
     ) -> None:
-        self.design, self.clock, self.audit = design, clock, audit
-        self._links, self._cameras = links, cameras
-        self.logbook = Logbook(clock, records)
-        if cameras is not None:
-            cameras.on_alarm = self.logbook.take_alarm
+        chosen = settings or AssemblySettings()
+        self.design, self.ports, self.settings = design, ports, chosen
+        self.clock = ports.clock
+        self.logbook = Logbook(ports.clock, ports.records)
+        fed = frozenset() if ports.sensors is None else ports.sensors.names
         self.plant = PlantController(
             design,
-            self.logbook.tapped(links.links),
-            clock,
-            audit,
-            settings=plant or PlantSettings(sensors=links.sensors.names),
-            assigned=assigned,
+            self.logbook.tapped(ports.links),
+            ports.clock,
+            ports.audit,
+            settings=replace(chosen.plant, sensors=chosen.plant.sensors | fed),
+            assigned=ports.assigned,
             on_alarm=self.logbook.take_alarm,
         )
-        settings = work or AutomaticSettings()
-        chosen = (
-            None if cameras is None else CalibrationCycle(self.plant, cameras, cycle, Centring())
+        cameras = ports.cameras if design.targets else None
+        cycle = (
+            None
+            if cameras is None
+            else CalibrationCycle(self.plant, cameras, chosen.cycle, Centring())
         )
-        scheduler: Scheduling | None = None
-        if chosen is not None and cameras is not None:
-            scheduler = _Watched(self._scheduler(chosen), cameras)
-        seen = (
-            () if cameras is None else [t for t in design.targets if t.name not in cameras.unseen]
-        )
+        self.schedule = None if cycle is None else self._schedule(cycle)
         self.operations = Operations(
             self.plant,
             self.logbook,
-            chosen,
-            cameras={} if cameras is None else {t.name: cameras for t in seen},
-            scheduler=scheduler,
-            records=records,
-            settings=settings,
-            extra=self._extra,
+            cycle,
+            cameras={} if cameras is None else dict.fromkeys(self._seen(cameras), cameras),
+            scheduler=self._watched(cameras),
+            records=ports.records,
+            truth=ports.truth,
+            settings=chosen.work,
+            extra=ports.facts,
         )
-        if machine is not None:
-            self._want(machine)
+        if chosen.machines is not MachineTables.UNKNOWN:
+            self._rest_on_machines()
+        if chosen.machines is MachineTables.WRITTEN:
+            self._want()
 
-    def _scheduler(self, cycle: CalibrationCycle) -> Scheduling:
-        names = self.plant.field.names
-        chosen = Scheduler(
-            self.design, settings_for(cycle.settings), now=self.clock.utc(), names=names
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Heliostats, in the order of the plant's field."""
+        return self.plant.field.names
+
+    def _seen(self, cameras: Cameras) -> list[str]:
+        return [target.name for target in self.design.targets if cameras.sees(target.name)]
+
+    def _schedule(self, cycle: CalibrationCycle) -> PlantSchedule:
+        scheduler = Scheduler(
+            self.design, settings_for(cycle.settings), now=self.clock.utc(), names=self.names
         )
-        return PlantSchedule(self.plant, chosen)
+        return PlantSchedule(self.plant, scheduler)
 
-    def _extra(self) -> Mapping[str, Any]:
-        refusal = self._links.refusal()
-        return {"refused link": refusal} if refusal else {}
+    def _watched(self, cameras: Cameras | None) -> Scheduling | None:
+        if cameras is None or self.schedule is None:
+            return None
+        return _WhereAwake(self.schedule, cameras)
 
-    def _want(self, machine: Machine) -> None:
-        """Want of every local controller what the design and the last calibration say."""
-        rest_on(self.plant.standbys, machine.standby)
-        for name in self.plant.field.names:
+    def _rest_on_machines(self) -> None:
+        """Take the standby points of the plant file for all that were assigned none."""
+        for row, name in enumerate(self.names):
+            rest_on(self.plant.standbys[row : row + 1], self.design.machine(name).standby)
+
+    def _want(self) -> None:
+        """Want every local controller to store the machine table and the last calibration."""
+        for name in self.names:
             mechanism = self.plant.beliefs.present(name)[0]
-            self.plant.wanted.set(name, items_of(mechanism, machine))
+            self.plant.wanted.set(name, items_of(mechanism, self.design.machine(name)))
 
     # -- running ---------------------------------------------------------------------------
 
     @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator["RealPlant"]:
-        """Run everything beside a block."""
-        local = self._links.local
-        parts = [*self._links.parts, *(part for one in local for part in one.parts)]
-        if self._cameras is not None:
-            self._cameras.start()
+    async def running(self) -> AsyncIterator["PlantAssembly"]:
+        """Run plant, operations and everything beside them for the time of a block."""
+        cameras, sensors = self.ports.cameras, self.ports.sensors
+        if cameras is not None:
+            cameras.start(self.logbook.take_alarm)
         try:
             async with (
-                running(*parts),
-                running(*(one.cluster for one in local)),
+                self.ports.beside(),
                 running(self.plant),
                 running(self.operations),
                 asyncio.TaskGroup() as group,
             ):
-                tasks = [group.create_task(self._look()), group.create_task(self._sense())]
+                tasks = []
+                if cameras is not None:
+                    tasks.append(group.create_task(self._look(cameras)))
+                if sensors is not None:
+                    tasks.append(group.create_task(self._sense(sensors)))
                 yield self
                 for task in tasks:
                     task.cancel()
         finally:
-            self.audit.close()
-            if self._cameras is not None:
-                self._cameras.close()
+            self.ports.audit.close()
+            if cameras is not None:
+                cameras.close()
 
-    async def _sense(self) -> None:
+    async def _sense(self, sensors: Sensors) -> None:
         """Hand readings of sensors to the safety table as they come."""
         while True:
-            news = await asyncio.to_thread(self._links.sensors.read)
+            news = await asyncio.to_thread(sensors.read)
             for name, value in news.values.items():
                 self.plant.put(name, value)
             for name, text in news.problems.items():
@@ -190,16 +214,14 @@ class RealPlant:
                 )
             await asyncio.sleep(_SENSED)
 
-    async def _look(self) -> None:
-        """Photograph each target once: whether its camera works is known before a beam comes."""
-        if self._cameras is None:
-            return
+    async def _look(self, cameras: Cameras) -> None:
+        """Photograph each target once, so that a camera that fails is known before a beam comes."""
         for target in self.design.targets:
-            if target.name in self._cameras.unseen:
+            if not cameras.sees(target.name):
                 self.logbook.event("calibration", target.name, "no camera looks at it")
                 continue
             try:
-                await self._cameras.look(target.name)
+                await cameras.look(target.name)
             except HeliotropeError as error:
                 self.logbook.event("calibration", target.name, str(error))
 
@@ -211,10 +233,10 @@ class RealPlant:
     # -- the end ---------------------------------------------------------------------------
 
     async def stowed(self, limit: float = 300.0) -> bool:
-        """Stow the field; return whether all of it is.
+        """Stow the field; return whether every heliostat is stowed.
 
-        It waits ``limit`` s at most, and for those only that are heard and can stow by an order;
-        see `left` for the others.
+        It waits ``limit`` s at most, and only for heliostats that are heard and can be stowed by
+        an order; `left` names the others.
         """
         await self.operations.automatic.halt()
         self.plant.stow("plant's end")
@@ -228,31 +250,30 @@ class RealPlant:
         return False
 
     def _hopeless(self, now: float) -> npt.NDArray[np.bool_]:
-        """Return whom waiting does not help: silent, faulty, locked, unconfigured, (N,)."""
-        field = self.plant.field
-        silent = field.age(now) > SILENT
-        return np.asarray(silent | field.among(_STUCK, now))
+        """Return which heliostats it is useless to wait for, (N,)."""
+        rows = self.plant.field
+        silent = rows.age(now) > SILENT
+        return np.asarray(silent | rows.among(_STUCK, now))
 
     def left(self) -> str:
-        """Return who is not in stow, in words; "" if all are."""
-        field, now = self.plant.field, self.clock.monotonic()
-        rows = np.flatnonzero(~field.among((states.STOWED,), now))
-        if not len(rows):
+        """Return which heliostats are not stowed, in words; "" if all are."""
+        rows, now = self.plant.field, self.clock.monotonic()
+        away = np.flatnonzero(~rows.among((states.STOWED,), now))
+        if not len(away):
             return ""
-        live = field.live(now)
-        state = field.rows["state"]
+        live, state = rows.live(now), rows.rows["state"]
         said = [
-            f"{field.names[row]} {states.STATES[state[row]] if live[row] else 'silent'}"
-            for row in rows[:5]
+            f"{rows.names[row]} {states.STATES[state[row]] if live[row] else 'silent'}"
+            for row in away[:5]
         ]
-        more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
+        more = f" and {len(away) - 5} more" if len(away) > 5 else ""
         return f"not in stow: {', '.join(said)}{more}"
 
 
-class _Watched:
-    """A schedule that leaves targets alone whose camera is silent."""
+class _WhereAwake:
+    """A schedule that leaves out targets whose camera is silent."""
 
-    def __init__(self, schedule: Scheduling, cameras: RealCameras) -> None:
+    def __init__(self, schedule: Scheduling, cameras: Cameras) -> None:
         self._schedule, self._cameras = schedule, cameras
 
     def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
@@ -260,7 +281,7 @@ class _Watched:
             return None
         return self._schedule.next(target, ready)
 
-    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Any:
+    def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         return self._schedule.plan(ready, limit)
 
     def done(self, entry: CalibrationEntry) -> None:

@@ -1,4 +1,4 @@
-"""What a plant's cameras saw last, for people to look at."""
+"""The last photographs of a plant's targets, for people to look at."""
 
 from dataclasses import replace
 
@@ -10,10 +10,8 @@ from heliotrope.imaging.photograph import Photograph
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
 
-#: Quality of the pictures for people, 0 to 100.
-_JPEG = 80
-#: Of the pictures for people.
-_GAMMA = 0.45
+#: JPEG quality (0 to 100) and gamma of the pictures for people.
+_JPEG, _GAMMA = 80, 0.45
 
 
 class Views:
@@ -23,11 +21,11 @@ class Views:
         self._views: dict[str, CameraView] = {}
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of a target for people."""
+        """Return the last photograph of a target."""
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     def keep(self, name: str, at: float, seen: Photograph, jpeg: bytes) -> None:
-        """Keep what was seen of a target at a time (POSIX s), and its picture."""
+        """Keep the reading of a target at a time (POSIX s), with its picture."""
         reading = seen.reading(name)
         lines = [f"{reason.name}: {reason.text}" for reason in reading.reasons]
         centroid = None
@@ -40,7 +38,7 @@ class Views:
 
 
 def shot_of(seen: Photograph, target: str, at: float) -> Shot:
-    """Return what a photograph, taken at ``at`` (monotonic s), shows of a beam on a target."""
+    """Return the beam on a target in a photograph taken at ``at``, monotonic s."""
     reading = seen.reading(target)
     reasons = tuple(f"{reason.name}: {reason.text}" for reason in reading.reasons)
     if not reading.spots:
@@ -50,7 +48,7 @@ def shot_of(seen: Photograph, target: str, at: float) -> Shot:
 
 
 def picture_of(seen: Photograph) -> bytes:
-    """Return a photograph with what was seen in it drawn in, as a JPEG."""
+    """Return a photograph with targets and spots drawn in, as a JPEG."""
     import cv2
 
     _, data = cv2.imencode(".jpg", annotate(_brightened(seen)), [cv2.IMWRITE_JPEG_QUALITY, _JPEG])
@@ -58,7 +56,7 @@ def picture_of(seen: Photograph) -> bytes:
 
 
 def _brightened(seen: Photograph) -> Photograph:
-    """Return a photograph for people: beside a beam the target would look black."""
+    """Return a brighter photograph: beside a beam the target would look black."""
     frame = seen.frame
     top = 255.0 if frame.pixels.dtype == np.uint8 else 65535.0
     table = np.round(255.0 * np.linspace(0.0, 1.0, int(top) + 1) ** _GAMMA).astype(np.uint8)

@@ -1,12 +1,12 @@
-"""Cameras of a real plant: their newest frames, read as every photograph is read.
+"""Cameras of a real plant: the newest frame of each source, read like every photograph.
 
 A thread for each camera keeps the newest frame of its source (`imaging.sources`): a watched
-folder, a stream, a device, an address of one image. A photograph of a beam is the first frame that
-was exposed after it was asked for; where none comes within some seconds that is an alarm, and the
-camera's targets are left alone until one comes.
+folder, a stream, a device, or the address of one image. A photograph of a beam is the first frame
+exposed after it was asked for. Where none comes within some seconds an alarm is raised, and the
+camera's targets are left alone until a frame comes.
 
-The picture of the empty target is learnt from every frame (`imaging.memory`), so that light that
-changes over the day is no beam.
+The picture of the empty target is learnt from every frame (`imaging.memory`), so that light which
+changes over the day is not taken for a beam.
 """
 
 import asyncio
@@ -33,15 +33,15 @@ from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Alarm, alarms
 
-#: A photograph is awaited for so long, and its frame looked for so often, s.
+#: Longest wait for a photograph, and the time between looks for its frame, s.
 PATIENCE, _LOOK = 15.0, 0.05
-#: A source that failed is opened again after so long, s.
+#: Time until a source that failed is opened again, s.
 _AGAIN = 5.0
-#: A frame's time may be unsure by so much, s: in 1 s the sun moves a normal by 36 µrad.
+#: Largest standard deviation of a frame's time, s: in 1 s the sun moves a normal by 36 µrad.
 _UNSURE = 1.0
-#: A stream whose delay nobody has stated is late by so much at most, s.
+#: Largest delay of a stream whose delay is not stated, s.
 _LATE = 2.0
-#: What was learnt of empty targets is kept after so many photographs.
+#: Photographs after which the models of empty targets are saved.
 _OFTEN = 20
 
 
@@ -51,16 +51,16 @@ def source_of(camera: Camera, folder: Path, stop: threading.Event) -> Source:
     Parameters
     ----------
     camera
-        With its ``source``; see docs/how-to/camera-sources.md.
+        With a ``source``; see docs/how-to/camera-sources.md.
     folder
-        Of the plant file.
+        Folder of the plant file.
     stop
-        Ends it.
+        Ends the source.
 
     Raises
     ------
     InputError
-        If it names none, or a recording.
+        No source, a recording, or a folder that does not exist.
     """
     who = f"camera {camera.name}"
     if not camera.source:
@@ -82,14 +82,14 @@ class Feed:
     Parameters
     ----------
     source
-        Of frames; its ``stop`` ends the thread.
+        Source of frames; its ``stop`` ends the thread.
 
     Attributes
     ----------
     newest
         The last frame, None before the first.
     problem
-        Why there is none now, "" if nothing is wrong.
+        Why no frame comes, "" if nothing is wrong.
     """
 
     def __init__(self, source: Source) -> None:
@@ -103,7 +103,7 @@ class Feed:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread; one that hangs in a driver is left behind."""
+        """End the thread; a thread that hangs in a driver is left behind."""
         self._source.stop.set()
         if self._thread.is_alive():
             self._thread.join(2.0)
@@ -117,14 +117,14 @@ class Feed:
                         self.newest, self.problem = frame, ""
             except HeliotropeError as error:
                 self.problem = str(error)
-            except Exception as error:  # noqa: BLE001 - a driver's; the plant goes on without it
+            except Exception as error:  # noqa: BLE001 - of a driver; the plant goes on without it
                 self.problem = f"{type(error).__name__}: {error}"
             stop.wait(_AGAIN)
 
 
 @dataclass(frozen=True)
 class _Eye:
-    """A camera with its feed and the targets that it is asked for."""
+    """A camera with its feed and the targets that it serves."""
 
     camera: Camera
     targets: tuple[Target, ...]
@@ -132,31 +132,27 @@ class _Eye:
 
 
 class RealCameras:
-    """All cameras of a plant; a `calibration_cycle.Camera` and an `operations.Photographer`.
+    """All cameras of a plant, as the port `plant.ports.Cameras` asks for them.
 
     Parameters
     ----------
     design
-        Of its cameras those are used that name a target; the first of each target.
+        The first camera that names a target serves it.
     folder
-        Of the plant file.
+        Folder of the plant file.
     clock
-        Of the plant.
+        Clock of the plant.
     memory
-        Folder in which pictures of empty targets are kept; None: they are learnt anew.
+        Folder in which models of empty targets are kept; None: they are learnt anew.
     patience
-        For a frame, s.
+        Longest wait for a frame, s.
     sources
         Makes the source of a camera.
 
     Attributes
     ----------
-    on_alarm
-        Called when a camera has fallen silent, and when it is back.
     silent
         Targets whose camera gave no frame when it was last asked.
-    unseen
-        Targets that no camera looks at.
 
     Raises
     ------
@@ -175,7 +171,7 @@ class RealCameras:
         sources: Callable[[Camera, Path, threading.Event], Source] = source_of,
     ) -> None:
         self._clock, self._patience = clock, patience
-        self.on_alarm: Callable[[Alarm], None] = lambda _: None
+        self._on_alarm: Callable[[Alarm], None] = lambda _: None
         self._stop = threading.Event()
         self._pool = ThreadPoolExecutor(1, "camera")
         self._memory = Memory() if memory is None else Memory.load(memory)
@@ -185,21 +181,21 @@ class RealCameras:
         for camera, targets in _watching(design.cameras, design.targets):
             eye = _Eye(camera, targets, Feed(sources(camera, folder, self._stop)))
             self._eyes |= {target.name: eye for target in targets}
-        self.unseen = tuple(t.name for t in design.targets if t.name not in self._eyes)
         self._settings = Settings(pictures=read_pictures(folder, design.targets))
 
-    def start(self) -> None:
-        """Begin to take frames."""
+    def start(self, on_alarm: Callable[[Alarm], None]) -> None:
+        """Begin to take frames; ``on_alarm`` hears of cameras that fall silent and come back."""
+        self._on_alarm = on_alarm
         for feed in {id(eye.feed): eye.feed for eye in self._eyes.values()}.values():
             feed.start()
 
     def close(self) -> None:
-        """End all threads, and keep what was learnt.
+        """End all threads, and save the models of empty targets.
 
         Raises
         ------
         InputError
-            If that cannot be written.
+            They cannot be written.
         """
         self._stop.set()
         for eye in self._eyes.values():
@@ -209,11 +205,15 @@ class RealCameras:
             self._memory.save(self._folder)
 
     def view(self, target: str) -> CameraView:
-        """Return the last photograph of a target for people."""
+        """Return the last photograph of a target, for people."""
         return self._views.view(target)
 
+    def sees(self, target: str) -> bool:
+        """Return whether a camera looks at a target."""
+        return target in self._eyes
+
     def awake(self, target: str) -> bool:
-        """Return whether a target has a camera that is not silent, or has spoken since."""
+        """Return whether a target has a camera that is not silent, or delivers frames again."""
         eye = self._eyes.get(target)
         if eye is None:
             return False
@@ -230,9 +230,9 @@ class RealCameras:
         Raises
         ------
         FetchError
-            If no frame comes.
+            No frame comes.
         UnknownNameError
-            If no camera looks at the target.
+            No camera looks at the target.
         """
         del heliostat
         return await self.look(target.name)
@@ -256,7 +256,7 @@ class RealCameras:
         return shot
 
     async def _frame(self, eye: _Eye, target: str) -> Frame:
-        """Wait for a frame that was exposed from now on."""
+        """Wait for a frame that is exposed from now on."""
         asked, until = self._clock.utc(), self._clock.monotonic() + self._patience
         while self._clock.monotonic() < until:
             frame = eye.feed.newest
@@ -274,7 +274,7 @@ class RealCameras:
         """Raise the alarm about a target's camera, or end it."""
         (self.silent.add if problem else self.silent.discard)(target)
         kind = alarms.CAMERA
-        self.on_alarm(kind.raised(target, problem=problem) if problem else kind.ended(target))
+        self._on_alarm(kind.raised(target, problem=problem) if problem else kind.ended(target))
 
     def _read(self, eye: _Eye, frame: Frame) -> tuple[Photograph, bytes]:
         settings = replace(self._settings, empty=self._memory.models)
@@ -289,7 +289,7 @@ class RealCameras:
 def _watching(
     cameras: Sequence[Camera], targets: Sequence[Target]
 ) -> list[tuple[Camera, tuple[Target, ...]]]:
-    """Return the cameras that are used, each with its targets; a target has one camera."""
+    """Return the cameras in use with their targets; each target has one camera."""
     left = {target.name: target for target in targets}
     found = []
     for camera in cameras:
@@ -301,7 +301,7 @@ def _watching(
 
 
 def _dated(frame: Frame, camera: Camera) -> datetime:
-    """Return the instant after which a frame was exposed, for all that is known."""
+    """Return the earliest instant at which a frame may have been exposed."""
     if frame.time is None:
         raise InputError(
             f"camera {camera.name}: {frame.name} says no time with a zone; let the camera write "

@@ -1,8 +1,9 @@
-"""The file that tells a plant how it reaches its clusters, and the links that follow from it.
+"""The links file: how a plant reaches its clusters, and the links that follow from it.
 
 A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
-at an MQTT broker, or its bus is at this machine and its cluster file is given: then the cluster's
-own program runs in this process. Keys stand in a file of their own that nobody else may read.
+at an MQTT broker, or its bus is at this machine and its cluster file is given. In the last case
+whoever builds the plant runs the cluster's program in this process (`cluster.program`) and adds its
+link. Keys stand in a file of their own that nobody else may read.
 """
 
 import ssl
@@ -14,11 +15,9 @@ from urllib.parse import urlsplit
 
 from pydantic import Field
 
-from heliotrope.cluster.config_file import Table
-from heliotrope.cluster.program import LocalCluster
 from heliotrope.errors import FormatError
 from heliotrope.files.documents import read_document
-from heliotrope.links.addresses import Keys, url_parts
+from heliotrope.links.addresses import Keys, Table, url_parts
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.links.mqtt import Broker, mqtt_link
@@ -33,7 +32,9 @@ class TcpTable(Table):
     certificate: str | None = Field(None, description="PEM file, with its key: TLS.")
     key: str | None = Field(None, description="PEM file of the certificate's key.")
     authority: str | None = Field(
-        None, description="PEM file of who signs clusters' certificates; without: they need none."
+        None,
+        description="PEM file of the authority that signs clusters' certificates; "
+        "default: they need none.",
     )
 
 
@@ -41,9 +42,13 @@ class MqttTable(Table):
     """``[mqtt]``: the broker at which clusters are met."""
 
     url: str = Field(min_length=1, description="`mqtt://host:port/prefix`, or `mqtts://…` (TLS).")
-    username: str | None = Field(None, description="At the broker; password: the keys' file.")
+    username: str | None = Field(
+        None, description="At the broker; the password stands in the keys' file."
+    )
     authority: str | None = Field(
-        None, description="PEM file of who signs the broker's certificate; default: the system's."
+        None,
+        description="PEM file of the authority that signs the broker's certificate; "
+        "default: the system's.",
     )
 
 
@@ -56,10 +61,10 @@ class LinksDocument(Table):
     tcp: TcpTable | None = None
     mqtt: MqttTable | None = None
     sensors: dict[str, str] = Field(
-        default_factory=dict, description="By reading of the safety table: a file with one number."
+        default_factory=dict, description="File with one number, by reading of the safety table."
     )
     clusters: dict[str, str] = Field(
-        min_length=1, description='By name: `"tcp"`, `"mqtt"`, or the cluster file of a local bus.'
+        min_length=1, description='`"tcp"`, `"mqtt"`, or the cluster file of a local bus, by name.'
     )
 
 
@@ -69,18 +74,18 @@ TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable)
 
 @dataclass(frozen=True)
 class LinksFile:
-    """A links file as it was read.
+    """A links file as read.
 
     Attributes
     ----------
     path
-        Of the file; other files are beside it.
+        Links file; other files stand beside it.
     document
         Its tables.
     keys
         By cluster.
     password
-        At the broker.
+        For the broker.
     """
 
     path: Path
@@ -89,17 +94,17 @@ class LinksFile:
     password: str = field(repr=False)
 
     def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
-        """See that it names every cluster of a plant and no other.
+        """Check that it names every cluster of a plant and no other.
 
         Parameters
         ----------
         homes
-            Heliostats of each cluster, as `plant_settings.clusters_of` gives them.
+            Heliostats of each cluster, as `plant.settings.clusters_of` gives them.
 
         Raises
         ------
         FormatError
-            If a cluster has no link, or a link no cluster.
+            A cluster without a link, or a link without a cluster.
         """
         for name in homes:
             if name not in self.document.clusters:
@@ -118,12 +123,12 @@ class LinksFile:
                 )
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
-        """Return the plant's ends of the links, and what has to run beside them.
+        """Return the plant's ends of the links, with all that has to run beside them.
 
         Raises
         ------
         FormatError
-            See `check`; a local cluster whose heliostats are not the plant's.
+            See `check`.
         InputError
             Certificates that cannot be used.
         """
@@ -139,9 +144,7 @@ class LinksFile:
                 made.links[name] = self._meet(name, clock)
                 made.parts.append(made.links[name])
             elif how != "tcp":
-                local = LocalCluster(self.path.parent / how, name, homes[name], clock)
-                made.local.append(local)
-                made.links[name] = local.link
+                made.local[name] = folder / how
         return made
 
     def _serve(self, made: "PlantLinks", keys: Mapping[str, bytes], clock: Clock) -> None:
@@ -177,26 +180,27 @@ class PlantLinks:
     Attributes
     ----------
     links
-        By cluster.
+        Links over TCP and MQTT, by cluster.
     parts
-        To be run beside the plant, with what `local` has.
+        What has to run beside the plant.
     local
-        Clusters whose bus is at this machine.
+        Cluster files of clusters whose bus is at this machine, by cluster; they have no link yet.
     server
-        That clusters connect to; None if none does.
+        Server that clusters connect to; None if none does.
     sensors
         Readings of the safety table from files.
     """
 
     links: dict[str, Link] = field(default_factory=dict)
     parts: list[Any] = field(default_factory=list)
-    local: list[LocalCluster] = field(default_factory=list)
+    local: dict[str, Path] = field(default_factory=dict)
     server: TcpServer | None = None
     sensors: SensorFiles = field(default_factory=lambda: SensorFiles({}))
 
-    def refusal(self) -> str:
-        """Return why the last that connected was not let in, "" if all were."""
-        return self.server.last_refusal if self.server is not None else ""
+    def facts(self) -> dict[str, str]:
+        """Return why the last connection was refused, by name; empty if none was."""
+        refusal = self.server.last_refusal if self.server is not None else ""
+        return {"refused link": refusal} if refusal else {}
 
 
 def read_links(path: str | Path) -> LinksFile:
@@ -205,7 +209,7 @@ def read_links(path: str | Path) -> LinksFile:
     Raises
     ------
     FormatError
-        If something cannot be used; the text names file, place, value and limit.
+        Something cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
     document = read_document(path, "links", LinksDocument, TABLES)
@@ -255,7 +259,7 @@ def _check(found: LinksFile) -> None:
 
 
 def _listen(path: Path, text: str) -> tuple[str, int]:
-    """Return address and port."""
+    """Return address and port of ``[tcp].listen``."""
     try:
         parts = urlsplit(f"//{text}")
         host, port = parts.hostname, parts.port

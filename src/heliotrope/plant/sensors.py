@@ -1,8 +1,8 @@
-"""Readings of the safety table from files, as whatever reads the sensors writes them.
+"""Readings of the safety table from files, written by whatever program reads the sensors.
 
-A file holds one number, in the unit of its row, and is written anew with each reading (beside, then
-renamed). A file that is not written anew is no new reading: after some seconds the worst case of
-its row counts, as if the sensor were gone. See `control.safety`.
+A file holds one number in the unit of its row, and is written anew with each reading (beside, then
+renamed). A file that is not written anew gives no new reading: after some seconds its row counts as
+in the worst case, as if the sensor were gone. See `safety.conditions`.
 """
 
 import math
@@ -15,20 +15,20 @@ from heliotrope.safety import CONDITIONS, Watcher, watched_by
 
 #: Readings that have to come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS
-#: A file with more is none of a number, bytes.
+#: Longest text of a number, bytes.
 _LONGEST = 64
 
 
 @dataclass(frozen=True)
 class Readings:
-    """What has changed since the last look.
+    """Readings that changed since the last look.
 
     Attributes
     ----------
     values
-        New ones, by reading.
+        New values, by reading.
     problems
-        Why one cannot be read, by reading; "" where it can be again.
+        Why a reading cannot be read, by reading; "" where it can be read again.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class SensorFiles:
     Attributes
     ----------
     names
-        Of the readings.
+        Readings.
     """
 
     def __init__(self, files: Mapping[str, Path]) -> None:
@@ -66,7 +66,7 @@ class SensorFiles:
                     continue
                 value = float(path.read_text(encoding="ascii")[:_LONGEST])
                 if math.isfinite(value):
-                    # The file of the start may be of long ago.
+                    # The file that is there at the start may be old.
                     if name in self._written:
                         found.values[name] = value
                     self._written[name] = written

@@ -1,1 +1,9 @@
-"""The simulated plant: drives, boards, buses, clocks, whole fields; and what tries to break it."""
+"""The simulated plant: boards and buses, whole fields, worlds, and attempts to break it.
+
+- `boards`: local controllers true to the firmware, on a simulated bus.
+- `field`: ten thousand local controllers as arrays.
+- `cameras`, `wind`: cameras that see the simulated beams, and wind that turns the mirrors.
+- `live`: a world for a plant at work; begin with `live.World`.
+- `world`, `invariants`: the deterministic simulation with its faults, and the safety invariants
+  that it checks at every step.
+"""

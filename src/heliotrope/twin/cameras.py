@@ -1,12 +1,14 @@
 """Cameras of a simulated plant: what they see of the beams on its targets.
 
-Both cameras are a `control.calibration_cycle.Camera`. `ExactCamera` gives the true centroid with
-noise of a known covariance. `RenderedCamera` draws the frame with all light that is on the target
-at that moment, whoever threw it, and reads it as photographs of a real plant are read. Neither
-looks at which heliostat is meant more than a real camera could.
+Both fit the port `plant.ports.Cameras`. `ExactCamera` gives the true centroid with noise of a
+known covariance. `RenderedCamera` draws the frame with all light that is on the target at that
+moment, whichever mirrors it comes from, and reads it as photographs of a real plant are read.
+Neither knows more of the heliostat that is asked for than a real camera could.
 """
 
+import asyncio
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,19 +18,22 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.photograph import Reading, Settings, read_photograph
+from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.optics.mirror_image import reflected_beam
+from heliotrope.plant.camera_views import Views, picture_of, shot_of
+from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.safety import Alarm
 from heliotrope.twin.boards.board import Board
 
-#: Light further from the middle of a target than this many of its half diagonals is left out.
+#: Light further from the centre of a target than this many of its half diagonals is left out.
 NEAR = 2.0
-#: Cosine of the incidence below which a mirror throws no light worth drawing.
+#: Cosine of the incidence below which the light of a mirror is not worth drawing.
 GRAZING = 0.05
-#: Brightest reading that the exposure is set for, of the full scale.
+#: Brightest reading after exposure, as a share of full scale.
 PEAK = 0.7
 
 
@@ -55,7 +60,7 @@ class Mirror:
     height: float = 2.0
 
     def on(self, target: Target, sun: FloatArray) -> FloatArray:
-        """Return where its ray meets a target's plane, ENU, (3,); NaN if it never does."""
+        """Return where its ray meets the plane of a target, ENU, m, (3,); NaN if it does not."""
         if not float(self.normal @ sun) > GRAZING:
             return np.full(3, np.nan)
         return target.intersect(self.vertex, reflect(sun, self.normal))
@@ -63,18 +68,18 @@ class Mirror:
 
 @dataclass(frozen=True)
 class Sight:
-    """What there is to be seen: mirrors and sun, in truth, at the moment of the call.
+    """The true mirrors and sun at the moment of the call.
 
     Attributes
     ----------
     clock
-        Of the plant.
+        Clock of the plant.
     mirrors
         Gives all mirrors whose light may be on a target.
     sun
         Gives the unit vector to the sun, (3,).
     latency
-        From being asked for a photograph to the middle of its exposure, s.
+        Time from the request for a photograph to the middle of its exposure, s.
     """
 
     clock: Clock
@@ -83,7 +88,7 @@ class Sight:
     latency: float = 1.0
 
     async def exposure(self) -> float:
-        """Wait for the middle of an exposure; return when it is, monotonic s."""
+        """Wait for the middle of an exposure; return its time, monotonic s."""
         await sleep_until(self.clock, self.clock.monotonic() + self.latency)
         return self.clock.monotonic()
 
@@ -91,7 +96,7 @@ class Sight:
 def mirrors_of(
     boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
 ) -> Callable[[], Sequence[Mirror]]:
-    """Return what gives the mirrors of boards, by name, each of one size in m."""
+    """Return a function that gives the mirrors of boards, by name, all of one size in m."""
 
     def mirrors() -> Sequence[Mirror]:
         return [Mirror(name, *board.mirror(), width, height) for name, board in boards.items()]
@@ -99,22 +104,61 @@ def mirrors_of(
     return mirrors
 
 
+def mirrors_near(
+    target: Target,
+    sun: FloatArray,
+    stand: tuple[FloatArray, FloatArray],
+    names: tuple[str, ...],
+    sizes: FloatArray,
+    reach: float = NEAR,
+) -> list[Mirror]:
+    """Return the mirrors whose rays meet the plane of a target near its centre.
+
+    Parameters
+    ----------
+    target
+        Its corners and normal count.
+    sun
+        Unit vector to the sun, (3,).
+    stand
+        Unit normals and vertices of N mirrors, (N, 3) each.
+    names
+        Heliostats, N.
+    sizes
+        Width and height of the mirrors, m, (N, 2).
+    reach
+        Largest distance from the centre, in half diagonals of the target.
+    """
+    middle = np.asarray(target.corners).mean(axis=0)
+    limit = reach * 0.5 * float(np.hypot(target.width, target.height))
+    facing, vertex = stand
+    cosine = facing @ sun
+    rays = 2.0 * cosine[:, None] * facing - sun
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = ((middle - vertex) @ target.normal) / (rays @ target.normal)
+    away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
+    hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
+    return [
+        Mirror(names[i], vertex[i], facing[i], float(sizes[i, 0]), float(sizes[i, 1])) for i in hits
+    ]
+
+
 class ExactCamera:
-    """Gives true centroids of beams with noise.
+    """Gives true centroids of beams with noise, and no picture.
 
     Parameters
     ----------
     sight
-        What there is to be seen.
+        Mirrors and sun.
     covariance
-        Of a centroid in the target's plane: a variance or (2, 2), m².
+        Of a centroid in the plane of the target: a variance or (2, 2), m².
     seed
-        Of the noise.
+        Seed of the noise.
 
     Raises
     ------
     InputError
-        A covariance that none is.
+        A covariance of another shape, or not a covariance.
     """
 
     def __init__(self, sight: Sight, covariance: npt.ArrayLike = 1e-4, seed: int = 0) -> None:
@@ -129,9 +173,32 @@ class ExactCamera:
             raise InputError("exact camera: a covariance must be symmetric and nowhere below 0 m²")
         self._sight = sight
         self._plane = plane
-        # Its root; a Cholesky factor would not bear a covariance of 0.
+        # Its root; a Cholesky factor would not exist for a covariance of 0.
         self._root = vectors * np.sqrt(values)
         self._chance = np.random.default_rng(seed)
+        self._views: dict[str, CameraView] = {}
+
+    def start(self, on_alarm: Callable[[Alarm], None]) -> None:
+        """Do nothing: this camera never fails."""
+
+    def close(self) -> None:
+        """Do nothing: nothing runs."""
+
+    def sees(self, target: str) -> bool:
+        """Return True: it looks at every target."""
+        del target
+        return True
+
+    def awake(self, target: str) -> bool:
+        """Return True: it never falls silent."""
+        return self.sees(target)
+
+    async def look(self, target: str) -> None:
+        """Do nothing: exact centroids need no empty photograph."""
+
+    def view(self, target: str) -> CameraView:
+        """Return what was seen last of a target."""
+        return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return where a heliostat's beam is on a target.
@@ -139,7 +206,7 @@ class ExactCamera:
         Raises
         ------
         UnknownNameError
-            If there is no such heliostat.
+            There is no such heliostat.
         """
         at = await self._sight.exposure()
         mirrors = {mirror.heliostat: mirror for mirror in self._sight.mirrors()}
@@ -155,19 +222,31 @@ class ExactCamera:
         others = [n for n, p in places.items() if n != heliostat and _within(target, p)]
         if others:
             reasons.append(f"several beams: {', '.join(others)} too")
+        self._keep(target, point, (heliostat, *reasons))
         return Shot(point, at, target.axes.T @ self._plane @ target.axes, tuple(reasons))
+
+    def _keep(self, target: Target, point: FloatArray, lines: tuple[str, ...]) -> None:
+        centroid = None
+        if np.isfinite(point).all():
+            x, y = target.plane_coordinates(point)
+            centroid = float(x), float(y)
+        version = self.view(target.name).version + 1
+        at = self._sight.clock.utc().timestamp()
+        self._views[target.name] = CameraView(target.name, version, at, b"", lines, centroid)
 
 
 @dataclass(frozen=True)
 class Optics:
-    """How mirrors throw their light.
+    """Quality of the mirrors and strength of the light.
 
     Attributes
     ----------
     slope_error
         Standard deviation of the mirrors' normals per axis, rad.
-    dni, reflectivity
-        W/m², and a share.
+    dni
+        W/m².
+    reflectivity
+        Share, 0 to 1.
     facets
         Columns and rows, canted at the slant range.
     """
@@ -181,25 +260,30 @@ class Optics:
 class RenderedCamera:
     """Draws photographs and reads them.
 
+    A photograph takes a second of a processor. With ``threads`` it is drawn, read and annotated
+    beside the event loop; without, at once, as virtual time needs it.
+
     Parameters
     ----------
     sight
-        What there is to be seen.
+        Mirrors and sun.
     scenes
-        Of one target each: camera, target with its marks, light, paint and sensor, no beams.
+        One target each: camera, target with its marks, light, paint and sensor, without beams.
     optics
-        Of all mirrors.
+        Mirrors and light.
     settings
         How photographs are read.
     seed
-        Of the sensor's noise.
+        Seed of the sensor's noise.
+    threads
+        Photographs that are worked on at a time; 0: in the event loop itself.
 
     Attributes
     ----------
     taken
-        Photographs so far, empty ones too.
+        Photographs so far, empty ones included.
     last
-        The frame that was taken last, None before.
+        The last frame, None before the first.
 
     Raises
     ------
@@ -215,42 +299,64 @@ class RenderedCamera:
         optics: Optics | None = None,
         settings: Settings | None = None,
         seed: int = 0,
+        threads: int = 0,
     ) -> None:
         for scene in scenes:
             names = ", ".join(target.name for target in scene.targets)
             if len(scene.targets) > 1 or scene.beams:
                 raise InputError(
                     f"rendered camera: the scene of {names} has {len(scene.targets)} targets and "
-                    f"{len(scene.beams)} beams; give one target each and none: mirrors throw them"
+                    f"{len(scene.beams)} beams; give one target and no beam: mirrors throw them"
                 )
         self._sight, self._scenes = sight, {s.targets[0].name: s for s in scenes}
         self._optics, self._settings = optics or Optics(), settings or Settings()
         self._chance = np.random.default_rng(seed)
-        self._empty: dict[str, Frame] = {}
+        self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
+        self._views, self._empty = Views(), dict[str, Frame]()
         self.taken = 0
         self.last: Frame | None = None
 
-    async def take_empty(self, target: Target) -> None:
-        """Photograph a target before a beam comes: the background of what is taken later.
+    def start(self, on_alarm: Callable[[Alarm], None]) -> None:
+        """Do nothing: a simulated camera never falls silent."""
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def sees(self, target: str) -> bool:
+        """Return whether there is a scene of the target."""
+        return target in self._scenes
+
+    def awake(self, target: str) -> bool:
+        """Return whether there is a scene of the target."""
+        return self.sees(target)
+
+    def view(self, target: str) -> CameraView:
+        """Return the last photograph of a target, for people."""
+        return self._views.view(target)
+
+    async def look(self, target: str) -> None:
+        """Photograph a target before a beam comes, as background for later photographs.
 
         Raises
         ------
         InputError
-            If light of a beam is seen on it.
+            A beam is on the target, or the target is not found in the photograph.
         UnknownNameError
-            If there is no scene of it.
+            There is no scene of the target.
         """
-        frame = await self._take(target.name)
-        reading = self._read(target, frame, None)
+        seen, _ = await self._take(target)
+        reading = seen.reading(target)
         if reading.spots:
             place = reading.spots[0].plane
             raise InputError(
-                f"target {target.name}: a beam is on it, {place[0]:.2f} m right of and "
+                f"target {target}: a beam is on it, {place[0]:.2f} m right of and "
                 f"{place[1]:.2f} m above its middle; take the empty frame before one comes"
             )
         if not reading.found.found:
-            raise InputError(f"target {target.name}: {reading.found.reason}; look at the camera")
-        self._empty[target.name] = frame
+            raise InputError(f"target {target}: {reading.found.reason}; look at the camera")
+        self._empty[target] = seen.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
         """Return the beam that is seen on a target; the camera does not know whose it is.
@@ -258,71 +364,79 @@ class RenderedCamera:
         Raises
         ------
         UnknownNameError
-            If there is no scene of the target.
+            There is no scene of the target.
         """
         del heliostat
-        frame = await self._take(target.name)
-        at = self._sight.clock.monotonic()
-        reading = self._read(target, frame, self._empty.get(target.name))
-        reasons = tuple(f"{reason.name}: {reason.text}" for reason in reading.reasons)
-        if not reading.spots:
-            return Shot(np.full(3, np.nan), at, 0.0, reasons)
-        spot = reading.spots[0]
-        return Shot(spot.point, at, spot.covariance_enu, reasons)
+        seen, at = await self._take(target.name)
+        return shot_of(seen, target.name, at)
 
     def beams(self, target: Target) -> tuple[Thrown, ...]:
-        """Return what is thrown on a target, and beside it as near as a frame shows, now."""
-        sun, optics = self._sight.sun(), self._optics
-        thrown = []
-        for mirror in self._sight.mirrors():
-            if not _within(target, mirror.on(target, sun), NEAR):
-                continue
-            # The facets are canted at the distance of the target, wherever the mirror looks.
-            slant = float(np.linalg.norm(target.center - mirror.vertex))
-            beam = reflected_beam(
-                target,
-                mirror.vertex,
-                sun,
-                mirror.width,
-                mirror.height,
-                normal=mirror.normal,
-                facets=optics.facets,
-                focal=slant,
-                slope_error=optics.slope_error,
-                reflectivity=optics.reflectivity,
-                dni=optics.dni,
-            )
-            thrown.append(Thrown(target.name, beam))
-        return tuple(thrown)
+        """Return the beams on a target, and those beside it that a frame would show, now."""
+        return _thrown(target, self._sight.mirrors(), self._sight.sun(), self._optics)
 
-    async def _take(self, name: str) -> Frame:
+    async def _take(self, name: str) -> tuple[Photograph, float]:
+        """Take a photograph; return it as read, and when it was exposed, monotonic s."""
         if name not in self._scenes:
             raise UnknownNameError("target", name, list(self._scenes))
-        await self._sight.exposure()
-        scene = self._scenes[name]
-        beams = self.beams(scene.targets[0])
-        # As a camera with automatic exposure: the brightest of paint and beams sets it.
-        scene = exposed(replace(scene, beams=beams), PEAK)
+        at = await self._sight.exposure()
+        scene, utc = self._scenes[name], self._sight.clock.utc()
+        mirrors, sun = self._sight.mirrors(), self._sight.sun()
+        seed = int(self._chance.integers(1 << 32))
         self.taken += 1
-        picture = render(
-            scene,
-            int(self._chance.integers(1 << 32)),
-            name=f"{scene.camera.name} {self.taken}",
-            time=self._sight.clock.utc(),
-        )
-        self.last = picture.frame
-        return picture.frame
+        title = f"{scene.camera.name} {self.taken}"
 
-    def _read(self, target: Target, frame: Frame, without: Frame | None) -> Reading:
-        scene = self._scenes[target.name]
-        seen = read_photograph(
-            frame, scene.targets, scene.camera, settings=self._settings, without=without
+        def work() -> tuple[Photograph, bytes]:
+            beams = _thrown(scene.targets[0], mirrors, sun, self._optics)
+            # Automatic exposure: the brightest of paint and beams sets it.
+            lit = exposed(replace(scene, beams=beams), PEAK)
+            frame = render(lit, seed, name=title, time=utc).frame
+            seen = read_photograph(
+                frame,
+                scene.targets,
+                scene.camera,
+                settings=self._settings,
+                without=self._empty.get(name),
+            )
+            return seen, picture_of(seen)
+
+        if self._pool is None:
+            seen, jpeg = work()
+        else:
+            seen, jpeg = await asyncio.get_running_loop().run_in_executor(self._pool, work)
+        self.last = seen.frame
+        self._views.keep(name, utc.timestamp(), seen, jpeg)
+        return seen, at
+
+
+def _thrown(
+    target: Target, mirrors: Sequence[Mirror], sun: FloatArray, optics: Optics
+) -> tuple[Thrown, ...]:
+    """Return the beams of mirrors on a target, and near enough beside it."""
+    thrown = []
+    for mirror in mirrors:
+        if not _within(target, mirror.on(target, sun), NEAR):
+            continue
+        # Facets are canted at the distance of the target, wherever the mirror looks.
+        slant = float(np.linalg.norm(target.center - mirror.vertex))
+        beam = reflected_beam(
+            target,
+            mirror.vertex,
+            sun,
+            mirror.width,
+            mirror.height,
+            normal=mirror.normal,
+            facets=optics.facets,
+            focal=slant,
+            slope_error=optics.slope_error,
+            reflectivity=optics.reflectivity,
+            dni=optics.dni,
         )
-        return seen.reading(target.name)
+        thrown.append(Thrown(target.name, beam))
+    return tuple(thrown)
 
 
 def _within(target: Target, point: FloatArray, share: float = 0.0) -> bool:
-    """Whether a point of the plane is on a target, or within a share of its half diagonal."""
+    """Return whether a point is on a target, or within a share of its half diagonal."""
     if not np.isfinite(point).all():
         return False
     away = np.abs(target.plane_coordinates(point) - target.plane_coordinates(_middle(target)))

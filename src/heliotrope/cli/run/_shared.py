@@ -1,4 +1,4 @@
-"""What every plant at work shares, simulated or real: store, archive, console, lines, its end."""
+"""A plant at work, simulated or real: store, archive, console, printed lines, and its end."""
 
 import asyncio
 import contextlib
@@ -11,45 +11,30 @@ import webbrowser
 from collections.abc import AsyncIterator, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from heliotrope.errors import HeliotropeError, InputError
+from heliotrope.field.plant import Plant
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
-from heliotrope.links.clock import Clock
-from heliotrope.plant.operations.operations import Operations
+from heliotrope.plant.assembly import PlantAssembly
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
 if TYPE_CHECKING:
     from heliotrope.console.serve import ConsoleServer
 
-#: A console prints lines more seldom: people look at it.
+#: Factor on the time between lines while a console is served: people look at that.
 _SELDOM = 6.0
-#: Seconds between lines by default.
-EVERY = 10.0
-
-
-class AtWork(Protocol):
-    """A plant with all that runs beside it."""
-
-    operations: Operations
-
-    @property
-    def clock(self) -> Clock:
-        """Of the plant."""
-        ...
-
-    async def stowed(self, limit: float = 300.0) -> bool:
-        """Stow the field; return whether all of it is."""
-        ...
+#: Default time between lines, and period of the archive, s.
+EVERY, _ARCHIVED = 10.0, 5.0
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Console, store and lines, as they were asked for; see `cli.run`."""
+    """Options of console, store and lines; see `cli.run.command`."""
 
     host: str = "127.0.0.1"
     port: int = 8080
@@ -70,7 +55,7 @@ class Shown:
                 raise InputError(f"run: --{name} {value:g}; give above 0")
         if self.database is not None and not self.database.startswith("postgresql://"):
             raise InputError(
-                "run: --database is no postgresql://user@host/name; SQLite needs --data alone"
+                "run: --database must be postgresql://user@host/name; for SQLite give --data alone"
             )
         if self.certificate is not None and self.key is not None:
             from heliotrope.links.tcp import server_tls
@@ -85,7 +70,7 @@ class Shown:
         Raises
         ------
         InputError
-            If they do not hold together, or the console is not installed.
+            Settings that contradict each other, or a console that is not installed.
         """
         try:
             from heliotrope.console.settings import ConsoleSettings
@@ -102,12 +87,12 @@ class Shown:
 
 
 def load_console(shown: Shown) -> None:
-    """Import the console before the plant begins: that takes longer than a lease lasts.
+    """Import the console before the plant begins: it takes longer than a lease lasts.
 
     Raises
     ------
     InputError
-        If it is not installed, or its address is taken.
+        The console is not installed, or its address is taken.
     """
     if not shown.console:
         return
@@ -117,8 +102,8 @@ def load_console(shown: Shown) -> None:
     except OSError as error:
         why = error.strerror or str(error)
         raise InputError(
-            f"console: {shown.host} port {shown.port} cannot be had ({why}); another program may "
-            "use it, choose another with --port"
+            f"console: {shown.host} port {shown.port} cannot be opened ({why}); another program "
+            "may use it: choose another with --port"
         ) from None
     try:
         import heliotrope.console.serve  # noqa: F401 - only loaded
@@ -135,7 +120,7 @@ def _missing(error: ImportError) -> InputError:
 
 @contextlib.contextmanager
 def one_error() -> Iterator[None]:
-    """Raise the first error that Heliotrope raised on purpose in place of a group that holds it."""
+    """Raise the first error of Heliotrope or the system in place of the group that holds it."""
     try:
         yield
     except BaseExceptionGroup as group:
@@ -153,7 +138,7 @@ def _leaves(error: BaseException) -> list[BaseException]:
 
 
 def ending_at_signals() -> asyncio.Event:
-    """Return an event that Ctrl-C and SIGTERM set."""
+    """Return an event that is set by Ctrl-C and SIGTERM."""
     ending, loop = asyncio.Event(), asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, ending.set)
@@ -162,7 +147,7 @@ def ending_at_signals() -> asyncio.Event:
 
 @contextlib.contextmanager
 def store(shown: Shown) -> Iterator[Keeper]:
-    """Open the store: a database, or in its folder, or in one that is gone afterwards."""
+    """Open the store: a database, a folder, or a folder that is deleted afterwards."""
     kept = shown.data is not None or shown.database is not None
     folder = shown.data if kept else Path(tempfile.mkdtemp(prefix="heliotrope-"))
     try:
@@ -179,8 +164,8 @@ def store(shown: Shown) -> Iterator[Keeper]:
 
 
 @contextlib.asynccontextmanager
-async def archive(live: AtWork, shown: Shown) -> AsyncIterator[None]:
-    """Archive the field's telemetry beside a block, if there is a folder."""
+async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
+    """Archive the telemetry of the field during a block, if there is a folder."""
     if shown.data is None:
         yield
         return
@@ -193,7 +178,7 @@ async def archive(live: AtWork, shown: Shown) -> AsyncIterator[None]:
             kept.take(
                 frame.at, Look(frame.state, frame.fault, flags, frame.counts, as_float(frame.age))
             )
-            await asyncio.sleep(5.0)
+            await asyncio.sleep(_ARCHIVED)
 
     try:
         async with asyncio.TaskGroup() as group:
@@ -204,10 +189,10 @@ async def archive(live: AtWork, shown: Shown) -> AsyncIterator[None]:
         kept.close()
 
 
-def console_of(live: AtWork, keeper: Keeper, shown: Shown) -> "ConsoleServer | None":
-    """Return the console of a plant that does not run yet; None if none is wanted.
+def console_of(live: PlantAssembly, keeper: Keeper, shown: Shown) -> "ConsoleServer | None":
+    """Return the console of a plant that does not run yet; None without one.
 
-    It takes longer to make than a lease lasts, so it is made before.
+    Making it takes longer than a lease lasts, so it is made before the plant begins.
     """
     if not shown.console:
         return None
@@ -218,9 +203,13 @@ def console_of(live: AtWork, keeper: Keeper, shown: Shown) -> "ConsoleServer | N
 
 @contextlib.asynccontextmanager
 async def console(
-    server: "ConsoleServer | None", live: AtWork, keeper: Keeper, shown: Shown, speed: float = 1.0
+    server: "ConsoleServer | None",
+    live: PlantAssembly,
+    keeper: Keeper,
+    shown: Shown,
+    speed: float = 1.0,
 ) -> AsyncIterator[bool]:
-    """Serve the console beside a block; say where it is."""
+    """Serve the console during a block and print its address; give whether there is one."""
     if server is None:
         yield False
         return
@@ -241,9 +230,9 @@ async def console(
 
 
 async def watch(
-    live: AtWork, shown: Shown, ending: asyncio.Event, *, seen: bool, speed: float = 1.0
+    live: PlantAssembly, shown: Shown, ending: asyncio.Event, *, seen: bool, speed: float = 1.0
 ) -> None:
-    """Print a line now and then until the end; ``seen``: people look at a console."""
+    """Print a line at intervals until the end; ``seen``: a console is served."""
     loop = asyncio.get_running_loop()
     pause = speed * shown.every * (_SELDOM if seen and shown.every == EVERY else 1.0)
     until = None if shown.minutes is None else loop.time() + 60.0 * shown.minutes
@@ -255,8 +244,8 @@ async def watch(
         print(line(live), flush=True)
 
 
-async def stow(live: AtWork, ending: asyncio.Event) -> bool:
-    """Stow the field, or give up at a second signal; return whether all of it is."""
+async def stow(live: PlantAssembly, ending: asyncio.Event) -> bool:
+    """Stow the field, or give up at a second signal; return whether all of it is stowed."""
     print("stowing; Ctrl-C again ends at once", flush=True)
     ending.clear()
     stowing = asyncio.ensure_future(live.stowed())
@@ -269,12 +258,12 @@ async def stow(live: AtWork, ending: asyncio.Event) -> bool:
         if isinstance(error, Exception):
             raise error
     good = list(done) == [True]
-    print("the field is stowed" if good else "not all is stowed", flush=True)
+    print("the field is stowed" if good else "not every heliostat is stowed", flush=True)
     return good
 
 
-def line(live: AtWork) -> str:
-    """Return one line on a plant."""
+def line(live: PlantAssembly) -> str:
+    """Return one line about a plant."""
     summary, work = live.operations.summary(), live.operations.calibration()
     counts = ", ".join(f"{count:,} {name.lower()}" for name, count in summary.states.items())
     parts = [f"{summary.at:%H:%M:%S} UTC", counts, f"{work.done} calibrated"]
@@ -296,10 +285,41 @@ def line(live: AtWork) -> str:
     return " | ".join(parts)
 
 
-def _silent(live: AtWork) -> str:
-    """Return which clusters are silent, and why the first of them is."""
+def _silent(live: PlantAssembly) -> str:
+    """Return which clusters are silent, and why the first one is."""
     rows = live.operations.cluster_rows()
     away = [row for row in rows if not row.alive]
     names = ", ".join(row.name for row in away[:3]) + (", …" if len(away) > 3 else "")
     why = f" ({away[0].problem})" if away and away[0].problem else ""
     return f"{len(away)} of {len(rows)} clusters silent: {names}{why}"
+
+
+def begin(design: Plant, shown: Shown) -> asyncio.Event:
+    """Say what begins and load the console; return the event that ends it.
+
+    Raises
+    ------
+    InputError
+        See `load_console`.
+    """
+    ending = ending_at_signals()
+    print(f"{design.name}: {len(design):,} heliostats", flush=True)
+    load_console(shown)
+    return ending
+
+
+async def at_work(
+    live: PlantAssembly, keeper: Keeper, shown: Shown, ending: asyncio.Event, speed: float = 1.0
+) -> None:
+    """Run a plant with console and archive until the end, then stow its field."""
+    server = console_of(live, keeper, shown)
+    async with (
+        live.running(),
+        archive(live, shown),
+        console(server, live, keeper, shown, speed) as seen,
+    ):
+        await watch(live, shown, ending, seen=seen, speed=speed)
+        if not await stow(live, ending):
+            print(live.left(), flush=True)
+        await live.end()
+    print("ended", flush=True)

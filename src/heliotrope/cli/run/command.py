@@ -1,4 +1,4 @@
-"""``heliotrope run``: a plant at work with its console until Ctrl-C, in the twin or for real."""
+"""``heliotrope run``: a plant at work with its console until Ctrl-C, simulated or real."""
 
 from itertools import groupby
 from pathlib import Path
@@ -43,16 +43,16 @@ def run(
     ] = None,
     heliostats: Annotated[
         int | None,
-        typer.Option(help="Of the default plant, instead of 10,000.", rich_help_panel=_TWIN),
+        typer.Option(help="Number in the default plant, instead of 10,000.", rich_help_panel=_TWIN),
     ] = None,
     prototype: Annotated[
         bool,
         typer.Option(
-            "--prototype", help="18 heliostats on simulated boards.", rich_help_panel=_TWIN
+            "--prototype", help="Run 18 heliostats on simulated boards.", rich_help_panel=_TWIN
         ),
     ] = False,
     speed: Annotated[
-        float, typer.Option(help="Simulated seconds in a second.", rich_help_panel=_TWIN)
+        float, typer.Option(help="Simulated seconds per second.", rich_help_panel=_TWIN)
     ] = 1.0,
     start: Annotated[
         str,
@@ -62,12 +62,14 @@ def run(
         ),
     ] = "morning",
     seed: Annotated[
-        int, typer.Option(help="Of how the mirrors really stand.", rich_help_panel=_TWIN)
+        int, typer.Option(help="Seed of how the mirrors really stand.", rich_help_panel=_TWIN)
     ] = 0,
     exact: Annotated[
         bool,
         typer.Option(
-            "--exact", help="Centroids with noise instead of photographs.", rich_help_panel=_TWIN
+            "--exact",
+            help="Take centroids with noise instead of photographs.",
+            rich_help_panel=_TWIN,
         ),
     ] = False,
     clusters: Annotated[
@@ -81,7 +83,7 @@ def run(
         bool,
         typer.Option(
             "--configure",
-            help="Store axes, limits, stow and standby in local controllers that hold others.",
+            help="Write calibration and machine table to local controllers that hold others.",
             rich_help_panel=_REAL,
         ),
     ] = False,
@@ -92,22 +94,22 @@ def run(
         bool | None,
         typer.Option(
             "--idle/--automatic",
-            help="Move nothing until a person says so, or begin to work at once; default: --idle "
-            "for a real plant, --automatic in simulation.",
+            help="Wait for an operator, or start automatic control at once; default: --idle for a "
+            "real plant, --automatic in simulation.",
             rich_help_panel=_WORK,
         ),
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="End after this time; default: at Ctrl-C.", rich_help_panel=_WORK),
+        typer.Option(help="Time after which to end; default: at Ctrl-C.", rich_help_panel=_WORK),
     ] = None,
     every: Annotated[
-        float, typer.Option(help="Seconds between lines that are printed.", rich_help_panel=_WORK)
+        float, typer.Option(help="Seconds between printed lines.", rich_help_panel=_WORK)
     ] = 10.0,
     host: Annotated[
         str,
         typer.Option(
-            help="Address to listen at; other than this machine's own it needs TLS.",
+            help="Address to listen at; TLS is required unless it is this machine's own.",
             rich_help_panel=_CONSOLE,
         ),
     ] = "127.0.0.1",
@@ -115,7 +117,7 @@ def run(
     name: Annotated[
         list[str] | None,
         typer.Option(
-            help="Name that people write for this machine; may be given again.",
+            help="Name by which browsers reach this machine; may be repeated.",
             rich_help_panel=_CONSOLE,
         ),
     ] = None,
@@ -143,7 +145,7 @@ def run(
     data: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for all that is kept; default: nothing outlasts the run.",
+            help="Folder for all records; default: nothing outlasts the run.",
             rich_help_panel=_KEPT,
         ),
     ] = None,
@@ -157,9 +159,9 @@ def run(
 ) -> None:
     """Run a plant: it tracks, photographs, learns and corrects; by default in simulation.
 
-    The field leaves stow some heliostats at a time, every target's camera calibrates one
-    heliostat after the other, and what was learnt is pushed to its controller. The console shows
-    it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
+    The field leaves stow some heliostats at a time, the camera of each target calibrates one
+    heliostat after another, and every calibration is pushed to its local controller. The console
+    shows it all. Ctrl-C stows the field and ends. With --clusters the heliostats are real.
     """
     from heliotrope.cli.run._shared import Shown
     from heliotrope.errors import InputError
@@ -167,7 +169,9 @@ def run(
     if not 0.0 < speed <= 1000.0:
         raise InputError(f"run: --speed {speed:g}; give above 0 to 1000")
     if prototype and (field is not None or heliostats is not None):
-        raise InputError("run: --prototype is a plant of its own; give no field and no number")
+        raise InputError(
+            "run: --prototype is a plant of its own; leave out the field and --heliostats"
+        )
     if field is not None and heliostats is not None:
         raise InputError("run: --heliostats is for the default plant; leave it out with a field")
     shown = Shown(
@@ -204,8 +208,8 @@ def run(
         raise InputError("run: --clusters needs the plant file; give it before")
     if speed != 1.0 or start != "morning" or seed or exact:
         raise InputError(
-            "run: --speed, --start, --seed and --exact are of the simulation; leave them out with "
-            "--clusters"
+            "run: --speed, --start, --seed and --exact belong to the simulation; leave them out "
+            "with --clusters"
         )
     design = open_plant(field)
     from heliotrope.cli.run.real import RealChoice, run_real
@@ -219,9 +223,9 @@ def _design(field: Path | None, heliostats: int | None, *, prototype: bool) -> "
     if field is not None:
         return open_plant(field)
     if prototype:
-        from heliotrope.twin.live.live import prototype_plant
+        from heliotrope.field.example import board_prototype
 
-        return prototype_plant()
+        return board_prototype()
     from heliotrope.field.layouts import malan_plant
 
     return malan_plant(10_000 if heliostats is None else heliostats)

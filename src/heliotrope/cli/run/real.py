@@ -1,39 +1,33 @@
 """A real plant with its store and its console, in one event loop."""
 
 import asyncio
+import contextlib
+from collections.abc import AsyncIterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from heliotrope.cli.run._shared import (
-    Shown,
-    archive,
-    console,
-    console_of,
-    ending_at_signals,
-    load_console,
-    one_error,
-    store,
-    stow,
-    watch,
-)
+from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.links.clock import SystemClock
-from heliotrope.plant.assembly import RealPlant
+from heliotrope.links.link import running
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.cameras import RealCameras
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
+from heliotrope.store.keeper import Keeper
 
 if TYPE_CHECKING:
-    from heliotrope.mechanism.board_items import Machine
+    from heliotrope.cluster.program import LocalCluster
     from heliotrope.plant.links_file import PlantLinks
 
 
 @dataclass(frozen=True)
 class RealChoice:
-    """What was asked for of a real plant on the command line; see `cli.run`."""
+    """Options of a real plant on the command line; see `cli.run.command`."""
 
     folder: Path
     clusters: Path
@@ -48,95 +42,102 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
     Raises
     ------
     InputError
-        Files that do not fit together, or no place for records.
+        Files that do not fit together, a group without the machine table that ``--configure``
+        needs, or no place for records.
     """
     clock = SystemClock()
-    homes = clusters_of(design)
-    links = _links(choice, homes, clock)
-    machine = _machine(design) if choice.configure else None
+    outside = _outside(design, choice, clock)
+    if choice.configure:
+        for name in design.names:
+            design.machine(name)
     if choice.check:
-        cameras = _cameras(design, choice, shown, clock)
-        seen = 0 if cameras is None else len(design.targets) - len(cameras.unseen)
-        print(
-            f"{design.name}: {len(design):,} heliostats on {len(homes)} clusters, "
-            f"{seen} of {len(design.targets)} targets with a camera"
-        )
+        _print_check(design, _cameras(design, choice, shown, clock))
         return
     if shown.data is None and shown.database is None:
         raise InputError(
             "run: a real plant keeps its records; give --data FOLDER, or --database URL"
         )
     with one_error(), asyncio.Runner() as runner:
-        runner.run(_run(design, choice, shown, links, machine))
+        runner.run(_run(design, choice, shown, outside))
 
 
-def _links(
-    choice: RealChoice, homes: dict[str, tuple[str, ...]], clock: SystemClock
-) -> "PlantLinks":
+def _print_check(design: Plant, cameras: RealCameras | None) -> None:
+    seen = 0 if cameras is None else sum(cameras.sees(t.name) for t in design.targets)
+    print(
+        f"{design.name}: {len(design):,} heliostats on {len(clusters_of(design))} clusters, "
+        f"{seen} of {len(design.targets)} targets with a camera"
+    )
+    bare = [name for name, group in design.groups.items() if not group.machines]
+    if bare:
+        print(f"no machine table, which --configure needs: group {', '.join(bare)}")
+
+
+@dataclass(frozen=True)
+class _Outside:
+    """Links of a plant, and the clusters that run in its process."""
+
+    links: "PlantLinks"
+    local: "list[LocalCluster]"
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Run servers, links and local clusters for the time of a block."""
+        parts = [*self.links.parts, *(part for one in self.local for part in one.parts)]
+        async with running(*parts), running(*(one.cluster for one in self.local)):
+            yield
+
+    def ports(
+        self, design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock, keeper: Keeper
+    ) -> Ports:
+        """Return the ports of the plant."""
+        return Ports(
+            {**self.links.links, **{one.cluster.config.name: one.link for one in self.local}},
+            clock,
+            KeptAudit(keeper, clock, clock.utc()),
+            _cameras(design, choice, shown, clock),
+            self.links.sensors,
+            records=keeper,
+            assigned=KeptPoints(keeper),
+            beside=self.running,
+            facts=self.links.facts,
+        )
+
+
+def _outside(design: Plant, choice: RealChoice, clock: SystemClock) -> _Outside:
     try:
+        from heliotrope.cluster.program import LocalCluster
         from heliotrope.plant.links_file import read_links
     except ImportError as error:
         raise InputError(
             f"run: {error.name} is not installed; say pip install 'heliotrope[control]'"
         ) from None
-    return read_links(choice.clusters).build(homes, clock)
+    homes = clusters_of(design)
+    links = read_links(choice.clusters).build(homes, clock)
+    local = [LocalCluster(file, name, homes[name], clock) for name, file in links.local.items()]
+    return _Outside(links, local)
 
 
 def _cameras(
     design: Plant, choice: RealChoice, shown: Shown, clock: SystemClock
 ) -> RealCameras | None:
-    """Return the cameras, None if the plant has none that can work."""
+    """Return the cameras; None if the plant has no camera that can work."""
     if not design.targets or not design.cameras:
         return None
     memory = None if shown.data is None else shown.data / "targets"
     return RealCameras(design, choice.folder, clock, memory=memory)
 
 
-def _machine(design: Plant) -> "Machine":
-    from heliotrope.twin.live.live import machine_of
-
-    if len(design.groups) != 1:
-        raise InputError(
-            f"run: --configure takes heliostats of one kind, the plant has {len(design.groups)} "
-            "groups; store their limits group by group"
-        )
-    return machine_of(design)
-
-
-async def _run(
-    design: Plant,
-    choice: RealChoice,
-    shown: Shown,
-    links: "PlantLinks",
-    machine: "Machine | None",
-) -> None:
-    ending = ending_at_signals()
-    print(f"{design.name}: {len(design):,} heliostats", flush=True)
-    load_console(shown)
+async def _run(design: Plant, choice: RealChoice, shown: Shown, outside: _Outside) -> None:
+    settings = AssemblySettings(
+        # A heliostat that a person gives to automatic control is calibrated too.
+        work=AutomaticSettings(wanted=not choice.idle),
+        machines=MachineTables.WRITTEN if choice.configure else MachineTables.UNKNOWN,
+    )
+    ending = begin(design, shown)
     with store(shown) as keeper:
         clock = SystemClock()
-        live = RealPlant(
-            design,
-            links,
-            clock,
-            KeptAudit(keeper, clock, clock.utc()),
-            records=keeper,
-            assigned=KeptPoints(keeper),
-            machine=machine,
-            cameras=_cameras(design, choice, shown, clock),
-            # What a person gives to the automatic work is calibrated too.
-            work=AutomaticSettings(wanted=not choice.idle),
-        )
+        ports = outside.ports(design, choice, shown, clock, keeper)
+        live = PlantAssembly(design, ports, settings)
         if live.plant.unwatched:
             print(f"no readings for: {', '.join(live.plant.unwatched)}", flush=True)
-        server = console_of(live, keeper, shown)
-        async with (
-            live.running(),
-            archive(live, shown),
-            console(server, live, keeper, shown) as seen,
-        ):
-            await watch(live, shown, ending, seen=seen)
-            if not await stow(live, ending):
-                print(live.left(), flush=True)
-            await live.end()
-    print("ended", flush=True)
+        await at_work(live, keeper, shown, ending)

@@ -1,32 +1,21 @@
-"""A plant of the twin with its store and its console, in one event loop."""
+"""A simulated plant with its store and its console, in one event loop."""
 
 import asyncio
 from dataclasses import dataclass
 from datetime import datetime
 
-from heliotrope.cli.run._shared import (
-    Shown,
-    archive,
-    console,
-    console_of,
-    ending_at_signals,
-    load_console,
-    one_error,
-    store,
-    stow,
-    watch,
-)
+from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
 from heliotrope.field.plant import Plant
 from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
-from heliotrope.twin.live.live import LiveOptions, LivePlant
-from heliotrope.twin.live.loop import PacedLoop
+from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
 
 
 @dataclass(frozen=True)
 class Choice:
-    """What was asked for of the twin on the command line; see `cli.run`."""
+    """Options of a simulated plant on the command line; see `cli.run.command`."""
 
     speed: float
     start: datetime
@@ -45,36 +34,19 @@ def run_plant(design: Plant, choice: Choice, shown: Shown) -> None:
 async def _run(design: Plant, choice: Choice, shown: Shown) -> None:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, PacedLoop)
-    ending = ending_at_signals()
-    print(f"{design.name}: {len(design):,} heliostats", flush=True)
-    load_console(shown)
     clock = VirtualClock(loop.time, choice.start)
-    with store(shown) as keeper:
-        live = LivePlant(
-            design,
-            clock,
-            _options(choice),
-            records=keeper,
-            audit=KeptAudit(keeper, SystemClock(), clock.utc()),
-            assigned=KeptPoints(keeper),
-            extra=lambda: {"lag": loop.lag, "speed": loop.speed},
-        )
-        server = console_of(live, keeper, shown)
-        async with (
-            live.running(),
-            archive(live, shown),
-            console(server, live, keeper, shown, choice.speed) as seen,
-        ):
-            await watch(live, shown, ending, seen=seen, speed=choice.speed)
-            await stow(live, ending)
-            await live.end()
-    print("ended", flush=True)
-
-
-def _options(choice: Choice) -> LiveOptions:
-    return LiveOptions(
-        seed=choice.seed,
-        rendered=not choice.exact,
-        boards=choice.boards,
+    options = WorldOptions(choice.seed, rendered=not choice.exact, boards=choice.boards)
+    settings = AssemblySettings(
         work=AutomaticSettings(wanted=not choice.idle, calibrate=not choice.idle),
+        cycle=CYCLE,
+        machines=MachineTables.HELD,
     )
+    ending = begin(design, shown)
+    with store(shown) as keeper:
+        ports = World(design, clock, options).ports(
+            audit=KeptAudit(keeper, SystemClock(), clock.utc()),
+            records=keeper,
+            assigned=KeptPoints(keeper),
+            facts=lambda: {"lag": loop.lag, "speed": loop.speed},
+        )
+        await at_work(PlantAssembly(design, ports, settings), keeper, shown, ending, choice.speed)

@@ -1,4 +1,4 @@
-"""Marks and cameras of a plant file: from tables and back."""
+"""Marks and cameras of a plant file: from tables to objects, and back."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from heliotrope.field.marks import Mark
 
 
 def build_mark(table: MarkTable) -> Mark:
-    """Return a mark of its table."""
+    """Return the mark of a table."""
     stroke = table.stroke_m
     if stroke is None:
         stroke = 0.2 * table.size_m if table.kind in ("corner", "tee") else 0.0
@@ -39,7 +39,7 @@ def mark_document(mark: Mark) -> dict[str, Any]:
 
 
 def build_camera(table: CameraTable) -> Camera:
-    """Return a camera of its table."""
+    """Return the camera of a table."""
     (fx, fy), (cx, cy) = table.focal_px, table.center_px
     return Camera(
         name=table.name,

@@ -1,6 +1,6 @@
-"""Groups of a plant file: from tables to mechanisms, and back number by number."""
+"""Groups of a plant file: from tables to mechanisms and machines, and back number by number."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ from heliotrope.field.formats._plant_models import (
     ANGLE_UNITS,
     DRIVE_ANGLES,
     KINDS,
+    AxisTable,
     GroupTable,
+    MachineTable,
 )
 from heliotrope.field.formats._plant_table import HeliostatTable
 from heliotrope.field.heliostats import Facets, Heliostats
@@ -22,10 +24,11 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, Drive
 from heliotrope.mechanism.kernels import slots as slot
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.sun import Site
 
-# Numbers of a drive as the writer names them; "rate" and its like have no unit in the
-# name because it depends on the kind.
+# Numbers of a drive as the writer names them; names such as "rate" have no unit because it
+# depends on the kind.
 _RAW = {
     **{n: i for n, i in SLOTS.items() if n != "initial_angle"},
     "kind": slot.KIND,
@@ -48,7 +51,7 @@ def build_group(
     Raises
     ------
     FormatError, InputError
-        If the group cannot be built.
+        The group cannot be built.
     """
     reader = _Reader(path, name, group, table, rows)
     position = np.stack([table.numbers[c][rows] for c in _POSITION], axis=-1)
@@ -71,11 +74,12 @@ def build_group(
         parameters=reader.parameters(mechanism),
         aim=aim,
         cluster=cluster if any(cluster) else (),
+        machines=reader.machines(mechanism),
     )
 
 
 class _Reader:
-    """Numbers of one group, from the TOML or, where it has such a column, from the table."""
+    """Numbers of one group: from a column of the table where there is one, else from the TOML."""
 
     def __init__(
         self,
@@ -92,7 +96,7 @@ class _Reader:
         return FormatError(self.path, problem, place)
 
     def column(self, key: str) -> FloatArray | None:
-        """The table's column for this group; None if it is not there or empty for all."""
+        """Return the table's column for this group; None if it is missing or empty for all."""
         column = self.table.column(key, self.rows)
         if column is None or np.isnan(column).all():
             return None
@@ -100,8 +104,8 @@ class _Reader:
             i = int(self.rows[np.flatnonzero(np.isnan(column))[0]])
             raise FormatError(
                 self.table.path,
-                f"heliostat {self.table.name[i]}: the cell is empty, but others "
-                f"of group {self.name} have a value; fill it",
+                f"heliostat {self.table.name[i]}: the cell is empty, but other heliostats of "
+                f"group {self.name} have a value; fill it",
                 f"line {i + 2}, column {key}",
             )
         return column
@@ -113,7 +117,7 @@ class _Reader:
         return None if given is None else np.asarray(given, dtype=np.float64)
 
     def array(self, key: str, given: Any) -> FloatArray:
-        """An array of numbers; columns ``key.i.j`` replace single elements."""
+        """Return an array of numbers (N, …); columns ``key.i.j`` replace single elements."""
         base = np.asarray(given, dtype=np.float64)
         full = np.array(np.broadcast_to(base, (len(self.rows), *base.shape)))
         for index in np.ndindex(base.shape):
@@ -197,7 +201,7 @@ class _Reader:
         for key in needed:
             if key not in values:
                 raise self.fail(f"{key} is missing, here and as a column {where}.{key}", where)
-        # Taken out first: an unpacked generator would run only after **values.
+        # Popped first: an unpacked generator would run only after **values.
         constants = [values.pop(key) for key in needed]
         return drive_kinds.linear_paint(*constants, **values)
 
@@ -256,7 +260,7 @@ class _Reader:
             key = column.removeprefix("parameters.")
             name = next((n for n in mechanism.parameters if _column(mechanism, n) == key), None)
             values = self.column(column)
-            # A plant of several kinds has columns that are empty for the others.
+            # A plant of several kinds has columns that are empty for the other groups.
             if values is None:
                 continue
             if name is None:
@@ -264,6 +268,104 @@ class _Reader:
                 raise UnknownNameError(f"parameter (column {column})", key, known)
             found[name] = values
         return found
+
+    def machines(self, mechanism: Mechanism) -> tuple[Machine, ...]:
+        """Return the machine of each heliostat; () if the group has no such table."""
+        table = self.group.machine
+        if table is None:
+            if any(column.startswith("machine.") for column in self.table.numbers):
+                raise self.fail("the table of heliostats has columns machine.…; add it", "machine")
+            return ()
+        joints = [mechanism.joints[d] for d in mechanism.driven]
+        if sorted(table.axes) != sorted(joints):
+            given = ", ".join(table.axes) or "none"
+            raise self.fail(
+                f"axes of {given}; give those of {' and '.join(joints)}", "machine.axes"
+            )
+        first = table.leaves_stow_first or joints[0]
+        if first not in joints:
+            raise self.fail(f"{first!r} is no driven joint; they are {joints}", "machine")
+        drives = Drive(
+            np.broadcast_to(mechanism.drives.table, (len(self.rows), 2, slot.DRIVE_SLOTS))
+        )
+        axes = [
+            self.axis(drives[i], f"machine.axes.{j}", table.axes[j]) for i, j in enumerate(joints)
+        ]
+        stow, defocus = self.stow(drives, table), self.defocus(table)
+        standby = (
+            None if table.standby_m is None else self.array("machine.standby_m", table.standby_m)
+        )
+        way = tuple((x, y, z) for x, y, z in table.way_m)
+        made: dict[tuple[Any, ...], Machine] = {}
+        found = []
+        for k in range(len(self.rows)):
+            numbers = (
+                tuple(axes[0][k].tolist()),
+                tuple(axes[1][k].tolist()),
+                tuple(stow[k].tolist()),
+                tuple(defocus[k].tolist()),
+                None if standby is None else tuple(standby[k].tolist()),
+            )
+            if numbers not in made:
+                limits = (AxisLimits(*numbers[0]), AxisLimits(*numbers[1]))
+                made[numbers] = Machine(limits, *numbers[2:], joints.index(first), way)
+            found.append(made[numbers])
+        return tuple(found)
+
+    def axis(self, drive: Drive, where: str, table: AxisTable) -> npt.NDArray[np.int64]:
+        """Return low, high, rate, acceleration and backlash of one axis, (N, 5)."""
+        stops = (slot.MIN_ANGLE, slot.MAX_ANGLE)
+        ends = [
+            self.end(drive, f"{where}.{name}", getattr(table, f"{name}_steps"), deg, stop)
+            for name, deg, stop in zip(
+                ("min", "max"), (table.min_deg, table.max_deg), stops, strict=True
+            )
+        ]
+        rate = self.number(f"{where}.rate_steps_per_s", table.rate_steps_per_s)
+        if rate is None:
+            rate = drive.table[:, slot.SPEED]
+            if not np.isfinite(rate).all():
+                raise self.fail("rate_steps_per_s is missing, and the drive has no speed", where)
+        rest = [
+            self.array(f"{where}.{key}", getattr(table, key))
+            for key in ("acceleration_steps_per_s2", "backlash_steps")
+        ]
+        # A drive whose counts fall with the angle has its lower stop at the higher count.
+        low, high = np.minimum(*ends), np.maximum(*ends)
+        columns = [np.broadcast_to(v, self.rows.shape) for v in (low, high, rate, *rest)]
+        return np.round(np.stack(columns, axis=-1)).astype(np.int64)
+
+    def end(
+        self, drive: Drive, where: str, steps: int | None, deg: float | None, stop: int
+    ) -> FloatArray:
+        """Return one end of an axis, steps, (N,): as given, or the stop of its drive."""
+        given = self.number(f"{where}_steps", steps)
+        angle = self.number(f"{where}_deg", deg)
+        if given is not None and angle is not None:
+            raise self.fail("it is given in steps and in deg; keep one", where)
+        if given is not None:
+            return np.broadcast_to(given, self.rows.shape)
+        radians = drive.table[:, stop] if angle is None else np.radians(angle)
+        if not np.isfinite(radians).all():
+            raise self.fail("it is missing in _steps and _deg, and the drive has no stop", where)
+        return np.asarray(drive.counts(np.broadcast_to(radians, self.rows.shape)))
+
+    def stow(self, drives: Drive, table: MachineTable) -> npt.NDArray[np.int64]:
+        if (table.stow_steps is None) == (table.stow_deg is None):
+            raise self.fail("give either stow_steps or stow_deg", "machine")
+        if table.stow_steps is not None:
+            steps = self.array("machine.stow_steps", table.stow_steps)
+        else:
+            steps = drives.counts(np.radians(self.array("machine.stow_deg", table.stow_deg)))
+        return np.round(steps).astype(np.int64)
+
+    def defocus(self, table: MachineTable) -> FloatArray:
+        units = [u for u in ANGLE_UNITS if getattr(table, f"defocus_{u}") is not None]
+        if len(units) != 1:
+            raise self.fail("give one of defocus_deg, defocus_mrad, defocus_rad", "machine")
+        key = f"defocus_{units[0]}"
+        given = self.array(f"machine.{key}", getattr(table, key))
+        return np.asarray(given * ANGLE_UNITS[units[0]])
 
 
 def _joint_names(kind: str) -> tuple[str, str]:
@@ -292,8 +394,8 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
     if heliostats.aim is not None:
         columns |= {f"aim_{c}": heliostats.aim[:, k] for k, c in enumerate(_POSITION)}
 
-    def first(key: str, array: FloatArray) -> Any:
-        """The first heliostat's numbers; where others differ, a column for all."""
+    def first(key: str, array: npt.NDArray[Any]) -> Any:
+        """Return the numbers of the first heliostat; where others differ, add a column for all."""
         for index in np.ndindex(array.shape[1:]):
             values = array[(slice(None), *index)]
             if (values != values[0]).any():
@@ -320,6 +422,8 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
                 columns[f"drives.{key}.{n}"] = table[:, i]
         drives[key] = {"kind": "raw", "numbers": numbers}
     document: dict[str, Any] = {"kind": m.kind, "chain": chain, "drives": drives}
+    if heliostats.machines:
+        document["machine"] = _machine_document(heliostats, first)
     if heliostats.facets is not None:
         f = heliostats.facets
         document["facets"] = first(
@@ -328,3 +432,36 @@ def group_document(name: str, heliostats: Heliostats) -> tuple[dict[str, Any], d
     for parameter, values in heliostats.parameters.items():
         columns[f"parameters.{_column(m, parameter)}"] = values
     return document, columns
+
+
+def _machine_document(
+    heliostats: Heliostats, first: Callable[[str, npt.NDArray[Any]], Any]
+) -> dict[str, Any]:
+    """Return the table of the machines; ``first`` puts numbers that differ into columns."""
+    machines, m = heliostats.machines, heliostats.mechanism
+    joints = [m.joints[d] for d in m.driven]
+    axes = {}
+    keys = {
+        "min_steps": "low",
+        "max_steps": "high",
+        "rate_steps_per_s": "rate",
+        "acceleration_steps_per_s2": "acceleration",
+        "backlash_steps": "backlash",
+    }
+    for i, joint in enumerate(joints):
+        where = f"machine.axes.{joint}"
+        axes[joint] = {
+            key: first(f"{where}.{key}", np.array([getattr(one.axes[i], name) for one in machines]))
+            for key, name in keys.items()
+        }
+    document: dict[str, Any] = {
+        "stow_steps": first("machine.stow_steps", np.array([one.stow for one in machines])),
+        "defocus_rad": first("machine.defocus_rad", np.array([one.defocus for one in machines])),
+        "leaves_stow_first": joints[machines[0].azimuth_axis],
+    }
+    if machines[0].standby is not None:
+        standby = np.array([one.standby for one in machines])
+        document["standby_m"] = first("machine.standby_m", standby)
+    if machines[0].way:
+        document["way_m"] = [list(point) for point in machines[0].way]
+    return {**document, "axes": axes}

@@ -1,4 +1,4 @@
-"""What a plant's TOML file may hold: pydantic models, at the boundary only."""
+"""Tables of a plant's TOML file as pydantic models, used at the boundary only."""
 
 from typing import Annotated, Any, Literal
 
@@ -8,7 +8,7 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Vector = Annotated[list[Number], Field(min_length=3, max_length=3)]
 
-#: Names of mechanisms, each with the geometry that its group may give.
+#: Kinds of mechanisms, each with the geometry keys of its group.
 KINDS: dict[str, tuple[str, ...]] = {
     "azimuth_elevation": ("pivot_height_m", "pivot_offset_m"),
     "tilt_roll": ("axis", "pivot_height_m", "spacing_m", "pivot_offset_m"),
@@ -21,7 +21,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 
-#: Angles of a drive; each may be given with ``_deg``, ``_mrad`` or ``_rad``.
+#: Angles of a drive; each may be given in ``_deg``, ``_mrad`` or ``_rad``.
 DRIVE_ANGLES = (
     "zero",
     "initial_angle",
@@ -37,7 +37,7 @@ ANGLE_UNITS = {"deg": 0.017453292519943295, "mrad": 1e-3, "rad": 1.0}
 
 
 class Strict(BaseModel):
-    """Refuses what it does not know."""
+    """A table that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=False)
 
@@ -49,7 +49,7 @@ class PlantTable(Strict):
 
 
 class SiteTable(Strict):
-    """``[site]``: the reference point and its air."""
+    """``[site]``: the origin of ENU, and its air."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
     longitude_deg: Annotated[float, Field(ge=-180, le=180)]
@@ -65,22 +65,22 @@ class MarkTable(Strict):
 
     name: str = Field(min_length=1)
     kind: Literal["corner", "tee", "square", "disc", "tag", "picture"]
-    at_m: Vector = Field(description="ENU of its vertex, middle of bar, or centre.")
+    at_m: Vector = Field(description="ENU of vertex, middle of the bar, or centre.")
     size_m: Positive
-    stroke_m: Positive | None = Field(None, description="Of a corner or tee; default a fifth.")
+    stroke_m: Positive | None = Field(None, description="Of corner or tee; default: size / 5.")
     turn_deg: Number = Field(0.0, description="Counterclockwise, as seen from the front.")
-    code: str = Field("", description="Of a tag 4X4_50:7 or APRILTAG_36h11:7; of a picture a file.")
+    code: str = Field("", description="Tag: 4X4_50:7 or APRILTAG_36h11:7; picture: its file.")
 
 
 class TargetTable(Strict):
-    """``[[targets]]``: four corners from the upper left as seen from the front, or a size."""
+    """``[[targets]]``: four corners from the upper left, seen from the front, or a size."""
 
     name: str = Field(min_length=1)
     corners_m: Annotated[list[Vector], Field(min_length=4, max_length=4)] | None = None
     center_m: Vector | None = None
     width_m: Positive | None = None
     height_m: Positive | None = None
-    facing_deg: Number | None = Field(None, description="Azimuth that the front looks to.")
+    facing_deg: Number | None = Field(None, description="Azimuth that the front faces.")
     markers_m: dict[str, Vector] = Field(default_factory=dict)
     marks: list[MarkTable] = Field(default_factory=list)
 
@@ -126,10 +126,10 @@ class BoxTable(Strict):
     kind: Literal["box"]
     center_m: Vector
     size_m: Annotated[list[Positive], Field(min_length=3, max_length=3)] = Field(
-        description="To its right, forwards and up."
+        description="To its right, forwards, and up."
     )
-    azimuth_deg: Number = Field(0.0, description="Of its forward direction.")
-    azimuth_rad: Number | None = Field(None, description="Instead, as the writer leaves it.")
+    azimuth_deg: Number = Field(0.0, description="Azimuth of its forward direction.")
+    azimuth_rad: Number | None = Field(None, description="Instead, as the program writes it.")
 
 
 class SphereTable(Strict):
@@ -169,7 +169,7 @@ AnyVolume = Annotated[
 
 
 class ChainTable(Strict):
-    """``chain``: a mechanism number by number, as the writer leaves it."""
+    """``chain``: a mechanism number by number, as the program writes it."""
 
     joints: list[str]
     driven: list[int]
@@ -182,7 +182,7 @@ class ChainTable(Strict):
 
 
 class RawDrive(Strict):
-    """A drive number by number, as the writer leaves it."""
+    """A drive number by number, as the program writes it."""
 
     kind: Literal["raw"]
     numbers: dict[str, float]
@@ -212,8 +212,7 @@ RotaryDrive = _drive(
     sense=(Literal[1, -1], 1),
 )
 DirectDrive = _drive("DirectDrive", "direct")
-# The constants of a jack often differ from heliostat to heliostat, so that they may
-# stand in the table instead.
+# The constants of a jack often differ between heliostats: they may stand in the table instead.
 LinearDrive = _drive(
     "LinearDrive",
     "linear",
@@ -227,6 +226,52 @@ AnyDrive = Annotated[
     RotaryDrive | DirectDrive | LinearDrive | RawDrive,  # type: ignore[valid-type]
     Field(discriminator="kind"),
 ]
+
+
+Steps = Annotated[int, Field(ge=-(1 << 29), le=1 << 29)]
+Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
+
+
+class AxisTable(Strict):
+    """``[groups.NAME.machine.axes.JOINT]``: the motor of one driven joint."""
+
+    rate_steps_per_s: Annotated[int, Field(gt=0, le=1 << 29)] | None = Field(
+        None, description="Default: the drive's speed_counts_per_s."
+    )
+    acceleration_steps_per_s2: Annotated[int, Field(gt=0, le=1 << 29)]
+    backlash_steps: Annotated[int, Field(ge=0, le=65535)] = Field(
+        description="Length of the final approach from below; 0: none."
+    )
+    min_steps: Steps | None = Field(None, description="Or min_deg; default: the drive's stop.")
+    max_steps: Steps | None = Field(None, description="Or max_deg; default: the drive's stop.")
+    min_deg: Number | None = None
+    max_deg: Number | None = None
+
+
+class MachineTable(Strict):
+    """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
+
+    axes: dict[str, AxisTable] = Field(description="By driven joint.")
+    stow_steps: Annotated[list[Steps], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="Of both driven joints in their order; or stow_deg."
+    )
+    stow_deg: Pair | None = None
+    defocus_deg: Pair | None = Field(
+        None, description="By which both joints turn away; or defocus_mrad, defocus_rad."
+    )
+    defocus_mrad: Pair | None = None
+    defocus_rad: Pair | None = None
+    standby_m: Vector | None = Field(
+        None, description="ENU; without: the local controller keeps the point it has."
+    )
+    leaves_stow_first: str | None = Field(
+        None, description="Joint that moves first when leaving stow; default: the first driven."
+    )
+    way_m: Annotated[list[Vector], Field(max_length=4)] = Field(
+        default_factory=list,
+        description="Points that the beam passes from the ground to the standby point; default: "
+        "the local controller finds its own.",
+    )
 
 
 class GroupTable(Strict):
@@ -254,8 +299,11 @@ class GroupTable(Strict):
     concentrator_translation_m: Vector | None = None
     chain: ChainTable | None = None
     drives: dict[str, AnyDrive] = Field(default_factory=dict)
+    machine: MachineTable | None = Field(
+        None, description="Motor limits and resting places; needed to run and to configure."
+    )
     facets: list[list[Vector]] | None = Field(
-        None, description="Center, half width and half height of each, in the mirror's frame, m."
+        None, description="Centre, half width and half height of each, in the mirror's frame, m."
     )
 
 
@@ -266,7 +314,7 @@ class PlantDocument(Strict):
     version: Literal[1]
     plant: PlantTable
     site: SiteTable
-    heliostats: str = Field(description="Table of the heliostats (CSV or Parquet), beside.")
+    heliostats: str = Field(description="Table of the heliostats (CSV or Parquet), beside it.")
     groups: dict[str, GroupTable] = Field(min_length=1)
     targets: list[TargetTable] = Field(default_factory=list)
     receivers: list[ReceiverTable] = Field(default_factory=list)
@@ -275,5 +323,5 @@ class PlantDocument(Strict):
         default_factory=list, description="Volumes where no beam may be."
     )
     eyes_m: dict[str, Vector] = Field(
-        default_factory=dict, description="From where people may look into beams at rest."
+        default_factory=dict, description="Places from which people may look into beams at rest."
     )

@@ -15,7 +15,7 @@ from heliotrope.geometry import FloatArray
 TEXTS = ("name", "group", "cluster")
 REQUIRED = ("name", "group", "east_m", "north_m", "up_m")
 
-#: Plausible values by column: what lies outside has most likely another unit.
+#: Plausible values by column: a value outside is most likely in another unit.
 PLAUSIBLE = {
     "east_m": (-50e3, 50e3, "m from the site's reference"),
     "north_m": (-50e3, 50e3, "m from the site's reference"),
@@ -25,13 +25,13 @@ PLAUSIBLE = {
     "pivot_height_m": (-1.0, 30.0, "m"),
     "pivot_offset_m": (-3.0, 3.0, "m"),
 }
-#: Names of heliostats are not repeated in more than this many lines of errors.
+#: Most errors of one kind that are listed.
 MOST_PROBLEMS = 50
 
 
 @dataclass(frozen=True)
 class HeliostatTable:
-    """The columns of a table that could be read.
+    """Columns of the table of heliostats.
 
     Attributes
     ----------
@@ -40,9 +40,9 @@ class HeliostatTable:
     name, group, cluster
         Texts, (N,).
     numbers
-        Columns of numbers, each (N,).
+        Columns of numbers, each (N,), by name.
     problems
-        What is wrong in it.
+        Errors found in it.
     """
 
     path: Path
@@ -63,7 +63,7 @@ def read_table(path: Path) -> HeliostatTable:
     Raises
     ------
     FormatError
-        If it is no table at all; single values that are wrong go to ``problems``.
+        Not a table at all; single wrong values go to ``problems``.
     """
     import pandas as pd
 
@@ -73,7 +73,7 @@ def read_table(path: Path) -> HeliostatTable:
         check_file(path, "the table of heliostats")
         texts = dict.fromkeys(TEXTS, str)
         try:
-            # Since pandas 3.1 numbers are read to the last digit.
+            # pandas reads numbers to the last digit since 3.1.
             frame = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""])
         except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:
             raise FormatError(path, f"not a CSV table: {str(error).strip()}") from None
@@ -140,7 +140,7 @@ def _numbers(
 
     read = pd.to_numeric(values, errors="coerce").to_numpy(dtype=np.float64)
     low, high, unit = PLAUSIBLE.get(column, (-np.inf, np.inf, ""))
-    # A cell may be empty where the heliostat's group does not need the column.
+    # A cell may be empty if the heliostat's group does not need the column.
     empty = values.isna().to_numpy()
     wrong = np.isnan(read) & (~empty if column not in REQUIRED else True)
     for i in np.flatnonzero(wrong)[:MOST_PROBLEMS]:

@@ -1,9 +1,8 @@
 """Our own format: one TOML file for the plant, and a table of its heliostats beside it.
 
-The TOML holds what all heliostats share (site, tower, kinds of mechanism); the table holds
-what differs: name, group, position, and any number of the mechanism or the drives in a
-column of its dotted name. Numbers are written with all their digits, so that reading a
-written plant gives the same plant.
+The TOML holds what all heliostats share (site, tower, kinds of mechanism, machines); the table
+holds what differs: name, group, position, and any number of the group in a column of its dotted
+name. Files are written with every digit, so that a plant reads back exactly as it was.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,20 +36,20 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Finding:
-    """Something wrong ("error") or strange ("warning") in a plant file."""
+    """An error or a warning about a plant file."""
 
     severity: Literal["error", "warning"]
     text: str
 
 
 def read_plant(path: str | Path) -> Plant:
-    """Return the plant of a TOML file and the table that it names.
+    """Return the plant of a TOML file and of the table that it names.
 
     Raises
     ------
     FormatError
-        If something cannot be used; the text names file, place, value and limit, and
-        how many more problems there are.
+        Something cannot be used; the text names file, place, value and limit, and how
+        many more problems there are.
     """
     document = read_document(path, "plant", PlantDocument, _MODELS)
     table = read_table(Path(path).parent / document.heliostats)
@@ -79,6 +78,8 @@ def _models() -> list[Any]:
         models.CameraTable,
         models.GroupTable,
         models.ChainTable,
+        models.MachineTable,
+        models.AxisTable,
         models.RotaryDrive,
         models.LinearDrive,
         models.BoxTable,
@@ -94,7 +95,7 @@ _MODELS = _models()
 def _assemble(
     path: Path, document: PlantDocument, table: HeliostatTable, problems: list[FormatError]
 ) -> Plant | None:
-    """Build the plant; what is wrong is added to ``problems``."""
+    """Build the plant; errors are added to ``problems``."""
     site = Site(
         document.site.latitude_deg,
         document.site.longitude_deg,
@@ -149,7 +150,7 @@ def _each(
     build: Callable[[Table], Made],
     problems: list[FormatError],
 ) -> tuple[Made, ...]:
-    """Build one object from each table of an array; what is wrong is added to ``problems``."""
+    """Build one object from each table of an array; errors are added to ``problems``."""
     made = []
     for k, table in enumerate(tables):
         try:
@@ -191,7 +192,7 @@ def _target(table: TargetTable) -> Target:
 
 
 def rectangle(center: FloatArray, width: float, height: float, facing: float) -> FloatArray:
-    """Return the corners (4, 3) of an upright rectangle whose front looks to azimuth ``facing``.
+    """Return the corners (4, 3) of an upright rectangle whose front faces azimuth ``facing``.
 
     From the upper left, as seen from the front; metres and radians.
     """
@@ -206,22 +207,22 @@ def rectangle(center: FloatArray, width: float, height: float, facing: float) ->
 def write_plant(plant: Plant, path: str | Path, table: Literal["csv", "parquet"] = "csv") -> None:
     """Write the TOML file and, beside it, the table of the heliostats.
 
-    Both are written beside their places and renamed, the table first: a reader never
-    sees a file that is half there.
+    Both are written under another name and then renamed, the table first: a reader never
+    sees half a file.
 
     Parameters
     ----------
     plant
-        Any plant; its calibrated parameters go with it.
+        Any plant; calibrated parameters are included.
     path
-        Of the TOML file; the table takes its name with the other ending.
+        TOML file; the table has the same name with another suffix.
     table
         "csv" or "parquet".
 
     Raises
     ------
     InputError
-        If the folder cannot be written to.
+        The folder cannot be written to.
     """
     import tomli_w
 
@@ -287,7 +288,7 @@ def json_schema() -> dict[str, Any]:
 
 
 def check_plant(path: str | Path) -> list[Finding]:
-    """Return everything that is wrong or strange in a plant file, as findings."""
+    """Return all errors and warnings about a plant file."""
     place = Path(path)
     try:
         document = read_document(place, "plant", PlantDocument, _MODELS)

@@ -10,9 +10,10 @@ from heliotrope.twin.boards.bus import BusFaults, Station, Tap, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import Axis
-from heliotrope.twin.boards.outfit import Outfit, items_of, mechanisms, outfits
+from heliotrope.twin.boards.outfit import MACHINE, Outfit, mechanisms, outfits, own_items
 
 __all__ = [
+    "MACHINE",
     "Axis",
     "Board",
     "BusFaults",
@@ -26,7 +27,7 @@ __all__ = [
     "TickCounter",
     "TwinBus",
     "Witness",
-    "items_of",
     "mechanisms",
     "outfits",
+    "own_items",
 ]

@@ -20,7 +20,7 @@ from heliotrope.lcu.node import Node
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import Axis
-from heliotrope.twin.boards.outfit import STOW, Outfit, sha256
+from heliotrope.twin.boards.outfit import Outfit, sha256
 from heliotrope.twin.wind import Wind
 
 #: Longest pauses between two looks of the main loop: while steps are made; while the sun is
@@ -105,7 +105,9 @@ class Board:
         self.outfit, self.wind = outfit, wind
         self.ticks = ticks or TickCounter()
         self.flash = NorFlash(chance.getrandbits(32))
-        self.axes = [Axis(count, play, miss, random.Random(chance.random())) for count in STOW]
+        self.axes = [
+            Axis(count, play, miss, random.Random(chance.random())) for count in outfit.stow
+        ]
         self.node: Node | None = None
         self.witness: Witness | None = None
         self.slip = [0, 0]
@@ -117,7 +119,7 @@ class Board:
         journal = Journal(self.flash)
         journal.load()
         journal.store(outfit.items)
-        journal.zero(*STOW)
+        journal.zero(*outfit.stow)
 
     # -- the supply --------------------------------------------------------------------
 

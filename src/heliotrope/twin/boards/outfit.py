@@ -1,4 +1,4 @@
-"""Heliostats to simulate: imperfect mechanisms with what their boards are told of them."""
+"""Heliostats to simulate: imperfect mechanisms, and what their boards store of them."""
 
 import hashlib
 import math
@@ -11,41 +11,46 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.lcu.drives import ROTARY
 from heliotrope.lcu.journal import CODES_OF
 from heliotrope.mechanism import kinds
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import rotary
+from heliotrope.mechanism.machine import AxisLimits, Machine
 
-#: Steps of a turn of a joint: 15.7 µrad a step. With 8000 steps/s a turn takes 50 s.
+#: Steps per turn of a joint: 15.7 µrad a step. At 8000 steps/s a turn takes 50 s.
 STEPS_PER_TURN = 400_000
-#: rate (steps/s), acceleration (steps/s²), backlash (steps) of both axes.
+#: Rate (steps/s), acceleration (steps/s²) and backlash (steps) of both axes.
 LIMITS = (8000, 16_000, 40)
-#: Azimuth looks east, the mirror up.
+#: Stow, steps: azimuth east, mirror facing up.
 STOW = (100_000, 97_900)
 RANGES = ((-20_000, 406_000), (-4000, 104_000))
-#: Centre of the receiver, and the standby point beside it and below.
+#: Centre of the receiver, and the standby point beside and below it, ENU, m.
 RECEIVER = (0.0, 0.0, 50.0)
 STANDBY = (12.0, 0.0, 40.0)
 DEFOCUS = (0.1, 0.05)
-#: Middle and radius of a ball that no beam may enter; nothing leads there that is not asked for.
+#: What the boards of `outfits` store besides their mechanisms.
+MACHINE = Machine(
+    (AxisLimits(*RANGES[0], *LIMITS), AxisLimits(*RANGES[1], *LIMITS)), STOW, DEFOCUS, STANDBY
+)
+#: Centre and radius of a sphere that no beam may enter, m; no way leads there unless ordered.
 KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
-#: Imperfections that are drawn.
+#: Parameters whose imperfections are drawn.
 CAUSES = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
-#: A cluster has no more.
+#: Most heliostats of a cluster.
 MOST = 32
 
 
 @dataclass(frozen=True)
 class Outfit:
-    """One heliostat: its name, its addresses and key, its true mechanism, its journal.
+    """One heliostat: name, addresses and key, true mechanism, journal.
 
     Attributes
     ----------
     causes
-        Its imperfections, by the names of parameters, rad.
+        Imperfections by parameter, rad.
     items
-        What its journal holds, by name: `lcu.journal.ITEMS`.
+        Items of its journal, by name: see `lcu.journal.ITEMS`.
     """
 
     name: str
@@ -56,9 +61,15 @@ class Outfit:
     causes: dict[str, float]
     items: dict[str, bytes]
 
+    @property
+    def stow(self) -> tuple[int, int]:
+        """Stow position of both axes, steps."""
+        primary, secondary = struct.unpack(CODES_OF["stow"], self.items["stow"])
+        return primary, secondary
+
 
 def sha256(data: bytes) -> bytes:
-    """Return the hash that the boards have."""
+    """Return the hash that the boards use."""
     return hashlib.sha256(data).digest()
 
 
@@ -70,15 +81,15 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
     count
         1 to 32.
     seed
-        Of their places and imperfections.
+        Seed of places and imperfections.
 
     Raises
     ------
     InputError
-        A count that no cluster has.
+        Not 1 to 32 heliostats.
     """
     if not 1 <= count <= MOST:
-        raise InputError(f"{count} heliostats on a bus; a cluster has 1 to {MOST}")
+        raise InputError(f"{count} heliostats on a bus; give 1 to {MOST}")
     chance = random.Random(seed)
     found = []
     for i in range(count):
@@ -98,7 +109,7 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
                 key,
                 mechanism,
                 causes,
-                items_of(mechanism, address),
+                {**items_of(mechanism, MACHINE), **own_items(address)},
             )
         )
     return found
@@ -120,19 +131,6 @@ def mechanisms(fits: Sequence[Outfit]) -> Mechanism:
     )
 
 
-def items_of(mechanism: Mechanism, address: int) -> dict[str, bytes]:
-    """Return what the journal of a board of such a heliostat holds."""
-    rate = 2.0 * math.pi / STEPS_PER_TURN
-    numbers: dict[str, tuple[float, ...]] = {
-        "address": (address,),
-        "location": tuple(float(x) for x in mechanism.position),
-        "armature": tuple(float(x) for x in mechanism.armature.table),
-        "stow": STOW,
-        "standby": STANDBY,
-        "biases": (0.0, 0.0),
-        "defocus": DEFOCUS,
-    }
-    for i, end in enumerate(("primary", "secondary")):
-        numbers[f"drive_{end}"] = (ROTARY, 0.0, rate, *(0.0,) * 8)
-        numbers[f"limits_{end}"] = (*RANGES[i], *LIMITS)
-    return {name: struct.pack(CODES_OF[name], *values) for name, values in numbers.items()}
+def own_items(address: int) -> dict[str, bytes]:
+    """Return the items that belong to a board itself, which the plant never pushes."""
+    return {"address": struct.pack(CODES_OF["address"], address)}

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import InputError
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import states
 from heliotrope.lcu.controller import LATCHED, NO_FAULT
 from heliotrope.lcu.lease import RATE_FACTOR, UNIT
@@ -31,12 +31,12 @@ from heliotrope.lcu.motion import (
     TRACK,
 )
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.drives import Drive
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.twin.field import _kernels as kernels
 from heliotrope.twin.field._among import among
 from heliotrope.twin.field._drives import Drives
 from heliotrope.twin.field._ways import pieces
+from heliotrope.twin.field.journals import Journals
 from heliotrope.twin.wind import Wind
 
 Rows = npt.NDArray[np.intp]
@@ -75,18 +75,10 @@ class Field:
     ----------
     mechanism
         True mechanisms, batch shape (N,), each with two drives.
+    machine
+        Limits and resting places, the same for all; with a standby point.
     believed
         Mechanisms that the controllers are told of; None: the true ones.
-    stow
-        Step counts, (2,) or (N, 2).
-    ranges
-        Lowest and highest step counts of both axes, (2, 2).
-    limits
-        Rate (steps/s), acceleration (steps/s²), backlash (steps).
-    standby
-        Points, (3,) or (N, 3), m.
-    defocus
-        Angles of both axes, rad.
     play, miss, seed
         See `Drives`.
     wind
@@ -106,7 +98,9 @@ class Field:
         Time since the beginning, ms.
     edition
         Rises with every change: a reading at the same edition is still valid.
-    aim, standby
+    journals
+        What the controllers store.
+    aim
         (N, 3), m.
 
     Raises
@@ -118,12 +112,8 @@ class Field:
     def __init__(
         self,
         mechanism: Mechanism,
+        machine: Machine,
         *,
-        stow: npt.ArrayLike,
-        ranges: npt.ArrayLike,
-        limits: tuple[int, int, int],
-        standby: npt.ArrayLike,
-        defocus: tuple[float, float] = (0.1, 0.05),
         believed: Mechanism | None = None,
         play: npt.ArrayLike = 0.0,
         miss: float = 0.0,
@@ -137,18 +127,12 @@ class Field:
             )
         count = mechanism.shape[0]
         self.mechanism = mechanism
-        self._told = believed if believed is not None else mechanism
-        self._stow = np.broadcast_to(np.asarray(stow, dtype=np.int64), (count, 2))
-        self._defocus = np.asarray(defocus)
+        self.journals = Journals(mechanism if believed is None else believed, machine)
+        self._stow = np.broadcast_to(np.array(machine.stow, dtype=np.int64), (count, 2))
+        self._defocus = np.array(machine.defocus)
         self.axes = np.zeros((count, 2), dtype=AXIS)
-        rate, acceleration, backlash = limits
-        low, high = np.asarray(ranges, dtype=np.int64).T
-        self.axes["low"], self.axes["high"] = low, high
-        # As in `lcu.stepper.Axis`, intervals are whole microseconds.
-        room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // rate)
-        self.axes["top"] = max(1, min(rate * SLOT_MS * kernels.SCALE // 1000, room))
-        self.axes["change"] = max(1, acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000)
-        self.axes["backlash"], self.axes["direction"] = backlash, 1
+        for i, axis in enumerate(machine.axes):
+            _limit(self.axes[:, i], axis)
         for name in ("count", "goal", "leg"):
             self.axes[name] = self._stow
         ends = np.stack([self._angles_at(self.axes[name]) for name in ("low", "high")])
@@ -163,7 +147,6 @@ class Field:
         self._kept = self.state.copy()
         self.kind = np.full(count, HOLD, dtype=np.int8)
         self._base = np.full(count, HOLD, dtype=np.int8)
-        self.standby = np.array(np.broadcast_to(np.asarray(standby, dtype=np.float64), (count, 3)))
         self.aim = np.full((count, 3), np.nan)
         self._target = np.full((count, 3), np.nan)
         self._ready = np.zeros(count, dtype=np.bool_)
@@ -174,7 +157,7 @@ class Field:
         self._path = np.zeros((count, 1, 3))
         self._length = np.zeros(count, dtype=np.int64)
         self._place = np.zeros(count, dtype=np.int64)
-        self._way, self._way_length = self._ways()
+        self._way, self._way_length = self._ways(machine.way)
         self._sun = np.zeros((2, 3), dtype=np.int64)
         self._sun_ms = 0
 
@@ -183,44 +166,36 @@ class Field:
 
     # -- the safe way ----------------------------------------------------------------------
 
-    def _ways(self) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    def _ways(
+        self, given: tuple[tuple[float, float, float], ...]
+    ) -> tuple[FloatArray, npt.NDArray[np.int64]]:
         """Return the points from the ground to standby, (N, P, 3), and how many there are."""
-        origin = self._told.armature.origin_1
-        here = np.broadcast_to(self._told.position, origin.shape)
-        half = 0.5 * (self.standby - here)
+        origin, here, standby = self.journals.origin, self.journals.position, self.journals.standby
+        if given:
+            corners = np.broadcast_to(np.array(given), (len(here), len(given), 3))
+            return pieces(np.concatenate([corners, standby[:, None]], axis=1), origin)
+        half = 0.5 * (standby - here)
         sine, cosine = 0.5, 0.866
-        aside, foot = here.copy(), self.standby.copy()
+        aside, foot = here.copy(), standby.copy()
         aside[:, 0] += cosine * half[:, 0] - sine * half[:, 1]
         aside[:, 1] += sine * half[:, 0] + cosine * half[:, 1]
         foot[:, 2] = here[:, 2]
-        return pieces(np.stack([aside, foot, self.standby], axis=1), origin)
+        return pieces(np.stack([aside, foot, standby], axis=1), origin)
 
     # -- poses -----------------------------------------------------------------------------
 
-    def _drives(self, rows: Rows) -> Drive:
-        table = self._told.drives.table
-        return Drive(table if table.ndim == 2 else table[rows])
-
     def _angles_at(self, counts: npt.ArrayLike, rows: Rows | None = None) -> FloatArray:
         chosen = np.arange(len(self.axes)) if rows is None else rows
-        return np.asarray(self._drives(chosen).angles(np.asarray(counts, dtype=np.float64)))
+        return np.asarray(self.journals.drives(chosen).angles(np.asarray(counts, dtype=np.float64)))
 
     def _pose(self, rows: Rows, aims: FloatArray, ahead_ms: int) -> tuple[FloatArray, Bools]:
         """Return joint angles (M, 2) at which beams reach aims (M, 3), and whether they do."""
         sun = (self._sun[0] + self._sun[1] * (self._sun_ms + ahead_ms) // 1000) / UNIT
-        found = track(
-            self._told[rows],
-            sun / np.linalg.norm(sun),
-            aims,
-            current=self.axes["count"][rows].astype(np.float64),
-            tolerance=2e-10,
-        )
-        return np.asarray(found.chosen(found.angles)), np.asarray(
-            found.chosen(found.status) == Status.OK
-        )
+        counts = self.axes["count"][rows].astype(np.float64)
+        return self.journals.pose(rows, sun / np.linalg.norm(sun), aims, counts)
 
     def _go(self, rows: Rows, angles: FloatArray, how: npt.NDArray[np.int64]) -> None:
-        steps = np.floor(self._drives(rows).counts(angles) + 0.5).astype(np.int64)
+        steps = np.floor(self.journals.drives(rows).counts(angles) + 0.5).astype(np.int64)
         kernels.go_rows(self.axes, self._order, rows, steps, how)
 
     def _away(self, rows: Rows, angles: FloatArray) -> FloatArray:
@@ -300,10 +275,10 @@ class Field:
         way = self._way[i, : self._way_length[i]][::-1]
         if self.kind[i] == TRACK:
             corners = np.concatenate([self.aim[i][None], way])[None]
-            long, length = pieces(corners, self._told.armature.origin_1[i][None])
+            long, length = pieces(corners, self.journals.origin[i][None])
             return np.asarray(long[0, 1 : length[0]])
         if self.kind[i] == DEFOCUS:
-            return np.asarray(way[way[:, 2] < self.standby[i, 2]])
+            return np.asarray(way[way[:, 2] < self.journals.standby[i, 2]])
         return np.asarray(way)
 
     def _set_path(self, i: np.intp, points: FloatArray) -> None:
@@ -435,7 +410,7 @@ class Field:
 
     def _stand_by(self, rows: Rows) -> None:
         able = self._ready[rows] & (self._lease[rows] > 0)
-        self._begin(rows[able], STANDBY, self.standby[rows[able]])
+        self._begin(rows[able], STANDBY, self.journals.standby[rows[able]])
         self._hold(rows[~able])
 
     def _defocus_now(self, rows: Rows) -> None:
@@ -628,15 +603,30 @@ class Field:
 
     def normals(self) -> FloatArray:
         """Return the true normals of the mirrors now, (N, 3)."""
-        return self._stand()[0]
+        return self.stand()[0]
 
-    def _stand(self) -> tuple[FloatArray, FloatArray]:
+    def stand(self) -> tuple[FloatArray, FloatArray]:
         """Return true normals and vertices, (N, 3)."""
         pose = self.mechanism.pose(self.drives.joint)
         if self.wind is None:
             return pose.normal, pose.vertex
         place = np.broadcast_to(self.mechanism.position, pose.normal.shape)
         return self.wind.turned(pose.normal, place, 1e-3 * self.now_ms), pose.vertex
+
+    def store(self, row: int, items: dict[str, bytes]) -> None:
+        """Let a controller take items into its journal; a new armature counts from now on."""
+        self.journals.store(row, items)
+        self.edition += 1
+
+    def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
+        """Return the error of each normal if it tracked aims (N, 3) now, rad, (N,)."""
+        rows = np.arange(len(self))
+        counts = self.axes["count"].astype(np.float64)
+        angles, good = self.journals.pose(rows, sun, aims, counts)
+        pose = self.mechanism.pose(np.floor(self.journals.drives(rows).counts(angles) + 0.5))
+        wanted = bisector(sun, normalize(aims - pose.vertex))
+        off = np.linalg.norm(np.cross(pose.normal, wanted), axis=-1)
+        return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
         """Return the share of the field's light that passes a receiver, 0 to 1.
@@ -652,7 +642,7 @@ class Field:
             cosine of its incidence, relative to all beams aimed at the middle.
         """
         s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
-        normal, vertex = self._stand()
+        normal, vertex = self.stand()
         cosine = normal @ s
         rays = 2.0 * cosine[:, None] * normal - s
         way = point - vertex
@@ -662,3 +652,13 @@ class Field:
         nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
         on = (along > 0.0) & (off <= radius)
         return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())
+
+
+def _limit(rows: npt.NDArray[np.void], axis: AxisLimits) -> None:
+    """Set the limits of an axis for all rows of dtype `AXIS`, as `lcu.stepper.Axis` does."""
+    # Intervals are whole microseconds.
+    room = 1000 * SLOT_MS * kernels.SCALE // -(-1_000_000 // axis.rate)
+    rows["low"], rows["high"] = axis.low, axis.high
+    rows["top"] = max(1, min(axis.rate * SLOT_MS * kernels.SCALE // 1000, room))
+    rows["change"] = max(1, axis.acceleration * SLOT_MS * SLOT_MS * kernels.SCALE // 1_000_000)
+    rows["backlash"], rows["direction"] = axis.backlash, 1

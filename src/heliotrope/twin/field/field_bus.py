@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from heliotrope.errors import InputError
-from heliotrope.lcu import messages, states, wire
+from heliotrope.lcu import journal, messages, states, wire
 from heliotrope.links.link import LinkClosedError, Outcome
 from heliotrope.twin.field.field import LEASE_MS, Field
 
@@ -33,6 +33,14 @@ _STATUS = np.dtype(
 #: Bits of `lcu.names.FLAGS`: sun fresh, clock set, configured; at stow.
 _SUN_FRESH, _SOUND, _AT_STOW = 1 << 1, 0b1100, 1 << 5
 _NEVER = 0xFFFFFFFF
+#: Size of a keyed message's head, and the place of the edition in it.
+_KEY_HEAD = struct.calcsize("<" + messages.HEADS[messages.KEY][0])
+_EDITION = slice(_KEY_HEAD - 4, _KEY_HEAD)
+_ITEMS = tuple(row[0] for row in journal.ITEMS)
+#: Messages of calibration with the states that accept them, and the states that accept the others.
+_CALIBRATION = frozenset({"SET_ARMATURE", "SET_BIAS", "SET_POSITION", "SET_DEFOCUS"})
+_TAKES = (states.STOWED, states.LOCKED, states.FAULT, states.IDLE, states.DEFOCUSED)
+_TAKES_ALL = (states.LOCKED, states.FAULT)
 #: Commands that the field knows.
 KNOWN = frozenset(
     {
@@ -132,7 +140,10 @@ class FieldBus:
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
         """Send a frame and return the answer, b"" if there is none."""
-        del timeout, expires, urgent, complete
+        del timeout, expires, complete
+        if urgent:
+            # In an emergency all buses and the plant take turns.
+            await asyncio.sleep(0)
         if self.closed:
             raise LinkClosedError("field bus: closed")
         return self._hear(frame) if self.plugged else b""
@@ -184,6 +195,7 @@ class FieldBus:
             made["f2"] = field.fault[self._all]
             made["f4"] = np.where(fresh, LEASE_MS - left, _NEVER)
             made["f5"], made["f6"], made["f8"] = 24_000, 25, 1
+            made["f7"] = field.journals.checksums[self._all]
             data, size = made.tobytes(), made.itemsize
             self._told = [data[i : i + size] for i in range(0, len(data), size)]
             self._edition = field.edition
@@ -202,7 +214,11 @@ class FieldBus:
 
     def _command(self, name: str, number: int, payload: bytes, place: int, sequence: int) -> bytes:
         result, row = messages.REFUSED_STATE, self._rows[place]
-        if name in KNOWN:
+        if name == "QUERY_STORED":
+            return self._answer(place, sequence, "STORED", payload[:1] + self._stored(row, payload))
+        if name == "STANDBY" or messages.who_of(number) == messages.KEY:
+            result = self._store(name, number, payload, row)
+        elif name in KNOWN:
             aim = _AIM.unpack_from(payload, 8) if name == "AIM" else None
             # Most have received the broadcast before and do nothing.
             idle = name == "DEFOCUS" and self._field.state[row] == states.DEFOCUSED
@@ -210,6 +226,31 @@ class FieldBus:
                 result = messages.DONE
             self._tell(name, range(row, row + 1))
         return self._answer(place, sequence, "ACK", _ACK.pack(sequence, number, result))
+
+    def _stored(self, row: int, payload: bytes) -> bytes:
+        place = payload[0] - 1
+        if not 0 <= place < len(_ITEMS):
+            return b""
+        return self._field.journals.items(row).get(_ITEMS[place], b"")
+
+    def _store(self, name: str, number: int, payload: bytes, row: int) -> int:
+        if name == "STANDBY":
+            self._field.store(row, {"standby": payload[8:20]})
+            return messages.DONE
+        state = int(self._field.state[row])
+        if state not in (_TAKES if name in _CALIBRATION else _TAKES_ALL):
+            return messages.REFUSED_STATE
+        body = payload[: len(payload) - wire.MAC_SIZE]
+        targets = journal.TARGETS.get(name, ())
+        size = struct.calcsize("<" + messages.codes_of(number))
+        if len(body) != size or not targets or name == "SET_ADDRESS":
+            return messages.BAD_VALUE
+        data = body[_KEY_HEAD:]
+        if len(targets) == 2:
+            axis, data = data[0], data[1:]
+            targets = targets[axis : axis + 1]
+        self._field.store(row, {targets[0]: data, "edition": body[_EDITION]})
+        return messages.DONE
 
 
 def _unstuffed(data: bytes) -> bytes:

@@ -1,1 +1,12 @@
-"""A simulated field for a live plant."""
+"""A simulated world for a plant at work, in paced or virtual time.
+
+Begin with `World`: its `ports` go into `plant.assembly.PlantAssembly`. `PacedLoop` runs both at a
+chosen multiple of real time.
+"""
+
+from heliotrope.twin.live.boards import BoardField
+from heliotrope.twin.live.live import CYCLE, World, WorldOptions
+from heliotrope.twin.live.loop import PacedLoop
+from heliotrope.twin.live.near_link import NearLink, near_pair
+
+__all__ = ["CYCLE", "BoardField", "NearLink", "PacedLoop", "World", "WorldOptions", "near_pair"]

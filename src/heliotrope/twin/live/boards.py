@@ -1,10 +1,10 @@
-"""A small field of firmware-true boards, with what a live plant asks of a field.
+"""A small field of firmware-true boards.
 
-Each heliostat is a `twin.board.Board`: the real local controller on simulated hardware, with
-journal, MACs and editions. Boards stand on a `twin.bus.TwinBus` at its baud rate.
+Each heliostat is a `twin.boards.board.Board`: the real local controller on simulated hardware, with
+journal, MACs and editions. Boards stand on a `TwinBus` at its baud rate.
 """
 
-import struct
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,16 +12,22 @@ from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, bisector, normalize
 from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
-from heliotrope.mechanism.board_items import Machine, items_of
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.machine import Machine
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus
-from heliotrope.twin.boards.outfit import STOW, Outfit
-from heliotrope.twin.cameras import Mirror
-from heliotrope.twin.live._field import key_of, near
+from heliotrope.twin.boards.outfit import Outfit, own_items, sha256
 
-#: More boards than this are too much for one process.
+#: Most boards that one process can run.
 MOST = 64
+#: Errors above this are of a mirror on its way, or on a target, rad.
+_ON_ITS_WAY = 0.05
+
+
+def key_of(name: str) -> bytes:
+    """Return the key of a simulated heliostat."""
+    return sha256(b"live " + name.encode())
 
 
 class BoardField:
@@ -30,25 +36,25 @@ class BoardField:
     Parameters
     ----------
     clock
-        Of the loop.
+        Clock of the loop.
     names
-        Of the heliostats.
+        Heliostats.
     truth, believed
         Mechanisms as they stand, and as the boards are told, (N,).
     machine
-        What no calibration changes, the same for all; stow is the boards' own.
+        Limits and resting places, the same for all.
     seed
-        Of flash and motors.
+        Seed of flash and motors.
 
     Attributes
     ----------
     boards
-        In the order of the names; they are switched on.
+        In the order of the names; `bus` switches them on.
 
     Raises
     ------
     InputError
-        Too many, or a stow position that a new board does not stand at.
+        Too many heliostats.
     """
 
     def __init__(
@@ -61,13 +67,11 @@ class BoardField:
         seed: int = 0,
     ) -> None:
         if len(names) > MOST:
-            raise InputError(f"boards: {len(names)} heliostats; one process bears {MOST}")
-        if machine.stow != STOW:
-            raise InputError(f"boards: stow at {machine.stow}; a new board stands at {STOW}")
+            raise InputError(f"boards: {len(names)} heliostats; one process runs {MOST} at most")
         self._clock = clock
         self.boards: list[Board] = []
         for i, name in enumerate(names):
-            items = {**items_of(believed[i], machine), "address": struct.pack("<H", 0)}
+            items = items_of(believed[i], machine)
             outfit = Outfit(name, 0, 1 + i, key_of(name), truth[i], {}, items)
             self.boards.append(Board(outfit, seed=seed + i))
 
@@ -79,44 +83,29 @@ class BoardField:
         made = []
         for place, row in enumerate(rows):
             old = self.boards[row].outfit
-            items = {**old.items, "address": struct.pack("<H", place + 1)}
-            outfit = Outfit(
-                old.name, place + 1, old.serial, old.key, old.mechanism, old.causes, items
-            )
-            self.boards[row] = board = Board(outfit, seed=row)
+            items = {**old.items, **own_items(place + 1)}
+            self.boards[row] = board = Board(replace(old, address=place + 1, items=items), seed=row)
             board.power_on(self._clock.monotonic())
             made.append(board)
         return TwinBus(self._clock, [*made])
 
     def advance(self, milliseconds: int) -> None:
-        """Let the boards look as often as they must; their time is the clock's."""
+        """Let each board run when it is due; its time is the clock's."""
         del milliseconds
         now = self._clock.monotonic()
         for board in self.boards:
             if board.due(now) <= now:
                 board.step(now)
 
-    def _stand(self) -> tuple[FloatArray, FloatArray]:
+    def stand(self) -> tuple[FloatArray, FloatArray]:
+        """Return true normals and vertices, (N, 3)."""
         pairs = [board.mirror() for board in self.boards]
         return np.stack([n for _, n in pairs]), np.stack([v for v, _ in pairs])
 
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
-        """Return by how much normals are off their aims (N, 3), rad, (N,); NaN if none tracks."""
-        normal, vertex = self._stand()
+        """Return the error of each normal against its aim (N, 3), rad, (N,); NaN if none tracks."""
+        normal, vertex = self.stand()
         wanted = bisector(sun, normalize(aims - vertex))
         off = np.arcsin(np.clip(np.linalg.norm(np.cross(normal, wanted), axis=-1), 0.0, 1.0))
         tracks = np.array([board.state == states.TRACKING for board in self.boards])
-        # What is on its way, or on a target, tells nothing of the aim that is asked for.
-        return np.where(tracks & (off < 0.05), off, np.nan)
-
-    def mirrors_near(
-        self,
-        sun: FloatArray,
-        middle: FloatArray,
-        normal: FloatArray,
-        reach: float,
-        names: tuple[str, ...],
-        sizes: FloatArray,
-    ) -> list[Mirror]:
-        """Return the mirrors whose rays meet a plane within a distance of its middle, m."""
-        return near(self._stand(), sun, middle, normal, reach, names, sizes)
+        return np.where(tracks & (off < _ON_ITS_WAY), off, np.nan)

@@ -1,8 +1,8 @@
-"""An event loop whose time goes at a speed, and waits for those who are late.
+"""An event loop whose time runs at a chosen speed, and waits for late timers.
 
-Loop time advances with the wall's, times the speed, but never past a timer that has not had its
-turn. Where the machine is too slow for the speed, or stands still for a while, simulated time
-goes slower instead of jumping over leases and deadlines; `PacedLoop.lag` says by how much.
+Loop time is wall time times the speed, but it never passes a timer that has not fired. Where the
+machine is too slow for the speed, or stands still for a while, simulated time slows down instead of
+jumping over leases and deadlines; `PacedLoop.lag` tells by how much.
 """
 
 import asyncio
@@ -12,14 +12,14 @@ from collections.abc import Callable
 
 from heliotrope.errors import InputError
 
-#: Timers may be late by so much loop time before the loop's time is held back, s.
+#: Loop time that timers may be late by before the loop's time is held back, s.
 LATE = 0.25
-#: Loop time that may pass while callbacks are ready without end, s.
+#: Loop time that passes in one turn while callbacks are always ready, s.
 _BUSY = 0.005
 
 
 class _Pace(selectors.DefaultSelector):
-    """Waits for files and for wall time, and lets the loop's time run."""
+    """Waits for files and for wall time, and advances the loop's time."""
 
     def __init__(self, speed: float, start: float, wall: Callable[[], float]) -> None:
         super().__init__()
@@ -46,21 +46,21 @@ class _Pace(selectors.DefaultSelector):
 
 
 class PacedLoop(asyncio.SelectorEventLoop):
-    """See the head of this module; sockets and threads work as in any loop.
+    """An event loop at a chosen speed; sockets and threads work as in any loop.
 
     Parameters
     ----------
     speed
-        Loop seconds in a second of the wall.
+        Loop seconds per second of wall time, above 0 to 1000.
     start
-        Of `time`, s.
+        First value of `time`, s.
     wall
-        Gives seconds of the wall.
+        Gives wall time, s.
 
     Raises
     ------
     InputError
-        A speed that none is.
+        A speed out of range.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
         wall: Callable[[], float] = time.monotonic,
     ) -> None:
         if not 0.0 < speed <= 1000.0:
-            self._closed = True  # its end asks for it
+            self._closed = True  # BaseEventLoop.__del__ asks for it
             raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds in a second")
         self._pace = _Pace(speed, start, wall)
         super().__init__(self._pace)
@@ -81,10 +81,10 @@ class PacedLoop(asyncio.SelectorEventLoop):
 
     @property
     def speed(self) -> float:
-        """Loop seconds in a second of the wall, if the machine keeps up."""
+        """Loop seconds per second of wall time, if the machine keeps up."""
         return self._pace.speed
 
     @property
     def lag(self) -> float:
-        """By how much the loop's time is behind what the speed asks for, s."""
+        """Loop time by which the loop is behind its speed, s."""
         return self._pace.lag

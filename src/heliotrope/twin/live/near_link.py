@@ -1,7 +1,7 @@
-"""A line between plant and cluster in one process that takes no time and loses nothing.
+"""A link between plant and cluster in one process that takes no time and loses nothing.
 
-For whole fields: hundreds of clusters with the heartbeats of real links would cost more than
-all the rest. What a line may do to messages is shown by `control.memory`.
+For whole fields: the heartbeats of real links would cost more than everything else where there are
+hundreds of clusters. `links.in_process` simulates what a real line does to messages.
 """
 
 import asyncio
@@ -10,19 +10,19 @@ from collections import deque
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import LinkClosedError, Outcome, Statistics
 
-#: Messages that may wait at an end; beyond it the oldest is dropped, as at any link.
+#: Most messages that wait at an end; beyond that the oldest is dropped, as at any link.
 _CAPACITY = 256
 
 
 class NearLink:
-    """One end; a `control.link.Link`.
+    """One end; a `links.link.Link`.
 
     Attributes
     ----------
     name
-        Whom it leads to.
+        What it leads to.
     plugged
-        Whether the line holds; unplug one end to cut it.
+        Whether this end is plugged in; unplug one to cut the line.
     other
         The other end.
     """
@@ -53,7 +53,7 @@ class NearLink:
 
     @property
     def silent_for(self) -> float:
-        """0 s while the line holds."""
+        """0 s while it is connected."""
         return 0.0 if self.connected else float("inf")
 
     @property
@@ -62,7 +62,7 @@ class NearLink:
         return "" if self.connected else "the line is cut"
 
     async def run(self) -> None:
-        """Wait for the end."""
+        """Wait until it is closed."""
         await self._closing.wait()
 
     async def send(
@@ -109,7 +109,7 @@ class NearLink:
 
 
 def near_pair(clock: Clock, names: tuple[str, str]) -> tuple[NearLink, NearLink]:
-    """Return two ends: the first leads to the second name, as the plant's to its cluster."""
+    """Return two ends: the first leads to the second name, as the plant's end to its cluster."""
     first, second = NearLink(names[1], clock), NearLink(names[0], clock)
     first.other, second.other = second, first
     return first, second

@@ -1,0 +1,118 @@
+"""Everything that a plant needs from outside, as protocols.
+
+A real plant and a simulated one are built by the same `plant.assembly.PlantAssembly`; they differ
+only in the `Ports` that are passed in: links to clusters, cameras, sensors, a clock, and places for
+records.
+"""
+
+from collections.abc import Callable, Mapping
+from contextlib import AbstractAsyncContextManager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Link
+from heliotrope.plant.assigned import Assigned
+from heliotrope.plant.audit import Audit
+from heliotrope.plant.operations.views import CameraView
+from heliotrope.plant.sensors import Readings
+from heliotrope.plant.visits.photographs import Shot
+from heliotrope.safety import Alarm
+from heliotrope.store.records import Records
+
+
+class Cameras(Protocol):
+    """The cameras of a plant's targets."""
+
+    def start(self, on_alarm: Callable[[Alarm], None]) -> None:
+        """Begin to take frames; ``on_alarm`` hears of cameras that fall silent and come back."""
+        ...
+
+    def close(self) -> None:
+        """End all cameras."""
+        ...
+
+    def sees(self, target: str) -> bool:
+        """Return whether a camera looks at the target."""
+        ...
+
+    def awake(self, target: str) -> bool:
+        """Return whether the target's camera delivers frames, as far as is known."""
+        ...
+
+    async def look(self, target: str) -> object:
+        """Photograph the target before a beam comes.
+
+        Raises
+        ------
+        HeliotropeError
+            No usable photograph; the text is for the operator.
+        """
+        ...
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        """Return what is seen now of a heliostat's beam on the target."""
+        ...
+
+    def view(self, target: str) -> CameraView:
+        """Return the last photograph of the target, for people."""
+        ...
+
+
+class Sensors(Protocol):
+    """Sensors that feed readings of the safety table."""
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Readings that they feed."""
+        ...
+
+    def read(self) -> Readings:
+        """Return what has changed since the last call; it may block, and runs in a thread."""
+        ...
+
+
+@dataclass(frozen=True)
+class Ports:
+    """What a plant is connected to.
+
+    Attributes
+    ----------
+    links
+        Plant's end of the link to each cluster.
+    clock
+        Clock of the plant.
+    audit
+        Where commands are recorded before they are sent.
+    cameras
+        None: nothing is calibrated.
+    sensors
+        None: no reading comes from outside.
+    records
+        Where sightings, events and holds outlast the program; None: nowhere.
+    assigned
+        Where assigned aims and standby points outlast the program; None: nowhere.
+    beside
+        Makes what runs beside the plant and begins before it: links, clusters of this machine, a
+        simulated field.
+    truth
+        Gives the true tracking error of each heliostat, rad, (N,), in the order of the plant's
+        field; None where nobody knows it, as in every real plant.
+    facts
+        Gives what the summary shows besides, by name.
+    """
+
+    links: Mapping[str, Link]
+    clock: Clock
+    audit: Audit
+    cameras: Cameras | None = None
+    sensors: Sensors | None = None
+    records: Records | None = field(default=None, kw_only=True)
+    assigned: Assigned | None = field(default=None, kw_only=True)
+    beside: Callable[[], AbstractAsyncContextManager[object]] = field(
+        default=nullcontext, kw_only=True
+    )
+    truth: Callable[[], FloatArray] | None = field(default=None, kw_only=True)
+    facts: Callable[[], Mapping[str, Any]] = field(default=dict, kw_only=True)

@@ -1,0 +1,322 @@
+"""A simulated world for a plant: a field on buses, clusters, cameras, and the truth.
+
+`World` is handed to `plant.assembly.PlantAssembly` as its ports. Everything runs in one event loop:
+the plant's program and its operations, a cluster program for each bus, the field in ticks of 50 ms.
+Mirrors stand as a quick installation leaves them; the plant is told of perfect ones, and learns
+from photographs. The clock decides the speed: a `VirtualClock` on a `PacedLoop` (real time times a
+speed) or on a `VirtualLoop` (as fast as it goes).
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from heliotrope import sun
+from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
+from heliotrope.cluster.controller import Cluster
+from heliotrope.cluster.timekeeping import SystemTime
+from heliotrope.errors import InputError
+from heliotrope.field.example import roughly_installed
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.imaging.synthetic.scenes import Scene
+from heliotrope.links.clock import Clock
+from heliotrope.links.link import Bus, running
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.machine import Machine
+from heliotrope.mechanism.parameters import MODELS
+from heliotrope.plant.aims import default_aims
+from heliotrope.plant.assigned import Assigned
+from heliotrope.plant.audit import Audit, Record
+from heliotrope.plant.ports import Ports
+from heliotrope.plant.settings import clusters_of
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import Records
+from heliotrope.twin.cameras import (
+    ExactCamera,
+    Mirror,
+    Optics,
+    RenderedCamera,
+    Sight,
+    mirrors_near,
+)
+from heliotrope.twin.field.field import Field
+from heliotrope.twin.field.field_bus import FieldBus
+from heliotrope.twin.live.boards import BoardField, key_of
+from heliotrope.twin.live.near_link import NearLink, near_pair
+
+#: Tick of the field, and period at which the true sun is computed, s.
+_TICK, _SUN_EVERY = 0.05, 5.0
+#: Most ticks that are made up at once after a pause.
+_MOST_TICKS = 20
+#: Step counts of each heliostat are asked for each second in plants up to this size, and every few
+#: seconds in larger ones.
+_SMALL, _STEPS_EVERY = 320, 5
+#: A calibration that removes what a quick installation leaves, with the deviation of a beam that
+#: this world has, rad.
+CYCLE = CycleSettings(
+    shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"), sigma=2e-4
+)
+
+
+@dataclass(frozen=True)
+class WorldOptions:
+    """How a world is simulated.
+
+    Attributes
+    ----------
+    seed
+        Seed of imperfections and noise.
+    rendered
+        Whether photographs are drawn and read; else centroids come with noise.
+    threads
+        Threads for photographs; 0 in virtual time.
+    installed
+        Makes the true mechanisms from the nominal ones; None: as roughly as Malan's stood.
+    boards
+        Whether each heliostat is a firmware-true board; for small plants.
+    centroid
+        Variance of centroids that are not photographed, m².
+    """
+
+    seed: int = 0
+    rendered: bool = True
+    threads: int = 1
+    installed: Callable[[Mechanism], Mechanism] | None = None
+    boards: bool = False
+    centroid: float = 1e-5
+
+    def __post_init__(self) -> None:
+        if self.threads < 0 or not self.centroid >= 0.0:
+            raise InputError(
+                f"simulated plant: {self.threads} threads, centroids of {self.centroid} m²; give 0 "
+                "or more of both"
+            )
+
+
+class Forgetful:
+    """An audit that keeps nothing, for plants that are only looked at."""
+
+    def begin(self, record: Record) -> None:
+        """Take a record."""
+
+    def finish(self, identity: str, result: str, at: str) -> None:
+        """Take a result."""
+
+    def confirm(self) -> None:
+        """Do nothing: nothing can go wrong."""
+
+    def close(self) -> None:
+        """Do nothing: nothing is open."""
+
+
+class World:
+    """What a plant is connected to in simulation.
+
+    Parameters
+    ----------
+    design
+        As the plant knows it: heliostats of one group with one machine table, each on a cluster;
+        its mechanisms count as nominal.
+    clock
+        Clock of the loop that it will run in.
+    options
+        See `WorldOptions`.
+
+    Attributes
+    ----------
+    names
+        Heliostats, in the order of the design.
+    truth
+        Mechanisms as they stand, (N,).
+    field
+        The simulated heliostats.
+    links
+        Plant's end of the link to each cluster.
+    buses
+        Bus of each cluster.
+    cameras
+        Cameras of the targets.
+    beats
+        Ticks that were left out because the machine was too slow.
+
+    Raises
+    ------
+    InputError
+        Several groups, clusters that do not stand together, a target without a camera, or a
+        machine table that is missing or incomplete.
+    """
+
+    def __init__(self, design: Plant, clock: Clock, options: WorldOptions | None = None) -> None:
+        chosen = options or WorldOptions()
+        if len(design.groups) != 1:
+            raise InputError(
+                f"simulated plant: {len(design.groups)} groups of heliostats; the simulation takes "
+                "one group"
+            )
+        self.design, self.clock, self.options = design, clock, chosen
+        (group,) = design.groups.values()
+        self.names = group.names
+        install = chosen.installed or partial(roughly_installed, seed=chosen.seed)
+        self.truth = install(group.mechanism)
+        machine = machine_of(design)
+        self.field: Field | BoardField = (
+            BoardField(clock, self.names, self.truth, group.calibrated, machine, chosen.seed)
+            if chosen.boards
+            else Field(self.truth, machine, believed=group.calibrated)
+        )
+        self._sizes = np.stack([group.width, group.height], axis=-1)
+        self._sun: tuple[float, FloatArray] | None = None
+        self.beats = 0
+        self._parts: list[Any] = []
+        self._clusters: list[Cluster] = []
+        self.links: dict[str, NearLink] = {}
+        self.buses: dict[str, Bus] = {}
+        homes = clusters_of(design)
+        place = {name: row for row, name in enumerate(self.names)}
+        for k, (name, members) in enumerate(homes.items()):
+            self._wire(name, [place[member] for member in members], spread_phase(k, len(homes)))
+        # The plant orders its rows cluster by cluster, the field as the design has them.
+        self._rows = np.array([place[name] for members in homes.values() for name in members])
+        aims = default_aims(design, self.names, design.position, None)
+        self._aims = np.stack([aims[name] for name in self.names])
+        self.cameras = self._new_cameras()
+
+    # -- putting it together ---------------------------------------------------------------
+
+    def _wire(self, name: str, rows: list[int], phase: float) -> None:
+        """Make a cluster with its bus, and its link to the plant."""
+        if rows != list(range(rows[0], rows[0] + len(rows))):
+            raise InputError(
+                f"simulated plant: the heliostats of cluster {name} do not stand together in the "
+                "plant file; sort them by cluster"
+            )
+        span = range(rows[0], rows[0] + len(rows))
+        near, far = near_pair(self.clock, ("plant", name))
+        bus: Bus = (
+            self.field.bus(span)
+            if isinstance(self.field, BoardField)
+            else FieldBus(self.field, span)
+        )
+        members = tuple(
+            Member(self.names[row], i + 1, 1 + row, key_of(self.names[row]))
+            for i, row in enumerate(rows)
+        )
+        every = 1 if len(self.names) <= _SMALL else _STEPS_EVERY
+        config = ClusterConfig(name, self.design.site, members, steps_every=every, phase=phase)
+        time = SystemTime(self.clock)
+        self._clusters.append(Cluster(config, bus, far, self.clock, time))
+        self._parts += [near, far, bus, time]
+        self.links[name], self.buses[name] = near, bus
+
+    def _new_cameras(self) -> ExactCamera | RenderedCamera:
+        seed, sight = self.options.seed, Sight(self.clock, self._mirrors, self.sun)
+        if not self.options.rendered:
+            return ExactCamera(sight, self.options.centroid, seed)
+        scenes = []
+        for target in self.design.targets:
+            cameras = [c for c in self.design.cameras if target.name in c.targets]
+            if not cameras or cameras[0].position is None:
+                raise InputError(
+                    f"target {target.name}: no camera with a known position looks at it; add one "
+                    "to the plant file, or take exact centroids"
+                )
+            scenes.append(Scene(cameras[0], (target,)))
+        # Malan's small mirrors are of one piece.
+        optics = Optics(facets=(1, 1))
+        return RenderedCamera(sight, scenes, optics=optics, seed=seed, threads=self.options.threads)
+
+    def ports(
+        self,
+        *,
+        audit: Audit | None = None,
+        records: Records | None = None,
+        assigned: Assigned | None = None,
+        facts: Callable[[], Mapping[str, Any]] = dict,
+    ) -> Ports:
+        """Return this world as the ports of a plant, with places for its records."""
+        return Ports(
+            self.links,
+            self.clock,
+            audit or Forgetful(),
+            self.cameras,
+            records=records,
+            assigned=assigned,
+            beside=self.running,
+            truth=self.errors,
+            facts=facts,
+        )
+
+    # -- the world -------------------------------------------------------------------------
+
+    def sun(self) -> FloatArray:
+        """Return the true direction to the sun, (3,)."""
+        now = self.clock.monotonic()
+        place, part = divmod(now, _SUN_EVERY)
+        if self._sun is None or self._sun[0] != place:
+            utc = self.clock.utc().timestamp() - part
+            ends = sun.vector(np.array([utc, utc + _SUN_EVERY]), self.design.site)
+            self._sun = place, np.asarray(ends)
+        first, second = self._sun[1]
+        mixed = first + (second - first) * (part / _SUN_EVERY)
+        return np.asarray(mixed / np.linalg.norm(mixed))
+
+    def _mirrors(self) -> list[Mirror]:
+        """Return the mirrors whose light may be on a target."""
+        light, stand = self.sun(), self.field.stand()
+        found: dict[str, Mirror] = {}
+        for target in self.design.targets:
+            for mirror in mirrors_near(target, light, stand, self.names, self._sizes):
+                found[mirror.heliostat] = mirror
+        return list(found.values())
+
+    def errors(self) -> FloatArray:
+        """Return the true tracking errors at the design's aims, rad, (N,), in the plant's order."""
+        return np.asarray(self.field.errors(self.sun(), self._aims)[self._rows])
+
+    async def _turn(self) -> None:
+        """Advance the field tick by tick."""
+        done = self.clock.monotonic()
+        while True:
+            await asyncio.sleep(_TICK)
+            late = int((self.clock.monotonic() - done) / _TICK + 1e-6)
+            ticks = min(late, _MOST_TICKS)
+            self.beats += late - ticks
+            done += late * _TICK
+            self.field.advance(50 * ticks)
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator[None]:
+        """Run field, buses, links and clusters for the time of a block."""
+        async with asyncio.TaskGroup() as group:
+            turns = group.create_task(self._turn())
+            async with running(*self._parts), running(*self._clusters):
+                yield
+            turns.cancel()
+
+
+def machine_of(design: Plant) -> Machine:
+    """Return the machine of the heliostats of a design, which must all have the same.
+
+    Raises
+    ------
+    InputError
+        None, different ones, or one without a standby point.
+    """
+    machines = {design.machine(name) for name in design.names}
+    if len(machines) != 1:
+        raise InputError(
+            f"simulated plant: {len(machines)} different machines in the plant file; the "
+            "simulation takes heliostats with equal limits and resting places"
+        )
+    (machine,) = machines
+    if machine.standby is None:
+        raise InputError(
+            "simulated plant: no standby point; give standby_m in the machine table of the group"
+        )
+    return machine

@@ -1,0 +1,90 @@
+"""A simulated plant at work, for tests: the plant's assembly and the world around it."""
+
+import contextlib
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from heliotrope.field.plant import Plant
+from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.assigned import Assigned
+from heliotrope.plant.audit import Audit
+from heliotrope.plant.operations.automatic import AutomaticSettings
+from heliotrope.plant.settings import PlantSettings
+from heliotrope.plant.visits.settings import CycleSettings
+from heliotrope.store.records import Records
+from heliotrope.twin.live import CYCLE, World, WorldOptions
+
+
+@dataclass(frozen=True)
+class LiveOptions:
+    """Options of the world, and settings of the plant; see `WorldOptions`, `AssemblySettings`."""
+
+    seed: int = 0
+    rendered: bool = True
+    threads: int = 1
+    installed: Callable[[Mechanism], Mechanism] | None = None
+    boards: bool = False
+    centroid: float = 1e-5
+    cycle: CycleSettings = CYCLE
+    work: AutomaticSettings = field(default_factory=lambda: AutomaticSettings(wanted=True))
+    plant: PlantSettings = field(default_factory=PlantSettings)
+
+    def world(self) -> WorldOptions:
+        """Return the options of the world."""
+        return WorldOptions(
+            self.seed, self.rendered, self.threads, self.installed, self.boards, self.centroid
+        )
+
+    def settings(self) -> AssemblySettings:
+        """Return the settings of the plant."""
+        return AssemblySettings(self.work, self.plant, self.cycle, MachineTables.HELD)
+
+
+class LivePlant:
+    """A plant with its world."""
+
+    def __init__(
+        self,
+        design: Plant,
+        clock: Clock,
+        options: LiveOptions | None = None,
+        *,
+        audit: Audit | None = None,
+        records: Records | None = None,
+        assigned: Assigned | None = None,
+        extra: Callable[[], Mapping[str, Any]] = dict,
+    ) -> None:
+        chosen = options or LiveOptions()
+        self.design, self.clock = design, clock
+        self.world = World(design, clock, chosen.world())
+        ports = self.world.ports(audit=audit, records=records, assigned=assigned, facts=extra)
+        self.assembly = PlantAssembly(design, ports, chosen.settings())
+        self.plant, self.operations = self.assembly.plant, self.assembly.operations
+        self.names, self.cameras, self.field = (
+            self.world.names,
+            self.world.cameras,
+            self.world.field,
+        )
+        self.truth, self.links = self.world.truth, self.world.links
+
+    def errors(self) -> FloatArray:
+        """True tracking errors, rad, (N,)."""
+        return self.world.errors()
+
+    @contextlib.asynccontextmanager
+    async def running(self) -> AsyncIterator["LivePlant"]:
+        """Run it for the time of a block."""
+        async with self.assembly.running():
+            yield self
+
+    async def end(self) -> None:
+        """End it."""
+        await self.assembly.end()
+
+    async def stowed(self, limit: float = 300.0) -> bool:
+        """Stow the field."""
+        return await self.assembly.stowed(limit)
