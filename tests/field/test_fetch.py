@@ -16,7 +16,7 @@ import pytest
 from heliotrope.errors import FetchError
 from heliotrope.field.formats import fetch, paint
 from heliotrope.field.formats._download import JOURNAL
-from heliotrope.field.formats.fetch import FetchState, Settings, fetch_heliostats, fetch_tower
+from heliotrope.field.formats.fetch import FetchSettings, FetchState, fetch_heliostats, fetch_tower
 from support.paint_server import (
     BIG,
     FAST,
@@ -165,7 +165,7 @@ def test_files_come_side_by_side_but_not_too_many(database: Database, tmp_path: 
     database.add("AA39", measurements=24)
     for path in database.files:
         database.faults[path] = [slow(0.02)]
-    get(database, tmp_path, settings=Settings(workers=3, timeout=5.0))
+    get(database, tmp_path, settings=FetchSettings(workers=3, timeout=5.0))
     assert database.busiest == 3
 
 
@@ -255,7 +255,7 @@ def test_a_line_that_breaks_often_but_moves_on_is_not_given_up(
 ) -> None:
     content = big(database)
     database.fail(BIG, *[cut(20_000)] * 9)
-    get(database, tmp_path, settings=Settings(retries=1, backoff=0.0))
+    get(database, tmp_path, settings=FetchSettings(retries=1, backoff=0.0))
     assert (tmp_path / BIG).read_bytes() == content
     assert len(database.requests(BIG)) == 10
 

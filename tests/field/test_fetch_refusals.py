@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from heliotrope.errors import FetchError, InputError, UnknownNameError
-from heliotrope.field.formats.fetch import Settings, fetch_heliostats
+from heliotrope.field.formats.fetch import FetchSettings, fetch_heliostats
 from support.paint_server import (
     BIG,
     FAST,
@@ -231,7 +231,7 @@ def test_no_network_is_said(tmp_path: Path) -> None:
 def test_a_silent_server_is_said(database: Database, tmp_path: Path) -> None:
     database.fail(CATALOGUE, *[slow(0.5)] * 2)
     text = refused(
-        database, tmp_path, settings=Settings(timeout=0.1, retries=1, backoff=0.0), client=None
+        database, tmp_path, settings=FetchSettings(timeout=0.1, retries=1, backoff=0.0), client=None
     )
     assert "the server does not answer in time" in text
 
@@ -285,7 +285,7 @@ def test_kinds_and_images_are_checked(tmp_path: Path) -> None:
 )
 def test_settings_are_checked(wrong: dict[str, Any], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
-        Settings(**wrong)
+        FetchSettings(**wrong)
 
 
 def test_importing_is_light() -> None:

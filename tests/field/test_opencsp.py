@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from heliotrope.errors import FormatError
 from heliotrope.field.formats import opencsp
 from heliotrope.field.formats.frames import mirror_frame
-from heliotrope.field.formats.opencsp import Centroids, Field
+from heliotrope.field.formats.opencsp import Centroids, FieldTable
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import rotation
 from heliotrope.sun import Site
@@ -77,7 +77,7 @@ PUBLISHED = {
 
 def test_published_places_of_facets_are_met() -> None:
     one = np.ones(1, dtype=np.int64)
-    table = Field(
+    table = FieldTable(
         ("5W1",),
         np.array([[-4.84, 57.93, 3.89]]),
         3 * one,

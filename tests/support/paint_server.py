@@ -18,10 +18,10 @@ import pytest
 from heliotrope.errors import FetchError
 from heliotrope.field.formats import fetch
 from heliotrope.field.formats._download import JOURNAL
-from heliotrope.field.formats.fetch import Settings, fetch_heliostats
+from heliotrope.field.formats.fetch import FetchSettings, fetch_heliostats
 
 PLANT = "WRI1030197"
-FAST = Settings(workers=4, timeout=5.0, retries=3, backoff=0.002)
+FAST = FetchSettings(workers=4, timeout=5.0, retries=3, backoff=0.002)
 
 #: Makes of an answer what really goes out: (status, headers, body, bytes to send).
 Fault = Callable[["Answer"], "Answer"]

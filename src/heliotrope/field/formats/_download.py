@@ -49,7 +49,7 @@ class _LaterError(Exception):
 
 
 @dataclass(frozen=True)
-class Entry:
+class FileRecord:
     """The server's description of a file.
 
     Attributes
@@ -68,7 +68,7 @@ class Entry:
     done: bool
 
 
-class Journal:
+class FetchJournal:
     """Entries by file name, appended to a file in the folder.
 
     Parameters
@@ -80,7 +80,7 @@ class Journal:
     def __init__(self, folder: Path) -> None:
         self._path = folder / JOURNAL
         self._lock = threading.Lock()
-        self._entries: dict[str, Entry] = {}
+        self._entries: dict[str, FileRecord] = {}
         try:
             lines = self._path.read_bytes().splitlines()
         except FileNotFoundError:
@@ -89,16 +89,16 @@ class Journal:
             try:
                 record = json.loads(line)
                 name = str(record.pop("file"))
-                self._entries[name] = Entry(**record)
+                self._entries[name] = FileRecord(**record)
             except (ValueError, KeyError, TypeError, AttributeError):
                 # A line cut off by a power failure: its file is requested again.
                 continue
 
-    def get(self, name: str) -> Entry | None:
+    def get(self, name: str) -> FileRecord | None:
         """Return the last entry of a file."""
         return self._entries.get(name)
 
-    def put(self, name: str, entry: Entry) -> None:
+    def put(self, name: str, entry: FileRecord) -> None:
         """Store an entry."""
         # The line end comes first, so that it also ends a line that was cut off.
         line = "\n" + json.dumps({"file": name, **asdict(entry)})
@@ -109,7 +109,7 @@ class Journal:
 
 
 @dataclass(frozen=True)
-class Job:
+class RemoteFile:
     """A file to fetch.
 
     Attributes
@@ -155,14 +155,14 @@ class Channel:
     """
 
     client: "httpx.Client"
-    journal: Journal
+    journal: FetchJournal
     retries: int
     backoff: float
     received: Callable[[int], None]
     stop: threading.Event = field(default_factory=threading.Event)
 
 
-def download(job: Job, channel: Channel) -> bool:
+def download(job: RemoteFile, channel: Channel) -> bool:
     """Fetch a file; return False if it was there already and has not changed.
 
     Raises
@@ -268,7 +268,7 @@ def _check_status(response: "httpx.Response", url: str, *also: HTTPStatus) -> No
     raise FetchError(f"{url}: {answer}")
 
 
-def _attempt(job: Job, channel: Channel) -> bool:
+def _attempt(job: RemoteFile, channel: Channel) -> bool:
     have, entry = _size(job.path), channel.journal.get(job.name)
     if job.sha256 is not None or (job.size is not None and job.size != have):
         have = -1  # the catalogue describes another file
@@ -289,7 +289,7 @@ def _attempt(job: Job, channel: Channel) -> bool:
             raise _LaterError("the incomplete file does not fit the one on the server")
         _check_status(response, job.url, *([HTTPStatus.PARTIAL_CONTENT] if start else []))
         start = start if status == HTTPStatus.PARTIAL_CONTENT else 0
-        said = Entry(
+        said = FileRecord(
             response.headers.get("etag", ""),
             response.headers.get("last-modified", ""),
             _whole(response),
@@ -305,13 +305,13 @@ def _attempt(job: Job, channel: Channel) -> bool:
     return True
 
 
-def _if_changed(entry: Entry) -> dict[str, str]:
+def _if_changed(entry: FileRecord) -> dict[str, str]:
     if entry.etag:
         return {"If-None-Match": entry.etag}
     return {"If-Modified-Since": entry.modified} if entry.modified else {}
 
 
-def _unchanged_mark(entry: Entry) -> str:
+def _unchanged_mark(entry: FileRecord) -> str:
     """Return the value for If-Range: a weak ETag does not promise the same bytes."""
     return entry.modified if entry.etag.startswith("W/") or not entry.etag else entry.etag
 
@@ -335,7 +335,9 @@ def _whole(response: "httpx.Response") -> int:
     return int(size) if size.isdigit() else -1
 
 
-def _store(job: Job, channel: Channel, response: "httpx.Response", start: int, said: Entry) -> None:
+def _store(
+    job: RemoteFile, channel: Channel, response: "httpx.Response", start: int, said: FileRecord
+) -> None:
     with job.part.open("ab" if start else "wb") as stream:
         if not start:
             channel.journal.put(job.name, said)
@@ -348,7 +350,7 @@ def _store(job: Job, channel: Channel, response: "httpx.Response", start: int, s
         os.fsync(stream.fileno())
 
 
-def _finish(job: Job, channel: Channel, said: Entry) -> None:
+def _finish(job: RemoteFile, channel: Channel, said: FileRecord) -> None:
     """Give a complete file its name."""
     size = _size(job.part)
     if said.size >= 0 and size != said.size:

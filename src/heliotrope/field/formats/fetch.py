@@ -30,9 +30,9 @@ from urllib.parse import unquote, urljoin, urlsplit
 from heliotrope.errors import FetchError, InputError, UnknownNameError
 from heliotrope.field.formats._download import (
     Channel,
-    Job,
-    Journal,
+    FetchJournal,
     NotFoundError,
+    RemoteFile,
     download,
     get_document,
 )
@@ -79,7 +79,7 @@ class FetchState:
     name: str = ""
 
 
-class Progress(Protocol):
+class FetchProgress(Protocol):
     """Receives the progress of a run, from one thread at a time."""
 
     def __call__(self, state: FetchState, /) -> None:
@@ -87,7 +87,7 @@ class Progress(Protocol):
 
 
 @dataclass(frozen=True)
-class Settings:
+class FetchSettings:
     """Settings of a run.
 
     Attributes
@@ -151,9 +151,9 @@ def fetch_heliostats(
     base_url: str = DEFAULT_BASE_URL,
     kinds: Sequence[str] = ("properties", "calibration"),
     images: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: FetchProgress | None = None,
     client: "httpx.Client | None" = None,
-    settings: Settings | None = None,
+    settings: FetchSettings | None = None,
 ) -> Fetched:
     """Fetch what the database has of one or several heliostats.
 
@@ -174,7 +174,7 @@ def fetch_heliostats(
     client
         HTTP client with its own timeout; the caller closes it. Default: one for this run.
     settings
-        Default ``Settings()``.
+        Default ``FetchSettings()``.
 
     Raises
     ------
@@ -207,9 +207,9 @@ def fetch_tower(
     into: str | Path,
     *,
     base_url: str = DEFAULT_BASE_URL,
-    progress: Progress | None = None,
+    progress: FetchProgress | None = None,
     client: "httpx.Client | None" = None,
-    settings: Settings | None = None,
+    settings: FetchSettings | None = None,
 ) -> Fetched:
     """Fetch the measurements of the tower: its targets and its receiver.
 
@@ -282,20 +282,20 @@ class _Document:
 
 
 def _run(
-    find: "Callable[[_Run], list[Job]]",
+    find: "Callable[[_Run], list[RemoteFile]]",
     into: str | Path,
     base_url: str,
-    progress: Progress | None,
+    progress: FetchProgress | None,
     client: "httpx.Client | None",
-    settings: Settings | None,
+    settings: FetchSettings | None,
 ) -> Fetched:
     """Find the files and fetch them."""
     import httpx
 
-    how, folder = settings or Settings(), Path(into)
+    how, folder = settings or FetchSettings(), Path(into)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        journal = Journal(folder)
+        journal = FetchJournal(folder)
     except OSError as error:
         raise FetchError(f"{folder}: cannot be used ({error.strerror})") from None
     opened = httpx.Client(timeout=how.timeout) if client is None else nullcontext(client)
@@ -314,10 +314,10 @@ class _Run:
         self,
         folder: Path,
         base: str,
-        progress: Progress | None,
-        settings: Settings,
+        progress: FetchProgress | None,
+        settings: FetchSettings,
         client: "httpx.Client",
-        journal: Journal,
+        journal: FetchJournal,
     ) -> None:
         self.folder, self.base = folder, base
         self.missing: list[str] = []
@@ -326,14 +326,14 @@ class _Run:
         self._lock = threading.Lock()
         self._channel = Channel(client, journal, settings.retries, settings.backoff, self._received)
 
-    def fetch(self, jobs: list[Job]) -> list[bool]:
+    def fetch(self, jobs: list[RemoteFile]) -> list[bool]:
         """Fetch the files; return for each whether it was downloaded now."""
         self._done = self._total = 0
         return self._each("fetching", self._download, jobs)
 
     def heliostats(
         self, names: Sequence[str], kinds: Sequence[str], images: Sequence[str]
-    ) -> list[Job]:
+    ) -> list[RemoteFile]:
         """Return the files of heliostats."""
         catalogues = [
             _Link(name, "", f"{self.base}/{name}/{name}-heliostat-catalog-stac.json")
@@ -360,7 +360,7 @@ class _Run:
             for job in [self._job(item, entry)]
         ]
 
-    def tower(self) -> list[Job]:
+    def tower(self) -> list[RemoteFile]:
         """Return the files of the tower."""
         plant = DEFAULT_BASE_URL.rsplit("/", 1)[-1]
         link = _Link("", "", f"{self.base}/{plant}-tower-measurements-item-stac.json")
@@ -407,7 +407,7 @@ class _Run:
             raise FetchError(f"{url}: the address is neither http nor https; refused")
         return url
 
-    def _job(self, item: _Document, asset: dict[str, Any]) -> Job:
+    def _job(self, item: _Document, asset: dict[str, Any]) -> RemoteFile:
         url = self._address(item.address(asset["href"]))
         name = unquote(urlsplit(url).path.rsplit("/", 1)[-1])
         if not _FILE.fullmatch(name) or name.endswith(".part"):
@@ -421,7 +421,7 @@ class _Run:
         parts = [part for part in place if part]
         size, checksum = asset.get("file:size"), str(asset.get("file:checksum", ""))
         match = _SHA256.fullmatch(checksum)
-        return Job(
+        return RemoteFile(
             url,
             self.folder.joinpath(*parts),
             "/".join(parts),
@@ -429,7 +429,7 @@ class _Run:
             match[1] if match else None,
         )
 
-    def _download(self, job: Job) -> bool:
+    def _download(self, job: RemoteFile) -> bool:
         try:
             job.path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -483,7 +483,7 @@ def _of(heliostat: str, problem: object) -> str:
     return f"heliostat {heliostat}: {problem}" if heliostat else str(problem)
 
 
-def _distinct(jobs: Iterable[Job]) -> list[Job]:
+def _distinct(jobs: Iterable[RemoteFile]) -> list[RemoteFile]:
     """Return the jobs without repetitions.
 
     Raises
@@ -491,7 +491,7 @@ def _distinct(jobs: Iterable[Job]) -> list[Job]:
     FetchError
         If two different files would go to one place.
     """
-    found: dict[Path, Job] = {}
+    found: dict[Path, RemoteFile] = {}
     for job in jobs:
         first = found.setdefault(job.path, job)
         if first.url != job.url:

@@ -39,8 +39,8 @@ from heliotrope.mechanism.kinds import two_axis
 from heliotrope.sun import Site
 
 __all__ = [
-    "Axis",
     "Document",
+    "DrivenAxis",
     "Element",
     "Model",
     "PlacedModel",
@@ -63,7 +63,7 @@ FACET_LIMIT_DEG = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class Axis:
+class DrivenAxis:
     """A driven axis of a heliostat.
 
     Attributes
@@ -122,8 +122,8 @@ class Model:
     """
 
     name: str
-    primary: Axis
-    secondary: Axis
+    primary: DrivenAxis
+    secondary: DrivenAxis
     facets: tuple[Surface, ...]
     angles: FloatArray
     point: FloatArray
@@ -236,7 +236,7 @@ def _model(values: Values, element: Element, name: str) -> Model:
     )
 
 
-def _axis(values: Values, element: Element) -> Axis:
+def _axis(values: Values, element: Element) -> DrivenAxis:
     along = values.ratios(element, "rotationAxis", 3)
     if not along.any():
         raise values.error(
@@ -249,7 +249,7 @@ def _axis(values: Values, element: Element) -> Axis:
             f"<{element.tag}> rotationAngles {np.degrees(stops[0]):g}° to "
             f"{np.degrees(stops[1]):g}°: the lower stop stands first; exchange them",
         )
-    return Axis(values.lengths(element, "translation", 3), normalize(along), stops)
+    return DrivenAxis(values.lengths(element, "translation", 3), normalize(along), stops)
 
 
 def _facet(values: Values, element: Element, normal: FloatArray) -> Surface:
@@ -517,7 +517,7 @@ def _group(placed: list[PlacedModel], upright: int) -> Heliostats:
     )
 
 
-def _drive(axes: list[Axis]) -> Drive:
+def _drive(axes: list[DrivenAxis]) -> Drive:
     """Return drives whose counts are radians, one an axis, with its stops."""
     stops = np.array([axis.stops for axis in axes])
     each = Drive(np.tile(direct().table, (len(axes), 1)))

@@ -48,7 +48,7 @@ SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class FieldTable:
     """The table of heliostats.
 
     Attributes
@@ -103,7 +103,7 @@ class Centroids:
         return len(self.ids)
 
 
-def read_field(path: str | Path) -> Field:
+def read_field(path: str | Path) -> FieldTable:
     """Read the table of heliostats.
 
     Raises
@@ -126,7 +126,7 @@ def read_field(path: str | Path) -> Field:
             f"heliostat {names[i]}: {facets[i]} facets are not {rows[i]} rows × {columns[i]} "
             "columns",
         )
-    return Field(
+    return FieldTable(
         names=names,
         location=np.stack([table.numbers(axis) for axis in "XYZ"], axis=-1),
         facets=facets,
@@ -255,7 +255,7 @@ class _Table:
         return values.astype(np.int64)
 
 
-def to_plant(table: Field, site: Site, centroids: Centroids | None = None) -> Plant:
+def to_plant(table: FieldTable, site: Site, centroids: Centroids | None = None) -> Plant:
     """Return the plant of a field: azimuth-elevation heliostats.
 
     Heliostats with the same number of facets share a group. Each one's foot stands the pivot height
@@ -291,7 +291,9 @@ def to_plant(table: Field, site: Site, centroids: Centroids | None = None) -> Pl
     return Plant(site.name, site, groups)
 
 
-def _group(table: Field, members: npt.NDArray[np.intp], centroids: Centroids | None) -> Heliostats:
+def _group(
+    table: FieldTable, members: npt.NDArray[np.intp], centroids: Centroids | None
+) -> Heliostats:
     size = np.stack([table.facet_width[members], table.facet_height[members]], axis=-1)
     if centroids is None:
         center = _edge_to_edge(int(table.rows[members[0]]), int(table.columns[members[0]]), size)
