@@ -63,12 +63,17 @@ class BeamWatch:
         Assigned aims and standby points.
     sun
         Gives the unit vector to the sun now, (3,).
+
+    Attributes
+    ----------
+    points
+        As given.
     """
 
     def __init__(
         self, check: BeamCheck, field: FieldState, points: Points, sun: Callable[[], FloatArray]
     ) -> None:
-        self._check, self._field, self._points, self._sun = check, field, points, sun
+        self._check, self._field, self.points, self._sun = check, field, points, sun
         self._seen: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
@@ -85,7 +90,7 @@ class BeamWatch:
         BeamError
             If one of the beams may not go there.
         """
-        aims, standbys = self._points.aims, self._points.standbys
+        aims, standbys = self.points.aims, self.points.standbys
         start = np.where(tracking[:, None], aims[rows], standbys[rows])
         stopped, light = name == "AIM", self._sun()
         wrong = self._check.problems(rows, wanted, light, start=start, stopped=stopped)
@@ -113,7 +118,7 @@ class BeamWatch:
         wrong: dict[str, str] = {}
         if name == "IDLE":
             rows = rows[self._field.among(_TO_STANDBY, now)[rows]]
-            known = np.isfinite(self._points.standbys[rows]).all(axis=-1)
+            known = np.isfinite(self.points.standbys[rows]).all(axis=-1)
             wrong = {
                 self._field.names[row]: "its standby point is not known here; give it one "
                 "(STANDBY) first, or stow it"
@@ -134,7 +139,7 @@ class BeamWatch:
         if not self._check.volumes:
             return {}
         rows = np.array([self._field.index[n] for n in heliostats], dtype=np.intp)
-        aims = self._points.aims[rows]
+        aims = self.points.aims[rows]
         unknown = ~np.isfinite(aims).all(axis=-1)
         found = {
             heliostats[i]: f"{name}: its aim is not known here; give it one (AIM) first"
@@ -150,7 +155,7 @@ class BeamWatch:
 
     def _to_standby(self, rows: Rows, light: FloatArray) -> tuple[Rows, FloatArray]:
         counts = self._field.counts(rows)
-        found = self._check.poses(rows, self._points.standbys[rows], light, counts)
+        found = self._check.poses(rows, self.points.standbys[rows], light, counts)
         path = np.stack([self._angles(rows, counts), found.chosen(found.angles)], axis=-2)
         good = found.chosen(found.status) == Status.OK
         return rows[good], path[good]

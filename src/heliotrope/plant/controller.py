@@ -15,6 +15,7 @@ import math
 import secrets
 from collections import deque
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -148,9 +149,9 @@ class PlantController:
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
-        self._points = Points(self.field.names, assigned)
-        self.aims, self.standbys = self._points.aims, self._points.standbys
-        self._ways = BeamWatch(self.beams, self.field, self._points, self.sun_vector)
+        points = Points(self.field.names, assigned)
+        self.aims, self.standbys = points.aims, points.standbys
+        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector)
         self._clusters = Clusters(members, links, clock, self.counters)
         self._orders = PlantOrders(
             clock,
@@ -165,23 +166,20 @@ class PlantController:
         self._sync = ParameterSync(
             self.field, self.wanted, self._orders, self._clusters, self._tell
         )
-        self._watch_over(conditions(self.settings.autonomy) if table is None else table)
+        rows = conditions(self.settings.autonomy) if table is None else table
+        self._sentinel = self._guarded(rows)
         self._named_at = dict.fromkeys(members, -math.inf)
         self._slow_at = -math.inf
         self._closing = asyncio.Event()
 
-    def _watch_over(self, rows: Iterable[Condition]) -> None:
-        """Build what watches the safety table and what obeys it."""
+    def _guarded(self, rows: Iterable[Condition]) -> Sentinel:
+        """Return what watches the safety table and obeys it."""
         readings = PlantReadings(
             self.field, self.authority, self._orders, self._ways, self.sun_vector
         )
-        self._table = TableWatch(
-            rows, self.field.clusters, readings.names, self.settings.sensors, self.now()
-        )
-        self._sentinel = Sentinel(
+        return Sentinel(
             self.clock,
-            self._table,
-            readings,
+            TableWatch(rows, readings, self.field.clusters, self.settings.sensors, self.now()),
             self.field,
             self._orders,
             self._joining,
@@ -231,15 +229,7 @@ class PlantController:
                 if found is not None:
                     self._sentinel.take_progress(*found, message)
             case Alarm(subject=""):
-                self._tell(
-                    Alarm(
-                        message.condition,
-                        end.name,
-                        message.severity,
-                        message.text,
-                        message.active,
-                    )
-                )
+                self._tell(replace(message, subject=end.name))
             case Alarm():
                 self._tell(message)
             case Answer():
@@ -310,7 +300,7 @@ class PlantController:
     @property
     def unwatched(self) -> tuple[str, ...]:
         """Rows of the safety table that have no reading."""
-        return self._table.unwatched
+        return self._sentinel.table.unwatched
 
     @property
     def waiting(self) -> int:
@@ -330,7 +320,7 @@ class PlantController:
         UnknownNameError
             If it is not one of the settings' sensors.
         """
-        self._table.put(name, value, self.now(), subject)
+        self._sentinel.table.put(name, value, self.now(), subject)
 
     def put_flux(self, share: float) -> None:
         """Take the flux on the receiver as a share of the nominal, measured now, as proof."""
@@ -439,8 +429,8 @@ class PlantController:
         """
         person.must_be(Role.OPERATOR, condition)
         role = person.role.acknowledges_as
-        if condition in self._table.rows or subject not in self._clusters.ends:
-            refusal = self._table.acknowledge(condition, person.name, role, subject)
+        if condition in self._sentinel.table.rows or subject not in self._clusters.ends:
+            refusal = self._sentinel.table.acknowledge(condition, person.name, role, subject)
             if refusal:
                 raise refusals.NOT_ACKNOWLEDGED.error(reason=refusal)
         else:
@@ -610,7 +600,7 @@ class PlantController:
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
         ticket = self._accept(person, token, name, values, names, f"{len(groups)} points")
-        if problem := self._points.assign(name, rows, wanted):
+        if problem := self._ways.points.assign(name, rows, wanted):
             ticket.advance(names, Stage.FAILED, f"not sent, because it cannot be stored: {problem}")
             return ticket
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)

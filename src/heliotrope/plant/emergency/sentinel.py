@@ -15,7 +15,7 @@ from heliotrope.links.messages import Progress
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.emergency.order import EmergencyOrder
-from heliotrope.plant.emergency.table import PlantReadings, TableWatch
+from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
@@ -35,8 +35,8 @@ class Sentinel:
     ----------
     clock
         Its monotonic time decides.
-    table, readings
-        The plant's rows of the safety table, and its own readings.
+    table
+        The plant's rows of the safety table.
     field, orders, joining, authority
         Of the plant.
     drives
@@ -46,6 +46,8 @@ class Sentinel:
 
     Attributes
     ----------
+    table
+        As given.
     order
         The last order to the whole field, None before the first.
     on
@@ -56,7 +58,6 @@ class Sentinel:
         self,
         clock: Clock,
         table: TableWatch,
-        readings: PlantReadings,
         field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
@@ -67,7 +68,7 @@ class Sentinel:
         self.order: EmergencyOrder | None = None
         self.on = False
         self._called = False
-        self._clock, self._table, self._own, self._field = clock, table, readings, field
+        self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._authority = orders, joining, authority
         self._drives, self._repeat = drives, repeat
         #: The strongest act that each cluster was sent as a whole, while it holds.
@@ -80,29 +81,29 @@ class Sentinel:
     def beat(self, now: float) -> list[Alarm]:
         """Evaluate the table and do what it demands; return the alarms raised and ended."""
         proof = self.order.proof if self.on and self.order is not None else None
-        news = self._table.evaluate(self._own.take(proof, called=self._called, now=now), now)
+        news = self.table.evaluate(proof, called=self._called, now=now)
         self._obey_field(now)
         self._obey_clusters()
         self._obey_heliostats(now)
         return news
 
     def _obey_field(self, now: float) -> None:
-        wanted, caused = self._table.demanded(), self._table.caused()
+        wanted, caused = self.table.demanded(), self.table.caused()
         order = self.order
         # A consequence of an emergency may make it worse, but begins none: it would never end.
         if wanted is not None and wanted >= Act.DEFOCUS and (caused or self.on):
             if not self.on or order is None or wanted > order.act:
-                self._begin(wanted, _TABLE, self._table.reasons(Act.DEFOCUS))
+                self._begin(wanted, _TABLE, self.table.reasons(Act.DEFOCUS))
             elif now - self._repeated_at >= self._repeat:
                 self._repeat_order(self._field.clusters)
         if not caused:
             self.on = False
         if wanted is not None and wanted >= Act.HOLD:
-            self._joining.drop(self._table.reasons(Act.HOLD))
+            self._joining.drop(self.table.reasons(Act.HOLD))
 
     def _obey_clusters(self) -> None:
         for name, members in self._field.members.items():
-            act = self._table.demanded(name)
+            act = self.table.demanded(name)
             if act is None or act < Act.DEFOCUS:
                 self._acts.pop(name, None)
                 continue
@@ -111,7 +112,7 @@ class Sentinel:
                 sent.append(self.order.act)
             if all(act > other for other in sent):
                 self._acts[name] = act
-                text = self._table.reasons(Act.DEFOCUS, name)
+                text = self.table.reasons(Act.DEFOCUS, name)
                 self._joining.drop(text, frozenset(members))
                 self.send_safe(_TABLE, act, members, text)
 
@@ -122,7 +123,7 @@ class Sentinel:
         """
         token = self._authority.token
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
-        for name, text in self._table.held().items():
+        for name, text in self.table.held().items():
             if self.on or name in self._sent_off:
                 continue
             self._joining.drop(text, frozenset([name]))
@@ -212,5 +213,5 @@ class Sentinel:
         """Return why no new motion may begin in some clusters, "" if it may."""
         if self.on and self.order is not None:
             return f"an emergency holds ({self.order.act.name}: {self.order.reason})"
-        texts = (self._table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
+        texts = (self.table.reasons(Act.REFUSE_NEW, name) for name in sorted(set(clusters)))
         return next((text for text in texts if text), "")

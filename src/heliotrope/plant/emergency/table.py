@@ -1,7 +1,7 @@
 """The plant's part of the safety table: readings in, demands and alarms out."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -117,10 +117,10 @@ class TableWatch:
     ----------
     rows
         The table as `safety.conditions` gives it and the plant adjusted it.
+    readings
+        Those that the plant makes itself.
     clusters
         Names.
-    own
-        Names of the readings that the plant makes itself.
     sensors
         Names of the readings that come from sensors, by `put`.
     now
@@ -145,8 +145,8 @@ class TableWatch:
     def __init__(
         self,
         rows: Iterable[Condition],
+        readings: PlantReadings,
         clusters: Sequence[str],
-        own: frozenset[str],
         sensors: Iterable[str],
         now: float,
     ) -> None:
@@ -158,14 +158,15 @@ class TableWatch:
                 f"sensor {name}: no row of the safety table that the plant watches takes it from a "
                 f"sensor; known: {', '.join(sorted(known))}"
             )
-        able = tuple(row for row in table if row.reading in self._sensors | own)
+        able = tuple(row for row in table if row.reading in self._sensors | readings.names)
         self.unwatched = tuple(row.name for row in table if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
         self._single = tuple(row for row in able if row.scope is Scope.HELIOSTAT)
         subjects = {row.name: clusters for row in able if row.scope is Scope.CLUSTER}
         self._state = start(able, now, subjects)
-        self._readings: dict[tuple[str, str], Reading] = {}
+        self._own = readings
+        self._put: dict[tuple[str, str], Reading] = {}
         self._told: dict[tuple[str, str], Alarm] = {}
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
@@ -178,11 +179,14 @@ class TableWatch:
         """
         if name not in self._sensors:
             raise UnknownNameError("sensor of the plant", name, self._sensors)
-        self._readings[name, subject] = Reading(value, at)
+        self._put[name, subject] = Reading(value, at)
 
-    def evaluate(self, own: Mapping[tuple[str, str], Reading], now: float) -> list[Alarm]:
-        """Evaluate all rows; return the alarms raised and ended since the last time."""
-        readings = {**self._readings, **own}
+    def evaluate(self, proof: Proof | None, *, called: bool, now: float) -> list[Alarm]:
+        """Evaluate all rows; return the alarms raised and ended since the last time.
+
+        For ``proof`` and ``called`` see `PlantReadings.take`.
+        """
+        readings = {**self._put, **self._own.take(proof, called=called, now=now)}
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
             self._state = narrowed(self._state, row.name, subjects)
