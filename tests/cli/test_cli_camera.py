@@ -209,7 +209,7 @@ def test_calibrate_with_a_chessboard(call: Any, shelf: Path, place: Path) -> Non
     text = call(*arguments)
     assert re.search(r"^focal length 5\d\d\.\d ± \d+\.\d, 5\d\d\.\d ± ", text, re.MULTILINE)
     assert re.search(r"board3\.png: 0\.\d\d px", text)
-    assert "note: where the camera stands was found with the old lens and is forgotten" in text
+    assert "note: the camera's pose belonged to the old lens and is dropped" in text
     camera = read_plant(plant).camera("south")
     assert camera.size == (480, 360)
     assert camera.matrix[0, 0] == pytest.approx(MATRIX[0, 0], rel=0.02)
@@ -257,7 +257,7 @@ def test_show(call: Any, place: Path) -> None:
     )
     assert found[0]["targets"]["target"]["marks"] == 6
     assert found[0]["targets"]["target"]["distance"] == pytest.approx(np.sqrt(665.0))
-    assert "there are no cameras; heliotrope camera teach" in call("show", place / "bare.toml")
+    assert "no cameras; heliotrope camera teach" in call("show", place / "bare.toml")
     assert json.loads(call("show", place / "bare.toml", "--json")) == []
     bare = replace(prototype(), cameras=(replace(CAMERA, position=None, R_enu_camera=None),))
     write_plant(bare, place / "lens.toml")
@@ -288,16 +288,16 @@ BOARDS = ("board0.png", "board1.png", "board2.png")
         ((*TEACH, *points(), "--kind", "corner"), "a corner needs its size in metres (--size)"),
         ((*TEACH, *points(), "--kind", "dot=disc"), "point dot: a disc needs its size in metres"),
         ((*TEACH, *points(), "--kind", "nose=disc", "--size", "1"), "among those given: 'nose'"),
-        ((*TEACH, *points(), "--size", "big"), "'big' is no number of metres"),
+        ((*TEACH, *points(), "--size", "big"), "'big' is not a number of metres"),
         ((*TEACH, *points(), "--size", "0"), "size 0.0 m; give metres above 0"),
         ((*TEACH, *points(), "--size", "1", "--size", "2"), "'2': given twice"),
         ((*TEACH, *points(), "--size", "dot=1", "--size", "dot=2"), "given twice for point dot"),
         ((*TEACH, *points(), "--sigma-px", "0"), "sigma 0.0 px; give a standard deviation above 0"),
         ((*TEACH, *points(), "--out", "plant.xml"), "plant.xml: only plant files (TOML)"),
-        ((*TEACH, *points(), "--out", "no/plant.toml"), "there is no folder no; make it first"),
+        ((*TEACH, *points(), "--out", "no/plant.toml"), "folder no does not exist; make it first"),
         (
             ("teach", "tower-measurements.json", "south.png", "--target", "t"),
-            "tower-measurements.json: a tower alone is no plant; give the folder",
+            "tower-measurements.json: a tower file alone is not a plant; give the",
         ),
         (("teach", ".", "south.png", "--target", "t"), "add --out plant.toml"),
         (

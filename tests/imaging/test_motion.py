@@ -259,7 +259,7 @@ def test_why_frames_cannot_be_compared() -> None:
     upset = np.rint(255.0 - good[::-1].astype(float)).astype(np.uint8)
     cases: list[tuple[Image, Image, str]] = [
         (black, good, "the first frame is dark"),
-        (good, white, "the second frame is overexposed: 100 % of it are saturated"),
+        (good, white, "the second frame is overexposed: 100 % of it is saturated"),
         (good, _shoot(SCENES[0], rng, gain=0.2), "the brightness changed by 0.2"),
         (good, _shoot(SCENES[0], rng, (40.0, 20.0)), "the camera moved by 44."),
         (good, upset, "more than half of the frame changed"),

@@ -310,7 +310,7 @@ def test_an_edge_or_nothing_is_no_mark(frame: Frame) -> None:
 
 def test_pictures_that_cannot_be_cut(blotted: Frame) -> None:
     small = teach(PLAIN, "target", blotted, at(BLOTS), wish=Wish("picture", 0.05))
-    assert all("12 are needed" in p.note for p in small.points)
+    assert all("below 12 px" in p.note for p in small.points)
     large = teach(PLAIN, "target", blotted, at(BLOTS), wish=Wish("picture", 3.0))
     assert all("leaves the frame" in p.note for p in large.points[:4])
     assert not small.pictures

@@ -1,4 +1,4 @@
-"""``heliotrope camera``: calibrate the cameras that look at targets, and teach them the targets."""
+"""``heliotrope camera``: calibrate target cameras, and teach them their targets."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -38,16 +38,16 @@ def calibrate(
     images: Annotated[list[Path], typer.Argument(help="Pictures of the board or the targets.")],
     camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")],
     chessboard: Annotated[
-        str | None, typer.Option(help="Inner corners of a chessboard, COLUMNSxROWS, as 9x6.")
+        str | None, typer.Option(help="Inner corners of a chessboard, COLUMNSxROWS, e.g. 9x6.")
     ] = None,
     square: Annotated[float | None, typer.Option(help="Side of its squares, m.")] = None,
     anew: Annotated[
-        bool, typer.Option("--anew", help="From marks: solve a known lens again, too.")
+        bool, typer.Option("--anew", help="From marks: solve for a known lens again.")
     ] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate the lens from pictures of a chessboard, or lens and place from targets' marks."""
+    """Calibrate a lens by a chessboard, or lens and pose by the marks of targets."""
     if (chessboard is None) != (square is None):
         raise InputError("--chessboard and --square go together: --chessboard 9x6 --square 0.03")
     board = None if chessboard is None or square is None else (_pattern(chessboard), square)
@@ -84,7 +84,7 @@ def _from_chessboard(
     old = next((c for c in plant.cameras if c.name == name), None)
     camera = lens.camera(name)
     if old is not None:
-        # Its place was found with the old lens.
+        # Its pose was found with the old lens.
         camera = replace(camera, targets=old.targets, source=old.source)
     write_with_pictures(with_camera(plant, camera), places[1], places[0].parent)
     forgotten = old is not None and old.position is not None
@@ -95,8 +95,8 @@ def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgo
     notes = list(lens.notes)
     if forgotten:
         notes.append(
-            "where the camera stands was found with the old lens and is forgotten; find it again: "
-            "heliotrope camera calibrate without --chessboard, or teach"
+            "the camera's pose belonged to the old lens and is dropped; find it again by "
+            "heliotrope camera calibrate without --chessboard, or by teach"
         )
     if as_json:
         boards = [
@@ -144,7 +144,7 @@ def _show_lens(lens: "Lens", camera: "Camera", place: Path, as_json: bool, forgo
         )
         if sigma > 0.0
     ]
-    print("distortion: " + (", ".join(terms) or "none that the pictures show"))
+    print("distortion: " + (", ".join(terms) or "none visible in the pictures"))
     print(
         f"deviation {lens.deviation:.2f} px; boards cover {100 * lens.coverage:.0f} % of the frame"
     )
@@ -199,30 +199,30 @@ def teach(
     target: Annotated[str, typer.Option("--target", help="Name of the target.")],
     at: Annotated[
         list[str] | None,
-        typer.Option(help="Where a point is, NAME=X,Y in pixels; repeat it, four or more."),
+        typer.Option(help="Place of a point, NAME=X,Y in pixels; give four or more."),
     ] = None,
     click: Annotated[bool, typer.Option("--click", help="Click the points in a browser.")] = False,
     kind: Annotated[
         list[str] | None,
         typer.Option(
-            help="What is at the points: corner, tee, square, disc or picture; "
-            "NAME=KIND for one of them."
+            help="Marks at the points: corner, tee, square, disc or picture; "
+            "NAME=KIND for one point."
         ),
     ] = None,
     size: Annotated[
-        list[str] | None, typer.Option(help="Size of the marks, m; NAME=SIZE for one of them.")
+        list[str] | None, typer.Option(help="Size of the marks, m; NAME=SIZE for one point.")
     ] = None,
     stroke: Annotated[
         list[str] | None,
-        typer.Option(help="Breadth of the strokes of corners and tees, m; or NAME=BREADTH."),
+        typer.Option(help="Stroke width of corners and tees, m; NAME=WIDTH for one."),
     ] = None,
     camera: Annotated[str, typer.Option("--camera", help="Name of the camera.")] = "camera",
-    sigma_px: Annotated[float, typer.Option(help="How well the points are given, px.")] = 1.0,
-    anew: Annotated[bool, typer.Option("--anew", help="Solve a known lens again, too.")] = False,
+    sigma_px: Annotated[float, typer.Option(help="Error of the given points, px.")] = 1.0,
+    anew: Annotated[bool, typer.Option("--anew", help="Solve for a known lens again.")] = False,
     out: OutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Tell once where a target's points are in a picture: its marks and the camera's place."""
+    """Point out a target's points in one picture; gives its marks and the camera's pose."""
     from heliotrope.imaging.targets import teaching
 
     place = _place_to_write(plant, out)
@@ -252,7 +252,7 @@ def teach(
 
 
 def _announcer(quiet: bool) -> Callable[[str], None]:
-    """Tell where the page is, beside JSON too."""
+    """Return a function that prints the page's address, on stderr if ``quiet``."""
 
     def announce(address: str) -> None:
         typer.echo(f"click the points at {address}", err=quiet)
@@ -268,7 +268,7 @@ def _at(text: str) -> tuple[str, tuple[float, float]]:
             return name, (float(parts[0]), float(parts[1]))
         except ValueError:
             pass
-    raise InputError(f"--at {text!r}: write NAME=X,Y with pixels, as upper_left=812.5,304")
+    raise InputError(f"--at {text!r}: write NAME=X,Y in pixels, as upper_left=812.5,304")
 
 
 def _wishes(
@@ -280,7 +280,7 @@ def _wishes(
         try:
             return float(text)
         except ValueError:
-            raise InputError(f"{text!r} is no number of metres") from None
+            raise InputError(f"{text!r} is not a number of metres") from None
 
     kind = _split(kinds, str)
     size, stroke = _split(sizes, metres), _split(strokes, metres)
@@ -300,7 +300,7 @@ def _wishes(
 
 
 def _split(texts: Sequence[str], read: Callable[[str], Value]) -> dict[str, Value]:
-    """Return values by the name before "=", and the one without under ""."""
+    """Return values by the name before "="; the value without a name is under ""."""
     found: dict[str, Value] = {}
     for text in texts:
         name, _, value = text.rpartition("=")
@@ -372,14 +372,14 @@ def show(
     plant: Annotated[Path, typer.Argument(help="Plant file, or a folder in PAINT's form.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Print the cameras of a plant and how they see its targets."""
+    """Print the cameras of a plant and their views of its targets."""
     import numpy as np
 
     from heliotrope.imaging.targets.teaching import sights
 
     loaded = open_plant(plant)
     if not loaded.cameras and not as_json:
-        print(f"{plant}: there are no cameras; heliotrope camera teach makes one")
+        print(f"{plant}: no cameras; heliotrope camera teach adds one")
         return
     seen = {camera.name: sights(camera, loaded.targets) for camera in loaded.cameras}
     if as_json:
@@ -454,18 +454,18 @@ def _print_cameras(cameras: "Sequence[Camera]") -> None:
 
 
 def _place_to_write(plant: Path, out: Path | None) -> Path:
-    """Return the plant file to write, before anything is worked out."""
+    """Return the plant file to write; checked before any computation."""
     if plant.suffix.lower() == ".json":
         raise FormatError(
             plant,
-            "a tower alone is no plant; give the folder that has heliostat properties too "
-            "(properties/ID.json), and --out plant.toml",
+            "a tower file alone is not a plant; give the folder that also has heliostat "
+            "properties (properties/ID.json), and --out plant.toml",
         )
     place = plant if out is None else out
     if place.suffix.lower() != ".toml":
         raise InputError(f"{place}: only plant files (TOML) are written; add --out plant.toml")
     if not place.parent.is_dir():
-        raise InputError(f"{place}: there is no folder {place.parent}; make it first")
+        raise InputError(f"{place}: folder {place.parent} does not exist; make it first")
     return place
 
 
@@ -476,7 +476,7 @@ def _read(image: Path) -> "Frame":
 
 
 def _field(camera: "Camera") -> Any:
-    """Angles of view, across and up, rad, (2,)."""
+    """Return the angles of view, horizontal and vertical, rad, (2,)."""
     import numpy as np
 
     from heliotrope.field.camera import undistort
@@ -517,7 +517,7 @@ def _fit_document(fit: "CameraFit") -> dict[str, Any]:
 
 
 def _sigma(covariance: Any) -> float:
-    """One number for two coordinates."""
+    """Return one standard deviation for two coordinates."""
     return float((0.5 * (covariance[0, 0] + covariance[1, 1])) ** 0.5)
 
 

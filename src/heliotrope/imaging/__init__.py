@@ -1,1 +1,87 @@
-"""The target camera: from a photograph to a place in metres, or the reason why not."""
+"""Photographs of targets: from a frame to spots in metres with covariance, and to sightings.
+
+- `frame`, `files`, `sources`: frames, image files, and where frames come from.
+- `targets`: find targets by their marks; teach a camera its targets.
+- `spots`: background, spots and their quality.
+- `photograph`: read one photograph; `campaign`: many, into sightings; `memory`: models of empty
+  targets; `log`: facts about photographs; `annotate`: draw the result.
+- `lens`: calibrate lenses and locate cameras; the camera model is `heliotrope.field.camera`.
+- `motion`: did a beam move between two frames?
+- `synthetic`: rendered frames with exact truth. Simulations import it themselves.
+
+Begin with `read_image` and `read_photograph`.
+"""
+
+from heliotrope.imaging.annotate import annotate
+from heliotrope.imaging.campaign import Job, Outcome, process_many, to_sightings
+from heliotrope.imaging.files import find_images, read_image, write_image
+from heliotrope.imaging.frame import Frame
+from heliotrope.imaging.lens import (
+    CameraFit,
+    Lens,
+    calibrate_chessboard,
+    calibrate_marks,
+    resection,
+)
+from heliotrope.imaging.log import Entry, Log, read_log
+from heliotrope.imaging.memory import Memory
+from heliotrope.imaging.motion import (
+    Motion,
+    MotionDetector,
+    MotionSettings,
+    detect_motion,
+    find_shift,
+)
+from heliotrope.imaging.photograph import (
+    Photograph,
+    PlacedSpot,
+    Reading,
+    Settings,
+    read_crop,
+    read_photograph,
+)
+from heliotrope.imaging.sources import Source, average, keep, open_source
+from heliotrope.imaging.spots.background import EmptyTarget
+from heliotrope.imaging.spots.quality import Expectation, Limits, Reason
+from heliotrope.imaging.targets.finding import find_targets
+
+__all__ = [
+    "CameraFit",
+    "EmptyTarget",
+    "Entry",
+    "Expectation",
+    "Frame",
+    "Job",
+    "Lens",
+    "Limits",
+    "Log",
+    "Memory",
+    "Motion",
+    "MotionDetector",
+    "MotionSettings",
+    "Outcome",
+    "Photograph",
+    "PlacedSpot",
+    "Reading",
+    "Reason",
+    "Settings",
+    "Source",
+    "annotate",
+    "average",
+    "calibrate_chessboard",
+    "calibrate_marks",
+    "detect_motion",
+    "find_images",
+    "find_shift",
+    "find_targets",
+    "keep",
+    "open_source",
+    "process_many",
+    "read_crop",
+    "read_image",
+    "read_log",
+    "read_photograph",
+    "resection",
+    "to_sightings",
+    "write_image",
+]

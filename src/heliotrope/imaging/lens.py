@@ -1,7 +1,7 @@
-"""Lenses and poses: a chessboard calibrates the lens, known points tell where a camera stands.
+"""Lenses and poses: calibrate a lens by a chessboard, locate a camera by known points.
 
-Distances in pixels are two-dimensional: a deviation is the root of the mean squared
-length of the residuals. A ``sigma`` is that of one coordinate.
+A deviation in pixels is two-dimensional: the root of the mean squared length of residuals. A
+``sigma`` is that of one coordinate.
 """
 
 from collections.abc import Sequence
@@ -15,16 +15,16 @@ from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, as_float, as_vectors, cross_matrix
 
-#: Terms of Brown and Conrady's distortion that a lens may have.
+#: Distortion models: terms of Brown and Conrady in each.
 MODELS: dict[str, tuple[int, ...]] = {
     "none": (), "k1": (0,), "k1 k2": (0, 1), "k1 k2 p1 p2": (0, 1, 2, 3),
     "k1 k2 p1 p2 k3": (0, 1, 2, 3, 4),
 }  # fmt: skip
-#: Boards whose normals differ by less than this tell the same about the lens, rad.
+#: Boards whose normals differ by less than this count as one tilt, rad.
 SAME_TILT = np.radians(3.0)
-#: A lens whose focal length is less certain is refused, relative.
+#: Greatest relative uncertainty of a focal length.
 FOCAL_LIMIT = 0.1
-#: Priors of marks alone: log of focal length over width ±, principal point over width ±, k1 ±.
+#: Priors for marks alone: log focal length over width ±, principal point over width ±, k1 ±.
 LOG_FOCAL, LOG_FOCAL_SIGMA, CENTER_SIGMA, K1_SIGMA = np.log(3.0), 1.5, 0.02, 0.1
 #: Rows of the covariance of a :class:`CameraFit`.
 POSE = ("turn_right", "turn_down", "turn_forward", "east", "north", "up")
@@ -33,16 +33,16 @@ INNER = ("log_focal", "center_x", "center_y", "k1")
 
 @dataclass(frozen=True)
 class Board:
-    """One picture of a chessboard.
+    """A picture of a chessboard.
 
     Attributes
     ----------
     name, corners
-        Of the picture; inner corners in it, row by row, px, (N, 2), None if not found.
+        Of the picture; its inner corners, row by row, px, (N, 2), or None if not found.
     reason
-        Why it went not into the lens; empty if it did.
+        Why it was not used for the lens; empty if it was.
     deviation, tilt
-        RMS of its residuals, px, and between its normal and the optical axis, rad; NaN if
+        RMS of its residuals, px; angle between its normal and the optical axis, rad; NaN if
         unknown.
     """
 
@@ -54,7 +54,7 @@ class Board:
 
     @property
     def used(self) -> bool:
-        """Whether it went into the lens."""
+        """Whether it was used for the lens."""
         return not self.reason
 
 
@@ -68,11 +68,11 @@ class Lens:
         As of :class:`~heliotrope.field.camera.Camera`.
     sigma, model
         Standard deviations of both focal lengths, the principal point (px) and the five terms
-        of the distortion, (9,); 0 for those that are not in the one of :data:`MODELS` used.
+        of distortion, (9,); 0 for terms outside the model (:data:`MODELS`).
     boards, coverage
-        All pictures, in their order; share of the frame that boards were seen in.
+        All pictures, in their order; share of the frame that boards cover.
     notes
-        What to know about it, in sentences.
+        Remarks, in sentences.
     """
 
     size: tuple[int, int]
@@ -86,7 +86,7 @@ class Lens:
     notes: tuple[str, ...] = ()
 
     def camera(self, name: str) -> Camera:
-        """Return a camera with this lens that stands nobody knows where."""
+        """Return a camera with this lens and without a pose."""
         return Camera(name, self.size, self.matrix, self.distortion, deviation=self.deviation)
 
 
@@ -98,8 +98,8 @@ def find_chessboard(grey: npt.ArrayLike, pattern: tuple[int, int]) -> FloatArray
     import cv2
 
     picture: Any = _eight_bit(grey)
-    # On drawn boards of known corners: 0.04 to 0.1 px off as SB finds them without flags, 0.2 to
-    # 0.4 px with EXHAUSTIVE, and 0.03 to 0.06 px after cornerSubPix, from wherever they come.
+    # Errors on drawn boards: 0.04 to 0.1 px by SB without flags, 0.2 to 0.4 px with EXHAUSTIVE,
+    # and 0.03 to 0.06 px after cornerSubPix, whatever the start.
     found, corners = cv2.findChessboardCornersSB(picture, pattern)
     if not found:
         flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
@@ -140,19 +140,19 @@ def calibrate_chessboard(
     Parameters
     ----------
     images
-        Grey (H, W), uint8 or uint16, all of one size; the board at different tilts, 20° to
-        45°, in all parts of the frame.
+        Grey (H, W), uint8 or uint16, all of one size; with the board at different tilts of
+        20° to 45°, in all parts of the frame.
     pattern
         Columns and rows of inner corners.
     square
         Side of a square, m.
     names
-        What to call the pictures; "picture 1" and so on if not given.
+        Of the pictures; "picture 1" and so on if not given.
 
     Raises
     ------
     InputError
-        If the pattern is found in fewer than three pictures, or what was found does not
+        If the pattern is found in fewer than three pictures, or the pictures do not
         determine the focal length.
     """
     columns, rows = (int(n) for n in pattern)
@@ -181,10 +181,10 @@ def calibrate_corners(
     square: float,
     names: Sequence[str],
 ) -> Lens:
-    """Return the lens from corners found elsewhere; the rest as :func:`calibrate_chessboard`.
+    """Return the lens from given corners; otherwise as :func:`calibrate_chessboard`.
 
-    ``corners`` has one entry for each picture, px (columns * rows, 2), None where none were
-    found. The terms of the distortion are those with the least Bayesian information criterion.
+    ``corners`` has one entry for each picture, px (columns * rows, 2), or None. The distortion
+    model is the one with the least Bayesian information criterion.
     """
     if not (np.isfinite(square) and square > 0.0):
         raise InputError(f"squares of {square} m; give their side in metres, above 0")
@@ -193,14 +193,14 @@ def calibrate_corners(
     points = np.pad(plane, ((0, 0), (0, 1)))
     what = f"the pattern of {columns} × {rows} inner corners"
     boards = [
-        Board(name, seen, f"{what} is not in it" if seen is None else "")
+        Board(name, seen, f"{what} was not found" if seen is None else "")
         for name, seen in zip(names, corners, strict=True)
     ]
     if sum(board.used for board in boards) < 3:
         have = ", ".join(board.name for board in boards if board.used) or "none"
         raise InputError(
             f"{what} is found in {have} of {len(boards)} pictures; three or more are needed: are "
-            "the numbers right, is the whole board in the frame, sharp and not burnt out?"
+            "the numbers right, and is the whole board in the frame, sharp and not overexposed?"
         )
     boards = _without_outliers(size, points, boards)
     solved = [_solve(size, points, boards, model) for model in MODELS]
@@ -215,7 +215,7 @@ def calibrate_corners(
 def _solve(
     size: tuple[int, int], points: FloatArray, boards: Sequence[Board], model: str
 ) -> tuple[Lens, float, FloatArray]:
-    """Return the lens with the terms of a model, its criterion and the boards' normals."""
+    """Return the lens of a model, its information criterion, and the boards' normals."""
     import cv2
 
     kept = (
@@ -238,7 +238,7 @@ def _solve(
         raise InputError(_FRONTAL.format("the focal length"))
     normals = np.stack([cv2.Rodrigues(as_float(turn))[0][:, 2] for turn in turns])
     n = 2 * len(seen) * len(points)
-    # The noise is unknown; without any, the digits of the 32-bit corners stand in for it.
+    # The noise is unknown; its lower bound is the rounding of the 32-bit corners.
     floor = (np.finfo(np.float32).eps * max(size)) ** 2
     criterion = n * np.log(0.5 * deviation**2 + floor) + len(MODELS[model]) * np.log(n)
     tilts = np.arccos(np.clip(np.abs(normals[:, 2]), 0.0, 1.0))
@@ -260,18 +260,18 @@ def _solve(
 
 
 _FRONTAL = (
-    "{} is not determined: the boards do not tell it from the distance; hold the board at "
-    "three or more different tilts of 20° to 45°"
+    "{} is not determined: it cannot be separated from the distance; hold the board at three "
+    "or more different tilts of 20° to 45°"
 )
 
 
 def _without_outliers(
     size: tuple[int, int], points: FloatArray, boards: Sequence[Board]
 ) -> list[Board]:
-    """Refuse boards whose residuals are far above the others', the worst first."""
+    """Leave out boards whose residuals are far above the others', the worst first."""
     kept = list(boards)
     while sum(board.used for board in kept) > 3:
-        # With all terms, so that no board is refused for what the lens does.
+        # With all terms, so that no board is blamed for distortion.
         solved = _solve(size, points, kept, "k1 k2 p1 p2 k3")[0].boards
         apart = np.array([board.deviation if board.used else np.nan for board in solved])
         usual, worst = float(np.nanmedian(apart)), int(np.nanargmax(apart))
@@ -298,7 +298,7 @@ def _check_lens(lens: Lens, normals: FloatArray) -> None:
 
 
 def _coverage(size: tuple[int, int], outlines: Sequence[FloatArray]) -> float:
-    """Return the share of the frame inside quadrilaterals (4, 2)."""
+    """Return the share of the frame that quadrilaterals (4, 2) cover."""
     import cv2
 
     scale = 256.0 / max(size)
@@ -312,9 +312,15 @@ def _lens_notes(lens: Lens) -> tuple[str, ...]:
     relative, share = 100.0 * lens.sigma[0] / lens.matrix[0, 0], 100.0 * lens.coverage
     used = sum(board.used for board in lens.boards)
     notes = (
-        (relative > 1.0, f"the focal length is known to {relative:.1f} %; steeper tilts tell more"),
-        (share < 50.0, f"boards cover {share:.0f} % of the frame; beyond, distortion is guessed"),
-        (used < 6, f"{used} pictures were used; ten or more make a lens that can be trusted"),
+        (
+            relative > 1.0,
+            f"the focal length is known to {relative:.1f} %; tilt more",
+        ),
+        (
+            share < 50.0,
+            f"boards cover {share:.0f} % of the frame; beyond, distortion is a guess",
+        ),
+        (used < 6, f"{used} pictures were used; ten or more give a lens that can be trusted"),
     )
     return tuple(text for said, text in notes if said)
 
@@ -324,22 +330,22 @@ def _lens_notes(lens: Lens) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class CameraFit:
-    """A camera from points seen.
+    """A camera fitted to points.
 
     Attributes
     ----------
     camera, residuals
-        With its pose; seen minus predicted, px, (N, 2).
+        With its pose; observed minus predicted, px, (N, 2).
     names, covariance
-        Rows: :data:`POSE`, then :data:`INNER` if they were solved; (6, 6) or (10, 10). Turns
-        are about the camera's own axes, rad; the position is in ENU metres.
+        Rows :data:`POSE`, then :data:`INNER` if solved; (6, 6) or (10, 10). Turns are about
+        the camera's own axes, rad; the position is in ENU metres.
     plane_sigma
-        Predicted standard deviation, per coordinate, of where a pixel lies on the plane of
-        the points, between them, m: that of the camera alone, not of what is seen there.
+        Predicted standard deviation, per coordinate, of a pixel's place on the plane of the
+        points, between them, m; from the camera alone.
     other
-        A second pose that explains the points as well, if there is one.
+        A second pose that explains the points equally well, or None.
     notes
-        What the points do not determine and what contradicts them, in sentences.
+        What the points do not determine, and contradictions, in sentences.
     """
 
     camera: Camera
@@ -351,7 +357,7 @@ class CameraFit:
     notes: tuple[str, ...] = ()
 
     def sigma(self, name: str) -> float:
-        """Return the standard deviation of one row."""
+        """Return the standard deviation of a parameter."""
         k = self.names.index(name)
         return float(np.sqrt(self.covariance[k, k]))
 
@@ -363,30 +369,30 @@ def resection(
     sigma: npt.ArrayLike = 0.3,
     name: str = "camera",
 ) -> CameraFit:
-    """Return where a camera stands whose lens is known.
+    """Return the pose of a camera with a known lens.
 
     Both poses of a plane (Collins and Bartoli 2014, IPPE) and that of the general problem
-    (SQPnP) are refined by least squares. The covariance is that of the points' noise; the
-    lens counts as known.
+    (SQPnP) are refined by least squares. The covariance contains the noise of the points; the
+    lens counts as exact.
 
     Parameters
     ----------
     lens
-        Lens or camera; a camera's pose, if it has one, is not used.
+        Lens or camera; a camera's pose is not used.
     points
         ENU metres, (N, 3), four or more, not on one line.
     pixels
-        Where they are seen, (N, 2).
+        Of the points, (N, 2).
     sigma
-        Standard deviation of a coordinate of the pixels: one number, (N,), or covariances
-        (N, 2, 2) in px².
+        Standard deviation of a pixel coordinate: one number or (N,); or covariances
+        (N, 2, 2), px².
     name
         Of the camera, if a lens is given.
 
     Raises
     ------
     InputError
-        If the points are too few, on one line, or no pose explains them.
+        If the points are too few or on one line, or no pose explains them.
     """
     base = lens.camera(name) if isinstance(lens, Lens) else lens
     problem = _problem(*_observed(points, pixels, sigma), base, free=False)
@@ -400,21 +406,21 @@ def calibrate_marks(
     sigma: float | Sequence[npt.ArrayLike] = 0.3,
     name: str = "camera",
 ) -> CameraFit:
-    """Return a camera of which nothing is known but the points that it saw.
+    """Return a camera from points alone.
 
-    Solves pose, focal length (pixels are square), principal point and k1, the last three with
+    Solves for pose, focal length (square pixels), principal point and k1. The last three have
     priors: 3 widths within a factor of 4.5, the frame's centre ± 2 % of the width, 0 ± 0.1.
-    What the points do not determine keeps its prior.
+    Parameters that the points do not determine keep their priors.
 
     Parameters
     ----------
     size
         Width and height of the frames, px.
     points, pixels
-        As of :func:`resection`, for each frame of the camera, which stands still between
-        them; four or more points in all. It raises what that raises.
+        As of :func:`resection`, for each frame of a camera that does not move between them;
+        four or more points in all. Errors are those of :func:`resection`.
     sigma
-        As of :func:`resection`; a list has one entry for each frame.
+        As of :func:`resection`, or a list with one entry for each frame.
     name
         Of the camera.
     """
@@ -436,7 +442,7 @@ def calibrate_marks(
 
 
 def _pinhole(size: tuple[int, int], wide: float, name: str) -> Camera:
-    """Return a camera without distortion whose focal length is ``wide`` widths."""
+    """Return a camera without distortion with a focal length of ``wide`` frame widths."""
     f, (cx, cy) = wide * size[0], (0.5 * (size[0] - 1), 0.5 * (size[1] - 1))
     return Camera(name, size, np.array([[f, 0.0, cx], [0.0, f, cy], [0.0, 0.0, 1.0]]))
 
@@ -445,9 +451,9 @@ def _pinhole(size: tuple[int, int], wide: float, name: str) -> Camera:
 class _Problem:
     """Least squares of a pose and, if ``free``, of focal length, principal point and k1.
 
-    The unknowns are the rotation vector and the translation from points about ``origin`` to
-    the camera, then log focal length, principal point and k1. If ``free``, the translation is
-    in units of the focal length: what a frontal plane tells is their ratio.
+    The unknowns are the rotation vector and the translation from points relative to ``origin``
+    to the camera, then log focal length, principal point and k1. If ``free``, the translation
+    is in units of the focal length, because a frontal plane determines only their ratio.
     """
 
     origin: FloatArray
@@ -546,7 +552,7 @@ def _problem(
     where: FloatArray, seen: FloatArray, white: FloatArray, base: Camera, free: bool
 ) -> _Problem:
     if len(where) < 4:
-        raise InputError(f"{len(where)} points; four or more tell where a camera stands")
+        raise InputError(f"{len(where)} points; four or more are needed to locate a camera")
     origin = where.mean(axis=0)
     spread = np.linalg.svd(where - origin, compute_uv=False)
     if spread[1] <= 1e-3 * spread[0]:
@@ -555,7 +561,7 @@ def _problem(
 
 
 def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArray]]:
-    """Return rotation vectors and translations to start from."""
+    """Return initial rotation vectors and translations."""
     import cv2
 
     local = problem.local
@@ -579,7 +585,7 @@ def _starts(problem: _Problem, lens: Camera) -> list[tuple[FloatArray, FloatArra
 
 
 def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
-    """Refine all starts; return the best, and the next if it is hardly worse."""
+    """Refine all starts; return the best, with the next if it is hardly worse."""
     from scipy.optimize import least_squares
     from scipy.special import chdtri
 
@@ -599,22 +605,22 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
             solved.append((2.0 * float(found.cost), found.x))
     name = f"camera {problem.base.name}"
     if not solved:
-        raise InputError(f"{name}: no pose explains the points; are they named rightly?")
+        raise InputError(f"{name}: no pose explains the points; are their names right?")
     solved.sort(key=lambda pair: pair[0])
     chi2, x = solved[0]
     camera = problem.camera(x)
     slopes = problem.slopes(x)
     freedom = len(slopes) - len(x)
-    # Scaled only where chance does it in one case of a hundred: else it would add noise.
+    # Scale only if chance explains the residuals in less than 1 %; otherwise it would add noise.
     scale = chi2 / freedom if freedom and chi2 > chdtri(freedom, 0.01) else 1.0
     slopes[: 2 * len(problem.local)] /= np.sqrt(scale)
     rivals = [y for cost, y in solved[1:] if cost - chi2 < 9.0 * scale]
-    # The same pose from another start is no other pose.
+    # Ignore the same pose reached from another start.
     differ = [y for y in rivals if np.ptp(problem.turn(y) - problem.turn(x)) > 0.01]
     other = problem.camera(differ[0]) if differ else None
     size = np.linalg.norm(slopes, axis=0)
     if not (size.min() > 0.0 and np.linalg.cond(slopes / size) < 1e8):
-        raise InputError(f"{name}: the points do not determine where it stands; take more")
+        raise InputError(f"{name}: the points do not determine its position; take more")
     raw = np.linalg.inv((slopes / size).T @ (slopes / size)) / size / size[:, None]
     residuals = problem.pixels - problem.predict(x, problem.local)[0]
     if problem.free:
@@ -632,7 +638,7 @@ def _finish(problem: _Problem, starts: Sequence[FloatArray]) -> CameraFit:
 
 
 def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
-    """Return the derivative of turns about the camera's axes and position by the unknowns."""
+    """Return the derivative of the camera's turns and position by the unknowns."""
     k, shift = cross_matrix(x[:3]), problem.shift(x)
     angle = max(float(np.linalg.norm(x[:3])), 1e-4)
     # Left Jacobian of SO(3).
@@ -650,7 +656,7 @@ def _to_pose(problem: _Problem, x: FloatArray) -> FloatArray:
 
 
 def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
-    """Return the standard deviation of pixel to plane at the points and half-way between them."""
+    """Return the standard deviation from pixel to plane, at the points and half-way between."""
     axes = np.linalg.svd(problem.local)[2][:2]
     few = problem.local[:: len(problem.local) // 40 + 1]
     points = (0.5 * (few + few[:, None])).reshape(-1, 3)
@@ -662,19 +668,19 @@ def _plane_sigma(problem: _Problem, x: FloatArray, raw: FloatArray) -> float:
         ],
         axis=-1,
     ) / (2.0 * step)
-    # The pixel is held: the place on the plane moves by what the prediction does not.
+    # With the pixel fixed, the place on the plane moves against the prediction.
     moved = np.linalg.solve(across, problem.predict(x, points)[1])
     return float(np.sqrt(0.5 * np.einsum("nip,pq,niq->n", moved, raw, moved).mean()))
 
 
 def _notes(problem: _Problem, fit: CameraFit, scale: float) -> list[str]:
     notes = []
-    good = f"pixels on the plane of the points stay good to {1e3 * fit.plane_sigma:.1f} mm"
+    good = f"pixels on the plane of the points remain good to {1e3 * fit.plane_sigma:.1f} mm"
     if problem.free and fit.sigma("log_focal") > 0.05:
         away = np.linalg.norm(np.asarray(fit.camera.position) - problem.origin)
         have = f"{fit.camera.matrix[0, 0]:.0f} px at {away:.1f} m"
         unsure = f"uncertain by a factor of {np.exp(fit.sigma('log_focal')):.2f}"
-        notes.append(f"the points do not tell focal length from distance: {have}, {unsure}; {good}")
+        notes.append(f"focal length and distance are not separable: {have}, {unsure}; {good}")
     if problem.free:
         sigma = problem.prior[1]
         what = (
@@ -688,11 +694,11 @@ def _notes(problem: _Problem, fit: CameraFit, scale: float) -> list[str]:
         ]
     if fit.other is not None and fit.other.position is not None:
         place = ", ".join(f"{v:.1f}" for v in fit.other.position)
-        notes.append(f"a second pose explains the points as well, at ({place}) m; {good}")
+        notes.append(f"a second pose explains the points equally well, at ({place}) m; {good}")
     if scale > 1.0:
         size = np.linalg.norm(fit.residuals, axis=1)
         notes.append(
             f"the residuals, up to {size.max():.1f} px at point {int(np.argmax(size)) + 1}, are "
-            f"{np.sqrt(scale):.1f} times what was promised; the covariance is scaled to them"
+            f"{np.sqrt(scale):.1f} times the given sigma; the covariance is scaled to them"
         )
     return notes

@@ -1,16 +1,16 @@
-"""Motion between frames: did a beam move across the scene, where and how surely.
+"""Motion between frames: whether a beam moved across the scene, where, and how significantly.
 
-Two frames of a camera that stands still differ by more than a beam: noise, another exposure,
-a cloud, wind at the mast. Each is modelled and taken out before a difference counts:
+Two frames of a fixed camera differ by more than a beam: noise, exposure, clouds, wind at the mast.
+Each of these is modelled and removed before a difference counts:
 
 1. Frames are reduced to at most 400 × 300 px, which also averages noise.
 2. Gain (with a slope across the frame) and offset are fitted robustly to cell means.
 3. A shift of the camera is measured by least squares in 8 × 6 tiles (Lucas and Kanade 1981),
-   if it is large from a start by phase correlation. It is believed only if tiles all over the
-   frame agree: a beam alone in the dark must not pass for a shaken camera.
+   starting from phase correlation if it is large. It is accepted only if tiles all over the frame
+   agree: a beam alone in the dark must not pass for a shaken camera.
 4. The difference is examined at three scales. Its deviation is measured for each level of
-   brightness (photon noise) and for each unit of gradient (what a shift leaves at edges); both
-   are the lesser of both frames: a beam does not raise the noise at the place where it came to.
+   brightness (photon noise) and per gradient (residuals of a shift at edges). The lesser value of
+   the two frames counts, so that a beam does not raise the noise at its new place.
 5. The threshold follows from the number of independent places and the rate of false alarms.
 """
 
@@ -25,21 +25,21 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.imaging.frame import Frame, Pixels
 
-_WIDTH, _HEIGHT = 400, 300  # of what is examined
+_WIDTH, _HEIGHT = 400, 300  # of reduced frames
 _CELL = 8  # reduced pixels of a cell whose mean enters the fit of gain and offset
 _TILES, _SCALES, _LEVELS = (8, 6), 3, 8
-_SATURATED = 0.98  # of the full scale; above, a pixel knows no gain
-_PARTLY = 0.88  # of the full scale; above, a mean of pixels may hide saturated ones
-#: Of what a shift leaves at edges: medians that make a deviation; its bounds in reduced pixels,
-#: and its upper bound in pixels of the frame if no shift was believed.
+_SATURATED = 0.98  # of the full scale; above, a pixel does not show gain
+_PARTLY = 0.88  # of the full scale; above, a mean may contain saturated pixels
+#: Residuals of a shift at edges: medians per deviation; its bounds in reduced pixels; and its upper
+#: bound in pixels of the frame if no shift was accepted.
 _EDGE, _LEAST_EDGE, _MOST_EDGE, _UNSURE = 2.0, 0.02, 0.1, 0.75
-_APART = 4  # pixels between places whose difference is noise: more than smoothing joins
-#: On the threshold of known normal noise: its deviation is measured, and edges have longer tails.
+_APART = 4  # pixels between samples of noise; more than smoothing correlates
+#: Factor on the threshold of normal noise: its deviation is estimated, and edges have tails.
 _MARGIN = 1.2
-#: Of white noise smoothed as for the shift: mean square of a gradient of the mean of two frames
-#: over that of their difference; and pixels that make one independent value.
+#: For white noise smoothed as for the shift: mean squared gradient of the mean of two frames over
+#: that of their difference; and pixels per independent value.
 _NOISE_GRADIENT, _JOINED = 0.064, 4.3
-_NORMAL = 1.4826  # deviation of a normal distribution over the median of its absolute values
+_NORMAL = 1.4826  # standard deviation over the median absolute value of a normal distribution
 _Image = npt.NDArray[Any]  # (H, W), float32 unless said
 _Pair = tuple[float, float]  # right and down, pixels
 
@@ -51,13 +51,13 @@ class Region:
     Attributes
     ----------
     appeared
-        True if it became lighter, False if darker.
+        Whether it became brighter rather than darker.
     area_px
         Pixels of the frame.
     centroid_px
         Of the difference, pixels right and down.
     significance
-        Greatest difference in it, in deviations of the noise.
+        Greatest difference, in deviations of the noise.
     """
 
     appeared: bool
@@ -68,27 +68,27 @@ class Region:
 
 @dataclass(frozen=True)
 class Motion:
-    """What changed between two frames.
+    """The change between two frames.
 
     Attributes
     ----------
     moved
         Whether anything changed significantly.
     significance, threshold
-        The greatest difference anywhere, and what it had to exceed, in deviations of the noise.
+        Greatest difference anywhere, and the value it must exceed, in deviations of the noise.
     area_px
-        Of all regions together, pixels of the frame.
+        Of all regions, pixels of the frame.
     appeared_px, vanished_px
-        Centroids of the light that came and of that which went, pixels right and down, or NaN.
+        Centroids of new and of lost light, pixels right and down, or NaN.
     shift_px
-        By how much the scene stands further right and down in the second frame; 0 if
-        there was no shift that could be believed.
+        Shift of the scene to the right and down in the second frame; 0 if no shift was
+        accepted.
     brightness_ratio
-        Of what did not move, second to first frame, in the middle of them.
+        Of the static scene, second to first frame, in the middle of the frame.
     regions
         The most significant first.
     problem
-        Why the frames cannot be compared, and nothing is said to have moved; empty if they can.
+        Why the frames cannot be compared, and ``moved`` is false; empty if they can.
     """
 
     moved: bool = False
@@ -105,17 +105,17 @@ class Motion:
 
 @dataclass(frozen=True)
 class MotionSettings:
-    """What counts as motion.
+    """Thresholds of motion.
 
     Attributes
     ----------
     false_alarms
-        Accepted rate of pairs of still frames that are said to have moved.
+        Accepted rate of still pairs of frames reported as moved.
     min_area_px
-        Regions below this area are left out, pixels of the frame.
+        Smallest region that counts, pixels of the frame.
     max_shift_px, max_ratio
         Greatest shift of the camera, pixels of the frame, and greatest change of brightness,
-        up or down, that are corrected; above, the frames cannot be compared.
+        up or down, that are corrected; beyond, the frames cannot be compared.
     """
 
     false_alarms: float = 1e-3
@@ -138,7 +138,7 @@ DEFAULT = MotionSettings()
 
 @dataclass(frozen=True)
 class _View:
-    """A frame as it is examined: grey, of full scale 1, reduced by ``factor``."""
+    """A frame prepared for comparison: grey, of full scale 1, reduced by ``factor``."""
 
     image: _Image
     cells: _Image  # float64, means of cells of it
@@ -153,33 +153,33 @@ def detect_motion(
     mask: npt.ArrayLike | None = None,
     settings: MotionSettings = DEFAULT,
 ) -> Motion:
-    """Return what moved between two frames of a camera that stands still.
+    """Return what moved between two frames of a fixed camera.
 
     Parameters
     ----------
     before, after
         Frames, or pixels (H, W) or (H, W, 3) of uint8 or uint16, of the same size.
     mask
-        Where motion counts, (H, W), true or not 0; everywhere if None. The rest still
-        helps to find shift and brightness.
+        Where motion counts, (H, W), true or not 0; None: everywhere. The rest still serves to
+        find shift and brightness.
     settings
-        What counts as motion.
+        Thresholds.
 
     Raises
     ------
     InputError
-        If the sizes differ, or the mask is of another size or covers everything.
+        If the sizes differ, or the mask has another size or covers everything.
     """
     one, two = _view(before), _view(after)
     return _compare(one, two, _mask(mask, one), settings)
 
 
 def find_shift(before: Frame | Pixels, after: Frame | Pixels) -> _Pair | None:
-    """Return by how many pixels the scene stands further right and down in ``after``.
+    """Return the shift of the scene to the right and down in ``after``, pixels.
 
-    None if no shift explains the frames in tiles all over them: without texture, or of different
-    scenes. Below 1 px it is good to about 0.05 px where there is texture. Raises InputError if
-    the sizes differ.
+    None if no shift explains tiles all over the frames: without texture, or for different scenes.
+    Below 1 px it is accurate to about 0.05 px where there is texture. Raises InputError if the
+    sizes differ.
     """
     one, two = _view(before), _view(after)
     found = _register(_expected(one, two)[0], two.image)
@@ -199,7 +199,7 @@ def _view(given: Frame | Pixels) -> _View:
     factor = max(1, math.ceil(width / _WIDTH), math.ceil(height / _HEIGHT))
     grey = frame.grey
     if factor > 1:
-        # Whole blocks alone: the shares of a fractional reduction vary over the frame.
+        # Whole blocks only: the weights of a fractional reduction vary over the frame.
         size = (width // factor, height // factor)
         grey = grey[: size[1] * factor, : size[0] * factor]
         grey = cv2.resize(grey.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -236,8 +236,8 @@ def _cells(image: _Image) -> _Image:
 def _expected(one: _View, two: _View) -> tuple[_Image, float]:
     """Return the first frame in the light of the second, and the ratio of brightness.
 
-    Gain, its slopes across the frame and the offset are fitted with Tukey's weights; without
-    contrast offset and gain cannot be told apart, and there is no offset.
+    Gain, its slopes across the frame and the offset are fitted with Tukey's weights. Without
+    contrast, offset and gain cannot be separated, and the offset is left out.
     """
     if one.size != two.size:
         raise InputError(
@@ -265,7 +265,7 @@ def _expected(one: _View, two: _View) -> tuple[_Image, float]:
 
 
 def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Image, float]:
-    """Return the parameters of a robust fit, and the deviation of what it leaves."""
+    """Return the parameters of a robust fit, and the deviation of its residuals."""
     p = np.zeros(design.shape[1])
     p[0] = start
     scale = step
@@ -283,7 +283,7 @@ def _fitted(design: _Image, b: _Image, start: float, step: float) -> tuple[_Imag
 
 
 def _register(a: _Image, b: _Image) -> _Pair | None:
-    """Return the shift of b against a, pixels; None if none can be believed."""
+    """Return the shift of b against a, pixels; None if no shift is accepted."""
     import cv2
 
     if min(a.shape) < 32:
@@ -291,7 +291,7 @@ def _register(a: _Image, b: _Image) -> _Pair | None:
     near = _refine(a, b, (0.0, 0.0))
     if near is not None and math.hypot(*near[1]) < 0.5:
         return near[1]
-    # Half the size is four times as quick, and as good as the least squares need it.
+    # Half the size is four times as fast, and accurate enough as a start.
     size = (a.shape[1] // 2, a.shape[0] // 2)
     halves = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (a, b)]
     (x, y), _ = cv2.phaseCorrelate(halves[0], halves[1], cv2.createHanningWindow(size, cv2.CV_32F))
@@ -304,7 +304,7 @@ def _refine(a: _Image, b: _Image, start: _Pair) -> tuple[int, _Pair] | None:
     """Return the number of tiles that agree and their shift."""
     import cv2
 
-    # A central difference is a gradient only of what is smooth.
+    # Central differences are gradients only of a smooth image.
     a, b = (cv2.GaussianBlur(i, (5, 5), 1.0) for i in (a, b))
     x, y = start
     agreed = 0
@@ -325,12 +325,12 @@ def _moved(image: _Image, x: float, y: float) -> _Image:
 
     if x == 0.0 and y == 0.0:
         return image
-    # The cubic kernel of Keys (1981, a = -0.5) at the exact place: a warp by OpenCV would round
-    # that to 1/32 px, which at an edge of 200 digits leaves 3 of them.
+    # The cubic kernel of Keys (1981, a = -0.5) at the exact place. OpenCV's warp would round the
+    # place to 1/32 px, which errs by 3 digits at an edge of 200 digits.
     whole = [math.floor(x), math.floor(y)]
     kernels = []
     for part in (x - whole[0], y - whole[1]):
-        d = np.abs(part + np.arange(-2.0, 2.0))  # from the place to the four pixels about it
+        d = np.abs(part + np.arange(-2.0, 2.0))  # from the place to its four neighbours
         near = 1.5 * d**3 - 2.5 * d**2 + 1.0
         kernels.append(np.where(d <= 1.0, near, -0.5 * d**3 + 2.5 * d**2 - 4.0 * d + 2.0))
     edge = cv2.BORDER_REPLICATE
@@ -346,7 +346,7 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
     """Return how many tiles agree on a small shift, and the shift, pixels."""
     import cv2
 
-    # The gradient of the mean of both: its noise does not depend on that of the difference.
+    # The noise of the gradient of the mean is independent of that of the difference.
     both, d = cv2.addWeighted(a, 0.5, b, 0.5, 0.0), a - b
     gx = cv2.Sobel(both, cv2.CV_32F, 1, 0, scale=0.125)
     gy = cv2.Sobel(both, cv2.CV_32F, 0, 1, scale=0.125)
@@ -354,14 +354,14 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
         cv2.resize(p, _TILES, interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
         for p in (gx * gx, gx * gy, gy * gy, gx * d, gy * d, d * d)
     )
-    # Noise has gradients too: those of the quietest tile are nobody's texture.
+    # Noise has gradients too; those of the quietest tile are not texture.
     quiet = min(float(np.partition(dd, 4)[4]) * _NOISE_GRADIENT, float(min(xx.min(), yy.min())))
     xx, yy = xx - quiet, yy - quiet
     trace, determinant = xx + yy, xx * yy - xy * xy
     weaker = 0.5 * trace - np.sqrt(np.maximum(0.25 * trace * trace - determinant, 0.0))
     safe = np.where(determinant > 0.0, determinant, 1.0)
     dx, dy = (yy * xd - xy * yd) / safe, (xx * yd - xy * xd) / safe
-    # Deviation of a tile's shift across its weaker direction, from what the shift leaves.
+    # Deviation of a tile's shift in its weaker direction, from the residuals.
     pixels = a.size / len(xx) / _JOINED
     left = np.maximum(dd - xd * dx - yd * dy, 1e-12)
     deviation = np.sqrt(left / np.maximum(pixels * weaker, 1e-30))
@@ -374,7 +374,7 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
     spread = max(np.ptp(columns) / _TILES[0], np.ptp(rows) / _TILES[1]) if len(rows) else 0.0
     if len(rows) < max(4.0, 0.5 * good.sum()) or spread < 0.4:
         return None
-    # All tiles that agree, as one: also those sharp in one direction only.
+    # One solution of all tiles that agree, including those sharp in only one direction.
     s = [v[near].sum() for v in (xx, xy, yy, xd, yd)]
     whole = s[0] * s[2] - s[1] * s[1]
     x, y = (s[2] * s[3] - s[1] * s[4]) / whole, (s[0] * s[4] - s[1] * s[3]) / whole
@@ -410,7 +410,7 @@ def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettin
     regions.sort(key=lambda pair: -pair[0].significance)
     area = sum(region.area_px for region, _ in regions)
     if area > 0.5 * places * one.factor**2:
-        problem = "more than half of the frame changed: another scene, or the light of it"
+        problem = "more than half of the frame changed: another scene, or another light"
     return Motion(
         moved=bool(regions) and not problem,
         significance=float(max(high.max(), -low.min())),
@@ -428,14 +428,14 @@ def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettin
 def _exposed(view: _View, which: str) -> str:
     most, full = float(view.cells.max()), float((view.cells >= _SATURATED).mean())
     if most < 4.0 * view.step:
-        return f"the {which} frame is dark: no more than {most / view.step:.1f} digits"
+        return f"the {which} frame is dark: at most {most / view.step:.1f} digits"
     if full > 0.5:
-        return f"the {which} frame is overexposed: {100 * full:.0f} % of it are saturated"
+        return f"the {which} frame is overexposed: {100 * full:.0f} % of it is saturated"
     return ""
 
 
 def _difference(one: _View, two: _View, wanted: _Image, shift: _Pair, ratio: float) -> list[_Image]:
-    """Return the difference, the lesser brightness and gradient, and 1 where they are known."""
+    """Return the difference, the lesser brightness and gradient, and 1 where they are valid."""
     import cv2
 
     bright = np.maximum(one.image, wanted)
@@ -443,11 +443,11 @@ def _difference(one: _View, two: _View, wanted: _Image, shift: _Pair, ratio: flo
         wanted, bright = _moved(wanted, *shift), _moved(bright, *shift)
     wanted = np.minimum(wanted, np.float32(1.0))
     d = two.image - wanted
-    # What is saturated in part says only that it is bright.
+    # Partly saturated places show only that they are bright.
     level = np.minimum(wanted, two.image)
     blind = np.maximum(bright, two.image) > _PARTLY
     blind &= level > (_PARTLY - 0.1) * min(1.0, ratio)
-    x, y = (math.ceil(abs(s)) + 1 for s in shift)  # at its edges a shifted frame knows nothing
+    x, y = (math.ceil(abs(s)) + 1 for s in shift)  # a shifted frame is unknown at its edges
     blind[:y], blind[-y:], blind[:, :x], blind[:, -x:] = True, True, True, True
     d[blind] = 0.0
     slopes = [
@@ -459,7 +459,7 @@ def _difference(one: _View, two: _View, wanted: _Image, shift: _Pair, ratio: flo
 
 
 def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
-    """Return the deviation where nothing moved: of places close by, so that no beam is noise."""
+    """Return the deviation of noise, from differences of nearby places, free of beams."""
     import cv2
 
     d, level, gradient, _ = parts
@@ -473,7 +473,7 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
     samples[3] = samples[0] - beside[0]
     rest, light, slope, apart = (np.abs(sample[known]) for sample in samples)
     order = np.argsort(light)[: len(light) // _LEVELS * _LEVELS]
-    # In each bin of brightness the half with the lesser gradients shows the noise.
+    # In each bin of brightness, the half with lesser gradients shows the noise.
     bins = order.reshape(_LEVELS, -1)
     flat = np.argpartition(slope[bins], bins.shape[1] // 2, axis=1)[:, : bins.shape[1] // 2]
     flat = np.take_along_axis(bins, flat, axis=1)
@@ -481,10 +481,10 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
     places = _median(light[flat])
     digits = np.arange(256) / 255.0
     table = np.interp(digits, places, noise)
-    # Above the brightest bin photon noise grows on, with the root of the brightness.
+    # Above the brightest bin, photon noise grows with the root of the brightness.
     table *= np.sqrt(np.maximum(digits / max(float(places[-1]), 1e-3), 1.0))
     quiet = cv2.LUT(cv2.convertScaleAbs(level, alpha=255.0), table.astype(np.float32))
-    # What a shift leaves at edges, per gradient, where the gradient is greatest.
+    # Residuals of a shift per gradient, where the gradient is greatest.
     sharp = np.argpartition(slope, -(len(slope) // 32))[-(len(slope) // 32) :]
     left = np.square(rest[sharp]) - np.square(quiet[every].ravel()[known][sharp])
     ratio = np.sqrt(np.maximum(left, 0.0)) / np.maximum(slope[sharp], 1e-9)
@@ -493,7 +493,7 @@ def _deviation(parts: list[_Image], step: float, edge: float) -> _Image:
 
 
 def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the medians of rows; as np.median, without its checks, which take longer."""
+    """Return the medians of rows; np.median spends more time on checks."""
     half = values.shape[-1] // 2
     return np.asarray(np.partition(values, half, axis=-1)[..., half])
 
@@ -501,7 +501,7 @@ def _median(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _significance(
     parts: list[_Image], counts: _Image, step: float, edge: float
 ) -> tuple[_Image, _Image, _Image]:
-    """Return the greatest and least significance of all scales, and the difference, halved."""
+    """Return greatest and least significance over all scales, and the difference, halved."""
     import cv2
 
     area = cv2.INTER_AREA
@@ -528,10 +528,10 @@ def _significance(
 
 
 def _threshold(places: float, settings: MotionSettings) -> float:
-    """Return the significance that noise exceeds at the accepted rate, of either sign."""
+    """Return the significance, of either sign, that noise exceeds at the accepted rate."""
     from scipy.special import ndtri
 
-    # The smoothing of a scale joins about four of its pixels to one independent place.
+    # Smoothing leaves about one independent place in four pixels of a scale.
     independent = sum(max(1.0, places / 4.0**scale / 4.0) for scale in range(_SCALES))
     return _MARGIN * float(-ndtri(settings.false_alarms / (2.0 * independent)))
 
@@ -539,7 +539,7 @@ def _threshold(places: float, settings: MotionSettings) -> float:
 def _regions(
     z: _Image, weight: _Image, threshold: float, appeared: bool, unit: int, least: float
 ) -> list[tuple[Region, float]]:
-    """Return regions above 0.6 thresholds that exceed the threshold somewhere, with weights."""
+    """Return regions above 0.6 of the threshold that exceed it somewhere, with their weights."""
     import cv2
 
     grown = (z > 0.6 * threshold).astype(np.uint8)
@@ -573,7 +573,7 @@ def _centroid(found: list[tuple[Region, float]], appeared: bool) -> _Pair:
 
 
 class MotionState(Enum):
-    """What a :class:`MotionDetector` says of a frame."""
+    """The verdict of a :class:`MotionDetector` on a frame."""
 
     WARMING_UP = "warming up"
     STILL = "still"
@@ -582,20 +582,20 @@ class MotionState(Enum):
 
 
 class MotionDetector:
-    """Compares each frame of a stream with what was there before.
+    """Compares each frame of a stream with a background of earlier frames.
 
-    The background is the mean of the frames with forgetting. Light that came and stays counts
-    as moving until it is forgotten, after about ``memory · ln(significance / threshold)`` frames.
-    Frames that cannot be compared are not learnt; ``memory`` of them in a row start it anew.
+    The background is a running mean. Light that appears and stays counts as moving until it is
+    part of the background, after about ``memory · ln(significance / threshold)`` frames. Frames
+    that cannot be compared are not learnt; after ``memory`` of them in a row it starts anew.
 
     Parameters
     ----------
     mask, settings
         As for :func:`detect_motion`.
     memory
-        Frames in which the weight of what was seen falls to 1/e.
+        Frames after which the weight of a frame falls to 1/e.
     warm_up
-        Frames before it says anything.
+        Frames before the first verdict.
     """
 
     def __init__(
@@ -613,9 +613,9 @@ class MotionDetector:
         self._learnt = self._refused = 0
 
     def update(self, frame: Frame | Pixels) -> tuple[MotionState, Motion]:
-        """Take the next frame; return what it shows against the background.
+        """Compare the next frame with the background.
 
-        Raises InputError if the mask does not fit, or the frame has another size than before.
+        Raises InputError if the mask does not fit, or if the frame size changed.
         """
         view = _view(frame)
         mask = _mask(self._mask, view)
@@ -635,7 +635,7 @@ class MotionDetector:
         return MotionState.MOVING if motion.moved else MotionState.STILL, motion
 
     def _learn(self, view: _View, motion: Motion) -> None:
-        """Bring the background to the light of the frame, then the frame into it."""
+        """Adjust the background to the frame's light, then add the frame."""
         assert self._background is not None
         old, _ = _expected(self._background, view)
         x, y = (-s / view.factor for s in motion.shift_px)

@@ -1,1 +1,32 @@
-"""Beams on a target face: background, spots and their centroids, and whether to believe them."""
+"""Spots on a face: the background without beams, the spots above it, and reasons against them.
+
+- `background`: what a target looks like without beams, from one frame, from an empty frame or
+  from a learnt model.
+- `spot`: centroid, covariance and shape of each spot.
+- `quality`: named reasons against a spot, with measured values and limits.
+"""
+
+from heliotrope.imaging.spots.background import (
+    Background,
+    EmptyTarget,
+    from_difference,
+    from_frame,
+    from_model,
+)
+from heliotrope.imaging.spots.quality import REASONS, Expectation, Limits, Reason, judge
+from heliotrope.imaging.spots.spot import Spot, find_spots
+
+__all__ = [
+    "REASONS",
+    "Background",
+    "EmptyTarget",
+    "Expectation",
+    "Limits",
+    "Reason",
+    "Spot",
+    "find_spots",
+    "from_difference",
+    "from_frame",
+    "from_model",
+    "judge",
+]

@@ -1,1 +1,37 @@
-"""Synthetic photographs with exact truth."""
+"""Synthetic frames with exact truth, for tests, figures and simulated cameras.
+
+`scenes` describes target, light, paint, lens and sensor; `rendering` makes a frame of a scene.
+Nothing that reads real photographs imports this room. Begin with `example_target`,
+`example_camera`, `Scene` and `render`.
+"""
+
+from heliotrope.imaging.synthetic.rendering import BeamTruth, MarkTruth, Rendered, render
+from heliotrope.imaging.synthetic.scenes import (
+    Lens,
+    Paint,
+    Scene,
+    Sensor,
+    Shadow,
+    Surroundings,
+    Thrown,
+    example_camera,
+    example_target,
+    exposed,
+)
+
+__all__ = [
+    "BeamTruth",
+    "Lens",
+    "MarkTruth",
+    "Paint",
+    "Rendered",
+    "Scene",
+    "Sensor",
+    "Shadow",
+    "Surroundings",
+    "Thrown",
+    "example_camera",
+    "example_target",
+    "exposed",
+    "render",
+]

@@ -1,1 +1,49 @@
-"""Targets in photographs: marks found, views fitted, faces rectified, known points taught."""
+"""Find targets in frames by their marks, and teach a camera its targets.
+
+- `marks` and `detection`: drawings of marks, and candidates for them in a frame.
+- `constellation` and `refinement`: which candidate is which mark, and its exact place.
+- `finding`: targets in a frame, or why they were not found. `view` maps a target's plane to a
+  frame, `rectify` shows it from the front.
+- `teaching` and `click_page`: marks and camera from points that a person gives.
+
+Begin with `find_targets`.
+"""
+
+from heliotrope.imaging.targets.finding import FoundMark, FoundTarget, find_targets
+from heliotrope.imaging.targets.marks import polygons
+from heliotrope.imaging.targets.rectify import Rectified, from_crop, rectify
+from heliotrope.imaging.targets.teaching import (
+    Sight,
+    Taught,
+    TaughtPoint,
+    Wish,
+    known_points,
+    read_pictures,
+    sights,
+    teach,
+    write_taught,
+)
+from heliotrope.imaging.targets.view import Face, View, faces, fit_view
+
+__all__ = [
+    "Face",
+    "FoundMark",
+    "FoundTarget",
+    "Rectified",
+    "Sight",
+    "Taught",
+    "TaughtPoint",
+    "View",
+    "Wish",
+    "faces",
+    "find_targets",
+    "fit_view",
+    "from_crop",
+    "known_points",
+    "polygons",
+    "read_pictures",
+    "rectify",
+    "sights",
+    "teach",
+    "write_taught",
+]
