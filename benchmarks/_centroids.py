@@ -1,6 +1,6 @@
-"""Simple ways to find a beam's centroid, to compare with.
+"""Simple centroids for comparison.
 
-Neither gives a covariance or says that it is wrong; :mod:`heliotrope.imaging.spots.spot` does.
+Neither gives a covariance or reports a failure; :mod:`heliotrope.imaging.spots.spot` does.
 """
 
 import numpy as np
@@ -15,8 +15,8 @@ def threshold_centroid(
 ) -> FloatArray | None:
     r"""Return the intensity-weighted centroid between two thresholds, m in the face's plane, (2,).
 
-    After Malan, §5.6, (5.2)-(5.4), as understood here; the thesis's text was not at hand and
-    the constants are ours. The empty target is subtracted, d = v - b, and
+    After Malan, §5.6, (5.2)-(5.4), as understood here; the thesis's text was not available,
+    and the constants are ours. The empty target is subtracted, d = v - b, and
 
     .. math:: w = d \text{ where } t_{low} < d \text{ and } v < t_{high}, \text{ else } 0,
               \qquad t_{low} = \bar d + low (d_{max} - \bar d)
@@ -28,11 +28,11 @@ def threshold_centroid(
     Parameters
     ----------
     picture, background
-        A face and what it would be without beams.
+        A face, and the same without beams.
     low
         Lower threshold between the mean and the greatest difference.
     high
-        Pixels from this part of the full scale on are clipped and left out.
+        Pixels above this share of the full scale count as clipped and are left out.
 
     Returns
     -------
@@ -46,7 +46,7 @@ def threshold_centroid(
 
 
 def moments_centroid(picture: Rectified) -> FloatArray | None:
-    """Return the centre of what Otsu's threshold calls bright, m in the face's plane, (2,).
+    """Return the centre of the pixels above Otsu's threshold, m in the face's plane, (2,).
 
     Plain OpenCV: ``threshold`` with ``THRESH_OTSU``, then ``moments`` of the binary picture.
 

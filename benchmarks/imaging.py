@@ -1,8 +1,8 @@
-"""One photograph to a sighting beside decoding it, Malan's way and OpenCV's moments.
+"""From a photograph to a sighting, compared with decoding, Malan's thresholds, OpenCV's moments.
 
-A rendered frame of 1600 × 1200 pixels in colour, as a PNG, and, where they are at hand
-(HELIOTROPE_DATA), a real one of Jülich. All contenders are given the decoded frame; Malan's
-thresholds and the moments are also given where the target lies, which Heliotrope finds.
+The photographs are a rendered colour frame of 1600 × 1200 pixels as a PNG and, if available
+(HELIOTROPE_DATA), a real one of Jülich. All contenders get the decoded frame; Malan's thresholds
+and the moments also get the place of the target, which Heliotrope finds itself.
 """
 
 import os
@@ -34,7 +34,7 @@ from heliotrope.imaging.targets.rectify import rectify
 from heliotrope.imaging.targets.view import View
 from heliotrope.optics.mirror_image import gaussian_beam
 
-#: One photograph to a sighting may take so many times its decoding.
+#: Greatest time from a photograph to a sighting, in times of its decoding.
 BUDGET = 1.5
 #: The design's photograph.
 SIZE = (1600, 1200)
@@ -96,7 +96,7 @@ def _contenders(path: Path, targets: tuple[Target, ...]) -> dict[str, Call]:
 
 
 def _rate(path: Path, targets: tuple[Target, ...], processes: int, count: int) -> float:
-    """Photographs a second with so many processes, their start not counted."""
+    """Return photographs per second with a number of processes, without their start."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         warm = [pool.submit(_to_sighting, path, targets) for _ in range(4 * processes)]
         places = [future.result() for future in warm]

@@ -1,4 +1,4 @@
-"""How well spots are found on the real photographs of Jülich: figures and contact sheets.
+"""Accuracy of spots on real photographs of Jülich: figures and contact sheets.
 
 python scripts/spot_figures.py DATA [OUT]
 
@@ -112,16 +112,16 @@ def compose(
 
 @dataclass(frozen=True)
 class Compared:
-    """A picture beside its references.
+    """A picture and its references.
 
     Attributes
     ----------
     name
         Of the picture.
     photograph
-        What was seen.
+        As read.
     target
-        That the beam was sent to.
+        Target that the beam was sent to.
     apart
         Distances from the published centroids by extractor, m.
     references

@@ -279,7 +279,7 @@ def _reflected(**changes: object) -> Beam:
         (lambda: _reflected(elements=0), "0 elements"),
         (lambda: _reflected(facets=(0, 2)), "0 × 2 facets"),
         (lambda: _reflected(step=1e-4), "take a larger step"),
-        (lambda: _reflected(normal=-SUN), "is not met"),
+        (lambda: _reflected(normal=-SUN), "misses target"),
         (lambda: _reflected(R_enu_mirror=np.ones((3, 3))), "must be a rotation"),
         (lambda: _reflected(aim=np.zeros((2, 3))), r"aim \(2, 3\)"),
     ],

@@ -1,4 +1,4 @@
-"""Beams on a target's plane: the flux that a heliostat throws, with its exact centroid."""
+"""The flux of a heliostat's beam on a target's plane, with its exact centroid."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,13 +21,13 @@ from heliotrope.geometry import (
 from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.optics.coverage import coverage
 
-#: Where Buie's aureole ends, rad.
+#: Outer radius of Buie's aureole, rad.
 AUREOLE_RADIUS = 43.6e-3
 SUN_SHAPES = ("pillbox", "limb", "buie")
 
-#: A Gaussian is drawn to this many σ: beyond lie 4e-6 of a two-dimensional one.
+#: A Gaussian is drawn to this many σ; 4e-6 of a two-dimensional one lies beyond.
 _REACH = 5.0
-#: Most samples of a grid along a side.
+#: Greatest number of samples along a side of a grid.
 _LARGEST = 4096
 
 
@@ -58,7 +58,7 @@ class Beam:
         if not (np.isfinite(flux).all() and flux.min() >= 0.0):
             raise InputError("beam: flux must be finite and nowhere below 0 W/m²")
         if flux.max() <= 0.0:
-            raise InputError("beam: flux is 0 W/m² everywhere; a beam without light has no place")
+            raise InputError("beam: flux is 0 W/m² everywhere; give a beam with light")
         _above_zero("beam: step", self.step, "m")
         if origin.shape != (2,) or not np.isfinite(origin).all():
             raise InputError(f"beam: origin {origin} must be two finite numbers, m")
@@ -73,7 +73,7 @@ class Beam:
         centre: npt.ArrayLike = (0.0, 0.0),
         power: float | None = None,
     ) -> "Beam":
-        """Return the beam that a picture shows, from the target's front and squarely.
+        """Return the beam in a picture taken from the target's front, at a right angle.
 
         Parameters
         ----------
@@ -82,9 +82,9 @@ class Beam:
         metres_per_pixel
             Size of a pixel on the target.
         centre
-            Where the middle of the picture lies, metres right of and above the target's centre.
+            Middle of the picture, metres right of and above the target's centre.
         power
-            W to scale it to; None takes the picture as W/m².
+            W, to which it is scaled; None: the picture is in W/m².
         """
         flux = as_float(image)
         if flux.ndim != 2:
@@ -105,12 +105,12 @@ class Beam:
 
     @cached_property
     def centroid(self) -> FloatArray:
-        """Centre of the energy, wherever it falls on the plane, m, (2,)."""
+        """Centre of the energy on the plane, also beyond the target, m, (2,)."""
         return _centroid(self.flux, self.origin, self.step)
 
     @cached_property
     def second_moments(self) -> FloatArray:
-        """Covariance of the energy's place, m², (2, 2), of the bilinear surface."""
+        """Second moments of the bilinear surface about its centroid, m², (2, 2)."""
         y, x = (np.arange(n) * self.step for n in self.flux.shape)
         rows, columns = self.flux.sum(axis=1), self.flux.sum(axis=0)
         total = rows.sum()
@@ -122,7 +122,7 @@ class Beam:
 
     @property
     def corners(self) -> FloatArray:
-        """Where its light ends: the corners of its grid with one step around it, m, (4, 2)."""
+        """Corners of its grid with a margin of one step, where its light ends, m, (4, 2)."""
         rows, columns = self.flux.shape
         ends = np.array([(-1, rows), (columns, rows), (columns, -1), (-1, -1)], dtype=np.float64)
         return self.origin + ends * self.step
@@ -139,11 +139,11 @@ class Beam:
         )
 
     def shifted(self, by: npt.ArrayLike) -> "Beam":
-        """Return the beam moved as a whole by metres right and up (2,)."""
+        """Return the beam moved by metres right and up (2,)."""
         return replace(self, origin=self.origin + as_float(by))
 
     def coarser(self, factor: int) -> "Beam":
-        """Return the beam with ``factor`` samples each way made one: power and centroid stay."""
+        """Return the beam with ``factor`` samples each way merged; power and centroid stay."""
         if factor < 2:
             return self
         rows, columns = (-(-n // factor) for n in self.flux.shape)
@@ -160,7 +160,7 @@ class Beam:
     def swept(self, motion: npt.ArrayLike) -> "Beam":
         """Return the mean over an exposure in which the beam moves by metres right and up (2,).
 
-        It moves evenly, and is where it was in the middle of the exposure: the centroid stays.
+        It moves evenly about its place in the middle of the exposure: the centroid stays.
         """
         from scipy.signal import fftconvolve
 
@@ -179,7 +179,7 @@ class Beam:
     def on_target(self, target: Target) -> tuple[float, FloatArray]:
         """Return the share of the energy that falls on a target, and its centroid, m, (2,).
 
-        The centroid is NaN if none does. Of samples at the border the part inside counts.
+        The centroid is NaN if there is none. Samples at the border count in part.
         """
         inside = coverage(
             [(target.plane_coordinates(target.corners) - self.origin) / self.step],
@@ -200,7 +200,7 @@ def gaussian_beam(
     power: float = 1.0,
     step: float | None = None,
 ) -> Beam:
-    """Return an elliptical Gaussian beam, drawn to 5 σ; its centroid is ``centre`` exactly.
+    """Return an elliptical Gaussian beam, drawn to 5 σ; its centroid is exactly ``centre``.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def flat_top_beam(
     *,
     round_: bool = False,
 ) -> Beam:
-    """Return an even beam with a sharp border; its centroid is ``centre`` exactly.
+    """Return a uniform beam with a sharp border; its centroid is exactly ``centre``.
 
     Parameters
     ----------
@@ -249,13 +249,13 @@ def flat_top_beam(
     width, height
         Sides, or diameters, m; a square or a circle if only one is given.
     angle
-        Turned by this, counterclockwise as seen from the front, rad.
+        Turn, counterclockwise as seen from the front, rad.
     power
         W.
     step
         Of the grid, m; default a sixtieth of the smaller side. The border is one step wide.
     round_
-        An ellipse instead of a rectangle.
+        Ellipse instead of rectangle.
     """
     tall = width if height is None else height
     _above_zero("flat-top beam: width", width, "m")
@@ -297,31 +297,31 @@ def reflected_beam(
     step: float = 0.02,
     elements: int = 24,
 ) -> Beam:
-    """Return the beam that one heliostat throws on a target, by cone optics.
+    """Return the beam of one heliostat on a target, by cone optics.
 
     Parameters
     ----------
     target
-        Whose plane it falls on; light beyond the border is kept.
+        The beam falls on its plane; light beyond the border is kept.
     mirror_center
         ENU metres, (3,).
     sun
         Unit vector to the sun, ENU, (3,).
     width, height
-        Of the mirror, m; not used with facets that are given.
+        Of the mirror, m; ignored if facets are given.
     aim
-        ENU metres, (3,), default the target's centre; sets the normal by the bisector law.
+        ENU metres, (3,); default: the target's centre. Sets the normal by the bisector law.
     normal
         The mirror's unit normal, ENU, (3,), instead of an aim.
     R_enu_mirror
-        Columns are the mirror's x (right), y (up) and z (normal), (3, 3), instead of both;
-        otherwise x is horizontal.
+        Instead of both: columns x (right), y (up) and z (normal) of the mirror, (3, 3).
+        Without it, x is horizontal.
     facets
-        Columns and rows of equal facets without gaps, or the facets of one heliostat, whose
-        tilts are then taken as they are.
+        Columns and rows of equal facets without gaps, or the facets of one heliostat with
+        their own tilts.
     focal
-        The facets are tilted towards a focus at this distance, m; None: at the slant range,
-        infinity: not at all.
+        Distance of the focus towards which the facets are tilted, m; None: the slant range;
+        infinity: no tilt.
     facet_focal
         Focal length of each facet's own curvature, m; None: as ``focal``, infinity: flat.
     slope_error
@@ -332,22 +332,22 @@ def reflected_beam(
         Parameter χ of Buie's shape, nearly the circumsolar ratio, 0.01 to 0.8.
     reflectivity, dni
         Share and W/m². Their product with the area and the cosine of incidence is the power;
-        shading, blocking and the air's extinction are left out.
+        shading, blocking and atmospheric extinction are not included.
     step
         Of the grid, m.
     elements
-        Each facet is cut into this number squared.
+        Each facet is divided into the square of this number.
 
     Raises
     ------
     InputError
-        If a value cannot be used, sun or target are behind the mirror, the mirror behind the
+        If a value is invalid, sun or target are behind the mirror, the mirror is behind the
         target, or the grid would have more than 4096 samples along a side.
 
     Notes
     -----
     The central ray of each element is exact. The spread around it is the same for the whole
-    beam, and linear in the angles: on a target whose normal is φ off the beam this leaves out
+    beam and linear in the angles. With an angle φ between beam and target normal, this neglects
     a shift of about d tan φ / cos φ · σ² (0.4 mm at d = 200 m, φ = 30°, σ = 1.7 mrad).
     """
     _reflection_guards(slope_error, sun_shape, circumsolar, reflectivity, dni, step, elements)
@@ -376,8 +376,8 @@ def reflected_beam(
     hits = target.intersect(points, rays)
     if incidence.min() <= 0.0 or not np.isfinite(hits).all():
         raise InputError(
-            f"reflected beam: target {target.name} is not met; sun and target must be in front "
-            "of the mirror, and the mirror in front of the target"
+            f"reflected beam: misses target {target.name}; sun and target must be in front of the "
+            "mirror, and the mirror in front of the target"
         )
     power = reflectivity * dni * areas * incidence
     ray = normalize(power @ rays)
@@ -397,8 +397,8 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     count
         Columns and rows.
     focal
-        Distance of the focus, m; infinity leaves them in one plane. Centres lie on the
-        paraboloid z = (x² + y²) / 4f, and a facet is perpendicular to it at its centre.
+        Distance of the focus, m; infinity: all in one plane. Centres lie on the paraboloid
+        z = (x² + y²) / 4f, to which each facet is tangent at its centre.
     """
     _above_zero("mirror: width", width, "m")
     _above_zero("mirror: height", height, "m")
@@ -447,7 +447,7 @@ def _mirror_axes(
         n = bisector(sun, normalize(aim - center, "aim − mirror_center"))
     else:
         n = normalize(_vector(normal, "normal"), "normal")
-    left, up = tangent_axes(n)  # the right of who looks along the normal is the mirror's left
+    left, up = tangent_axes(n)  # looking along the normal, the right is the mirror's left
     return np.stack([-left, up, n], axis=-1)
 
 
@@ -523,7 +523,7 @@ def _sun_kernel(
     """Return the sun's image by one ray, of sum 1, with its centre in the middle."""
     columns, rows = (np.ceil(reach / step).astype(int) + 1).tolist()
     value = _sun_cells(per_rad, (columns, rows), 1, shape, circumsolar, step)
-    # The limb is sharp, the aureole is not: cells about the disk are means of 4 × 4 places.
+    # The limb is sharp, unlike the aureole: cells around the disk are means of 4 × 4 places.
     j, i = (np.ceil(reach * SUN_RADIUS / radius / step).astype(int) + 1).tolist()
     inner = _sun_cells(per_rad, (j, i), 4, shape, circumsolar, step)
     value[rows - i : rows + i + 1, columns - j : columns + j + 1] = inner
@@ -578,14 +578,14 @@ def sun_profile(theta: npt.ArrayLike, shape: str, circumsolar: float = 0.05) -> 
 
 
 def deposit(places: FloatArray, weights: FloatArray, shape: tuple[int, int]) -> FloatArray:
-    """Return weights (E,) at columns and rows (E, 2), each shared by the four cells around it."""
+    """Return a grid of weights (E,) at columns and rows (E, 2), each split over four cells."""
     whole = np.floor(places).astype(np.intp)
     a, b = (places - whole).T
     total = np.zeros(shape[0] * shape[1])
     for right in (0, 1):
         for up in (0, 1):
             part = weights * (a if right else 1.0 - a) * (b if up else 1.0 - b)
-            # The last column has no neighbour; its share there is 0.
+            # The last column has no neighbour, but its share there is 0.
             column = np.minimum(whole[:, 0] + right, shape[1] - 1)
             row = np.minimum(whole[:, 1] + up, shape[0] - 1)
             total += np.bincount(row * shape[1] + column, part, minlength=total.size)
@@ -632,16 +632,16 @@ def _reflection_guards(
     step: float,
     elements: int,
 ) -> None:
-    who = "reflected beam"
+    name = "reflected beam"
     if not 0.0 <= slope_error < 0.1:
-        raise InputError(f"{who}: slope_error {slope_error} rad must be 0 or more, below 0.1")
+        raise InputError(f"{name}: slope_error {slope_error} rad must be 0 or more, below 0.1")
     if sun_shape not in SUN_SHAPES:
-        raise InputError(f"{who}: sun_shape {sun_shape!r}; known: {', '.join(SUN_SHAPES)}")
+        raise InputError(f"{name}: sun_shape {sun_shape!r}; known: {', '.join(SUN_SHAPES)}")
     if not 0.01 <= circumsolar <= 0.8:
-        raise InputError(f"{who}: circumsolar {circumsolar} must be from 0.01 to 0.8")
+        raise InputError(f"{name}: circumsolar {circumsolar} must be from 0.01 to 0.8")
     if not 0.0 < reflectivity <= 1.0:
-        raise InputError(f"{who}: reflectivity {reflectivity} must be above 0 and at most 1")
-    _above_zero(f"{who}: dni", dni, "W/m²")
-    _above_zero(f"{who}: step", step, "m")
+        raise InputError(f"{name}: reflectivity {reflectivity} must be above 0 and at most 1")
+    _above_zero(f"{name}: dni", dni, "W/m²")
+    _above_zero(f"{name}: step", step, "m")
     if elements < 1:
-        raise InputError(f"{who}: {elements} elements; give 1 or more")
+        raise InputError(f"{name}: {elements} elements; give 1 or more")

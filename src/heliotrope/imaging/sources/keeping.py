@@ -1,4 +1,4 @@
-"""What is done with frames of a source: their mean, and an archive."""
+"""Average and archive the frames of a source."""
 
 import json
 import math
