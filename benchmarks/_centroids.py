@@ -1,6 +1,6 @@
 """Simple centroids for comparison.
 
-Neither gives a covariance or reports a failure; :mod:`heliotrope.imaging.spots.spot` does.
+Neither gives a covariance or reports a failure; `heliotrope.imaging.spots.spot` does.
 """
 
 import numpy as np

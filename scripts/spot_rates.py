@@ -121,7 +121,7 @@ class Outcome:
     Attributes
     ----------
     condition
-        See :class:`Case`.
+        See `Case`.
     seed
         Of the frame: ``case(world, rng)`` with it gives the frame again.
     clean, accepted, named

@@ -3,11 +3,11 @@
 A mirror that shows the lamp to the camera points at the drone. The package plans such flights,
 evaluates their photographs, and simulates both.
 
-- :mod:`heliotrope.airborne.plan`: clusters, calibration points, hover patterns, airspace, sorties
+- `heliotrope.airborne.plan`: clusters, calibration points, hover patterns, airspace, sorties
   and waypoint files. Begin with ``plan_flight``.
-- :mod:`heliotrope.airborne.evaluate`: photographs to orientations, report and sightings. Begin with
+- `heliotrope.airborne.evaluate`: photographs to orientations, report and sightings. Begin with
   ``evaluate_flight``.
-- :mod:`heliotrope.airborne.simulate`: flights with their truth, with or without images.
+- `heliotrope.airborne.simulate`: flights with their truth, with or without images.
 
 Here are the things that all three share: mirrors and how they stand, photographs and the camera
 that took them.

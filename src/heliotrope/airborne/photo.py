@@ -1,6 +1,6 @@
 """Photographs from the air: camera, position and attitude.
 
-The camera model and its conventions are those of :mod:`heliotrope.field.camera`: camera axes x
+The camera model and its conventions are those of `heliotrope.field.camera`: camera axes x
 right, y down, z forward, and rotations from camera axes to ENU.
 """
 
@@ -121,7 +121,7 @@ class Photo:
     def pixels(self, camera: LedCamera, points: npt.ArrayLike) -> FloatArray:
         """Return the pixels (..., 2) at which points, ENU metres (..., 3), are seen.
 
-        NaN behind the camera or beyond :data:`REACH`.
+        NaN behind the camera or beyond `REACH`.
         """
         local = (as_vectors(points, "points") - self.position) @ self.rotation
         return local_pixels(camera, local, REACH)
@@ -145,7 +145,7 @@ def rotation_of_gimbal(yaw: float, pitch: float, roll: float) -> FloatArray:
 
 
 def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return yaw in [−π, π], pitch and roll, rad: the inverse of :func:`rotation_of_gimbal`.
+    """Return yaw in [−π, π], pitch and roll, rad: the inverse of `rotation_of_gimbal`.
 
     Straight down, yaw and roll are one angle, which is returned as yaw.
     """
@@ -162,7 +162,7 @@ def gimbal_of_rotation(turned: npt.ArrayLike) -> tuple[float, float, float]:
 
 
 def read_camera(path: str | Path) -> LedCamera:
-    """Return the camera of a TOML file written by :func:`write_camera`.
+    """Return the camera of a TOML file written by `write_camera`.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def read_photos(
     Parameters
     ----------
     folder
-        Of JPEG files, as :data:`SUFFIXES`.
+        Of JPEG files, as `SUFFIXES`.
     plant_origin
         Latitude and longitude (degrees) and height (m) of ENU's origin. Heights of photographs
         must be of the same kind (both above the ellipsoid, or both above the geoid).

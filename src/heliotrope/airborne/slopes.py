@@ -2,7 +2,7 @@
 
 A map comes from deflectometry (QDec-H and the like): for each facet a grid of the slope's
 deviations from the ideal surface, (F, H, W, 2); its signs are those of
-:class:`heliotrope.airborne.mirror.MirrorShape`.
+`heliotrope.airborne.mirror.MirrorShape`.
 """
 
 import zipfile
@@ -71,7 +71,7 @@ def read_slopes(path: str | Path, facets: int) -> FloatArray:
 
 
 def write_slopes(path: str | Path, slope: FloatArray) -> None:
-    """Write a slope map as :func:`read_slopes` reads it, completely or not at all."""
+    """Write a slope map as `read_slopes` reads it, completely or not at all."""
     file = Path(path)
     suffix = file.suffix.casefold()
     if suffix == ".npz":

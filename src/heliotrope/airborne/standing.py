@@ -170,7 +170,7 @@ def _counts(path: str | Path, line: int, name: str, texts: Sequence[str]) -> lis
 
 
 def write_commands(path: str | Path, names: Sequence[str], counts: npt.ArrayLike) -> None:
-    """Write drive counts (N, D) of heliostats as :func:`read_commands` reads them."""
+    """Write drive counts (N, D) of heliostats as `read_commands` reads them."""
     table = as_float(counts)
     header = ["heliostat", *(f"count_{k + 1}" for k in range(table.shape[1]))]
     lines = [",".join(header)]

@@ -27,9 +27,9 @@ class Mark:
     name
         Unique on its target ("upper_left").
     kind
-        One of :data:`KINDS`.
+        One of `KINDS`.
     point
-        ENU metres, (3,), of the point of the drawing given in :data:`KINDS`.
+        ENU metres, (3,), of the point of the drawing given in `KINDS`.
     size
         Length of an L's arm, of a T's bar and stem, side or diameter, m.
     stroke

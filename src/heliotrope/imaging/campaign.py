@@ -414,7 +414,7 @@ def to_sightings(
     Parameters
     ----------
     outcomes, entries
-        Of :func:`process_many` and :func:`entries_of`.
+        Of `process_many` and `entries_of`.
     names
         Names of the heliostats, in the plant's order.
     site

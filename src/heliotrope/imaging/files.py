@@ -39,9 +39,9 @@ from heliotrope.errors import FormatError, InputError
 from heliotrope.files.text import write_file
 from heliotrope.imaging.frame import Frame, Pixels
 
-#: Suffixes that :func:`find_images` looks for; :func:`read_image` goes by the content instead.
+#: Suffixes that `find_images` looks for; `read_image` goes by the content instead.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
-#: Default limit of :func:`read_image`, pixels.
+#: Default limit of `read_image`, pixels.
 LIMIT = 64_000_000
 #: Smallest side of an image that can show a target, px.
 SMALLEST = 16
@@ -549,7 +549,7 @@ def _exposure(tags: Mapping[int, Any]) -> tuple[float, float]:
 
 
 def _own_values(text: str) -> dict[str, float]:
-    """Return the numbers that :func:`write_image` left in a PNG."""
+    """Return the numbers that `write_image` left in a PNG."""
     values = None
     with suppress(ValueError):
         values = json.loads(text)
@@ -569,7 +569,7 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
         A frame, or grey (H, W) or blue-green-red (H, W, 3) pixels, uint8 or uint16.
     path
         The file; an existing one is replaced in one step. A PNG keeps the frame's time,
-        exposure, gain and count, and :func:`read_image` gives them back; the other formats
+        exposure, gain and count, and `read_image` gives them back; the other formats
         keep the pixels alone.
     quality
         Of a JPEG, 1 to 100.

@@ -26,7 +26,7 @@ SAME_TILT = np.radians(3.0)
 FOCAL_LIMIT = 0.1
 #: Priors for marks alone: log focal length over width ±, principal point over width ±, k1 ±.
 LOG_FOCAL, LOG_FOCAL_SIGMA, CENTER_SIGMA, K1_SIGMA = np.log(3.0), 1.5, 0.02, 0.1
-#: Rows of the covariance of a :class:`CameraFit`.
+#: Rows of the covariance of a `CameraFit`.
 POSE = ("turn_right", "turn_down", "turn_forward", "east", "north", "up")
 INNER = ("log_focal", "center_x", "center_y", "k1")
 
@@ -65,10 +65,10 @@ class Lens:
     Attributes
     ----------
     size, matrix, distortion, deviation
-        As of :class:`~heliotrope.field.camera.Camera`.
+        As of `Camera`.
     sigma, model
         Standard deviations of both focal lengths, the principal point (px) and the five terms
-        of distortion, (9,); 0 for terms outside the model (:data:`MODELS`).
+        of distortion, (9,); 0 for terms outside the model (`MODELS`).
     boards, coverage
         All pictures, in their order; share of the frame that boards cover.
     notes
@@ -181,7 +181,7 @@ def calibrate_corners(
     square: float,
     names: Sequence[str],
 ) -> Lens:
-    """Return the lens from given corners; otherwise as :func:`calibrate_chessboard`.
+    """Return the lens from given corners; otherwise as `calibrate_chessboard`.
 
     ``corners`` has one entry for each picture, px (columns * rows, 2), or None. The distortion
     model is the one with the least Bayesian information criterion.
@@ -337,7 +337,7 @@ class CameraFit:
     camera, residuals
         With its pose; observed minus predicted, px, (N, 2).
     names, covariance
-        Rows :data:`POSE`, then :data:`INNER` if solved; (6, 6) or (10, 10). Turns are about
+        Rows `POSE`, then `INNER` if solved; (6, 6) or (10, 10). Turns are about
         the camera's own axes, rad; the position is in ENU metres.
     plane_sigma
         Predicted standard deviation, per coordinate, of a pixel's place on the plane of the
@@ -417,10 +417,10 @@ def calibrate_marks(
     size
         Width and height of the frames, px.
     points, pixels
-        As of :func:`resection`, for each frame of a camera that does not move between them;
-        four or more points in all. Errors are those of :func:`resection`.
+        As of `resection`, for each frame of a camera that does not move between them;
+        four or more points in all. Errors are those of `resection`.
     sigma
-        As of :func:`resection`, or a list with one entry for each frame.
+        As of `resection`, or a list with one entry for each frame.
     name
         Of the camera.
     """
@@ -523,7 +523,7 @@ class _Problem:
         return np.concatenate([white, (x[6:] - mean) / sigma]) if self.free else white
 
     def slopes(self, x: FloatArray) -> FloatArray:
-        """Return the derivatives of :meth:`residuals`."""
+        """Return the derivatives of `residuals`."""
         white = np.einsum("nij,njp->nip", self.whitener, self.predict(x, self.local)[1])
         prior = np.eye(10)[6:] / self.prior[1][:, None]
         return np.concatenate([white.reshape(-1, len(x))] + [prior] * self.free)

@@ -82,7 +82,7 @@ def read_log(path: str | Path) -> Log:
     Parameters
     ----------
     path
-        With the columns :data:`COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
+        With the columns `COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
         relative to the log's folder.
 
     Raises

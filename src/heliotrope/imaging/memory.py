@@ -35,7 +35,7 @@ class Memory:
 
     @property
     def models(self) -> Mapping[str, EmptyTarget]:
-        """By the names of their targets, for :class:`heliotrope.imaging.photograph.Settings`."""
+        """By the names of their targets, for `heliotrope.imaging.photograph.Settings`."""
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:

@@ -573,7 +573,7 @@ def _centroid(found: list[tuple[Region, float]], appeared: bool) -> _Pair:
 
 
 class MotionState(Enum):
-    """The verdict of a :class:`MotionDetector` on a frame."""
+    """The verdict of a `MotionDetector` on a frame."""
 
     WARMING_UP = "warming up"
     STILL = "still"
@@ -591,7 +591,7 @@ class MotionDetector:
     Parameters
     ----------
     mask, settings
-        As for :func:`detect_motion`.
+        As for `detect_motion`.
     memory
         Frames after which the weight of a frame falls to 1/e.
     warm_up

@@ -80,7 +80,7 @@ class Controller:
     now_ms
         The present tick; see ``ticks``.
     gate
-        Decides which frames may act; None where :meth:`on_message` is called directly.
+        Decides which frames may act; None where `on_message` is called directly.
     sensor
         Tilt of the mirror; see ``Motion``.
 

@@ -3,7 +3,7 @@
 The law is that of ``heliotrope.mechanism.drives``:
 θ = bias + (1 + scale) φ + worm_cos cos u + worm_sin sin u + sag cos φ, where φ is linear in
 the steps (rotary) or follows the law of cosines (jack, with the constants of PAINT). A phase
-of the sag is taken into the other numbers by :func:`reduced`, so ten numbers and the bias do.
+of the sag is taken into the other numbers by `reduced`, so ten numbers and the bias do.
 """
 
 import math

@@ -43,7 +43,7 @@ class Motion:
     Parameters
     ----------
     config
-        Settings; :meth:`rebuild` after they change.
+        Settings; `rebuild` after they change.
     sun
         The lease.
     sensor
@@ -309,7 +309,7 @@ class Motion:
             self._begin(TRACK, self.aim)
 
     def search(self) -> None:
-        """Keep the beam on a spiral about the aim, set by :meth:`prepare_search`."""
+        """Keep the beam on a spiral about the aim, set by `prepare_search`."""
         if self.aim is not None:
             self._begin(SEARCH, self.aim)
             self._wait_ms = 0

@@ -118,7 +118,7 @@ def start(
     Parameters
     ----------
     table
-        The rows to evaluate, as of :func:`conditions` and :func:`watched_by`.
+        The rows to evaluate, as of `conditions` and `watched_by`.
     now
         Monotonic seconds; the ages of readings that never come count from here.
     subjects
@@ -155,7 +155,7 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
     Parameters
     ----------
     state
-        As of :func:`start` or the last evaluation.
+        As of `start` or the last evaluation.
     name
         Of the row.
     subjects
@@ -183,7 +183,7 @@ def evaluate(
         By name of the reading and subject. The reading of subject "" serves where a
         subject has none of its own.
     state
-        As :func:`start` or the last evaluation gave it.
+        As `start` or the last evaluation gave it.
     now
         Monotonic seconds. A time before the last one is a broken clock: DEFOCUS of the
         field is demanded, and nothing ages or releases.

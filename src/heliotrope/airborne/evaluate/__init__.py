@@ -1,8 +1,8 @@
 """The evaluation of a drone's photographs: orientations of mirrors, report and sightings.
 
-Begin with :func:`evaluate_flight`, which leads from the folder of photographs to the result; its
-docstring lists the stays. :func:`write_result` writes the result to files. Each step can be called
-by itself: :func:`read_many`, :func:`evaluate`, :func:`measure_field`, :func:`to_sightings`.
+Begin with `evaluate_flight`, which leads from the folder of photographs to the result; its
+docstring lists the stays. `write_result` writes the result to files. Each step can be called
+by itself: `read_many`, `evaluate`, `measure_field`, `to_sightings`.
 """
 
 from heliotrope.airborne.evaluate.budget import Budget

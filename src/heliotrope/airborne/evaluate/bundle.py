@@ -190,7 +190,7 @@ class Adjusted:
     offset_covariance
         Of b, m², (3, 3).
     position_sigma
-        Standard deviations of the positions, m, (P, 3); NaN beyond :data:`MOST_POSITIONS`.
+        Standard deviations of the positions, m, (P, 3); NaN beyond `MOST_POSITIONS`.
     place_covariance
         Of each mirror's position relative to the mean position of the photographs that show it,
         m², (N, 3, 3): shared by all its reflections.
@@ -270,7 +270,7 @@ def adjust(
     corners
         Corners seen.
     priors
-        By default those of :class:`Priors`.
+        By default those of `Priors`.
     owner
         Row of each mirror's heliostat, (N,); by default each mirror has its own.
 

@@ -1,7 +1,7 @@
 """Flights over the same heliostats in different poses, evaluated together.
 
 The survey errors of the heliostats and RTK's common offset are the same in all flights. From one
-position the images hardly tell the two apart (:mod:`heliotrope.airborne.evaluate.bundle`), so
+position the images hardly tell the two apart (`heliotrope.airborne.evaluate.bundle`), so
 flights that share heliostats go through one adjustment, in groups that fit into memory.
 """
 
@@ -118,7 +118,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
 
 
 def flight_groups(flights: Sequence[FlightData], usable: Sequence[int]) -> list[list[int]]:
-    """Return flights that share heliostats and camera, in groups of :data:`MOST_CORNERS`."""
+    """Return flights that share heliostats and camera, in groups of `MOST_CORNERS`."""
     groups = [[k] for k in usable if flights[k].dark]
     left = [k for k in usable if not flights[k].dark]
     while left:

@@ -1,9 +1,9 @@
 """One pose of a field evaluated: what photographs show becomes reflections on mirrors.
 
 All photographs together give the exterior orientation of each and RTK's common offset
-(:mod:`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
-mirror (:mod:`heliotrope.airborne.evaluate.rays`). In a night without moon no corner is seen, and
-:mod:`heliotrope.airborne.evaluate.night` takes the place of the bundle adjustment.
+(`heliotrope.airborne.evaluate.bundle`). Then the ray of each spot is intersected with its
+mirror (`heliotrope.airborne.evaluate.rays`). In a night without moon no corner is seen, and
+`heliotrope.airborne.evaluate.night` takes the place of the bundle adjustment.
 """
 
 from collections.abc import Sequence
@@ -91,7 +91,7 @@ def evaluate(
         Of the bundle adjustment.
     owner
         Row of each mirror's heliostat, if some heliostats stand in several poses
-        (:func:`heliotrope.airborne.evaluate.bundle.adjust`).
+        (`heliotrope.airborne.evaluate.bundle.adjust`).
 
     Raises
     ------

@@ -167,20 +167,20 @@ def evaluate_flight(
     7. ``orientation.measure_field``: reflections become ``Orientations`` with their accuracy.
        ``orientation.measure``.
     8. ``sightings.to_sightings``: orientations become ``Sightings`` for the calibration, when
-       :meth:`CampaignResult.sightings` is called.
+       `CampaignResult.sightings` is called.
 
-    :func:`heliotrope.airborne.evaluate.report.write_result` writes the result to files.
+    `heliotrope.airborne.evaluate.report.write_result` writes the result to files.
 
     Parameters
     ----------
     folder, camera, commands, cluster, point, slopes, focal
-        As :func:`heliotrope.airborne.evaluate.folder.open_flights`.
+        As `heliotrope.airborne.evaluate.folder.open_flights`.
     plant
         The field.
     priors
         Standard deviations of what is known beforehand.
     keep, processes, client
-        As :func:`heliotrope.airborne.evaluate.reading.read_many`.
+        As `heliotrope.airborne.evaluate.reading.read_many`.
     progress
         Called with what is being done, and (done, all) photographs.
 

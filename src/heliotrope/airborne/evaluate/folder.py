@@ -164,7 +164,7 @@ def open_flight(
     Parameters
     ----------
     folder, plant, camera, commands, cluster, point
-        As :func:`open_flights`.
+        As `open_flights`.
     shape
         Gives the surface of a heliostat by its name.
     """

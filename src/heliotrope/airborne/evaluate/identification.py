@@ -67,7 +67,7 @@ def expected_size(
     """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
 
     The side is the root of the area. A mirror may be in the frame if a gimbal error of up to
-    :data:`GIMBAL` can bring it there.
+    `GIMBAL` can bring it there.
     """
     local = (stand.corners - photo.position) @ photo.rotation
     depth = local[..., 2]

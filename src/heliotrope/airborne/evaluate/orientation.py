@@ -264,7 +264,7 @@ def measure(
         Errors common to all points; the default budget if None.
     place
         Covariance of the mirror's position relative to the drone, m², (3, 3), see
-        :meth:`~heliotrope.airborne.evaluate.budget.Budget.covariance`.
+        `Budget.covariance`.
     mean
         "area", weighted to represent the whole mirror, or "plain", equal weights, as in
         HelioPoint. Without a slope map the plain mean is worse: points crowd where the surface
@@ -328,7 +328,7 @@ def measure_field(
     wanted
         Rows to be measured; all if None.
     slopes, budget, mean
-        As :func:`measure`.
+        As `measure`.
     places
         Covariances of their positions relative to the drone, m², (N, 3, 3).
 

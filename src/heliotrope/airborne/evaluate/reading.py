@@ -132,7 +132,7 @@ class Seen:
 
     @classmethod
     def load(cls, path: Path) -> "Seen":
-        """Return what :meth:`save` wrote."""
+        """Return what `save` wrote."""
         with np.load(path, allow_pickle=False) as stored:
             values = {f.name: stored[f.name] for f in fields(cls)}
         return cls(
@@ -177,7 +177,7 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
 
 
 def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
-    """Return what a decoded picture shows, as :func:`read_photo` does."""
+    """Return what a decoded picture shows, as `read_photo` does."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
         return Seen(photo.name, "wrong_field: no mirror of the field can be in it")

@@ -56,12 +56,12 @@ def write_result(
     """Write the reflections, sightings and orientations of evaluated flights into a folder.
 
     ``reflections.csv`` (of a campaign ``reflections-FLIGHT.csv``), ``sightings.csv`` for the
-    calibration, and the report of :func:`write_campaign_report`.
+    calibration, and the report of `write_campaign_report`.
 
     Parameters
     ----------
     result
-        Of :func:`heliotrope.airborne.evaluate.flight.evaluate_flight`.
+        Of `heliotrope.airborne.evaluate.flight.evaluate_flight`.
     folder
         Is made if need be.
     page
@@ -104,7 +104,7 @@ def write_flight_report(
     Parameters
     ----------
     found, shape, position, budget, places
-        As :class:`heliotrope.airborne.evaluate.tables.MeasuredFlight`.
+        As `heliotrope.airborne.evaluate.tables.MeasuredFlight`.
     folder
         Is made if need be.
     notes
@@ -129,7 +129,7 @@ def write_campaign_report(
     notes: tuple[str, ...] = (),
     progress: Progress | None = None,
 ) -> Path:
-    """Write the page and the tables of several flights, as :func:`write_flight_report`.
+    """Write the page and the tables of several flights, as `write_flight_report`.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ The distances stay the same, and bisector and lever are those of the reflection.
 
 Unmapped slope deviations turn a mirror, as seen by the drone, alike in all poses. The centroid of
 a mirror's image on a target represents the mean over the whole mirror instead. In a fit of both,
-that turn is an additional unknown (:func:`fit_together`).
+that turn is an additional unknown (`fit_together`).
 """
 
 from collections.abc import Mapping
@@ -188,7 +188,7 @@ def fit_together(
     flights
         One for each orientation (``per="orientation"``), without the systematic part.
     model, priors
-        As :func:`heliotrope.calibration.fit.estimator.fit`.
+        As `heliotrope.calibration.fit.estimator.fit`.
 
     Raises
     ------
@@ -199,7 +199,7 @@ def fit_together(
     -----
     Simulated (4 facets, slopes 0.8 mrad, 5 camera-target and 15 drone sightings, 24 mirrors):
     normals elsewhere are predicted to 0.77 mrad from the first alone, 0.16 from the second, 0.16
-    from both in :func:`~heliotrope.calibration.fit.estimator.fit`, and 0.08 from this function.
+    from both in `estimator.fit`, and 0.08 from this function.
     """
     alone = fit(mechanism, flights, model, priors=priors, loss="square", adapt_scale=False)
     count = len(mechanism)

@@ -63,7 +63,7 @@ def rosner(
     Notes
     -----
     Rosner 1983, Technometrics 25, 165-172. Mean and standard deviation are the values' own;
-    :func:`heliotrope.calibration.learn.outliers.generalised_esd` is the test for a known
+    `heliotrope.calibration.learn.outliers.generalised_esd` is the test for a known
     covariance.
     """
     for name, value in (("alpha", alpha), ("share", share)):

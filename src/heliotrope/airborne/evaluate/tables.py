@@ -79,7 +79,7 @@ def orientation_rows(
     flight
         Its name, for a column of that name; no column if "".
     places
-        As given to :func:`heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
+        As given to `heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
     """
     known = None if places is None else as_float(places)
     return [

@@ -77,7 +77,7 @@ class KeepOut:
 
     @cached_property
     def shape(self) -> Geometry:
-        """The point or filled polygon on the ground that :attr:`radius` is measured from."""
+        """The point or filled polygon on the ground that `radius` is measured from."""
         found = Point(self.corners[0]) if len(self.corners) == 1 else Polygon(self.corners)
         shapely.prepare(found)
         return found

@@ -148,7 +148,7 @@ def calibration_points(
     names
         P parameters of its model.
     suns
-        Of the year, (K, 3), see :func:`~heliotrope.calibration.information.suns_of_year`.
+        Of the year, (K, 3), see `information.suns_of_year`.
     airspace, sampling, selection
         Limits and settings.
     label

@@ -123,9 +123,9 @@ def write_plan(
     folder
         Is made if need be.
     formats
-        Of :data:`FORMATS`.
+        Of `FORMATS`.
     aircraft
-        For DJI's files, see :data:`~heliotrope.airborne.plan.waypoints.AIRCRAFT`.
+        For DJI's files, see `AIRCRAFT`.
     progress
         Called with (done, all) sorties.
 

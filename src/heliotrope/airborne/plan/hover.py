@@ -270,7 +270,7 @@ def reach(
 
     Returns
     -------
-    Bounds along the plane's axes (:func:`~heliotrope.geometry.tangent_axes` of
+    Bounds along the plane's axes (`geometry.tangent_axes` of
     ``direction``), from ``point``, m, (2,) each. The mirrors' x axis is taken as horizontal.
     """
     away = point - vertex
@@ -336,7 +336,7 @@ def pattern(
     facing_vertex
         Vertices of the mirrors facing ``point``, ENU metres, (n, 3).
     corners, slopes, facet_area
-        As :class:`Mirrors`, of the n mirrors.
+        As `Mirrors`, of the n mirrors.
     point, direction
         Point that the mirrors face, and the normal of the plane, (3,).
     sampling

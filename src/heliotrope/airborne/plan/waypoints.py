@@ -237,7 +237,7 @@ def wpml(mission: Mission, aircraft: str = "M3E") -> bytes:
     mission
         At most 65,536 waypoints.
     aircraft
-        A key of :data:`AIRCRAFT`.
+        A key of `AIRCRAFT`.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Simulated flights with their truth: reflections by the law, rendered photographs, and trials.
 
-:func:`fly` simulates a flight. :func:`render_flight` writes its photographs, and
-:func:`reflections_of` gives its reflections without images. :func:`trials` measures one mirror
+`fly` simulates a flight. `render_flight` writes its photographs, and
+`reflections_of` gives its reflections without images. `trials` measures one mirror
 again and again, to find how many photographs a flight needs.
 """
 

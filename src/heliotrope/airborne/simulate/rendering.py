@@ -2,7 +2,7 @@
 
 Light is measured in full scale of the sensor. The share of a pixel that a facet covers is taken
 from an 8-fold finer grid; the lamp's reflections are at the exact positions of
-:mod:`heliotrope.airborne.mirror`. The blur of lens and motion is applied to all of it, then noise,
+`heliotrope.airborne.mirror`. The blur of lens and motion is applied to all of it, then noise,
 clipping, the curve of sRGB and JPEG.
 """
 
@@ -422,11 +422,11 @@ def render_flight(
     Parameters
     ----------
     flight
-        Of :func:`heliotrope.airborne.simulate.simulation.fly`.
+        Of `heliotrope.airborne.simulate.simulation.fly`.
     folder
         Is made if need be.
     origin
-        As :func:`write_photo`.
+        As `write_photo`.
     conditions
         By default those of a clear day.
     seed

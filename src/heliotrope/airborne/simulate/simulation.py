@@ -3,8 +3,8 @@
 A flight holds two versions of the same thing. *True*: mechanisms with imperfections, surveyed
 positions with errors, facets with slope errors, the real positions of the camera. *Recorded*: the
 plant file, the commands, and for each photograph a position from RTK and the angles of a gimbal.
-:func:`fly` makes both; :func:`reflections_of` gives the reflections that an image evaluation would
-find, without images; :mod:`heliotrope.airborne.simulate.rendering` draws them.
+`fly` makes both; `reflections_of` gives the reflections that an image evaluation would
+find, without images; `heliotrope.airborne.simulate.rendering` draws them.
 """
 
 from collections.abc import Mapping
@@ -188,7 +188,7 @@ def fly(
     focus
         Point that the camera is to look at, ENU metres, (3,).
     errors
-        By default those of :class:`Errors`.
+        By default those of `Errors`.
     focal
         Of the facets, m; inf if flat.
     start, interval
@@ -196,7 +196,7 @@ def fly(
     seed
         Of all randomness.
     installed
-        The heliostats as they really are, of :func:`install`, for several flights over the same
+        The heliostats as they really are, of `install`, for several flights over the same
         ones; ``focal`` is then ignored.
     flight
         Number of this flight among several: its photographs have errors of their own.
@@ -242,7 +242,7 @@ def install(
     rows
         Rows of the field.
     errors, focal, seed
-        As :func:`fly`. A heliostat is the same whichever others are asked for.
+        As `fly`. A heliostat is the same whichever others are asked for.
     """
     index = np.asarray(rows, dtype=np.intp)
     really = _installed(heliostats, errors, np.random.default_rng(seed)).take(index)
@@ -331,7 +331,7 @@ def reflections_of(
     Parameters
     ----------
     flight
-        Of :func:`fly`.
+        Of `fly`.
     errors
         Only ``reflection`` is used: noise of the positions on the mirror.
     seed

@@ -185,7 +185,7 @@ def trials(
     map_known
         Whether the evaluation has the mirror's slope map.
     mean
-        As :func:`heliotrope.airborne.evaluate.orientation.measure`.
+        As `heliotrope.airborne.evaluate.orientation.measure`.
     seed
         Of the first trial; the others follow.
 

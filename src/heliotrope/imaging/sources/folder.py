@@ -33,7 +33,7 @@ class FolderSource(Source):
         Leave out broken files and note them in ``skipped``, rather than raise FormatError;
         None: leave them out if the folder is watched.
     read
-        Reads a file; by default :func:`heliotrope.imaging.files.read_image`.
+        Reads a file; by default `heliotrope.imaging.files.read_image`.
     wait
         Waits for a number of seconds; by default until ``stop`` is set.
     """

@@ -31,7 +31,7 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
         Of one camera, size and depth.
     max_shift
         Greatest shift against the first frame, px, where
-        :func:`~heliotrope.imaging.motion.find_shift` can measure it.
+        `motion.find_shift` can measure it.
 
     Returns
     -------

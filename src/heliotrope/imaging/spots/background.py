@@ -197,7 +197,7 @@ class EmptyTarget:
 
     @staticmethod
     def load(path: str | Path) -> "EmptyTarget":
-        """Return a model that :meth:`save` wrote.
+        """Return a model that `save` wrote.
 
         Raises
         ------
@@ -280,7 +280,7 @@ def beams(picture: Rectified, background: Background) -> Mask:
 def unexplained(picture: Rectified, background: Background, spots: Sequence[Mask]) -> float:
     """Return the share of paint beside the spots that is brighter or darker than it should be.
 
-    Causes are shadows, stray light and obstacles. Only areas broader than :data:`BROAD` metres
+    Causes are shadows, stray light and obstacles. Only areas broader than `BROAD` metres
     count, so that single pixels, joints and stains do not.
     """
     import cv2

@@ -96,10 +96,10 @@ class Expectation:
     Attributes
     ----------
     power
-        As of :class:`~heliotrope.imaging.spots.spot.Spot`, over the ambient light, m²; NaN if
+        As of `Spot`, over the ambient light, m²; NaN if
         unknown.
     flux
-        As of :class:`~heliotrope.imaging.photograph.PlacedSpot`, full scales m²/s at gain 1; NaN
+        As of `PlacedSpot`, full scales m²/s at gain 1; NaN
         if unknown. It depends on the sun alone and is preferred to ``power`` where exposure
         and gain of a frame are known.
     length, width
@@ -130,7 +130,7 @@ class Reason:
     Attributes
     ----------
     name
-        One of :data:`REASONS`.
+        One of `REASONS`.
     value, limit
         Measured and tolerated; NaN where there is nothing to measure.
     text

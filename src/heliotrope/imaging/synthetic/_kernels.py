@@ -59,7 +59,7 @@ def sample_plane(
 
 @njit(**OPTIONS)
 def _sample(u, v, share, grid, x0, y0, per, out):
-    """:func:`sample_plane` of a grid with a border of 0; ``per`` is samples per metre."""
+    """`sample_plane` of a grid with a border of 0; ``per`` is samples per metre."""
     height, width = out.shape
     for i in range(height):
         up, down = max(i - 1, 0), min(i + 1, height - 1)

@@ -263,7 +263,7 @@ class Scene:
     targets
         With their marks, except pictures, which cannot be drawn.
     beams
-        :class:`Thrown`, or tuples of its arguments.
+        `Thrown`, or tuples of its arguments.
     ambient
         Irradiance of the targets without beams, W/m².
     gradient

@@ -94,7 +94,7 @@ class Outlines:
     covariance
         Second moments, pixels², (N, 2, 2).
     profile
-        As of :class:`Drawing`, (N, 9, 17).
+        As of `Drawing`, (N, 9, 17).
     """
 
     middle: FloatArray

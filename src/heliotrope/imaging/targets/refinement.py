@@ -165,7 +165,7 @@ def locate(
 ) -> tuple[FloatArray, float, float] | None:
     """Return the rough place of a mark, (2,), its standard deviation, px, and the correlation.
 
-    Parameters are those of :func:`refine`.
+    Parameters are those of `refine`.
     """
     import cv2
 

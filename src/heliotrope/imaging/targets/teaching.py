@@ -47,9 +47,9 @@ class Wish:
     Attributes
     ----------
     kind
-        One of :data:`KINDS`; None: the target's present mark, or a picture.
+        One of `KINDS`; None: the target's present mark, or a picture.
     size, stroke
-        As of :class:`~heliotrope.field.marks.Mark`, m; None: :data:`SHARE` of the target for
+        As of `Mark`, m; None: `SHARE` of the target for
         a picture, a fifth of the size for strokes.
     """
 
@@ -158,11 +158,11 @@ def teach(
     frame
         The picture.
     given
-        Pixels by the names of :func:`known_points`; four or more, each within :data:`REACH`
+        Pixels by the names of `known_points`; four or more, each within `REACH`
         of the truth.
     camera
         Its name. The lens of a camera of the plant counts as known; otherwise it is solved
-        too, see :func:`~heliotrope.imaging.lens.calibrate_marks`.
+        too, see `lens.calibrate_marks`.
     wishes, wish
         Marks to teach, by the name of the point, and at all others.
     sigma
@@ -220,7 +220,7 @@ def teach(
 
 
 def write_taught(taught: Taught, path: str | Path, folder: str | Path | None = None) -> None:
-    """Write the new pictures beside a plant file, then the file by :func:`write_with_pictures`.
+    """Write the new pictures beside a plant file, then the file by `write_with_pictures`.
 
     File names depend on the pictures' contents, so that an older plant file keeps its own.
     """

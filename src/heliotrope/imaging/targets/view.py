@@ -102,7 +102,7 @@ class View:
         Homography from plane metres to undistorted x/z, y/z, (3, 3).
     covariance
         Of the eight free parameters of the homography and of k1, (9, 9), in the scaled
-        coordinates of :func:`fit_view`.
+        coordinates of `fit_view`.
     residual
         RMS of the points' residuals, pixels.
     """
@@ -209,7 +209,7 @@ def fit_view(
         Of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
     lens
         Initial lens; unless ``lens_known``, its k1 is estimated with the prior
-        :data:`LENS_DEVIATION`.
+        `LENS_DEVIATION`.
 
     Notes
     -----
