@@ -94,13 +94,13 @@ class Outcome:
     problem
         Why it could not be read; "" if it could.
     point, covariance
-        Of the spot that counts, ENU, (3,) and (3, 3); None if no spot can be trusted.
+        Place of the spot that counts, ENU, (3,) and (3, 3); None if no spot can be trusted.
     target
         Target of that spot.
     refusal
         Why no spot can be trusted.
     time, time_deviation
-        Of the photograph.
+        Time of the photograph, and its standard deviation, s.
     annotated
         The annotated picture, if one was written.
     views
@@ -222,7 +222,7 @@ def meant(photograph: Photograph, target: str) -> tuple[Reading | None, str]:
     Parameters
     ----------
     photograph
-        As read.
+        The photograph, already read.
     target
         Target that the beam was sent to; "" if unknown, and then exactly one must have a spot.
     """
@@ -326,9 +326,9 @@ def process_many(
     job
         How to read them.
     processes
-        On this machine; few photographs are read in this process whatever the number.
+        Number of processes on this machine; a few photographs are always read in this process.
     client
-        Of a dask scheduler, used instead of processes.
+        Client of a dask scheduler, used instead of processes.
     progress
         Called with the numbers of finished and of all photographs.
     """
@@ -414,7 +414,7 @@ def to_sightings(
     Parameters
     ----------
     outcomes, entries
-        Of `process_many` and `entries_of`.
+        Results of `process_many` and `entries_of`.
     names
         Names of the heliostats, in the plant's order.
     site

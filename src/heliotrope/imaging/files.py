@@ -572,7 +572,7 @@ def write_image(image: Frame | Pixels, path: str | Path, *, quality: int = 95) -
         exposure, gain and count, and `read_image` gives them back; the other formats
         keep the pixels alone.
     quality
-        Of a JPEG, 1 to 100.
+        Quality of a JPEG, 1 to 100.
 
     Raises
     ------

@@ -38,7 +38,7 @@ class Board:
     Attributes
     ----------
     name, corners
-        Of the picture; its inner corners, row by row, px, (N, 2), or None if not found.
+        Name of the picture; its inner corners, row by row, px, (N, 2), or None if not found.
     reason
         Why it was not used for the lens; empty if it was.
     deviation, tilt
@@ -65,7 +65,7 @@ class Lens:
     Attributes
     ----------
     size, matrix, distortion, deviation
-        As of `Camera`.
+        See `Camera`.
     sigma, model
         Standard deviations of both focal lengths, the principal point (px) and the five terms
         of distortion, (9,); 0 for terms outside the model (`MODELS`).
@@ -147,7 +147,7 @@ def calibrate_chessboard(
     square
         Side of a square, m.
     names
-        Of the pictures; "picture 1" and so on if not given.
+        Names of the pictures; "picture 1" and so on if not given.
 
     Raises
     ------
@@ -335,7 +335,7 @@ class CameraFit:
     Attributes
     ----------
     camera, residuals
-        With its pose; observed minus predicted, px, (N, 2).
+        The camera with its pose; observed minus predicted pixels, (N, 2).
     names, covariance
         Rows `POSE`, then `INNER` if solved; (6, 6) or (10, 10). Turns are about
         the camera's own axes, rad; the position is in ENU metres.
@@ -382,12 +382,12 @@ def resection(
     points
         ENU metres, (N, 3), four or more, not on one line.
     pixels
-        Of the points, (N, 2).
+        Pixels of the points, (N, 2).
     sigma
         Standard deviation of a pixel coordinate: one number or (N,); or covariances
         (N, 2, 2), px².
     name
-        Of the camera, if a lens is given.
+        Name of the camera, if a lens is given.
 
     Raises
     ------
@@ -417,12 +417,12 @@ def calibrate_marks(
     size
         Width and height of the frames, px.
     points, pixels
-        As of `resection`, for each frame of a camera that does not move between them;
-        four or more points in all. Errors are those of `resection`.
+        Points and pixels as for `resection`, for each frame of a camera that does not move between
+        them; four or more points in all. Errors are those of `resection`.
     sigma
-        As of `resection`, or a list with one entry for each frame.
+        As for `resection`, or a list with one entry for each frame.
     name
-        Of the camera.
+        Name of the camera.
     """
     if not points or len(points) != len(pixels):
         raise InputError(f"{len(points)} lists of points, {len(pixels)} of pixels; give as many")

@@ -33,7 +33,7 @@ class Entry:
     target
         Target that the beam was sent to; "" if unknown.
     time
-        With its zone; None if unknown.
+        Time with its zone; None if unknown.
     sun
         Unit vector to the apparent sun, ENU, (3,); None if unknown.
     empty
@@ -82,7 +82,7 @@ def read_log(path: str | Path) -> Log:
     Parameters
     ----------
     path
-        With the columns `COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
+        A table with the columns `COLUMNS`, such as Jülich's ``measurements.csv``. ``empty`` is
         relative to the log's folder.
 
     Raises

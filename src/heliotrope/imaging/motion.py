@@ -55,7 +55,7 @@ class Region:
     area_px
         Pixels of the frame.
     centroid_px
-        Of the difference, pixels right and down.
+        Centroid of the difference, pixels right and down.
     significance
         Greatest difference, in deviations of the noise.
     """
@@ -77,14 +77,14 @@ class Motion:
     significance, threshold
         Greatest difference anywhere, and the value it must exceed, in deviations of the noise.
     area_px
-        Of all regions, pixels of the frame.
+        Area of all regions, pixels of the frame.
     appeared_px, vanished_px
         Centroids of new and of lost light, pixels right and down, or NaN.
     shift_px
         Shift of the scene to the right and down in the second frame; 0 if no shift was
         accepted.
     brightness_ratio
-        Of the static scene, second to first frame, in the middle of the frame.
+        Brightness of the static scene, second frame over first, in the middle of the frame.
     regions
         The most significant first.
     problem
@@ -591,7 +591,7 @@ class MotionDetector:
     Parameters
     ----------
     mask, settings
-        As for `detect_motion`.
+        See `detect_motion`.
     memory
         Frames after which the weight of a frame falls to 1/e.
     warm_up

@@ -42,13 +42,13 @@ class PlacedSpot:
         Metres right of and above the target's centre (of the face's origin if there is no
         target), (2,).
     covariance
-        Of ``plane``: spot, view and survey, m², (2, 2).
+        Covariance of ``plane``: spot, view and survey, m², (2, 2).
     point
         ENU metres, (3,).
     covariance_enu
-        Of the point, m², (3, 3); 0 across the plane.
+        Covariance of the point, m², (3, 3); 0 across the plane.
     pixel
-        In the frame, (2,).
+        Pixel of the frame, (2,).
     flux
         Its light over the frame's exposure and gain, full scales m² per second at gain 1,
         which makes frames of one camera comparable; NaN if exposure or gain is unknown.
@@ -78,7 +78,7 @@ class Reading:
     found
         The target in the frame.
     spots
-        On it: the intended one first, then by power.
+        Spots on the target: the intended one first, then by power.
     reasons
         Against the first spot; empty if it is good.
     """
@@ -166,12 +166,12 @@ class Settings:
     empty
         Models of empty faces under any names; a face's targets select its model.
     expectations
-        By target.
+        Expected beams by target.
     pictures
-        Of taught marks, by their code.
+        Pictures of taught marks, by their code.
     gamma
-        Of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2 is
-        close to sRGB. It is undone before anything is measured.
+        Exponent of the camera's response: a pixel is light to the power 1/gamma. 1 is linear, 2.2
+        is close to sRGB. It is undone before anything is measured.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -282,7 +282,7 @@ def linear(frame: Frame, gamma: float) -> Frame:
     Parameters
     ----------
     frame
-        As the camera gives it.
+        The frame as the camera gives it.
     gamma
         The frame's pixels are light to the power 1/gamma.
 

@@ -28,7 +28,7 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
     Parameters
     ----------
     frames
-        Of one camera, size and depth.
+        Frames of one camera, size and depth.
     max_shift
         Greatest shift against the first frame, px, where
         `motion.find_shift` can measure it.

@@ -41,7 +41,7 @@ def open_source(
         Time of a video's first frame; frame size requested of a device; whether to watch a
         folder.
     limit, stop
-        As of `Source`.
+        See `Source`.
 
     Raises
     ------

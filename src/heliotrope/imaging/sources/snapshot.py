@@ -39,7 +39,7 @@ class SnapshotSource(Source):
     url
         Address of the image.
     interval
-        Between requests, s.
+        Time between requests, s.
     timeout
         For an answer, s.
 

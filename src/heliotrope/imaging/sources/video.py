@@ -116,8 +116,9 @@ class CameraSource(Source):
     Attributes
     ----------
     latency, latency_deviation
-        From the middle of the exposure to the arrival of the frame, and its standard deviation,
-        s. A frame's time is its arrival minus ``latency``. Streams take 0.1 s to 2 s; measure it.
+        Time from the middle of the exposure to the arrival of the frame, and its standard
+        deviation, s. A frame's time is its arrival minus ``latency``. Streams take 0.1 s to 2 s;
+        measure it.
     retries, pause, longest_pause
         Consecutive failures before it gives up; first and longest pause before a retry, s.
     clock
@@ -219,7 +220,7 @@ class StreamSource(CameraSource):
     Attributes
     ----------
     url
-        With user:password@ where the camera needs it; they are never shown.
+        Address, with user:password@ where the camera needs it; they are never shown.
     timeout
         For opening, and for one frame, s.
     """

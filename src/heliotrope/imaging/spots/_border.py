@@ -25,9 +25,9 @@ class Beyond:
     Attributes
     ----------
     share
-        Of all light, that beyond included.
+        Share of this light in all light of the beam.
     shift
-        Of the centroid, m, (2,).
+        Shift of the centroid, m, (2,).
     most
         Shift if the beam went on as a Gaussian however faint, m, (2,).
     """
@@ -60,7 +60,7 @@ def beyond(
     region
         Pixels of the beam, (H, W).
     total, peak, centroid, moments
-        Of the visible light: sum, m², maximum, centre, m, and second moments, m².
+        Visible light: sum, m², maximum, centre, m, and second moments, m².
 
     Notes
     -----

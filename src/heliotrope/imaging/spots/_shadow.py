@@ -33,7 +33,7 @@ class Edge:
     Attributes
     ----------
     angle
-        Of its normal, clockwise from the right, rad.
+        Angle of its normal, clockwise from the right, rad.
     offset
         Along the normal, from the middle, cells.
     breadth

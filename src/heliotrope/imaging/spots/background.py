@@ -70,7 +70,7 @@ class Background:
     basis
         Derivatives of the values by the parameters of the fit, on the fit's grid, (h, w, K).
     covariance
-        Of the parameters, (K, K).
+        Covariance of the parameters, (K, K).
     stride
         Pixels between rows of the fit's grid.
     method
@@ -78,8 +78,8 @@ class Background:
     seen
         Share of the paint that was free of beams.
     reflectance
-        Of the paint relative to the usual one, (H, W), or None. Light divided by it is the
-        light that falls on the face.
+        Reflectance of the paint relative to the usual one, (H, W), or None. Light divided by it is
+        the light that falls on the face.
     """
 
     values: Image

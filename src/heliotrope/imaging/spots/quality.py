@@ -60,7 +60,7 @@ class Limits:
     motion
         Blur of the marks in one direction over that in the other.
     blur
-        Of the marks, m.
+        Blur of the marks, m.
     covered
         Share of a spot under marks.
     deviation
@@ -96,12 +96,10 @@ class Expectation:
     Attributes
     ----------
     power
-        As of `Spot`, over the ambient light, m²; NaN if
-        unknown.
+        Power as in `Spot`, over the ambient light, m²; NaN if unknown.
     flux
-        As of `PlacedSpot`, full scales m²/s at gain 1; NaN
-        if unknown. It depends on the sun alone and is preferred to ``power`` where exposure
-        and gain of a frame are known.
+        Flux as in `PlacedSpot`, full scales m²/s at gain 1; NaN if unknown. It depends on the sun
+        alone and is preferred to ``power`` where exposure and gain of a frame are known.
     length, width
         Standard deviations along its major and minor axis, m; NaN if unknown.
     deviation
@@ -134,7 +132,7 @@ class Reason:
     value, limit
         Measured and tolerated; NaN where there is nothing to measure.
     text
-        In words.
+        The reason in words.
     """
 
     name: str
@@ -160,7 +158,7 @@ def judge(
     found
         The target in its frame; None for a crop.
     spots
-        On this target, the intended one first.
+        Spots on this target, the intended one first.
     deviation
         Standard deviation of its centroid along its worse axis, target included, m.
     free
@@ -170,7 +168,7 @@ def judge(
     expectation
         Prior knowledge.
     flux
-        Of the first spot, full scales m²/s at gain 1; NaN if unknown.
+        Flux of the first spot, full scales m²/s at gain 1; NaN if unknown.
     unexplained
         Share of the face beside its spots that is not as it should be.
     """

@@ -51,12 +51,12 @@ class Spot:
     Attributes
     ----------
     centroid
-        Of its light, plane coordinates of the face, m, (2,); includes the estimated light
+        Centroid of its light, plane coordinates of the face, m, (2,); includes the estimated light
         beyond the target's border.
     covariance
-        Of the centroid, m², (2, 2): background, noise, tails, border and clipping.
+        Covariance of the centroid, m², (2, 2): background, noise, tails, border and clipping.
     second_moments
-        Of its light on the target about that light's centre, m², (2, 2).
+        Second moments of its light on the target about that light's centre, m², (2, 2).
     power
         Sum of its brightness over that of the background, m².
     peak
@@ -64,7 +64,7 @@ class Spot:
     contrast
         Peak over the background there.
     deviation
-        Of the background's residuals, of full scale.
+        Standard deviation of the background's residuals, of full scale.
     clipped
         Share of its light in clipped pixels.
     edge

@@ -129,7 +129,7 @@ def expose(level, noise, read_noise, per_electron, offset, curve, steps, out):
     read_noise
         Electrons.
     per_electron, offset
-        Of the full scale.
+        Shares of the full scale.
     curve
         Encoding of shares of the full scale from 0 to 1, in equal steps; empty: linear.
     steps

@@ -72,9 +72,9 @@ class BeamTruth:
     centroid_on_target, pixel_on_target
         The same for the energy on the target; NaN if there is none.
     share_on_target
-        Of the energy.
+        Share of the energy on the target.
     share_clipped
-        Of its light in the frame, on clipped pixels.
+        Share of its light in the frame that is on clipped pixels.
     peak
         Reading at its strongest light, in full scales, before clipping.
     """
@@ -97,9 +97,9 @@ class MarkTruth:
     Attributes
     ----------
     target, name
-        Of the mark.
+        Names of the target and of the mark.
     pixel
-        Of its point, (2,).
+        Pixel of its point, (2,).
     in_frame
         Whether the pixel is in the frame.
     light
@@ -131,7 +131,7 @@ class Rendered:
     frame
         The camera's frame.
     beams, marks
-        In the order of the scene.
+        Truth of beams and marks, in the order of the scene.
     clipped
         Share of the readings at full scale.
     level
@@ -162,9 +162,9 @@ def render(
         The scene. Its constant part (camera, targets, paint, surroundings) is cached for
         the last four combinations.
     seed
-        Of the noise, 0 or more.
+        Seed of the noise, 0 or more.
     name, time
-        Of the frame.
+        Name and time of the frame.
     level
         Whether to return the readings without noise too.
 

@@ -20,7 +20,7 @@ class Paint:
     Attributes
     ----------
     reflectance, mark
-        Of the white paint and of the marks.
+        Reflectances of the white paint and of the marks.
     panels
         Columns and rows of metal sheets.
     seam, seam_width
@@ -64,7 +64,7 @@ class Surroundings:
     wall
         Extent of the wall beyond the target to the left, right, up and down, m.
     reflectance
-        Of the wall, which catches the light of beams that misses the target.
+        Reflectance of the wall, which catches the light of beams that misses the target.
     sky
         Brightness of the sky, W/m² on white.
     texture
@@ -100,7 +100,7 @@ class Shadow:
     Attributes
     ----------
     point
-        On the edge, metres right of and above the target's centre, (2,).
+        A point on the edge, metres right of and above the target's centre, (2,).
     angle
         Direction into the shadow, counterclockwise from the right as seen from the front, rad.
     softness
@@ -259,9 +259,9 @@ class Scene:
     Attributes
     ----------
     camera
-        With its position and rotation.
+        The camera with its position and rotation.
     targets
-        With their marks, except pictures, which cannot be drawn.
+        Targets with their marks, except pictures, which cannot be drawn.
     beams
         `Thrown`, or tuples of its arguments.
     ambient
@@ -269,11 +269,11 @@ class Scene:
     gradient
         Its relative increase to the right and upwards, 1/m, about each target's centre.
     shadow
-        On each target's plane.
+        Shadow on each target's plane.
     cloud
         Factor of all beams; 1 under a clear sky.
     paint, surroundings, lens, sensor
-        As of their classes.
+        See their classes.
     """
 
     camera: Camera
@@ -313,7 +313,7 @@ def exposed(scene: Scene, peak: float = 0.8) -> Scene:
     Parameters
     ----------
     scene
-        With beams, or with ambient light alone; then the paint reads ``peak``.
+        Scene with beams, or with ambient light alone; then the paint reads ``peak``.
     peak
         Reading of the target's paint at the peak of the strongest beam, of the full scale.
     """
@@ -374,9 +374,9 @@ def example_camera(
     Parameters
     ----------
     target
-        In view; its centre is a little off the middle of the frame.
+        Target in view; its centre is a little off the middle of the frame.
     distance
-        From the target's centre, m.
+        Distance from the target's centre, m.
     size
         Width and height of a frame, pixels.
     side, below
@@ -388,7 +388,7 @@ def example_camera(
     distortion
         Inward shift of the frame's corners, as a share of their distance from the middle.
     name
-        Of the camera.
+        Name of the camera.
     """
     if not (distance > 0.0 and fill > 0.0):
         raise InputError(f"camera: distance {distance} m and fill {fill} must be above 0")

@@ -172,7 +172,7 @@ def ask(
     given
         Points already known; the page shows them.
     title
-        Of the page.
+        Title of the page.
     announce
         Called with the page's address once it can be opened; this function waits for the
         answer.

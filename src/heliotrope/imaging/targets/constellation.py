@@ -65,7 +65,7 @@ class Match:
     marks, candidates
         Indices of assigned pairs, (K,) each.
     H_pixel_plane
-        From plane metres to pixels, (3, 3); affine if fewer than five match.
+        Homography from plane metres to pixels, (3, 3); affine if fewer than five match.
     score
         Number of marks; then uprightness of the view, then likeness of the shapes.
     """

@@ -45,7 +45,7 @@ class Drawing:
     profile
         Fourier transform of its brightness around the middle, (9, 17).
     size
-        As of the mark, m.
+        Size of the mark, m.
     turning
         Whether a turn changes its look; false for a disc.
     """
@@ -94,7 +94,7 @@ class Outlines:
     covariance
         Second moments, pixels², (N, 2, 2).
     profile
-        As of `Drawing`, (N, 9, 17).
+        As in `Drawing`, (N, 9, 17).
     """
 
     middle: FloatArray
@@ -180,7 +180,7 @@ class Lightened:
     small, closed
         The frame, and its closing, (h, w).
     reduction
-        Of the frame.
+        Factor by which the frame was reduced.
     """
 
     small: Image
@@ -351,7 +351,7 @@ def find_pictures(
     marks
         All of kind picture; drawing k belongs to mark k.
     pictures
-        By the codes of the marks.
+        Pictures by the codes of the marks.
     """
     import cv2
 

@@ -81,7 +81,7 @@ class FoundMark:
     contrast
         Its brightness over that of its surroundings; NaN for a tag.
     blur
-        Of its upright and level edges, m, (2,); NaN for a tag.
+        Blur of its upright and level edges, m, (2,); NaN for a tag.
     """
 
     mark: Mark
@@ -130,16 +130,16 @@ def find_targets(
     Parameters
     ----------
     frame
-        As the camera gives it.
+        The frame as the camera gives it.
     targets
-        With known marks. Targets in one plane are found together.
+        Targets with known marks. Targets in one plane are found together.
     camera
         Its lens is used; if its pose is known too, marks are searched for at their expected
         places first. A camera of another frame size is ignored.
     previous
         Views of earlier frames of the same camera, tried first.
     pictures
-        Of taught marks, by their code.
+        Pictures of taught marks, by their code.
 
     Notes
     -----
@@ -251,7 +251,7 @@ class Attempt:
     known
         Whether the face's rough place was known beforehand.
     vague
-        By name, why the places of some targets remain unknown.
+        Why the places of some targets remain unknown, by name.
     """
 
     view: View | None
@@ -914,7 +914,7 @@ def symmetries(marks: Sequence[Mark], plane: FloatArray) -> list[tuple[FloatArra
     Parameters
     ----------
     marks
-        Of a face, M.
+        Marks of a face, M.
     plane
         Their places, m, (M, 2).
     """

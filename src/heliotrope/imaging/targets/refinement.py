@@ -49,7 +49,7 @@ class Refined:
     Attributes
     ----------
     pixel
-        Of its point, (2,).
+        Pixel of its point, (2,).
     covariance
         px², (2, 2), of the image alone, without the survey.
     contrast
@@ -126,7 +126,7 @@ def refine(
     search
         Search radius, in sizes of the mark; 0: within a stroke.
     picture
-        Of a taught mark, upright in the plane, (N, N).
+        Picture of a taught mark, upright in the plane, (N, N).
     within
         Bounds of the target's paint relative to the mark's point, m, (2, 2); pixels outside
         are ignored.

@@ -49,8 +49,7 @@ class Wish:
     kind
         One of `KINDS`; None: the target's present mark, or a picture.
     size, stroke
-        As of `Mark`, m; None: `SHARE` of the target for
-        a picture, a fifth of the size for strokes.
+        See `Mark`, m; None: `SHARE` of the target for a picture, a fifth of the size for strokes.
     """
 
     kind: str | None = None
@@ -74,7 +73,7 @@ class TaughtPoint:
     Attributes
     ----------
     name
-        Of the point.
+        Name of the point.
     pixel, covariance
         Its place, (2,), with covariance, px² (2, 2).
     mark
@@ -100,13 +99,13 @@ class Taught:
     Attributes
     ----------
     plant
-        With the new marks and the camera.
+        The plant with the new marks and the camera.
     target, camera
         Names of the target and the camera.
     fit
-        Of the camera.
+        Fit of the camera.
     points
-        In the order given.
+        Points in the order given.
     pictures
         Taught pictures (N, N), uint8, by file name, which is their code.
     """
@@ -152,7 +151,7 @@ def teach(
     Parameters
     ----------
     plant
-        With the target.
+        The plant with the target.
     target
         Its name.
     frame
@@ -620,11 +619,11 @@ class Sight:
     target
         Its name.
     distance
-        From the camera to its centre, m.
+        Distance from the camera to its centre, m.
     metres_per_pixel
         At its centre: the root of the area of a pixel, m.
     obliquity
-        Between the line of sight and its normal, rad.
+        Angle between the line of sight and its normal, rad.
     share
         Share of it in the frame.
     marks

@@ -55,7 +55,7 @@ def faces(targets: tuple[Target, ...], apart: float = 0.25) -> list[Face]:
     Parameters
     ----------
     targets
-        Of a plant.
+        Targets of a plant.
     apart
         Greatest distance of a corner from its plane, m.
     """
@@ -101,7 +101,7 @@ class View:
     H_norm_plane
         Homography from plane metres to undistorted x/z, y/z, (3, 3).
     covariance
-        Of the eight free parameters of the homography and of k1, (9, 9), in the scaled
+        Covariance of the eight free parameters of the homography and of k1, (9, 9), in the scaled
         coordinates of `fit_view`.
     residual
         RMS of the points' residuals, pixels.
@@ -206,7 +206,7 @@ def fit_view(
     plane, pixels
         Points in the plane, m, and their pixels, (N, 2), N ≥ 4.
     covariance
-        Of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
+        Covariance of the pixels, survey included: of each, (N, 2, 2), or of all together, (2N, 2N).
     lens
         Initial lens; unless ``lens_known``, its k1 is estimated with the prior
         `LENS_DEVIATION`.
