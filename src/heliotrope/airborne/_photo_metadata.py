@@ -27,9 +27,9 @@ class Metadata:
     time
         UTC, if the file states the time zone.
     latitude_deg, longitude_deg, altitude
-        Of the projection centre; the altitude in m.
+        Position of the projection centre; the altitude in m.
     yaw_deg, pitch_deg, roll_deg
-        Of the gimbal.
+        Angles of the gimbal.
     sigma
         Standard deviations east, north, up stated by the RTK receiver, m, (3,).
     rtk_flag

@@ -51,9 +51,9 @@ class MirrorShape:
     Attributes
     ----------
     center
-        Of the facets, m, (F, 3).
+        Centres of the facets, m, (F, 3).
     half_width, half_height
-        From a facet's centre to the middle of its right and of its upper edge, m, (F, 3).
+        Vectors from a facet's centre to the middle of its right and of its upper edge, m, (F, 3).
     focal
         Focal lengths of the facets, m, (F,); inf if flat.
     slope
@@ -299,7 +299,7 @@ def ideal(heliostats: Heliostats, row: int, focal: npt.ArrayLike = np.inf) -> Mi
     heliostats, row
         A heliostat without facets is one facet of its width and height.
     focal
-        Of the facets, m, () or (F,); inf for flat ones.
+        Focal length of the facets, m, () or (F,); inf for flat ones.
     """
     if heliostats.facets is None:
         return rectangle(heliostats.width[row], heliostats.height[row], focal)
@@ -333,11 +333,11 @@ def tiled(
     columns, rows
         Facets are counted from the lower left, row by row.
     width, height
-        Of a facet, m.
+        Size of a facet, m.
     gap
-        Between facets, m.
+        Gap between facets, m.
     focal
-        Of the whole and of each facet, m; inf for a flat mirror.
+        Focal length of the whole mirror and of each facet, m; inf for a flat mirror.
     """
     x = (np.arange(columns) - 0.5 * (columns - 1)) * (width + gap)
     y = (np.arange(rows) - 0.5 * (rows - 1)) * (height + gap)
@@ -362,7 +362,7 @@ def orientation(mechanism: Mechanism, counts: npt.ArrayLike) -> tuple[FloatArray
     mechanism
         Batch shape (...).
     counts
-        Of the drives, (..., D).
+        Counts of the drives, (..., D).
     """
     frame = mirror_frame(mechanism.normal)
     # A mechanism turns any direction fixed to the mirror as it turns the normal.
@@ -403,9 +403,9 @@ def reflection_points(
     Parameters
     ----------
     shape
-        Of the mirror, with its slope map if it has one.
+        Shape of the mirror, with its slope map if it has one.
     rotation
-        From concentrator coordinates to ENU, (3, 3).
+        Rotation from concentrator coordinates to ENU, (3, 3).
     vertex
         ENU metres, (3,).
     camera, led

@@ -52,7 +52,8 @@ class LedCamera:
     distortion
         k1, k2, p1, p2, k3, (5,).
     led_offset
-        From the projection centre to the lamp, m, in camera axes, (3,). HelioPoint's d_cam-led.
+        Vector from the projection centre to the lamp, m, in camera axes, (3,). HelioPoint's
+        d_cam-led.
     """
 
     size: tuple[int, int]
@@ -83,11 +84,11 @@ class Photo:
     Attributes
     ----------
     name
-        Of the file.
+        Name of the file.
     time
         UTC; None if no time with its zone is stated.
     position
-        Of the projection centre, ENU metres, (3,).
+        Position of the projection centre, ENU metres, (3,).
     rotation
         Camera axes to ENU, (3, 3).
     sigma_position
@@ -227,7 +228,7 @@ def read_photos(
     Parameters
     ----------
     folder
-        Of JPEG files, as `SUFFIXES`.
+        Folder of JPEG files, see `SUFFIXES`.
     plant_origin
         Latitude and longitude (degrees) and height (m) of ENU's origin. Heights of photographs
         must be of the same kind (both above the ellipsoid, or both above the geoid).

@@ -106,11 +106,11 @@ def smooth_slopes(
     Parameters
     ----------
     shape
-        Of the mirror.
+        Shape of the mirror.
     generator
         Source of the randomness.
     rms
-        Of ∂z/∂u and of ∂z/∂v over the mirror, rad.
+        RMS of ∂z/∂u and of ∂z/∂v over the mirror, rad.
     length
         Correlation length of the slopes, m: that of a Gaussian filter of the heights.
     cells

@@ -27,7 +27,7 @@ class Standing:
     Attributes
     ----------
     names
-        Of the heliostats.
+        Names of the heliostats.
     vertex
         ENU metres, (N, 3).
     rotation
@@ -120,7 +120,7 @@ def read_commands(
         CSV with the columns ``heliostat``, ``count_1``, ``count_2`` (one or two drives); that of a
         flight plan also has ``cluster``, ``point`` and ``reachable``.
     names
-        Of the plant's heliostats.
+        Names of the plant's heliostats.
     cluster, point
         Only rows of this cluster and this calibration point; "" for all.
 

@@ -188,14 +188,14 @@ class Adjusted:
     state
         Adjusted unknowns.
     offset_covariance
-        Of b, m², (3, 3).
+        Covariance of b, m², (3, 3).
     position_sigma
         Standard deviations of the positions, m, (P, 3); NaN beyond `MOST_POSITIONS`.
     place_covariance
-        Of each mirror's position relative to the mean position of the photographs that show it,
-        m², (N, 3, 3): shared by all its reflections.
+        Covariance of each mirror's position relative to the mean position of the photographs that
+        show it, m², (N, 3, 3): shared by all its reflections.
     residual
-        Of the corners, in standard deviations, (K, 2).
+        Residuals of the corners, in standard deviations, (K, 2).
     deviation
         Their RMS without outliers; 1 if the given standard deviations are right.
     outlier
@@ -270,7 +270,7 @@ def adjust(
     corners
         Corners seen.
     priors
-        By default those of `Priors`.
+        Prior standard deviations; by default those of `Priors`.
     owner
         Row of each mirror's heliostat, (N,); by default each mirror has its own.
 

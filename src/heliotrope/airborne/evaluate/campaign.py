@@ -30,9 +30,9 @@ class Campaign:
     Attributes
     ----------
     flights
-        In the order given; None for a flight without result.
+        Results in the order given; None for a flight without a result.
     problems
-        Of each flight: a line for each photograph that was not used, or why it has no result.
+        For each flight, a line for each photograph that was not used, or why it has no result.
     offset, offset_covariance
         RTK's common offset, recorded less true, m, (3,), and its covariance, m², (3, 3): mean of
         all groups, weighted by their accuracy.
@@ -78,9 +78,9 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     Parameters
     ----------
     flights
-        With their photographs read.
+        Flights whose photographs have been read.
     priors
-        Of the bundle adjustments.
+        Prior standard deviations of the bundle adjustments.
 
     Raises
     ------

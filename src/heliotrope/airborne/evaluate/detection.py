@@ -53,7 +53,7 @@ class Outlines:
     sigma
         Standard deviation of a corner in each direction, px, (M,).
     contrast
-        Of the weakest edge, share of full scale, (M,).
+        Contrast of the weakest edge, share of full scale, (M,).
     found
         Whether all four edges were found, (M,).
     """
@@ -326,7 +326,7 @@ def find_spots(
     picture
         Blue-green-red.
     corners
-        Of the mirrors, px, (M, 4, 2).
+        Corners of the mirrors, px, (M, 4, 2).
     most
         A mirror with more spots than this is left out as "cluttered": they are not the lamp's.
     """

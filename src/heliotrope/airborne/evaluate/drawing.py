@@ -34,7 +34,7 @@ class Panel:
     Attributes
     ----------
     left, top, width, height
-        Of the frame, px.
+        Place and size of the frame, px.
     x, y
         Lowest and highest value shown.
     title, across, up

@@ -47,7 +47,7 @@ class Evaluation:
     stand
         The mirrors, as their corners show them.
     place_covariance
-        Of each mirror's position relative to the drone, m², (N, 3, 3): shared by all its
+        Covariance of each mirror's position relative to the drone, m², (N, 3, 3): shared by all its
         reflections.
     reflections
         One row for each spot on a mirror; ``photo`` counts the photographs used.
@@ -80,15 +80,15 @@ def evaluate(
     Parameters
     ----------
     photos, seen
-        As recorded, and what each shows.
+        Photographs as recorded, and what each shows.
     camera
-        With its lamp.
+        The camera with its lamp.
     stand
         The mirrors, as they are believed to stand.
     shape
         Gives the surface of a mirror's row; slopes do not matter here.
     priors
-        Of the bundle adjustment.
+        Prior standard deviations of the bundle adjustment.
     owner
         Row of each mirror's heliostat, if some heliostats stand in several poses
         (`heliotrope.airborne.evaluate.bundle.adjust`).

@@ -174,13 +174,13 @@ def evaluate_flight(
     Parameters
     ----------
     folder, camera, commands, cluster, point, slopes, focal
-        As `heliotrope.airborne.evaluate.folder.open_flights`.
+        See `heliotrope.airborne.evaluate.folder.open_flights`.
     plant
         The field.
     priors
         Standard deviations of what is known beforehand.
     keep, processes, client
-        As `heliotrope.airborne.evaluate.reading.read_many`.
+        See `heliotrope.airborne.evaluate.reading.read_many`.
     progress
         Called with what is being done, and (done, all) photographs.
 

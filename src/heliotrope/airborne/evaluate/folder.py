@@ -25,17 +25,17 @@ class FlightData:
     Attributes
     ----------
     name
-        Of the flight; "" if it is the only one.
+        Name of the flight; "" if it is the only one.
     photos
-        As recorded by the drone.
+        Photographs as recorded by the drone.
     camera
-        With its lamp.
+        The camera with its lamp.
     stand
         The mirrors, as commanded.
     heliostat
         Their rows in the plant, (N,).
     counts
-        Of their drives, (N, D).
+        Counts of their drives, (N, D).
     shapes
         Their surfaces, (N,), with slope maps where there are any.
     problems
@@ -98,7 +98,7 @@ def open_flights(
     Parameters
     ----------
     folder
-        Of one flight, or of a campaign.
+        Folder of one flight, or of a campaign.
     plant
         The field.
     camera, commands
@@ -108,7 +108,7 @@ def open_flights(
     slopes
         Folder of slope maps, NAME.npz or NAME.csv.
     focal
-        Of the facets, m; inf if flat.
+        Focal length of the facets, m; inf if flat.
 
     Returns
     -------
@@ -164,7 +164,7 @@ def open_flight(
     Parameters
     ----------
     folder, plant, camera, commands, cluster, point
-        As `open_flights`.
+        See `open_flights`.
     shape
         Gives the surface of a heliostat by its name.
     """

@@ -106,7 +106,7 @@ def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArr
     camera
         Lens.
     photo
-        As recorded by the drone.
+        The photograph as recorded by the drone.
     stand
         All mirrors, as they are believed to stand.
     patches

@@ -42,11 +42,11 @@ class Turned:
     Attributes
     ----------
     photos
-        With their attitudes.
+        Photographs with their attitudes.
     stand
         The mirrors.
     reflections
-        Of all spots.
+        Reflections of all spots.
     common
         Covariance of the turn that all photographs and mirrors share, rad², (3, 3).
     """
@@ -91,9 +91,9 @@ def turn_together(
     Parameters
     ----------
     photos, seen
-        With attitudes to a few mrad, and what each photograph shows.
+        Photographs with attitudes to a few mrad, and what each shows.
     camera
-        With its lamp.
+        The camera with its lamp.
     stand
         Mirrors as commanded.
     shape

@@ -59,7 +59,7 @@ class FacetMean:
     facet, count
         Its number, and how many points it has: without outliers, unless most of them are.
     mean
-        Of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
+        Mean of the differences, rotX and rotY, rad, (2,): its canting error relative to the mean of
         all; NaN without points.
     sigma
         Plain standard error of the mean, rad, (2,).
@@ -80,7 +80,7 @@ class Orientation:
     heliostat
         Row.
     rotation
-        From concentrator coordinates to ENU, (3, 3).
+        Rotation from concentrator coordinates to ENU, (3, 3).
     vertex
         ENU metres, (3,).
     correction
@@ -93,7 +93,7 @@ class Orientation:
     outlier
         (n,).
     weight
-        Of each point in the mean, adding up to 1; 0 for outliers, (n,).
+        Weight of each point in the mean, adding up to 1; 0 for outliers, (n,).
     difference
         Angular difference of each point from the result, rotX and rotY, rad, (n, 2).
     sigma
@@ -168,7 +168,7 @@ class Orientations:
     Attributes
     ----------
     names
-        Of all N heliostats.
+        Names of all N heliostats.
     found
         Orientations that could be measured, in the order of the heliostats.
     left_out
@@ -197,9 +197,9 @@ def differences(
     Parameters
     ----------
     reflections
-        Of one heliostat, n rows.
+        Reflections of one heliostat, n rows.
     shape
-        Of its mirror.
+        Shape of its mirror.
     rotation, vertex
         Its orientation, (3, 3), and vertex, ENU metres, (3,).
     slopes
@@ -251,9 +251,9 @@ def measure(
     Parameters
     ----------
     reflections
-        Of this heliostat in this pose.
+        Reflections of this heliostat in this pose.
     shape
-        Of its mirror.
+        Shape of its mirror.
     rotation, vertex
         Expected orientation (3, 3) and vertex, ENU metres, (3,).
     pivot
@@ -270,7 +270,7 @@ def measure(
         HelioPoint. Without a slope map the plain mean is worse: points crowd where the surface
         is flat.
     alpha, rounds
-        Of the test for outliers, and of the corrections before it.
+        Probability of a false alarm of the test for outliers, and number of corrections before it.
 
     Raises
     ------
@@ -318,9 +318,9 @@ def measure_field(
     Parameters
     ----------
     reflections
-        Of one pose of the field.
+        Reflections in one pose of the field.
     names
-        Of the N heliostats.
+        Names of the N heliostats.
     shape
         Gives the mirror of a row.
     rotation, vertex
@@ -328,7 +328,7 @@ def measure_field(
     wanted
         Rows to be measured; all if None.
     slopes, budget, mean
-        As `measure`.
+        See `measure`.
     places
         Covariances of their positions relative to the drone, m², (N, 3, 3).
 

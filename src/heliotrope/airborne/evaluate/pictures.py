@@ -47,11 +47,11 @@ def field_map(found: Orientations, position: FloatArray, title: str = "") -> "Fi
     Parameters
     ----------
     found
-        Of the N heliostats.
+        Orientations of the N heliostats.
     position
         ENU metres, (N, 3).
     title
-        Of the picture.
+        Title of the picture.
     """
     figure, axes = figure_of(1, 2, (13.0, 5.6))
     figure.suptitle(title)

@@ -35,7 +35,7 @@ def spot_reflections(
     photos, seen
         Photographs where they were taken, and what each shows.
     camera
-        With its lamp.
+        The camera with its lamp.
     stand
         The mirrors.
     shape

@@ -70,7 +70,7 @@ class Seen:
     Attributes
     ----------
     name
-        Of the photograph.
+        Name of the photograph.
     problem
         Why nothing in it is trusted; "" if it is usable. Begins with a keyword: nothing,
         wrong_field, ambiguous, overexposed, small, unreadable.
@@ -87,7 +87,7 @@ class Seen:
     spot, spot_sigma
         Undistorted coordinates, (S, 2), and their standard deviation in each direction, (S,).
     flux
-        Of each spot, full scale times pixels, (S,).
+        Flux of each spot, full scale times pixels, (S,).
     clipped
         Clipped pixels of each spot, (S,).
     notes
@@ -154,7 +154,7 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
     Parameters
     ----------
     photo
-        As recorded by the drone, with its path.
+        The photograph as recorded by the drone, with its path.
     camera
         Lens.
     stand
@@ -318,15 +318,15 @@ def read_many(
     Parameters
     ----------
     photos
-        As recorded by the drone.
+        Photographs as recorded by the drone.
     camera
         Lens.
     stand
         All mirrors, as they are believed to stand.
     processes
-        On this machine.
+        Number of processes on this machine.
     client
-        Of a dask scheduler, used instead of own processes.
+        Client of a dask scheduler, used instead of processes.
     keep
         Folder that keeps the result of each photograph. A photograph whose file, camera and
         field are unchanged is not read again, so an interrupted run continues where it stopped.

@@ -61,9 +61,9 @@ def write_result(
     Parameters
     ----------
     result
-        Of `heliotrope.airborne.evaluate.flight.evaluate_flight`.
+        Result of `heliotrope.airborne.evaluate.flight.evaluate_flight`.
     folder
-        Is made if need be.
+        Created if it does not exist.
     page
         Whether to write the page with its pictures; otherwise only ``orientations.csv``.
     progress
@@ -104,9 +104,9 @@ def write_flight_report(
     Parameters
     ----------
     found, shape, position, budget, places
-        As `heliotrope.airborne.evaluate.tables.MeasuredFlight`.
+        See `heliotrope.airborne.evaluate.tables.MeasuredFlight`.
     folder
-        Is made if need be.
+        Created if it does not exist.
     notes
         Lines for the top of the page, such as unusable photographs and the offset of RTK.
     progress
@@ -134,9 +134,9 @@ def write_campaign_report(
     Parameters
     ----------
     flights
-        With different names.
+        Flights with different names.
     folder, notes, progress
-        As there.
+        See `write_flight_report`.
 
     Raises
     ------

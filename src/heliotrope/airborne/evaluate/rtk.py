@@ -24,13 +24,13 @@ class RtkCheck:
     Attributes
     ----------
     names
-        Of the photographs.
+        Names of the photographs.
     difference
         RTK less photogrammetry, east, north, up, m, (P, 3).
     mean, mean_sigma
         Offset common to all positions and its standard deviation, from the adjustment, m, (3,).
     covariance
-        Of a single position about the mean, m², (3, 3): RTK and photogrammetry together.
+        Covariance of a single position about the mean, m², (3, 3): RTK and photogrammetry together.
     photogrammetry
         Mean standard deviation of the photogrammetric positions relative to each other, m, (3,).
     """

@@ -54,9 +54,9 @@ def to_sightings(
     Parameters
     ----------
     orientations
-        Of the N heliostats.
+        Orientations of the N heliostats.
     counts
-        Of their drives in this pose, (N, D).
+        Counts of their drives in this pose, (N, D).
     time
         Unix seconds, () or (N,).
     per
@@ -147,9 +147,9 @@ class Together:
     Attributes
     ----------
     calibration
-        Of N heliostats. Its covariance accounts for the unknown turn.
+        Calibration of N heliostats. Its covariance accounts for the unknown turn.
     turn
-        By which the drone sees a mirror rotated in all poses, about the concentrator's x and y
+        Turn by which the drone sees a mirror rotated in all poses, about the concentrator's x and y
         axes, rad, (N, 2).
     turn_covariance
         rad², (N, 2, 2).
@@ -188,12 +188,12 @@ def fit_together(
     flights
         One for each orientation (``per="orientation"``), without the systematic part.
     model, priors
-        As `heliotrope.calibration.fit.estimator.fit`.
+        See `heliotrope.calibration.fit.estimator.fit`.
 
     Raises
     ------
     InputError, UnknownNameError
-        As there.
+        See `heliotrope.calibration.fit.estimator.fit`.
 
     Notes
     -----

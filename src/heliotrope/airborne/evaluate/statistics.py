@@ -137,8 +137,8 @@ class SpreadMean:
     sigma
         Standard deviation of the points' plain mean about the mean over the mirror, (c,).
     weights
-        Of the points in the best estimate of the mean over the mirror (ordinary block kriging),
-        adding up to 1, (n,).
+        Weights of the points in the best estimate of the mean over the mirror (ordinary block
+        kriging), adding up to 1, (n,).
     sigma_weighted
         Standard deviation of that weighted mean, (c,).
     length
@@ -164,9 +164,9 @@ def spread_mean(
     values
         (n, c): differences at the points, rad.
     shape
-        Of the mirror.
+        Shape of the mirror.
     facet, uv
-        Of each point, (n,), and its position along the facet's axes, m, (n, 2).
+        Facet of each point, (n,), and its position along the facet's axes, m, (n, 2).
 
     Returns
     -------

@@ -25,13 +25,13 @@ class MeasuredFlight:
     Attributes
     ----------
     name
-        Of the flight; "" if it is the only one.
+        Name of the flight; "" if it is the only one.
     found
         Orientations of the N heliostats.
     shape
         Gives the mirror of a row.
     position
-        Of the heliostats, ENU metres, (N, 3).
+        Positions of the heliostats, ENU metres, (N, 3).
     budget
         If given, the systematic part is split by cause.
     places
@@ -73,13 +73,13 @@ def orientation_rows(
     Parameters
     ----------
     found
-        Of one flight.
+        Orientations of one flight.
     budget
         If given, the systematic part is also split by cause.
     flight
         Its name, for a column of that name; no column if "".
     places
-        As given to `heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
+        See `heliotrope.airborne.evaluate.orientation.measure_field`, (N, 3, 3).
     """
     known = None if places is None else as_float(places)
     return [

@@ -44,7 +44,7 @@ class KeepOut:
     name
         Shown to people.
     corners
-        Of the polygon, in order, ENU metres east and north, (V, 2); a single corner with a
+        Corners of the polygon, in order, ENU metres east and north, (V, 2); a single corner with a
         radius is a cylinder.
     radius
         Everything within this distance of the polygon belongs to the volume, m.
@@ -145,8 +145,8 @@ class Airspace:
     fence
         Polygon to stay inside, ENU metres east and north, (V, 2); None for no fence.
     min_height, max_height
-        Above ground while measuring and in transit, m. Aviation law limits the upper one, to
-        120 m in the European Union's open category.
+        Least and greatest height above ground while measuring and in transit, m. Aviation law
+        limits the upper one, to 120 m in the European Union's open category.
     margin
         Distance to all keep-outs, m.
     ground

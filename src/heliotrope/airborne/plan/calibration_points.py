@@ -48,9 +48,10 @@ class PointSelection:
     sigma
         Standard deviation of a measured normal in each of two directions, rad.
     min_elevation, max_elevation
-        Of the drone as seen from the cluster, rad. At low ones mirrors hide each other.
+        Least and greatest elevation of the drone as seen from the cluster, rad. At low ones mirrors
+        hide each other.
     share
-        Of a cluster's mirrors that must be able to face the drone.
+        Least share of a cluster's mirrors that must be able to face the drone.
     priors
         Standard deviations to use instead of the parameter table's, by name.
     """
@@ -94,7 +95,7 @@ class CalibrationPoints:
     direction
         Unit vectors from the cluster's middle to the drone, (K, 3).
     point
-        Faced by all mirrors, ENU metres, (K, 3).
+        Point that all mirrors face, ENU metres, (K, 3).
     facing
         Poses, batch shape (K, n).
     plan
@@ -140,7 +141,7 @@ def calibration_points(
     Parameters
     ----------
     mirrors, rows
-        Of the plant, and the rows of the cluster, (n,).
+        Mirrors of the plant, and the rows of the cluster, (n,).
     middle
         Mechanism for which the points are chosen, batch shape (1,).
     aim
@@ -148,7 +149,7 @@ def calibration_points(
     names
         P parameters of its model.
     suns
-        Of the year, (K, 3), see `information.suns_of_year`.
+        Directions to the sun over the year, (K, 3), see `information.suns_of_year`.
     airspace, sampling, selection
         Limits and settings.
     label

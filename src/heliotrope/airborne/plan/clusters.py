@@ -103,7 +103,7 @@ def clusters(
     Parameters
     ----------
     position
-        Of the heliostats, ENU metres, (N, 3).
+        Positions of the heliostats, ENU metres, (N, 3).
     size
         Diameter of a disc with the area of a cluster, m.
     max_radius

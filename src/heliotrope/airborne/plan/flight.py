@@ -36,15 +36,15 @@ class Craft:
     count
         Drones flying at the same time.
     speed
-        Between stations, m/s, up to 15.
+        Speed between stations, m/s, up to 15.
     acceleration
         m/s².
     photo
         Time to come to rest at a hover point and take a photograph, s.
     endurance
-        From take-off to landing on one battery, without its reserve, s.
+        Time from take-off to landing on one battery, without its reserve, s.
     change
-        From landing to the next take-off, s.
+        Time from landing to the next take-off, s.
     """
 
     count: int = 1
@@ -120,7 +120,7 @@ class Visit:
     approach
         Points between the previous place and the first hover point, ENU metres, (M, 3).
     begin, end
-        Of photographing, s since the start of the campaign.
+        First and last moment of photographing, s since the start of the campaign.
     wait
         Time hovering beforehand, for mirrors that are still moving, s.
     """
@@ -141,13 +141,13 @@ class Sortie:
     Attributes
     ----------
     drone, number
-        From 0; the number counts the sorties of the drone.
+        Numbers from 0; ``number`` counts the sorties of the drone.
     start, end
         Take-off and landing, s since the start of the campaign.
     home
         Place of take-off and landing, ENU metres, (3,).
     visits
-        In order.
+        Visits in the order flown.
     back
         Points between the last hover point and the landing, ENU metres, (M, 3).
     """
@@ -219,7 +219,7 @@ def fly(
     Parameters
     ----------
     stations
-        Of all clusters; those of one cluster in the order of its points.
+        Stations of all clusters; those of one cluster in the order of its points.
     order
         Clusters in the order of a short tour.
     airspace, craft
@@ -478,7 +478,7 @@ class CameraTarget:
     Attributes
     ----------
     hours
-        Of sun, h.
+        Hours of sun, h.
     days, months
         Calendar time.
     sunny
@@ -510,7 +510,7 @@ def camera_target(
     photographs
         Heliostats times calibration points.
     minutes
-        From one photograph to the next on a target, min.
+        Time from one photograph to the next on a target, min.
     targets
         Each with a camera.
     clear
@@ -545,9 +545,9 @@ def mirror_travel(counts: FloatArray, speed: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     counts
-        Of n mirrors in K poses, (K, n, D).
+        Counts of n mirrors in K poses, (K, n, D).
     speed
-        Of the drives, counts/s, (n, D).
+        Speed of the drives, counts/s, (n, D).
     """
     seconds = (np.abs(np.diff(counts, axis=0)) / np.asarray(speed, dtype=np.float64)).max(axis=-1)
     return np.concatenate([[0.0], seconds.max(axis=-1)])

@@ -121,9 +121,9 @@ def write_plan(
     plan
         The plan.
     folder
-        Is made if need be.
+        Created if it does not exist.
     formats
-        Of `FORMATS`.
+        Names from `FORMATS`.
     aircraft
         For DJI's files, see `AIRCRAFT`.
     progress

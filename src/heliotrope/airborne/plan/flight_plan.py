@@ -54,8 +54,8 @@ class PlanSettings:
     hours_a_day
         Flying hours a day, h.
     photo_minutes, clear
-        Of camera and target, for comparison: time between photographs, min, and the share of
-        the sunny hours that are clear.
+        The same campaign with camera and target, for comparison: time between photographs, min, and
+        the share of the sunny hours that are clear.
     """
 
     size: float = 100.0
@@ -97,7 +97,7 @@ class FlightPlan:
     stations
         All clusters' poses, cluster by cluster.
     sorties
-        Of all drones.
+        Sorties of all drones.
     homes
         Take-off place of each drone, ENU metres, (drones, 3).
     separation
@@ -186,7 +186,7 @@ def plan_flight(
     Parameters
     ----------
     plant
-        With its calibrated mechanisms, if any.
+        The plant, with its calibrated mechanisms, if any.
     settings
         Settings; if its airspace has no ground, that of the plant is used.
     progress

@@ -42,12 +42,12 @@ class Sampling:
     Attributes
     ----------
     distance
-        From the middle of a cluster to its hover plane, m.
+        Distance from the middle of a cluster to its hover plane, m.
     pointing
         Pointing error that the pattern covers, rad: for newly installed heliostats a few times
         their standard deviation, later less.
     samples
-        On each facet.
+        Number of samples on each facet.
     focal
         Focal length of the facets, m; infinite for flat ones.
     led_offset
@@ -86,16 +86,16 @@ class Mirrors:
     Attributes
     ----------
     names
-        Of the heliostats.
+        Names of the heliostats.
     armature, drives
         Calibrated, batch shapes (N,) and (N, 2).
     corners
         Facets' corners in the mirror's plane (x to the right as seen from the front, y up), m,
         (N, F, 4, 2); NaN for facets that a heliostat lacks.
     slopes
-        Of the facets' normals from the mirror's, rad, (N, F, 2).
+        Slopes of the facets' normals against the mirror's, rad, (N, F, 2).
     facet_area
-        Of the smallest facet, m², (N,).
+        Area of the smallest facet, m², (N,).
     """
 
     names: tuple[str, ...]
@@ -166,11 +166,11 @@ class Facing:
     Attributes
     ----------
     counts
-        Of the drives, (..., 2).
+        Counts of the drives, (..., 2).
     normal, vertex
         ENU, (..., 3).
     able
-        Whether within the stops, (...).
+        Whether the pose is within the stops, (...).
     """
 
     counts: FloatArray
@@ -228,7 +228,7 @@ class Pattern:
     columns, rows
         Points across and upwards.
     spacing
-        Between neighbours, m.
+        Spacing between neighbours, m.
     samples
         Expected on each facet; fewer than asked for if the least spacing does not allow more.
     camera
@@ -260,9 +260,9 @@ def reach(
     Parameters
     ----------
     corners, slopes
-        Of n mirrors, (n, F, 4, 2) and (n, F, 2).
+        Corners and slopes of n mirrors, (n, F, 4, 2) and (n, F, 2).
     vertex
-        Of the mirrors, ENU metres, (n, 3); their axes pass through ``point``.
+        Vertices of the mirrors, ENU metres, (n, 3); their axes pass through ``point``.
     point, direction
         A point of the hover plane, and its normal, (3,).
     sampling
@@ -336,7 +336,7 @@ def pattern(
     facing_vertex
         Vertices of the mirrors facing ``point``, ENU metres, (n, 3).
     corners, slopes, facet_area
-        As `Mirrors`, of the n mirrors.
+        See `Mirrors`, for the n mirrors.
     point, direction
         Point that the mirrors face, and the normal of the plane, (3,).
     sampling

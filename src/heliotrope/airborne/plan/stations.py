@@ -23,11 +23,11 @@ class PlannedStation:
     heliostats
         Rows in the given list of names, (N,), without those that cannot face the drone there.
     counts
-        Of their drives, (N, D).
+        Counts of their drives, (N, D).
     pattern
         Positions of the photographs, in order, ENU metres, (P, 3).
     middle
-        Of the cluster, ENU metres, (3,).
+        Middle of the cluster, ENU metres, (3,).
     """
 
     name: str
@@ -45,7 +45,7 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     path
         ``plan.json`` written by ``heliotrope drone plan``.
     names
-        Of the heliostats to be measured.
+        Names of the heliostats to be measured.
 
     Raises
     ------

@@ -51,15 +51,15 @@ class Mission:
     Attributes
     ----------
     name
-        Of the flight.
+        Name of the flight.
     latitude_deg, longitude_deg
         WGS84, (W,).
     height
-        Above the place of take-off, m, (W,).
+        Height above the place of take-off, m, (W,).
     yaw_deg
         Heading, clockwise from north in [0, 360), (W,).
     pitch_deg
-        Of the gimbal, −90 is straight down, (W,).
+        Pitch of the gimbal, −90 is straight down, (W,).
     stay
         Rest before a photograph, s, (W,); 0 where there is none.
     photo
@@ -69,7 +69,7 @@ class Mission:
     home
         Latitude and longitude in degrees and height above the ellipsoid in m.
     return_height
-        To which the drone climbs before it flies home by itself, m above take-off.
+        Height to which the drone climbs before it flies home by itself, m above take-off.
     """
 
     name: str
@@ -117,7 +117,7 @@ class Fence:
     outside
         Polygons to stay out of.
     circles
-        To stay out of.
+        Circles to stay out of.
     """
 
     inside: tuple[FloatArray, ...] = ()
@@ -476,7 +476,7 @@ def qgc(mission: Mission, fence: Fence | None = None) -> str:
     mission
         The flight.
     fence
-        Given to the autopilot with it.
+        Airspace that the autopilot gets with the plan.
     """
     items: list[dict[str, Any]] = []
 

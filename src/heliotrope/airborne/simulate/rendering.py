@@ -65,7 +65,7 @@ class Conditions:
     read_noise
         Electrons.
     quality
-        Of JPEG, 1 to 100.
+        Quality of JPEG, 1 to 100.
     """
 
     sky: float = 0.55
@@ -136,7 +136,7 @@ def render(
     lamp
         The lamp's reflections in this photograph: ``heliostat`` is the row in the scene.
     seed
-        Of the noise, 0 or more.
+        Seed of the noise, 0 or more.
     """
     conditions = scene.conditions
     image = _ground(camera, photo, scene)
@@ -378,7 +378,7 @@ def write_photo(
     origin
         Latitude and longitude (degrees) and height (m) of ENU's origin.
     quality
-        Of JPEG.
+        Quality of JPEG, 1 to 100.
     """
     import cv2
 
@@ -422,15 +422,15 @@ def render_flight(
     Parameters
     ----------
     flight
-        Of `heliotrope.airborne.simulate.simulation.fly`.
+        A flight simulated by `heliotrope.airborne.simulate.simulation.fly`.
     folder
-        Is made if need be.
+        Created if it does not exist.
     origin
-        As `write_photo`.
+        See `write_photo`.
     conditions
-        By default those of a clear day.
+        Light, lens and sensor; by default those of a clear day.
     seed
-        Of the noise.
+        Seed of the noise.
     progress
         Called with (done, all) photographs.
     """

@@ -41,21 +41,21 @@ class Errors:
     Attributes
     ----------
     rtk
-        Of each position east, north, up, independent from photograph to photograph, m, (3,).
+        Error of each position east, north, up, independent from photograph to photograph, m, (3,).
     rtk_offset
         Recorded less true, the same in all photographs, m, (3,).
     gimbal
-        Of each of three rotations of the camera, rad.
+        Error of each of three rotations of the camera, rad.
     survey
-        Of each coordinate of a heliostat's position, m.
+        Error of each coordinate of a heliostat's position, m.
     slope
         RMS of each component of the mirrors' slope deviations, rad.
     slope_length
         Correlation length of the slopes, m.
     reflection
-        Of the detected position of a reflection on the mirror, x and y, m.
+        Error of the detected position of a reflection on the mirror, x and y, m.
     mechanism
-        Of parameters of the mechanisms, rad.
+        Errors of parameters of the mechanisms, rad.
     """
 
     rtk: tuple[float, float, float] = (0.008, 0.008, 0.008)
@@ -75,9 +75,9 @@ class Flight:
     Attributes
     ----------
     camera
-        With its lamp.
+        The camera with its lamp.
     heliostats
-        As in the plant file.
+        Heliostats as in the plant file.
     counts
         Drive positions during the flight, (N, D).
     truth
@@ -143,9 +143,9 @@ def hover_grid(
     focus
         Point that the camera looks at.
     columns, rows
-        Horizontally, and along the slope.
+        Numbers of positions horizontally and along the slope.
     step
-        Between neighbours, m. Rows are flown back and forth.
+        Distance between neighbours, m. Rows are flown back and forth.
     """
     turned = look_at(center, focus)
     across = (np.arange(columns) - 0.5 * (columns - 1)) * step
@@ -178,9 +178,9 @@ def fly(
     Parameters
     ----------
     heliostats
-        As in the plant file.
+        Heliostats as in the plant file.
     camera
-        With its lamp.
+        The camera with its lamp.
     counts
         Drive positions, (N, D).
     positions
@@ -188,13 +188,13 @@ def fly(
     focus
         Point that the camera is to look at, ENU metres, (3,).
     errors
-        By default those of `Errors`.
+        Standard deviations; by default those of `Errors`.
     focal
-        Of the facets, m; inf if flat.
+        Focal length of the facets, m; inf if flat.
     start, interval
         Time of the first photograph, and seconds between two.
     seed
-        Of all randomness.
+        Seed of all randomness.
     installed
         The heliostats as they really are, of `install`, for several flights over the same
         ones; ``focal`` is then ignored.
@@ -242,7 +242,7 @@ def install(
     rows
         Rows of the field.
     errors, focal, seed
-        As `fly`. A heliostat is the same whichever others are asked for.
+        See `fly`. A heliostat is the same whichever others are asked for.
     """
     index = np.asarray(rows, dtype=np.intp)
     really = _installed(heliostats, errors, np.random.default_rng(seed)).take(index)
@@ -331,11 +331,11 @@ def reflections_of(
     Parameters
     ----------
     flight
-        Of `fly`.
+        A flight simulated by `fly`.
     errors
         Only ``reflection`` is used: noise of the positions on the mirror.
     seed
-        Of that noise.
+        Seed of that noise.
     corrected
         Whether RTK's common offset is known and removed, as the evaluation of images does. The
         camera's attitude, which locates the lamp, is known to 0.1 mrad from the images and taken

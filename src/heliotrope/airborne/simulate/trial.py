@@ -27,19 +27,19 @@ class TrialConditions:
     Attributes
     ----------
     distance
-        From mirror to drone.
+        Distance from mirror to drone.
     columns, rows
-        Of the hover positions, which extend two slope errors beyond the mirror's edge.
+        Numbers of hover positions, which extend two slope errors beyond the mirror's edge.
     slope, length
         RMS of each component of the slope deviations, and their correlation length.
     rtk
-        Of each photograph's position.
+        Error of each photograph's position.
     reflection
-        Of the detected position of a reflection on the mirror.
+        Error of the detected position of a reflection on the mirror.
     hover
-        Of the drone's distance from its planned position, which it knows.
+        Distance of the drone from its planned position, known to the drone.
     pointing
-        Of the mirror's rotation from the expected orientation.
+        Rotation of the mirror from the expected orientation.
     lamp
         Offset from the camera, to the right.
     budget
@@ -73,13 +73,13 @@ class TrialMirror:
     Attributes
     ----------
     shape
-        With its true slopes.
+        The mirror with its true slopes.
     rotation, vertex
         True, (3, 3) and (3,).
     expected_rotation, expected_vertex
         Expected.
     reflections
-        As image evaluation would find them.
+        Reflections as the evaluation of images would find them.
     """
 
     shape: MirrorShape
@@ -99,11 +99,11 @@ class Trials:
     count
         Points without outliers, (K,).
     error
-        Of the mean alone: with the mirror's true position known, (K, 2).
+        Error of the mean alone, with the mirror's true position known, (K, 2).
     total_error
-        With all errors, (K, 2).
+        Error from all causes, (K, 2).
     sigma_plain, sigma_mean, systematic
-        As stated by the evaluation, (K, 2).
+        Standard deviations stated by the evaluation, (K, 2).
     """
 
     count: FloatArray
@@ -179,15 +179,15 @@ def trials(
     Parameters
     ----------
     conditions
-        Of the flight.
+        Settings of the flight.
     shape
-        As designed; four facets of 1.6 m by 1.25 m if None.
+        Mirror as designed; four facets of 1.6 m by 1.25 m if None.
     map_known
         Whether the evaluation has the mirror's slope map.
     mean
-        As `heliotrope.airborne.evaluate.orientation.measure`.
+        See `heliotrope.airborne.evaluate.orientation.measure`.
     seed
-        Of the first trial; the others follow.
+        Seed of the first trial; the others follow.
 
     Raises
     ------
