@@ -1,4 +1,4 @@
-"""The evaluation of a flight by its one public function: the stays of a photograph, the result."""
+"""The evaluation of a flight by its one public function: the steps of a photograph, the result."""
 
 import re
 import sys
@@ -25,7 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def stays(folder: Path) -> tuple[CampaignResult, list[str]]:
+def steps(folder: Path) -> tuple[CampaignResult, list[str]]:
     """Return the result and the functions of the package in the order of their first call."""
     met: list[str] = []
 
@@ -45,8 +45,8 @@ def stays(folder: Path) -> tuple[CampaignResult, list[str]]:
     return result, met
 
 
-def test_a_photograph_goes_forward_by_the_stays_that_the_function_lists(folder: Path) -> None:
-    result, met = stays(folder)
+def test_a_photograph_goes_forward_by_the_steps_that_the_function_lists(folder: Path) -> None:
+    result, met = steps(folder)
     listed = re.findall(r"``((?!report)\w+\.\w+)``", evaluate_flight.__doc__ or "")
     assert len(listed) == 14
     places = [met.index(name) for name in listed]

@@ -182,7 +182,7 @@ def test_sightings_name_what_is_left_out(folder: Path, call: Any) -> None:
     left = {line.split(": ", 1)[0]: line.split(": ", 1)[1] for line in found["left_out"]}
     assert left["p3.png"].startswith("no spot")
     assert left["p4.png"] == "the plant has no heliostat H9"
-    assert left["p5.png"].startswith("nothing is known of it")
+    assert left["p5.png"].startswith("nothing is known about it")
     assert "p6.png" in left
 
 

@@ -328,7 +328,7 @@ BAD: dict[str, tuple[bytes, str]] = {
         _animated(), "this WebP is animated; save one of its frames"
     ),
     "webp none": (b"RIFF" + struct.pack("<I", 4) + b"WEBP", "this WebP is damaged ("),
-    "wave": (b"RIFF" + struct.pack("<I", 36) + b"WAVEfmt ", "this is a RIFF file but no WebP"),
+    "wave": (b"RIFF" + struct.pack("<I", 36) + b"WAVEfmt ", "this is a RIFF file but not WebP"),
 }  # fmt: skip
 
 

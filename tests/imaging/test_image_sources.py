@@ -364,7 +364,7 @@ def test_streams_that_cannot_be_opened() -> None:
     with _server(camera) as port:
         lost = StreamSource(f"http://u:secret@127.0.0.1:{port}/other", **QUICK)
         with (
-            pytest.raises(FetchError, match=r"other: it answers, but with no video") as error,
+            pytest.raises(FetchError, match=r"other: it answers, but not with video") as error,
             lost,
         ):
             pass
@@ -519,7 +519,7 @@ def test_a_device_gets_its_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert set(plain.settings) == {cv2.CAP_PROP_BUFFERSIZE}
     other = _Capture(refuses=True)
     with (
-        pytest.raises(InputError, match="does not accept width 1600 px but says 640; see v4l2"),
+        pytest.raises(InputError, match="does not accept width 1600 px but reports 640; see v4l2"),
         played(other, width=1600),
     ):
         pass
@@ -639,7 +639,7 @@ def test_frames_that_have_no_average() -> None:
     with pytest.raises(InputError, match="no frame to average"):
         average([])
     for other in (_pixels(1), still.pixels.astype(np.uint16), np.dstack([still.pixels] * 3)):
-        with pytest.raises(InputError, match="have no mean; give frames of a kind"):
+        with pytest.raises(InputError, match="differ; give frames of one kind"):
             average([still, Frame(other, "other")])
 
 

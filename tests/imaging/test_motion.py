@@ -276,7 +276,7 @@ def test_bad_arguments() -> None:
         detect_motion(frame, frame[:, ::2])
     with pytest.raises(InputError, match=r"a mask of \(3, 4\) does not fit frames of \(420, 560\)"):
         detect_motion(frame, frame, np.ones((3, 4)))
-    with pytest.raises(InputError, match="the mask leaves nothing"):
+    with pytest.raises(InputError, match="the mask excludes the whole frame"):
         detect_motion(frame, frame, np.zeros((H, W)))
     with pytest.raises(InputError, match="a frame of 15 × 420 px; motion needs 16"):
         detect_motion(frame[:, :15], frame[:, :15])
@@ -338,7 +338,7 @@ def test_a_stream_learns_nothing_from_what_is_unusable() -> None:
         assert state is MotionState.UNUSABLE
         assert "dark" in motion.problem
     assert detector.update(_shoot(SCENES[0], rng))[0] is MotionState.STILL
-    # The camera was turned: after as many frames as it remembers it begins anew.
+    # The camera was turned: after as many frames as it remembers it starts again.
     turned = [_shoot(SCENES[0], rng, (60.0, 30.0)) for _ in range(6)]
     assert [detector.update(frame)[0] for frame in turned] == [
         *[MotionState.UNUSABLE] * 3,

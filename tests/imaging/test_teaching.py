@@ -303,7 +303,7 @@ def test_an_edge_or_nothing_is_no_mark(frame: Frame) -> None:
     for point in taught.points[4:]:
         assert point.mark is None
         assert "only an edge, or nothing" in point.note
-        assert "the point locates the camera but is no mark" in point.note
+        assert "the point locates the camera only" in point.note
     assert [m.name for m in taught.plant.target("target").marks] == list(TURNS)
     assert taught.fit.residuals.shape == (6, 2)
 

@@ -9,8 +9,7 @@ evaluates their photographs, and simulates both.
   ``evaluate_flight``.
 - `heliotrope.airborne.simulate`: flights with their truth, with or without images.
 
-Here are the things that all three share: mirrors and how they stand, photographs and the camera
-that took them.
+The package itself holds what all three share: mirrors and their poses, photographs and cameras.
 """
 
 from heliotrope.airborne.mirror import MirrorShape, ideal, measured_normal, rectangle, tiled

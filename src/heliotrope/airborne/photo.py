@@ -220,7 +220,7 @@ def write_camera(path: str | Path, camera: LedCamera) -> None:
 def read_photos(
     folder: str | Path, plant_origin: tuple[float, float, float]
 ) -> tuple[tuple[Photo, ...], tuple[str, ...]]:
-    """Return the photographs of a folder in the order of their names, and what is wrong.
+    """Return the photographs of a folder in the order of their names, and the problems.
 
     Position, gimbal angles and time come from ``photos.csv`` in the folder if there is one,
     otherwise from the EXIF and XMP that DJI writes.

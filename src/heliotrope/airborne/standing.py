@@ -1,4 +1,4 @@
-"""How mirrors stand: vertex, rotation and outline of each at its drive positions.
+"""Poses of mirrors: vertex, rotation and outline of each at its drive positions.
 
 Concentrator coordinates: origin at the vertex, x to the right as seen from the front, y up along
 the mirror, z the normal.
@@ -22,7 +22,7 @@ from heliotrope.geometry import FloatArray, as_float
 
 @dataclass(frozen=True)
 class Standing:
-    """N mirrors as they stand, or are believed to stand.
+    """Poses of N mirrors, true or expected.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Standing:
 
 
 def standing(heliostats: Heliostats, counts: npt.ArrayLike) -> Standing:
-    """Return how calibrated heliostats stand at drive counts (N, D)."""
+    """Return the poses of calibrated heliostats at drive counts (N, D)."""
     turned, vertex = orientation(heliostats.calibrated, counts)
     return Standing(heliostats.names, vertex, turned, outline(heliostats))
 

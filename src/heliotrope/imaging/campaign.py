@@ -457,11 +457,11 @@ def _unusable(outcome: Outcome, entry: Entry | None, index: Mapping[str, int]) -
     if outcome.problem:
         return outcome.problem.removeprefix(f"{outcome.path}: ")
     if entry is None:
-        return "nothing is known of it: no row in the log, no file beside it"
+        return "nothing is known about it: no row in the log, no file beside it"
     if outcome.point is None:
         return outcome.refusal
     if not entry.heliostat:
-        return "its heliostat is not known; give --heliostat or a log"
+        return "its heliostat is unknown; give --heliostat or a log"
     if entry.heliostat not in index:
         return f"the plant has no heliostat {entry.heliostat}"
     if entry.counts is None:

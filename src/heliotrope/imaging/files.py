@@ -201,7 +201,7 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
             raise FormatError(
                 file,
                 f"{state.st_size / 2**20:.0f} MiB are more than {limit / 1e6:.3g} million "
-                "pixels can have; this is no image, or the limit must be raised",
+                "pixels can have; check that it is an image, or raise the limit",
             )
         data = file.read_bytes()
     except FileNotFoundError:
@@ -244,7 +244,7 @@ def _opener(file: Path, data: bytes) -> tuple[str, Callable[[io.BytesIO], ImageF
     for start, (kind, opener) in _OPENERS.items():
         if data.startswith(start):
             if kind == "WebP" and data[8:12] != b"WEBP":
-                raise FormatError(file, f"this is a RIFF file but no WebP; give a {_KINDS}")
+                raise FormatError(file, f"this is a RIFF file but not WebP; give a {_KINDS}")
             return kind, opener
     if data[4:8] == b"ftyp":
         what = "an AVIF, a HEIC or a video"

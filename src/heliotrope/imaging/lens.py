@@ -425,7 +425,9 @@ def calibrate_marks(
         Name of the camera.
     """
     if not points or len(points) != len(pixels):
-        raise InputError(f"{len(points)} lists of points, {len(pixels)} of pixels; give as many")
+        raise InputError(
+            f"{len(points)} lists of points, {len(pixels)} of pixels; give one each for a frame"
+        )
     noise = [sigma] * len(points) if isinstance(sigma, int | float) else sigma
     frames = [_observed(*frame) for frame in zip(points, pixels, noise, strict=True)]
     where, seen, white = (np.concatenate(part) for part in zip(*frames, strict=True))

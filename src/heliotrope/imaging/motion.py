@@ -216,7 +216,7 @@ def _mask(mask: npt.ArrayLike | None, view: _View) -> _Image | None:
     if given.shape != (view.size[1], view.size[0]):
         raise InputError(f"a mask of {given.shape} does not fit frames of {view.size[::-1]} px")
     if not given.any():
-        raise InputError("the mask leaves nothing where motion could count")
+        raise InputError("the mask excludes the whole frame; clear a part of it")
     size = view.image.shape[1::-1]
     share = cv2.resize(given.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return np.asarray(share > 0.0, dtype=np.uint8)
@@ -586,7 +586,7 @@ class MotionDetector:
 
     The background is a running mean. Light that appears and stays counts as moving until it is
     part of the background, after about ``memory · ln(significance / threshold)`` frames. Frames
-    that cannot be compared are not learnt; after ``memory`` of them in a row it starts anew.
+    that cannot be compared are not learnt; after ``memory`` of them in a row it starts again.
 
     Parameters
     ----------

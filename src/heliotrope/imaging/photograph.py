@@ -337,7 +337,7 @@ def _views(found: Sequence[FoundTarget]) -> list[View]:
 def _empty_picture(
     without: Frame, view: View, camera: Camera | None, chosen: Settings
 ) -> Rectified:
-    """Return the face in the frame without the beam, found anew: the camera may have moved."""
+    """Return the face in the frame without the beam, searched again: the camera may move."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
     known = next((f.view for f in again if f.view is not None), None)
     if known is None:

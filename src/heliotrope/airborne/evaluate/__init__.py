@@ -1,7 +1,7 @@
 """The evaluation of a drone's photographs: orientations of mirrors, report and sightings.
 
 Begin with `evaluate_flight`, which leads from the folder of photographs to the result; its
-docstring lists the stays. `write_result` writes the result to files. Each step can be called
+docstring lists the steps. `write_result` writes the result to files. Each step can be called
 by itself: `read_many`, `evaluate`, `measure_field`, `to_sightings`.
 """
 

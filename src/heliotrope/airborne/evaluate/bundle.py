@@ -81,7 +81,7 @@ class Corners:
 
 @dataclass(frozen=True)
 class Priors:
-    """Standard deviations of what is known beforehand.
+    """Prior standard deviations of the unknowns.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class State:
     offset
         b, recorded less true, m, (3,).
     stand
-        The mirrors as they stand.
+        Poses of the mirrors.
     survey
         d of each heliostat's position, m, (H, 3); zeros if it was flown in one pose.
     """
@@ -257,7 +257,7 @@ def adjust(
     *,
     owner: npt.ArrayLike | None = None,
 ) -> Adjusted:
-    """Return the exterior orientation of all photographs, and the mirrors' positions.
+    """Return the exterior orientation of all photographs, and the mirrors' poses.
 
     Parameters
     ----------
@@ -356,7 +356,7 @@ def _place_covariances(layout: _Layout, corners: Corners, solver: "SuperLU") -> 
 def _priors(
     layout: _Layout, state: State, spreads: FloatArray, known: Priors, moved: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the weights of all priors, and their pull on the unknowns."""
+    """Return the weights of all priors, and the right-hand side that they add."""
     prior, pull = np.zeros(layout.size), np.zeros(layout.size)
     photo = slice(0, layout.offset)
     own, drawn = (a[photo].reshape(-1, 6) for a in (prior, pull))

@@ -73,7 +73,7 @@ class Campaign:
 
 
 def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = None) -> Campaign:
-    """Return the reflections of all flights; one without result does not stop the others.
+    """Return the reflections of all flights; a flight without a result does not stop the others.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     """
     found: list[Evaluation | None] = [None] * len(flights)
     problems = [tuple(flight.unused()) for flight in flights]
-    # Of a single flight, the evaluation itself says what is wrong.
+    # The error of a single flight is raised as it is.
     usable = [k for k, f in enumerate(flights) if f.corners or f.dark or len(flights) == 1]
     done = []
     for group in flight_groups(flights, usable):

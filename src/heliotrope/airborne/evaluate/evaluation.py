@@ -84,7 +84,7 @@ def evaluate(
     camera
         The camera with its lamp.
     stand
-        The mirrors, as they are believed to stand.
+        The mirrors in their expected poses.
     shape
         Gives the surface of a mirror's row; slopes do not matter here.
     priors

@@ -22,7 +22,7 @@ from heliotrope.field.plant import Plant
 if TYPE_CHECKING:
     from distributed import Client
 
-#: Called with what is being done, how many are done, and of how many.
+#: Called with the name of the step, and the numbers of items done and in all.
 Progress = Callable[[str, int, int], None]
 
 #: Survey (10 mm) and kinematics (30 mm) as HelioPoint assumes them; the 30 mm of RTK base are ours.
@@ -40,7 +40,7 @@ class FlightResult:
     evaluation
         Exterior orientations, and reflections.
     measured
-        Orientations of the mirrors, with what they were measured with.
+        Orientations of the mirrors, and the data used to measure them.
     """
 
     data: FlightData
@@ -48,7 +48,7 @@ class FlightResult:
     measured: MeasuredFlight
 
     def label(self, name: str) -> str:
-        """Return a name within this flight as the whole campaign calls it."""
+        """Return a name within this flight as a name within the campaign."""
         return f"{self.data.name}/{name}" if self.data.name else name
 
     def sightings(self) -> Sightings | None:
@@ -76,7 +76,7 @@ class CampaignResult:
     data
         All flights that could be opened.
     campaign
-        RTK's common offset, and what became of each flight.
+        RTK's common offset, and the outcome of each flight.
     flights
         Those with a result.
     not_used
@@ -153,8 +153,8 @@ def evaluate_flight(
 ) -> CampaignResult:
     """Return the orientations of a flight's mirrors, from the folder of its photographs.
 
-    A folder of such folders is a campaign: its flights are evaluated together. The way of a
-    photograph, each step once and in this order:
+    A folder of such folders is a campaign: its flights are evaluated together. The steps, in
+    order:
 
     1. ``folder.open_flights``: photographs, camera and commands become a ``FlightData``.
     2. ``reading.read_many``: each photograph is read, and what it shows is a ``Seen``.
@@ -178,11 +178,11 @@ def evaluate_flight(
     plant
         The field.
     priors
-        Standard deviations of what is known beforehand.
+        Prior standard deviations.
     keep, processes, client
         See `heliotrope.airborne.evaluate.reading.read_many`.
     progress
-        Called with what is being done, and (done, all) photographs.
+        Called with the name of the step, and the numbers of photographs done and in all.
 
     Raises
     ------

@@ -108,7 +108,7 @@ def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArr
     photo
         The photograph as recorded by the drone.
     stand
-        All mirrors, as they are believed to stand.
+        All mirrors in their expected poses.
     patches
         Centres of patches, px, (K, 2).
     """
@@ -264,7 +264,7 @@ def is_dark(picture: Picture) -> bool:
 
 
 def expected_feet(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[FloatArray, Rows]:
-    """Return where mirrors that stand as believed show the lamp, (K, 3), and their rows, (K,)."""
+    """Return where mirrors in expected poses show the lamp, (K, 3), and their rows, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
     half = 0.5 * np.ptp(stand.outline[..., :2], axis=1)

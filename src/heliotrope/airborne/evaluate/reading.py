@@ -158,7 +158,7 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
     camera
         Lens.
     stand
-        All mirrors, as they are believed to stand.
+        All mirrors in their expected poses.
     """
     if photo.path is None:
         return Seen(photo.name, "unreadable: there is no file")
@@ -322,7 +322,7 @@ def read_many(
     camera
         Lens.
     stand
-        All mirrors, as they are believed to stand.
+        All mirrors in their expected poses.
     processes
         Number of processes on this machine.
     client

@@ -20,7 +20,7 @@ _AXES = ("x", "y")
 
 @dataclass(frozen=True)
 class MeasuredFlight:
-    """Orientations of one flight (one pose of the mirrors), with what they were measured with.
+    """Orientations of one flight (one pose of the mirrors), and the data used to measure them.
 
     Attributes
     ----------

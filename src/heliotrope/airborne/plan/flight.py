@@ -122,7 +122,7 @@ class Visit:
     begin, end
         First and last moment of photographing, s since the start of the campaign.
     wait
-        Time hovering beforehand, for mirrors that are still moving, s.
+        Time hovering before the first photograph, for mirrors that are still moving, s.
     """
 
     station: int
@@ -255,7 +255,7 @@ def fly(
             rows = grouped(mine, place, size)
             tried = _one(drone, rows, stations, home[drone], craft, ways)
             if best and tried[-1].end > 0.995 * best[-1].end:
-                # The mirrors cause no wait any more; larger groups only fly farther.
+                # Mirrors no longer cause a wait; larger groups only lengthen the flight.
                 break
             best, rest = tried, rows
         if flown:

@@ -1,4 +1,4 @@
-r"""Hover patterns: drone positions from which all of every mirror is sampled.
+r"""Hover patterns: drone positions from which the whole of every mirror is sampled.
 
 Lamp and camera are side by side, so a mirror shows the lamp where its normal points at the drone.
 A point of the mirror at height x above its vertex (either direction of the mirror's plane), whose
@@ -71,7 +71,7 @@ class Sampling:
         if not 0.0 <= self.pointing <= 0.1:
             raise InputError(
                 f"pointing error {1e3 * self.pointing:g} mrad: give 0 to 100 mrad; roughly align "
-                "mirrors that are worse beforehand"
+                "mirrors with larger errors first"
             )
         if not abs(self.focal) > 0.0:
             raise InputError("focal length 0 m: give another, or infinity for flat facets")
@@ -329,7 +329,7 @@ def pattern(
     direction: npt.ArrayLike,
     sampling: Sampling,
 ) -> Pattern:
-    """Return the hover points from which all of n mirrors are sampled.
+    """Return the hover points from which the whole of n mirrors is sampled.
 
     Parameters
     ----------

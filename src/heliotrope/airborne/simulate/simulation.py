@@ -1,6 +1,6 @@
-"""A simulated flight with its truth: mirrors as they really stand, and what the drone records.
+"""A simulated flight with its truth: the true poses of the mirrors, and the drone's records.
 
-A flight holds two versions of the same thing. *True*: mechanisms with imperfections, surveyed
+A flight exists in two versions. *True*: mechanisms with imperfections, surveyed
 positions with errors, facets with slope errors, the real positions of the camera. *Recorded*: the
 plant file, the commands, and for each photograph a position from RTK and the angles of a gimbal.
 `fly` makes both; `reflections_of` gives the reflections that an image evaluation would
@@ -81,7 +81,7 @@ class Flight:
     counts
         Drive positions during the flight, (N, D).
     truth
-        How the mirrors really stand.
+        True poses of the mirrors.
     shapes
         Their surfaces with slope deviations, N of them.
     taken
@@ -101,7 +101,7 @@ class Flight:
 
 @dataclass(frozen=True)
 class Installed:
-    """N heliostats as they really are: mechanisms, and surfaces with slope deviations."""
+    """The truth about N heliostats: mechanisms, and surfaces with slope deviations."""
 
     heliostats: Heliostats
     shapes: tuple[MirrorShape, ...]
@@ -196,7 +196,7 @@ def fly(
     seed
         Seed of all randomness.
     installed
-        The heliostats as they really are, of `install`, for several flights over the same
+        True heliostats made by `install`, for several flights over the same
         ones; ``focal`` is then ignored.
     flight
         Number of this flight among several: its photographs have errors of their own.
@@ -233,7 +233,7 @@ def install(
     focal: npt.ArrayLike = np.inf,
     seed: int = 0,
 ) -> Installed:
-    """Return some heliostats of a field as they really are.
+    """Return the truth about some heliostats of a field.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _shape(
 
 
 def _installed(heliostats: Heliostats, wrong: Errors, rng: np.random.Generator) -> Heliostats:
-    """Return the heliostats as they really are."""
+    """Return the truth about the heliostats."""
     count = len(heliostats)
     sizes = {f"position_{axis}": wrong.survey for axis in ("east", "north", "up")}
     moved = dict(heliostats.parameters)
@@ -285,7 +285,7 @@ def _photograph(
     rng: np.random.Generator,
 ) -> tuple[Photo, Photo]:
     """Return a photograph with its true orientation, and as the drone records it."""
-    # The drone steers by its own RTK: it believes to be where it was sent.
+    # The drone steers by its own RTK, so it records the position that it was sent to.
     true = place - np.asarray(wrong.rtk_offset) + rng.normal(0.0, 1.0, 3) * wrong.rtk
     wanted = look_at(place, focus)
     lean = rng.normal(0.0, wrong.gimbal, 3)

@@ -53,7 +53,7 @@ def average(frames: Iterable[Frame], max_shift: float = 1.0) -> Frame:
         if (frame.pixels.shape, frame.pixels.dtype) != (first.pixels.shape, first.pixels.dtype):
             raise InputError(
                 f"{frame.name}: {frame.pixels.shape} of {frame.pixels.dtype} and {first.name}: "
-                f"{first.pixels.shape} of {first.pixels.dtype} have no mean; give frames of a kind"
+                f"{first.pixels.shape} of {first.pixels.dtype} differ; give frames of one kind"
             )
         shift = find_shift(first, frame) if used and min(frame.size) >= 16 else None
         if shift is not None and math.hypot(*shift) > max_shift:

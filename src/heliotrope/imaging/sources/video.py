@@ -245,7 +245,7 @@ class StreamSource(CameraSource):
         capture = _capture(self.url, cv2.CAP_FFMPEG, limits)
         if capture is not None:
             return capture
-        text = "it answers, but with no video; check the path, the user and the password"
+        text = "it answers, but not with video; check the path, the user and the password"
         try:  # OpenCV does not say why
             socket.create_connection(self._place, min(self.timeout, 5.0)).close()
         except OSError as error:
@@ -305,7 +305,7 @@ class UsbSource(CameraSource):
             got = capture.get(key)
             capture.release()
             raise InputError(
-                f"source {self.name}: the camera does not accept {what} {value:g}{unit} but says "
-                f"{got:g}; see v4l2-ctl --list-formats-ext and --list-ctrls"
+                f"source {self.name}: the camera does not accept {what} {value:g}{unit} "
+                f"but reports {got:g}; see v4l2-ctl --list-formats-ext and --list-ctrls"
             )
         return capture

@@ -249,7 +249,7 @@ class Attempt:
     looks
         Measurements of each mark.
     known
-        Whether the face's rough place was known beforehand.
+        Whether the face's rough place was known before the search.
     vague
         Why the places of some targets remain unknown, by name.
     """
@@ -495,7 +495,7 @@ class Search:
                 f"its marks do not fit together: {view.residual:.1f} px RMS, limit {limit:.1f} px"
             )
         if self._impossible(view):
-            return "its marks lie as no camera can see a plane"
+            return "no camera can see a plane with its marks in these places"
         return self._misshapen(used, seen, known) or self._dark(view, used, seen)
 
     def _points_of(self, used: list[int]) -> int:
@@ -551,7 +551,7 @@ class Search:
         if float(np.median(unlike)) > ALIKE or (few and float(unlike.max()) > ALIKE_EACH):
             return f"shapes that lie like its marks differ from them by up to {unlike.max():.0%}"
         if few and explained < EXPLAINED_EACH:
-            return f"shapes that lie like its marks are not they: one explains only {explained:.0%}"
+            return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
         return ""
 
     def _dark(self, view: View, used: list[int], seen: _Seen) -> str:

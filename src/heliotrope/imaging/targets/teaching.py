@@ -423,7 +423,7 @@ def _picture(
     spots = _mapped(H, grid) + here.pixel - _mapped(H, place[None])[0]
     width, height = frame.size
     if (spots.min(axis=0) < -0.5).any() or (spots.max(axis=0) > [width - 0.5, height - 0.5]).any():
-        return _nothing(here, f"a picture of {size:.2f} m about it leaves the frame; --size less")
+        return _nothing(here, f"a picture of {size:.2f} m about it leaves the frame; reduce --size")
     maps = spots.reshape(count, count, 2).astype(np.float32)
     grey: Any = _eight_bit(frame)
     patch = cv2.remap(grey, maps[..., 0], maps[..., 1], cv2.INTER_CUBIC)
@@ -438,7 +438,7 @@ def _picture(
 
 def _nothing(here: TaughtPoint, why: str) -> TaughtPoint:
     before = f"{here.note}; " if here.note else ""
-    return replace(here, note=f"{before}{why}: the point locates the camera but is no mark")
+    return replace(here, note=f"{before}{why}: the point locates the camera only")
 
 
 def _vagueness(picture: npt.NDArray[np.uint8]) -> float:
