@@ -1,13 +1,14 @@
-"""Days of calibration without controllers: mirrors are measured as a schedule says, and learnt.
+"""Days of calibration without controllers: the real schedule and the real fit on simulated mirrors.
 
-Visits begin when the real schedule says so and take as long as it expects; sightings come from
-the true mechanisms with noise, parameters from the real fit. So a month of 10,000 heliostats takes
-minutes, where the plant with all its controllers (`twin.live`) takes the month.
+A visit begins when the schedule chooses it and takes the time that the schedule expects. Sightings
+come from the true mechanisms, with noise. A day of 10,000 heliostats takes minutes; the plant with
+all its controllers (`twin.live`) takes the day.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -27,36 +28,52 @@ from heliotrope.optics.beam import CHI_SQUARE_90
 from heliotrope.plant.schedule import Assignment, Scheduler, Visited, Weather
 from heliotrope.sun import vector
 
-#: Before the end of a visit, its photographs are so far apart, s.
+#: Time between the photographs at the end of a visit, s.
 _APART = 20.0
+
+
+class Chooser(Protocol):
+    """Chooses the next visit; `Scheduler.next` is one."""
+
+    def __call__(
+        self,
+        now_utc: datetime,
+        sun: FloatArray,
+        states: "Standing",
+        free_targets: Sequence[str],
+        holds: Collection[str],
+        weather: Weather | None,
+    ) -> Assignment | None:
+        """Return the next visit, None if there is none."""
+        ...
 
 
 @dataclass
 class Standing:
-    """States of heliostats that all stand at their standby points."""
+    """States of heliostats at their standby points, as `Scheduler.next` takes them."""
 
     state: npt.NDArray[np.uint8]
     counts: npt.NDArray[np.int32]
 
     @classmethod
     def ready(cls, count: int) -> "Standing":
-        """All of them can be sent."""
+        """Return the states of heliostats that can all be sent to a target."""
         stand = np.full((count, 2), [0, 50_000], dtype=np.int32)
         return cls(np.full(count, states.IDLE, dtype=np.uint8), stand)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """How N heliostats would really point at some suns; NaN where they cannot.
+    """True pointing errors of N heliostats; NaN where they cannot point.
 
     Attributes
     ----------
     names
-        N of them.
+        The heliostats.
     error
         True error of the mirror's normal, RMS over the suns, rad, (N,).
     predicted
-        The same as the calibration predicts it, rad, (N,).
+        Error that the calibration predicts, rad, (N,).
     within
         Share of all pairs of heliostat and sun whose beam lies in the predicted 90 % ellipse.
     """
@@ -69,18 +86,24 @@ class Truth:
 
 @dataclass
 class Days:
-    """A plant whose true mirrors stand as a quick installation leaves them.
+    """A simulated plant whose mirrors stand as a quick installation leaves them.
 
     Attributes
     ----------
-    plant, scheduler
-        The plant as it knows itself, with heliostats of one group.
+    plant
+        The plant as it knows itself; all heliostats belong to one group.
+    scheduler, choose
+        The schedule, and a rule that chooses in its place; None: the schedule's own.
     now
-        Time; `live` moves it.
+        Present time; `live` moves it.
     noise
-        Of a photograph's beam direction, rad, in each direction.
-    weather, holds, blind
-        What the schedule is told; whose beams no photograph shows.
+        Standard deviation of a photograph's beam in each direction, rad.
+    seed
+        Seed of the true mirrors and of the noise.
+    weather, holds
+        Weather, and heliostats to leave alone, as given to the schedule.
+    blind
+        Heliostats whose beams no photograph shows.
     truth
         The true mechanisms.
     known, values, records
@@ -94,6 +117,7 @@ class Days:
     plant: Plant
     scheduler: Scheduler
     now: datetime
+    choose: Chooser | None = None
     noise: float = 5e-4
     seed: int = 0
     weather: Weather = field(default_factory=Weather)
@@ -123,11 +147,11 @@ class Days:
         Parameters
         ----------
         span
-            For so long.
+            Time that passes.
         look
-            While there is nothing to do, the schedule is asked so often.
+            Time until the schedule is asked again when it had nothing to do.
         progress
-            Told the time after each decision.
+            Called with the time before each decision.
         """
         until = self.now + span
         while self.now < until:
@@ -149,7 +173,8 @@ class Days:
         free = [t.name for t in self.plant.targets if t.name not in busy]
         if not free:
             return None
-        return self.scheduler.next(
+        choose: Chooser = self.choose or self.scheduler.next
+        return choose(
             self.now,
             vector(self.now, self.plant.site),
             self.field,
@@ -159,17 +184,17 @@ class Days:
         )
 
     def mechanism(self, name: str) -> Mechanism:
-        """Return a heliostat as it is believed to be, (1,)."""
+        """Return the mechanism of a heliostat by its last calibration, (1,)."""
         row = np.array([self.group.index(name)])
         return self.values.get(name, self.group.mechanism[row])
 
     def photographs(self, name: str, target: str, times: FloatArray) -> Sightings:
-        """Return sightings of a heliostat that tracks a target as it is believed to be.
+        """Return sightings of a heliostat that tracks a target by its last calibration.
 
         Parameters
         ----------
         name, target
-            Who and where.
+            Names of the heliostat and the target.
         times
             POSIX s, (M,).
         """
@@ -217,14 +242,15 @@ class Days:
         return Visited(name, told.target, told.until, True, measured)
 
     def look(self, times: FloatArray, names: tuple[str, ...] | None = None) -> Truth:
-        """Compare with the truth what heliostats would do at the receiver.
+        """Return the true errors of heliostats that aim at the receiver.
 
         Parameters
         ----------
         times
             POSIX s, (K,), with the sun up.
         names
-            Whose; default: all that were calibrated. With who was not, nothing is predicted.
+            Heliostats; default: all that were calibrated. Without a calibration nothing is
+            predicted.
         """
         chosen = tuple(self.values) if names is None else names
         suns = vector(times, self.plant.site)
@@ -257,7 +283,7 @@ class Days:
 
 
 def _half(squares: FloatArray) -> FloatArray:
-    """Return half of the root mean square over what is finite: normals turn half as much."""
+    """Return half of the RMS of the finite values: a normal turns half as much as its beam."""
     good = np.isfinite(squares)
     total = np.where(good, squares, 0.0).sum(axis=1)
     mean = total / np.where(good.any(axis=1), good.sum(axis=1), np.nan)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from benchmarks.days import Days, Standing
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,7 +25,6 @@ from heliotrope.plant.schedule.scheduler import (
     compare,
 )
 from heliotrope.sun import vector
-from heliotrope.twin.days import Days, Standing
 
 PLANT = malan_plant(24)
 SMALL = malan_plant(10)
