@@ -247,7 +247,7 @@ def test_an_emergency_goes_before_orders_and_needs_no_token() -> None:
         await field.emergency("nobody", "STOW", "A9")
         await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("one", "A2"), 1.0)
         await asyncio.sleep(1.0)
-        assert "'TRACK' is no emergency" in field.plant.text("wrong")
+        assert "'TRACK' is not an emergency" in field.plant.text("wrong")
         assert "cluster C1 has no heliostat 'A9'" in field.plant.text("nobody")
         assert "STOW came before it" in field.plant.text("aim39", "A2")
 
@@ -450,7 +450,7 @@ def test_a_node_that_starts_anew_is_taken_in() -> None:
 
 def test_a_cluster_runs_once() -> None:
     async def main(field: Field) -> None:
-        with pytest.raises(LinkError, match="cluster C1: it runs already"):
+        with pytest.raises(LinkError, match="cluster C1: it is already running"):
             await field.cluster.run()
 
     run(main)

@@ -72,7 +72,7 @@ def test_the_example_is_read(folder: Path) -> None:
         ("tcp://10.0.0.2:4840", "tcp://10.0.0.2", "has no port"),
         ("tcp://10.0.0.2:4840", "mqtt://10.0.0.2", "has no prefix"),
         ("tcp://10.0.0.2:4840", "http://10.0.0.2:80", "give tcp://host:port, mqtt://"),
-        ("tcp://10.0.0.2:4840", "tcp://host:99999", "is no URL"),
+        ("tcp://10.0.0.2:4840", "tcp://host:99999", "is not a URL"),
         ("[time]", "[time]\nerror_s = 0.6", "time.error_s: 0.6: input should be less than"),
         ("[time]", "[time]\nerror_s = 0", "time.error_s: 0: input should be greater than 0"),
         ('"localhost"', '"localhost:0x"', "time.gpsd: 'localhost:0x': give host or host:port"),
@@ -80,13 +80,13 @@ def test_the_example_is_read(folder: Path) -> None:
         (
             "[time]",
             '[time]\nsource = "gps"',
-            "time.source: the computer's clock is kept by chronyd",
+            "time.source: chronyd now keeps the computer's clock",
         ),
         ("[time]", '[time]\nurl = "/dev/ttyACM0"', 'write gpsd = "localhost"'),
         (
             "[time]",
             "[time]\nbaud_rate = 9600",
-            "time.baud_rate: the computer's clock is kept by chronyd now: give the baud",
+            "time.baud_rate: chronyd now keeps the computer's clock: give the baud",
         ),
         ("[time]", "[time]\nlatency_s = 0.5", "offset of chronyd's refclock"),
         (
@@ -133,7 +133,7 @@ def test_what_is_wrong_in_the_keys_is_named_without_the_key(
 
 def test_keys_that_others_may_read_are_refused(folder: Path) -> None:
     (folder / "C1.keys.toml").chmod(0o644)
-    with pytest.raises(FormatError, match=r"others may read it \(mode 644\); say chmod 600"):
+    with pytest.raises(FormatError, match=r"others may read it \(mode 644\); run chmod 600"):
         read_cluster(folder / "C1.toml")
 
 
@@ -336,7 +336,7 @@ def test_where_the_kernel_cannot_be_asked_that_is_said_at_the_start(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
-    with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
+    with pytest.raises(InputError, match="does not report whether its clock is synchronised"):
         time_of(read_cluster(folder / "C1.toml"), SystemClock())
 
 
@@ -347,7 +347,7 @@ def test_many_clusters_begin_their_seconds_apart() -> None:
     assert config_of(2, phase=phases[-1]).phase < 1.0
     assert spread_phase(0, 1) == 0.0
     for index, count in ((313, 313), (-1, 2), (0, 0)):
-        with pytest.raises(InputError, match=f"cluster {index} is none of {count}"):
+        with pytest.raises(InputError, match=f"cluster {index} of {count}"):
             spread_phase(index, count)
 
 

@@ -58,7 +58,7 @@ async def final(field: Field, identity: str, name: str = "A1", limit: float = 15
     [
         (
             Command("c", "TRACK", token=TOKEN + 1),
-            "no command authority: the token is not the present one",
+            "no command authority: the token is out of date",
         ),
         (Command("c", "TRACK"), "no command authority"),
         (Command("c", "FLY", token=TOKEN), "'FLY' is not a command for local controllers"),
@@ -216,7 +216,7 @@ def test_a_search_is_done_only_if_it_was_begun(lost: int) -> None:
         assert await final(field, "other", "A2") is Stage.FAILED
         assert field.boards[1].state == "IDLE"
         assert field.plant.text("other") == (
-            "SEARCH: its answer was lost, and nothing shows that it was taken; it is IDLE"
+            "SEARCH: its answer was lost, and nothing shows that it was taken; the state is IDLE"
         )
 
     run(main, "IDLE", bus=interrupted)
@@ -507,7 +507,7 @@ def test_no_more_orders_are_taken_than_the_bus_can_carry() -> None:
         for _ in range(1030):
             field.cluster._work.take(command)
         await asyncio.sleep(1.5)
-        assert "2048 orders wait already; at most 2048" in field.plant.text("c")
+        assert "2048 orders are waiting; the limit is 2048" in field.plant.text("c")
 
     run(main)
 

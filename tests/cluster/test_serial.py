@@ -374,7 +374,7 @@ def test_a_bus_runs_once_and_refuses_what_it_cannot_do(line: Line) -> None:
         bus = bus_of(line)
         async with running(bus):
             await bus.opened()
-            with pytest.raises(LinkError, match="it runs already"):
+            with pytest.raises(LinkError, match="it is already running"):
                 await bus.run()
             with pytest.raises(InputError, match="a timeout of 0 s"):
                 await bus.transact(b"", 0)

@@ -134,7 +134,7 @@ def test_a_restart_of_chronyd_ends_nothing_but_a_clock_set_meanwhile_does() -> N
     clock.advance(20.0)
     now = keeper.time()
     assert (now.quality, now.error) == ("holdover", pytest.approx(0.01 + 500e-6 * 20))
-    assert "nobody keeps the computer's clock" in now.note
+    assert "the computer's clock is not disciplined" in now.note
     clock.jump(5.0)
     now = keeper.time()
     assert (now.quality, now.error, now.jumped) == ("none", math.inf, True)
@@ -157,7 +157,7 @@ def test_a_clock_that_nobody_keeps_for_long_ends_too() -> None:
 def test_a_clock_that_nobody_ever_kept_is_no_source() -> None:
     now = SystemTime(VirtualClock(start=START), bound=lambda: math.inf).time()
     assert (now.quality, now.error) == ("none", math.inf)
-    assert now.note == "nobody keeps the computer's clock; is chronyd running?"
+    assert now.note == "the computer's clock is not disciplined; is chronyd running?"
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_the_kernel_is_asked(
 
 def test_a_kernel_that_does_not_say_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: object())
-    with pytest.raises(InputError, match="does not say whether its clock is synchronised"):
+    with pytest.raises(InputError, match="does not report whether its clock is synchronised"):
         kernel_bound()
 
 

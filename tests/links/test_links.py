@@ -81,7 +81,10 @@ def test_settings_that_contradict_each_other_are_refused(
 
 @pytest.mark.parametrize(
     ("values", "text"),
-    [({"loss": 1.5}, "chance of loss of 1.5"), ({"delay": (0.2, 0.1)}, "delay of 0.2 to 0.1 s")],
+    [
+        ({"loss": 1.5}, "probability of loss is 1.5"),
+        ({"delay": (0.2, 0.1)}, "delay of 0.2 to 0.1 s"),
+    ],
 )
 def test_faults_that_make_no_sense_are_refused(values: dict[str, object], text: str) -> None:
     with pytest.raises(InputError, match=text):
@@ -298,7 +301,7 @@ def test_a_partition_is_noticed_by_both_within_the_deadline_and_nothing_is_kept(
             assert await plant.send(b"dropped", expires=begin + 60.0) is Outcome.DISCONNECTED
             assert plant.statistics.dropped == 1
             await asyncio.sleep(5.0)
-            assert plant.problem == "no heartbeat of the other end for 1.5 s"
+            assert plant.problem == "no heartbeat from the other end for 1.5 s"
             assert plant.silent_for >= 5.0
             line.heal()
             await plant.established()
@@ -429,7 +432,7 @@ def test_a_link_runs_once_and_a_failing_block_comes_out_as_it_is() -> None:
         async def block() -> None:
             async with running(plant, cluster):
                 await plant.established()
-                with pytest.raises(LinkError, match="it runs already"):
+                with pytest.raises(LinkError, match="it is already running"):
                     await plant.run()
                 raise ZeroDivisionError
 
@@ -585,7 +588,7 @@ def test_who_cannot_prove_its_name_is_refused(name: str, key: bytes) -> None:
             async with running(stranger):
                 await until(lambda: plant.refused >= 2)
                 assert "could not prove" in plant.last_refusal
-                assert f"does not take cluster {name}" in stranger.problem
+                assert f"refuses cluster {name}" in stranger.problem
                 assert not stranger.connected
                 assert not plant.links["north"].connected
 
@@ -615,7 +618,10 @@ def test_a_server_without_the_key_is_refused_by_the_cluster() -> None:
 @pytest.mark.parametrize(
     ("bytes_sent", "text"),
     [
-        ((1 << 20).to_bytes(4, "big") + b"x", "a frame of 1048576 bytes came; at most 128"),
+        (
+            (1 << 20).to_bytes(4, "big") + b"x",
+            "received a frame of 1048576 bytes; the limit is 128",
+        ),
         ((3).to_bytes(4, "big") + b"abc", "could not prove"),
         (b"", "took too long"),
     ],

@@ -76,7 +76,7 @@ def test_messages_pass_both_ways_and_clusters_do_not_hear_each_other(mosquitto: 
                 assert await north[0].receive() == data
             assert south[1].statistics.received == south[0].statistics.received == 0
             assert north[1].statistics.refused == south[1].statistics.refused == 0
-            where = f"by 127.0.0.1:{mosquitto.port}"
+            where = f"via 127.0.0.1:{mosquitto.port}"
             assert (north[0].name, north[1].name) == (f"cluster north {where}", f"plant {where}")
 
     real(main)
@@ -229,7 +229,7 @@ def test_a_frozen_broker_is_noticed_by_the_heartbeat_and_what_it_held_comes_no_m
             await until(lambda: not plant.connected and not cluster.connected)
             # Long before the broker's keepalive of 60 s, for which this test would not wait.
             assert plant.silent_for >= QUICK.deadline
-            await until(lambda: "heartbeat" in cluster.problem or "let us in" in cluster.problem)
+            await until(lambda: "heartbeat" in cluster.problem or "refuses" in cluster.problem)
             late = await plant.send(b"later", expires=CLOCK.monotonic() + 60.0)
             assert late is Outcome.DISCONNECTED
             await until(lambda: plant.statistics.failures >= 1)  # it does not get in meanwhile
@@ -268,7 +268,7 @@ def test_a_killed_broker_is_found_again(mosquitto: Mosquitto) -> None:
             await connected(plant, cluster)
             mosquitto.kill()
             await until(lambda: plant.statistics.failures >= 1 and cluster.statistics.failures >= 1)
-            assert "does not let us in" in plant.problem
+            assert "refuses the connection" in plant.problem
             assert await plant.send(b"nobody") is Outcome.DISCONNECTED
             await asyncio.to_thread(mosquitto.start)
             await connected(plant, cluster)

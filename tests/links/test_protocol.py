@@ -74,7 +74,7 @@ def test_rows_and_items_come_back() -> None:
 
 
 def test_a_block_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="are no rows"):
+    with pytest.raises(ProtocolError, match="are not rows of"):
         decode(encode(MESSAGES[5])[:-1]).nodes()  # type: ignore[union-attr]
     with pytest.raises(ProtocolError, match="do not fit together"):
         decode(encode(MESSAGES[3]) + b"x").items()  # type: ignore[union-attr]

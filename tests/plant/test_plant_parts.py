@@ -326,7 +326,7 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     assert field.of("B", 10.0).state == "IDLE"
     assert not field.of("C", 10.0).live
     assert field.take("K", status(2), 11.0) == ["cluster K: 2 rows for 3 names"]
-    with pytest.raises(ProtocolError, match="are no rows"):
+    with pytest.raises(ProtocolError, match="are not rows of"):
         field.take("K", Status("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)
     # Who falls into FAULT or silent counts as failed for ten minutes.
     assert field.failed_share(11.0) == 0.0

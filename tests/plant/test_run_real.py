@@ -351,7 +351,7 @@ def test_each_cluster_gets_its_way(folder: Path) -> None:
         ("links.keys", "K1 =", "K8 =", "clusters.K8: the plant has no such cluster; remove"),
         ("links.keys", "[clusters]", "[cluster]", "'cluster' is not known; give plant, passw"),
         ("links.keys", "28282828", "2", "links.keys: K1: a key of 57 characters"),
-        ("K3.toml", 'name = "K3"', 'name = "K5"', "it is of cluster K5, not of K3"),
+        ("K3.toml", 'name = "K3"', 'name = "K5"', "it is for cluster K5, not for K3"),
     ],
 )
 def test_what_a_links_file_may_not_say(

@@ -2,8 +2,8 @@
 
 `Cluster` is the controller, made of a `ClusterConfig`, a bus, a link to the plant, a clock and a
 `TimeKeeper`. `SystemTime` is the time of this computer with the kernel's bound of its error;
-`Gpsd` shows a satellite receiver. `Kept` outlasts a restart: epoch, editions. `Turns` shares a bus
-between tasks.
+`Gpsd` shows the state of a satellite receiver. `Kept` holds what outlasts a restart: epoch and
+editions. `Turns` shares a bus between tasks.
 
 Modules that need the extra ``control`` are imported by name: ``config_file`` (`read_cluster`),
 ``serial_bus`` (`SerialBus`) and ``program`` (a cluster made from its file, `LocalCluster`).

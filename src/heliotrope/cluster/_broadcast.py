@@ -1,6 +1,6 @@
-"""The broadcasts that begin a second: SESSION, TIME and SUN.
+"""The broadcasts at the start of each second: SESSION, TIME and SUN.
 
-SESSION goes first: a local controller that has just started takes nothing before it. SUN is sent
+SESSION goes first: a local controller that has just started accepts nothing before it. SUN is sent
 only while the plant's lease (and the autonomy it grants) lasts, the time is sound, and no row of
 the safety table demands DEFOCUS or STOW. Without SUN each local controller defocuses by itself.
 """
@@ -18,7 +18,7 @@ _QUALITIES = ("none", "gps", "holdover", "system")
 
 
 class Broadcast:
-    """Sends session, time and sun; knows what time the local controllers were told."""
+    """Sends session, time and sun, and records the time that the local controllers have."""
 
     def __init__(
         self,
@@ -33,11 +33,11 @@ class Broadcast:
         self._offset: float | None = None  # GPS minus monotonic time, as told
 
     def bus_time(self) -> float | None:
-        """Return the GPS time of the local controllers in s, None if they were told none."""
+        """Return the GPS time of the local controllers in s, None if none was sent."""
         return None if self._offset is None else self._clock.monotonic() + self._offset
 
     async def second(self, present: Time) -> None:
-        """Send them; ``present`` is the time now."""
+        """Send the broadcasts; ``present`` is the time now."""
         now, exchange = self._clock.monotonic(), self._exchange
         sound = present.usable and not present.jumped
         if sound:

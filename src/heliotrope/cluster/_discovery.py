@@ -1,8 +1,8 @@
-"""Discovery of local controllers by serial number, in halves where answers collide.
+"""Discovery of local controllers by serial number, halving ranges where answers collide.
 
 All controllers with a serial number in a range answer in slots drawn at random. Where two answer at
-once, the bytes are damaged, and the range is asked in two halves. A range is done when it came
-clean twice in a row without a new answer.
+once, the bytes are damaged, and each half of the range is asked separately. A range is done after
+two clean questions in a row without a new answer.
 """
 
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _GARBLED = 4
 
 @dataclass(frozen=True)
 class Here:
-    """An answer."""
+    """The answer of a local controller."""
 
     serial: int
     firmware: int
@@ -40,7 +40,7 @@ class _Range:
 
 
 def heard(data: bytes, sequence: int) -> tuple[list[Here], bool]:
-    """Return the answers to a question, and whether anything else came."""
+    """Return the answers to a question, and whether other bytes came."""
     reader = wire.Reader()
     # A zero ends a frame that was cut off.
     frames = reader.feed(data + b"\0")
@@ -59,14 +59,14 @@ class Discovery:
     Parameters
     ----------
     nodes
-        The configured ones; the search begins with their serial numbers.
+        The configured local controllers; the search begins with their serial numbers.
     exchange
         The bus.
 
     Attributes
     ----------
     questions
-        Count so far.
+        Number of questions so far.
     """
 
     def __init__(self, nodes: Nodes, exchange: Exchange) -> None:

@@ -1,8 +1,7 @@
 """DEFOCUS and STOW: broadcast three times, then confirmed by each heliostat.
 
-They come from the operator, from anyone, or from the safety table. Nothing else goes on the bus
-before them. A heliostat that has not acknowledged is named, and asked again each second until it
-has.
+They come from anyone or from the safety table. Nothing else goes on the bus before them. A
+heliostat that has not acknowledged is named, and asked again each second until it has.
 """
 
 from collections import deque
@@ -19,11 +18,11 @@ NAMES = ("DEFOCUS", "STOW")
 _CALLS = 3
 #: Time for asking again in each second after the first, s: polling and the sun go on.
 _SHARE = 0.3
-#: Tries for a node in the first round.
+#: Attempts for each node in the first round.
 _ROUNDS = 3
 #: A node that missed this many questions in a row is asked after all others.
 _SILENT = 3
-#: Reported to the plant as failed after this, s; it is asked again all the same.
+#: Reported to the plant as failed after this, s; the node is still asked.
 _PATIENCE = 30.0
 
 
@@ -40,18 +39,18 @@ class _Order:
 
 
 def _rank(order: _Order) -> tuple[bool, bool, bool]:
-    """Sort key of the orders, the first to be served first."""
+    """Return the sort key of an order; the lowest is served first."""
     silent = all(node.missed >= _SILENT for node in order.waiting)
     return bool(order.sent), silent, not order.new
 
 
 class Emergencies:
-    """Emergencies that are not yet acknowledged by all.
+    """Emergencies that not all heliostats have acknowledged.
 
     Attributes
     ----------
     pressing
-        Whether something is to be sent before all else.
+        Whether something must be sent before all else.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class Emergencies:
         everybody = len(nodes) == len(self._nodes)
         if name == "STOW" and everybody:
             for older in self._orders:
-                # A heliostat that has not defocused yet goes to stow at once.
+                # A heliostat that has not defocused yet goes to stow directly.
                 older.name = name
         self._orders.append(_Order(identity, name, nodes, everybody, self._clock()))
         for node in nodes:
@@ -84,9 +83,9 @@ class Emergencies:
         self.pressing = True
 
     async def serve(self) -> None:
-        """Call and ask until every order has had its round.
+        """Broadcast and ask until every order has had its round.
 
-        Orders not yet sent at all go first, and of these the ones for heliostats that answer. Once
+        Orders not sent at all go first, and among these the ones for heliostats that answer. Once
         this has gone on for the budget of an order, silent heliostats wait for the next second, so
         that many orders on a dead bus take no longer than a few.
         """
@@ -111,7 +110,7 @@ class Emergencies:
         self.pressing = bool(self._orders)
 
     def waits(self, node: Node) -> bool:
-        """Whether a node has not acknowledged something."""
+        """Whether a node has yet to acknowledge an order."""
         return any(node in order.waiting for order in self._orders)
 
     async def _call(self, order: _Order) -> None:
@@ -146,7 +145,7 @@ class Emergencies:
         order.new = False
 
     def _later(self, order: _Order, node: Node, number: int) -> bool:
-        """Whether a node is not asked now, in a round of the order."""
+        """Whether a node is left out of a round of the order."""
         if order.given_up and node.missed > 0:
             return True  # polling finds it when it comes back
         if node.missed < _SILENT:
@@ -162,7 +161,7 @@ class Emergencies:
         begin = self._clock()
         answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
         self._asked.add((order.name, node.index))
-        # An order that came later than this frame is asked for by itself.
+        # An order that came after this frame is asked for separately.
         same = [
             other
             for other in self._orders

@@ -1,4 +1,4 @@
-"""The epoch of a cluster: renewed where frames of before must be void."""
+"""The epoch of a cluster: a new one makes all earlier frames void."""
 
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._reports import Reports
@@ -6,7 +6,7 @@ from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.safety import alarms
 
-#: Consecutive commands answered "duplicate" for no known reason that begin a new epoch.
+#: A new epoch begins after this many consecutive unexplained "duplicate" answers to commands.
 _OUT_OF_STEP = 3
 
 
@@ -22,13 +22,13 @@ class Epoch:
     reports
         Where alarms go.
     present
-        The time at the start. Without a state file it alone makes the epoch higher than that of
-        any run before.
+        The time at the start. Without a state file only the time makes the epoch higher than that
+        of any earlier run.
 
     Raises
     ------
     OSError
-        If the first epoch cannot be kept.
+        If the first epoch cannot be stored.
     """
 
     def __init__(self, kept: Kept, exchange: Exchange, reports: Reports, present: Time) -> None:
@@ -51,7 +51,7 @@ class Epoch:
             self._begin(0)
 
     def time_known(self, present: Time) -> None:
-        """Begin an epoch from the time, as soon as it is known."""
+        """Begin an epoch derived from the time, as soon as the time is known."""
         if not self._of_time:
             self._begin(int(present.gps_s))
             self._of_time = True

@@ -13,7 +13,7 @@ from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Bus, Outcome
 
-#: The share of bad frames is taken over this many seconds.
+#: The share of bad frames is computed over this many seconds.
 _WINDOW = 10
 
 
@@ -23,7 +23,7 @@ def sha256(data: bytes) -> bytes:
 
 
 class Answer(NamedTuple):
-    """An answer: name, values, and how often the question had gone out in vain before."""
+    """An answer: name, values, and the number of earlier attempts without an answer."""
 
     name: str
     values: tuple[Any, ...]
@@ -40,7 +40,7 @@ class Exchange:
     clock
         Clock of the bus's expiries.
     answer, stored_answer
-        Longest time to a whole answer, s; the same where flash is written before it.
+        Time limit of a whole answer, s; the same where flash is written before it.
 
     Attributes
     ----------
@@ -66,13 +66,13 @@ class Exchange:
         return self._bus.connected
 
     def begin_epoch(self, epoch: int) -> None:
-        """Number frames anew, in an epoch above all before (see `lcu.wire`)."""
+        """Restart the numbering of frames, in an epoch above all earlier ones (see `lcu.wire`)."""
         self.sender = wire.Sender(wire.CLUSTER_ADDRESS, epoch, sha256)
 
     def token(self, token: int) -> int:
-        """Return the token of the wire for that of the command authority.
+        """Return the wire's token for a token of the command authority.
 
-        It changes with the epoch, so that commands from before a restart, which may be heard late,
+        It changes with the epoch, so that commands from before a restart, which may arrive late,
         are void although the same authority still commands.
         """
         if token == 0:
@@ -88,7 +88,7 @@ class Exchange:
         )
 
     async def broadcast_session(self, token: int) -> None:
-        """Tell all which authority commands."""
+        """Broadcast the token of the command authority."""
         await self.transmit(self.sender.session(self.token(token)))
 
     async def transmit(self, frame: bytes, *, life: float = 0.5, urgent: bool = False) -> bool:
@@ -100,7 +100,7 @@ class Exchange:
     async def poll(
         self, node: Node, question: Question, sequence: int, begin: float
     ) -> tuple[Any, ...] | None:
-        """Ask a node at ``begin``, and return its answer's values or None; sets ``now``."""
+        """Ask a node at ``begin``, and return the values of its answer or None; sets ``now``."""
         node.asked()
         self._asked += 1
         data = await self._bus.transact(question.frame(node.address, sequence), self._answer)
@@ -128,12 +128,12 @@ class Exchange:
         tries: int = 1,
         urgent: bool = False,
     ) -> Answer | None:
-        """Send a message to a node, the same frame again if nothing comes, and return the answer.
+        """Send a message to a node, repeat the same frame if nothing comes, and return the answer.
 
         ``stored``: flash is written before the answer.
 
-        A frame that is repeated before any other is made acts once: if the node has taken it
-        before, it answers "duplicate".
+        A frame repeated before any other is made acts once: if the node has already taken it, it
+        answers "duplicate".
         """
         frame = self.sender.frame(node.address, name, *values, key=key)
         sequence = self.sender.count & 0xFFFF
@@ -170,7 +170,7 @@ class Exchange:
         stored: bool = False,
         complete: Callable[[bytes], bool] = lambda _: False,
     ) -> tuple[bytes | None, int]:
-        """Ask all, and return what comes within ``span`` s, and the sequence.
+        """Ask all, and return the bytes that arrive within ``span`` s, and the sequence.
 
         None in place of the bytes if `interrupt` was called meanwhile. ``stored``: flash is
         written before the answer.
@@ -197,13 +197,13 @@ class Exchange:
             self._gathering = None
 
     def interrupt(self) -> None:
-        """Give up what takes long, and repeat nothing, until `resume`: an emergency waits."""
+        """Abort long transactions and repeat nothing, until `resume`: an emergency waits."""
         self._hurry = True
         if self._gathering is not None:
             self._gathering.reschedule(asyncio.get_running_loop().time())
 
     def resume(self) -> None:
-        """End the hurry of `interrupt`."""
+        """End the effect of `interrupt`."""
         self._hurry = False
 
     def _spoilt(self, node: Node, data: bytes, now: float) -> None:

@@ -32,11 +32,11 @@ _MOVING = 1 << names.FLAGS.index("MOVING")
 _AT_STOW = 1 << names.FLAGS.index("AT_STOW")
 _DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
-#: A STATUS requested earlier after the ACK may not show the motion yet, s: a few ticks of a board.
+#: A STATUS requested sooner after the ACK may not show the motion yet, s: a few ticks of a board.
 _SETTLE = 0.2
-#: Step counts this close to their goal have reached it: the sun moves as much in a few ticks.
+#: Step counts this close to their goal have reached it: the sun moves this much in a few ticks.
 _NEAR = 20
-#: Limit of the longest way, from stow to standby, s.
+#: Time limit of the longest way, from stow to standby, s.
 _LONGEST = 900.0
 
 
@@ -57,7 +57,7 @@ class Goal:
         States and flags, one of which shows that the command was taken where the goal looks like
         the state before it and the answer was lost. None: the goal itself shows it.
     limit
-        Time to get there, s.
+        Time allowed to get there, s.
     """
 
     there: frozenset[int]
@@ -69,7 +69,7 @@ class Goal:
     limit: float = _LONGEST
 
     def reached(self, state: int, flags: int, off: int) -> bool | None:
-        """Return True if it is there, None if it is on its way, False if neither.
+        """Return True if the goal is reached, None if the mirror is on its way, False if neither.
 
         ``off`` is the distance of the step counts from their goal.
         """
@@ -123,9 +123,9 @@ class Shift:
     steps: int
 
     def shown(self, goals: tuple[int, int]) -> bool:
-        """Whether the goals can only be due to the command."""
+        """Whether only the command can explain the goals."""
         off = abs(goals[self.axis] - self.origin - self.steps)
-        # The sun moves the goals as well, until the command ends that.
+        # The sun moves the goals as well, until the command ends tracking.
         return off == 0 or (off <= _NEAR and abs(self.steps) > 2 * _NEAR)
 
 
@@ -139,7 +139,7 @@ class _Watch:
 
 
 class Goals:
-    """Goals that are not yet reached, judged by every STATUS."""
+    """Goals not yet reached, judged by every STATUS."""
 
     def __init__(self, reports: Reports) -> None:
         self._reports = reports
@@ -155,7 +155,7 @@ class Goals:
         sure: bool = True,
         shift: Shift | None = None,
     ) -> None:
-        """Begin the goal of a command that a node has acknowledged; goals of others are void.
+        """Begin the goal of a command that a node has acknowledged; its earlier goals are void.
 
         Not ``sure``: the answer was lost, and ``shift``, if known, shows whether it was taken.
         """
@@ -177,7 +177,7 @@ class Goals:
             self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
 
     def heard(self, node: Node, asked_at: float) -> None:
-        """Judge a node's STATUS and STEPS; the former was requested at ``asked_at``."""
+        """Judge a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""
         watches = self._watches.get(node.index)
         if watches is None:
             return
@@ -217,13 +217,13 @@ class Goals:
             watch.sure = watch.sure or watch.shift.shown((primary_goal, secondary_goal))
         off = max(abs(primary_goal - primary), abs(secondary_goal - secondary))
         reached = goal.reached(node.state, node.flags, off)
-        # Nothing later would show it either.
+        # No later STATUS would show it either.
         ended = not watch.sure and goal.told is _NOTHING
         if reached is None and not ended:
             return None
         state = states.STATES[node.state]
         if ended or (reached and not watch.sure):
-            return f"its answer was lost, and nothing shows that it was taken; it is {state}"
+            return f"its answer was lost, and nothing shows that it was taken; the state is {state}"
         fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
         return "" if reached else f"went to {state}{fault}"
 

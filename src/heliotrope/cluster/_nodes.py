@@ -1,11 +1,11 @@
-"""The local controllers of a cluster as the cluster knows them, and a quick reading of answers.
+"""The cluster's view of its local controllers, and a quick reading of answers.
 
 Each is asked once or twice a second, so the frames of the questions are made once, and an answer
 of the right size is read with one call of ``struct``. Anything else goes through `wire.Reader`,
-which decides; the quick reading accepts nothing that it would refuse. An answer carries the
-sequence of its question, and consecutive questions to a node have different ones: an answer that
-comes late (by many seconds, from a serial server in the network) is not taken for that of a later
-question.
+which decides; the quick reading accepts nothing that `wire.Reader` would refuse. An answer carries
+the sequence of its question, and consecutive questions to a node have different ones: an answer
+that comes late (by many seconds, from a serial server in the network) is not mistaken for the
+answer to a later question.
 """
 
 import math
@@ -22,7 +22,7 @@ from heliotrope.links.messages import NEVER, NODE
 _ROW = struct.Struct("<BBIIiiiiIHbHIIII")
 assert _ROW.size == NODE.itemsize
 
-#: Questions to a node go out under this many sequences in turn: four minutes of them.
+#: Questions to a node rotate through this many sequences: four minutes of them.
 SEQUENCES = 256
 
 _NO_STATUS = (states.UNCONFIGURED, 0, 0, 0, NEVER, 0, 0, 0, 0)
@@ -31,7 +31,7 @@ _UNSTUFFED_MOST = 254
 
 
 class Refusal(Exception):  # noqa: N818 (an answer, not a failure)
-    """A command that is not taken; the text says why."""
+    """A command that is refused; the text says why."""
 
 
 class Question:
@@ -45,7 +45,7 @@ class Question:
         self._frames: dict[int, bytes] = {}
 
     def frame(self, address: int, sequence: int) -> bytes:
-        """Return the question to an address."""
+        """Return the frame of the question to an address."""
         # Shared by all clusters of a process, which use the same addresses.
         key = address << 16 | sequence
         frame = self._frames.get(key)
@@ -57,7 +57,7 @@ class Question:
     def read(self, data: bytes, address: int, sequence: int) -> tuple[Any, ...] | None:
         """Return the answer's values if the bytes are exactly that answer, else None.
 
-        COBS is undone in place: where no block is full, each of its codes stands for one zero.
+        COBS is decoded in place: where no block is full, each of its codes stands for one zero.
         """
         last = self.size - 1
         if len(data) != self.size or data.find(0) != last:
@@ -98,7 +98,7 @@ class Counts:
     asked, answered
         Questions; answers.
     late, corrupt, silent
-        Questions answered by something else: an answer to another question; damage; nothing.
+        Questions without their answer: an answer to another question came; damaged bytes; nothing.
     retries
         Frames sent again.
     round_trip, longest
@@ -131,7 +131,7 @@ class Node:
     heard_at
         When it last answered anything, monotonic s; -inf: never.
     follow_until
-        Until when its step counts are asked for each second, monotonic s.
+        Until when its step counts are requested each second, monotonic s.
     missed
         Consecutive questions without an answer.
     """
@@ -173,15 +173,15 @@ class Node:
         return int(self.status[2])
 
     def take_status(self, status: tuple[Any, ...]) -> None:
-        """Take the values of a STATUS that has just come."""
+        """Store the values of a new STATUS."""
         self.status, self.status_at = status, self.heard_at
 
     def take_steps(self, steps: tuple[Any, ...]) -> None:
-        """Take the values of a STEPS that has just come."""
+        """Store the values of a new STEPS."""
         self.steps, self.steps_at = steps, self.heard_at
 
     def follow(self, until: float) -> None:
-        """Have its step counts asked for each second until a monotonic time."""
+        """Have its step counts requested each second until a monotonic time."""
         self.follow_until = max(self.follow_until, until)
 
     def asked(self, *, again: bool = False) -> None:
@@ -203,7 +203,7 @@ class Node:
         self.missed = 0
 
     def spoilt(self, data: bytes) -> None:
-        """Count what came in place of an answer."""
+        """Count bytes that came in place of an answer."""
         self.missed += 1
         if not data.strip(b"\0"):
             self.counts.silent += 1
@@ -215,7 +215,7 @@ class Node:
     def pack_into(self, block: bytearray, now: float) -> None:
         """Write its row of `messages.NODE`."""
         state, flags, fault, _, sun_age, supply, temperature, crc, boots = self.status
-        # An ACK shows that it is there, not its state: the row is as old as its STATUS.
+        # An ACK shows that the node is there, not its state: the row is as old as its STATUS.
         _ROW.pack_into(
             block,
             self.index * _ROW.size,
@@ -263,7 +263,7 @@ class Nodes:
         Raises
         ------
         Refusal
-            A name that is not of this cluster.
+            A name that does not belong to this cluster.
         """
         found = []
         for name in dict.fromkeys(wanted):
@@ -284,7 +284,7 @@ class Nodes:
 def answer_in(
     data: bytes, address: int, sequence: int, numbers: tuple[int, ...]
 ) -> wire.Frame | None:
-    """Return the answer to a question from the bytes that came, None if it is not there."""
+    """Return the answer to a question from received bytes, None if it is not there."""
     for frame in wire.Reader().feed(data):
         if (
             frame.to == wire.CLUSTER_ADDRESS

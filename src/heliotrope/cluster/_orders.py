@@ -27,25 +27,25 @@ from heliotrope.lcu import messages, names, states, wire
 from heliotrope.lcu.journal import CODES_OF, ITEMS, SIZE_OF, TARGETS
 from heliotrope.links.messages import Command, Parameters, ProtocolError, Stage
 
-#: The same frame is sent this often before others get their turn.
+#: The same frame is sent this often before other jobs get their turn.
 TRIES = 3
-#: Refused for the moment: the node has not heard the time, session or authority yet.
+#: Temporary refusals: the node has not heard the time, session or authority yet.
 _AGAIN = (messages.DUPLICATE, messages.EXPIRED, messages.REFUSED_AUTHORITY)
-#: May mean that an earlier frame was taken and its answer lost.
+#: Refusals that may mean that an earlier frame was taken and its answer lost.
 _MAYBE = (messages.DUPLICATE, messages.REFUSED_STATE, messages.BUSY)
-#: The goal looks like the state before: "duplicate" leaves open what the first answer was. A new
-#: frame tells, and does no harm if the first was taken.
+#: Commands whose goal looks like the state before: "duplicate" leaves the first answer open. A
+#: new frame settles it, and does no harm if the first was taken.
 _ANEW = ("GOTO", "SEARCH", "DIAGNOSE")
-#: A second frame would act again.
+#: Commands that would act again if sent in a second frame.
 _RELATIVE = ("JOG",)
-#: Limit for all heliostats together; the bus does about a hundred a second.
+#: Limit for all heliostats together; the bus carries about a hundred a second.
 _MOST_JOBS = 2048
-#: Heliostats commanded by so few at a time are followed: their step counts are asked for each
-#: second for this long, s.
+#: The step counts of heliostats commanded at most this many at a time are requested each second
+#: for this long, s.
 _FEW, FOLLOWED = 4, 60.0
-#: Written to flash before they are acknowledged.
+#: Commands written to flash before they are acknowledged.
 _STORED = ("STANDBY",)
-#: May move a mirror: refused while a row of the safety table forbids motion.
+#: Commands that may move a mirror: refused while a row of the safety table forbids motion.
 MOTIONS = frozenset(
     {"APPROACH", "IDLE", "TRACK", "REFOCUS", "AIM", "STANDBY", "JOG", "GOTO", "SEARCH", "DIAGNOSE"}
 )
@@ -184,7 +184,7 @@ class Orders:
                     )
                 values = node.member.serial, node.address
             if who == messages.KEY and not node.member.key:
-                raise Refusal(f"{node.name}: no key is configured; add it to the file of keys")
+                raise Refusal(f"{node.name}: no key is configured; add it to the key file")
             steps.append(Step(command.name, _typed(number, values)))
         return steps
 
@@ -193,12 +193,16 @@ class Orders:
         if authority == 0:
             raise Refusal("nobody has command authority: the plant's lease is over")
         if token != authority:
-            raise Refusal("no command authority: the token is not the present one; take it first")
+            raise Refusal(
+                "no command authority: the token is out of date; take command authority first"
+            )
         if not 0.0 < lifetime <= 3600.0:
             raise Refusal(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
         waiting = len(self._ready) + len(self._later)
         if waiting + jobs > _MOST_JOBS:
-            raise Refusal(f"{waiting} orders wait already; at most {_MOST_JOBS}: try again later")
+            raise Refusal(
+                f"{waiting} orders are waiting; the limit is {_MOST_JOBS}: try again later"
+            )
         if self._gps() is None:
             raise Refusal("the local controllers have no time yet, so no command could expire")
 
@@ -229,7 +233,7 @@ class Orders:
         self._later.clear()
 
     def cancel(self, nodes: Iterable[Node], why: str) -> None:
-        """Give up jobs not acknowledged, and goals not reached, for some heliostats."""
+        """Give up unacknowledged jobs and unreached goals, for some heliostats."""
         chosen = {node.index for node in nodes}
         for job in [*self._ready, *self._later]:
             if job.node.index in chosen:
@@ -267,7 +271,7 @@ class Orders:
         return await self._set(job)
 
     async def _note_origin(self, job: Job) -> None:
-        """Ask for the goals of the counts: if the answer is lost, they show what was done."""
+        """Ask for the goals of the step counts: if the answer is lost, they show what was done."""
         node, asked_at = job.node, self._clock()
         node.follow(asked_at + FOLLOWED)
         await self._look(node)
@@ -309,7 +313,7 @@ class Orders:
         return self._again(job, f"no answer to {step.name} before it expired")
 
     async def _give_address(self, job: Job, head: tuple[int, ...], key: bytes) -> None:
-        """Tell all, since its present address is unknown; then ask it by its serial number."""
+        """Broadcast to an unknown address; then ask the node by its serial number."""
         serial, address = job.step.values
         frame = self._exchange.sender.frame(
             wire.BROADCAST, "SET_ADDRESS", *head, serial, address, key=key
@@ -481,7 +485,7 @@ def _steps_of_items(node: Node, message: Parameters) -> tuple[Step, ...]:
     except ProtocolError as error:
         raise Refusal(str(error)) from None
     if not node.member.key:
-        raise Refusal(f"{node.name}: no key is configured; add it to the file of keys")
+        raise Refusal(f"{node.name}: no key is configured; add it to the key file")
     if not items:
         raise Refusal("no items; name at least one")
     sets, checks = [], []

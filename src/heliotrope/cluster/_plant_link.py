@@ -1,4 +1,4 @@
-"""The cluster's end of the link to the plant: takes its messages, sends reports and the status."""
+"""The cluster's end of the link to the plant: takes messages, sends reports and the status."""
 
 import contextlib
 from collections.abc import Callable
@@ -43,11 +43,11 @@ class PlantLink:
     Parameters
     ----------
     cluster
-        Its name.
+        Name of the cluster.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
-        Called when something has come: it may be urgent.
+        Called when a message has come: it may be urgent.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class PlantLink:
 
     @property
     def connected(self) -> bool:
-        """Whether the plant is there."""
+        """Whether the plant is connected."""
         return self._link.connected
 
     # -- from the plant --------------------------------------------------------------------
@@ -143,7 +143,7 @@ class PlantLink:
         self._reports.publish()
 
     async def tell(self) -> None:
-        """Send what is reported while the plant is there, until the link is closed."""
+        """Send reports while the plant is connected, until the link is closed."""
         with contextlib.suppress(LinkClosedError):
             while True:
                 if self._link.connected:

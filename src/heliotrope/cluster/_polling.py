@@ -1,6 +1,6 @@
 """Polling: each heliostat is asked for its state once a second, in the order of addresses.
 
-Commands are sent in between. The answers are checked, faults and silence are reported, and the
+Commands are sent in between. Answers are checked, faults and silence are reported, and the
 goals of commands are judged.
 """
 
@@ -19,7 +19,7 @@ from heliotrope.lcu import names, states
 from heliotrope.links.clock import Clock
 from heliotrope.safety import alarms
 
-#: A node that missed this many questions in a row is asked in every fifth second only.
+#: A node that missed this many questions in a row is asked only every fifth second.
 _ABSENT, _PROBE = 3, 5
 
 
@@ -56,7 +56,7 @@ class Polling:
 
     @property
     def silent(self) -> int:
-        """How many heliostats are silent."""
+        """Number of silent heliostats."""
         return len(self._silent)
 
     def begin_second(self) -> None:
@@ -64,7 +64,7 @@ class Polling:
         self._number += 1
 
     async def round(self, until: float, work: Work, closing: asyncio.Event) -> None:
-        """Ask every node once, and do in between what is ordered."""
+        """Ask every node once, and carry out orders in between."""
         nodes, count = self._by_address, len(self._nodes)
         first, self._next = self._next, 0
         now = self._clock.monotonic()
@@ -101,7 +101,7 @@ class Polling:
         return exchange.now
 
     def _believes(self, node: Node, status: tuple[Any, ...]) -> bool:
-        """Take a STATUS; False if its firmware has states unknown here."""
+        """Take a STATUS; return False if its firmware has states unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
             self._strange.add(node.index)
@@ -118,7 +118,7 @@ class Polling:
             and node.state in BEAM_OUT
             and not self._emergencies.waits(node)
         ):
-            # It missed the call, or has just come back.
+            # It missed the broadcast, or has just come back.
             self._emergencies.begin("", "DEFOCUS", [node])
         return True
 

@@ -15,13 +15,13 @@ from heliotrope.links.messages import Answer, Ask
 
 _SECRET = "key_id"  # noqa: S105 (the name of an item that is never revealed)
 _PATIENCE = 5.0
-#: Tries for a node that does not answer, one a second.
+#: Attempts for a node that does not answer, one a second.
 _TRIES = 3
 _STORED = tuple(name for name, _ in ITEMS if name != _SECRET)
 
 
 class _Recall:
-    """The question for a node's stored items, one by one."""
+    """A question for the stored items of a node, one by one."""
 
     def __init__(self, ask: Ask, node: Node) -> None:
         self.ask, self.node = ask, node
@@ -80,7 +80,7 @@ class Questions:
         }
 
     def second(self) -> None:
-        """Give questions to be tried again their turn."""
+        """Give questions that are to be retried their turn."""
         self._waiting.extend(self._later)
         self._later.clear()
 
@@ -111,7 +111,7 @@ class Questions:
             self._waiting.append(_Recall(ask, node))
 
     async def _recall(self, recall: _Recall) -> None:
-        """Ask for one item; items that came are not asked for again."""
+        """Ask for one item; items already received are not asked for again."""
         ask, node, found = recall.ask, recall.node, recall.found
         data = await stored(self._exchange, node, recall.item, self._clock() + _PATIENCE)
         if data is None:

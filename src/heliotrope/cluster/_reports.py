@@ -7,7 +7,7 @@ from dataclasses import replace
 from heliotrope.links.messages import Answer, Message, Progress, Stage, Status
 from heliotrope.safety import Alarm
 
-#: Messages waiting; the oldest are dropped first. Of the status only the newest is kept.
+#: Messages that may wait; the oldest are dropped first. Of the status only the newest is kept.
 _CAPACITY = 256
 
 
@@ -26,7 +26,7 @@ class Reports:
         self._published = asyncio.Event()
 
     def add(self, identity: str, stage: Stage, heliostat: str = "", text: str = "") -> None:
-        """Report a stage of a command; one without identity is the cluster's own."""
+        """Report a stage of a command; a command without identity is the cluster's own."""
         if identity:
             self._groups.setdefault((identity, stage, text), []).append(heliostat)
 
@@ -47,7 +47,7 @@ class Reports:
             self._out.append(alarm)
 
     def event(self, alarm: Alarm) -> None:
-        """Report something that happens and is over, each time."""
+        """Report an event without duration, each time it happens."""
         self._out.append(alarm)
 
     def clear(self, ended: Alarm) -> None:
@@ -58,7 +58,7 @@ class Reports:
 
     @property
     def alarms(self) -> tuple[Alarm, ...]:
-        """Alarms that are active."""
+        """Active alarms."""
         return tuple(self._alarms.values())
 
     def greet(self) -> None:
@@ -69,7 +69,7 @@ class Reports:
     # -- to the sender ---------------------------------------------------------------------
 
     def publish(self) -> None:
-        """Let the sender take what has been reported, if anything has."""
+        """Let the sender take the waiting reports, if there are any."""
         if self._groups or self._out or self._status:
             self._published.set()
 
@@ -79,7 +79,7 @@ class Reports:
         self._published.clear()
 
     def take(self) -> list[Message]:
-        """Return all that was reported, and forget it."""
+        """Return all waiting reports, and forget them."""
         messages = list(self._out)
         self._out.clear()
         for (identity, stage, text), names in self._groups.items():

@@ -26,7 +26,7 @@ from heliotrope.safety import (
 )
 
 _LINE = "emergency_line"
-#: The row of the plant's silence trips after this, autonomy apart; no lease may be longer. s.
+#: The row of the plant's silence trips after this, plus autonomy; no lease may be longer. s.
 _PLANT_LEASE = 3.0
 #: A row that has tripped releases below 2 s of silence; a shorter lease would never release it.
 _SHORTEST_LEASE = 1.0
@@ -57,7 +57,7 @@ class Verdict:
 
     @property
     def dark(self) -> bool:
-        """Whether the sun must not be sent."""
+        """Whether SUN must not be sent."""
         return self.act is not None and self.act >= Act.DEFOCUS
 
 
@@ -67,7 +67,7 @@ class Watch:
     Parameters
     ----------
     cluster
-        Its name.
+        Name of the cluster.
     longest_autonomy
         Longest autonomy that the plant may grant, s.
     reports
@@ -80,7 +80,7 @@ class Watch:
     Attributes
     ----------
     token
-        Token of the command authority, as of the last lease; 0: nobody has it.
+        Token of the command authority in the last lease; 0: nobody has it.
     verdict
         Demands of the safety table in this second.
     """
@@ -110,7 +110,7 @@ class Watch:
     # -- the lease -------------------------------------------------------------------------
 
     def take(self, lease: Lease, now: float) -> str:
-        """Take a lease that has just come; return why it is refused, "" if it is taken."""
+        """Take a new lease; return why it is refused, "" if it is accepted."""
         if not _SHORTEST_LEASE <= lease.lifetime <= _PLANT_LEASE:
             return f"lease of {lease.lifetime:g} s: give {_SHORTEST_LEASE:g} to {_PLANT_LEASE:g} s"
         if not (0 <= lease.token <= 0xFFFFFFFF and lease.autonomy >= 0.0):
@@ -204,6 +204,6 @@ class Watch:
             )
 
     def acknowledge(self, condition: str, who: str, role: Role) -> str:
-        """Acknowledge a row that latches; return why that is refused, "" if it is not."""
+        """Acknowledge a row that latches; return why that is refused, "" if it is accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

@@ -13,7 +13,7 @@ from heliotrope.links.messages import Ask, Command, Emergency, Parameters, Stage
 
 
 class Work:
-    """Takes what is ordered, and does it piece by piece, the most urgent first."""
+    """Takes orders, and carries them out piece by piece, the most urgent first."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Work:
     def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:
         try:
             if name not in NAMES:
-                raise Refusal(f"{name!r} is no emergency; give DEFOCUS or STOW")
+                raise Refusal(f"{name!r} is not an emergency; give DEFOCUS or STOW")
             nodes = self._nodes.chosen(heliostats)
         except Refusal as refusal:
             self._reports.add(identity, Stage.REFUSED, text=str(refusal))
@@ -55,12 +55,12 @@ class Work:
         self._exchange.interrupt()
 
     def obey(self, name: str, why: str) -> None:
-        """Obey the safety table: DEFOCUS or STOW for all; what was ordered before is void."""
+        """Obey the safety table: DEFOCUS or STOW for all; earlier orders are void."""
         self._orders.cancel(self._nodes, f"overruled: {why}")
         self._emergencies.begin("", name, list(self._nodes))
 
     def ready(self, *, patient: bool = True) -> bool:
-        """Whether something can be done; not ``patient``: questions wait."""
+        """Whether there is work to do; questions count only if ``patient``."""
         return self._exchange.connected and (
             self._emergencies.pressing or self._orders.ready or (patient and self._questions.ready)
         )
@@ -76,7 +76,7 @@ class Work:
         self._reports.publish()
 
     async def begin_second(self) -> None:
-        """Ask again for what is not acknowledged, emergencies at once."""
+        """Ask again for missing acknowledgements, of emergencies at once."""
         self._questions.second()
         self._epoch.second()
         self._emergencies.second()
@@ -84,5 +84,5 @@ class Work:
             await self._emergencies.serve()
 
     def resume(self) -> None:
-        """Give orders that are to be tried again their turn."""
+        """Give orders that are to be retried their turn."""
         self._orders.second()

@@ -1,4 +1,4 @@
-"""What a cluster controller is told: its site, its heliostats, its limits. See `cluster_file`."""
+"""Configuration of a cluster controller: site, heliostats, limits. Read by `config_file`."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.lcu import wire
 from heliotrope.sun import Site
 
-#: RS485 with unit loads carries as many.
+#: The number of unit loads that RS485 carries.
 MOST_MEMBERS = 32
 
 
@@ -22,10 +22,10 @@ class Member:
     address
         On the bus, 1 to 65534.
     serial
-        Number of its local controller, by which it is found and given its address; None: not
-        known.
+        Serial number of its local controller, by which it is found and given its address; None:
+        not known.
     key
-        Of its local controller, for what is stored there; b"": nothing can be stored.
+        Key of its local controller, for stored items; b"": nothing can be stored.
 
     Raises
     ------
@@ -62,26 +62,26 @@ class ClusterConfig:
     site
         Place and air, for the sun.
     heliostats
-        1 to 32; they are polled in the order of their addresses, and told of in this one.
+        1 to 32; polled in the order of their addresses, reported in this order.
     answer
-        Longest time from the end of a question to the whole answer, in s.
+        Time limit from the end of a question to the whole answer, in s.
     stored_answer
         The same where flash is written before the answer, in s.
     steps_every
-        Step counts of each heliostat are asked for every so many seconds.
+        Interval at which the step counts of each heliostat are requested, in s.
     silence
-        A heliostat not heard for so long is reported, in s.
+        Time without an answer after which a heliostat is reported, in s.
     longest_autonomy
-        Most that the plant may grant, in s. Above 0 only where a hard-wired emergency line
-        reaches this cluster.
+        Longest autonomy that the plant may grant, in s. Above 0 only where a hard-wired emergency
+        line reaches this cluster.
     phase
-        Each second begins so long after that of GPS, in s, 0 to below 1. Where one process runs
+        Delay of each second after that of GPS, in s, 0 to below 1. Where one process runs
         many clusters, see `spread_phase`.
 
     Raises
     ------
     InputError
-        Something that no cluster can be.
+        A value that no cluster can have.
     """
 
     name: str
@@ -106,7 +106,9 @@ class ClusterConfig:
             values = [getattr(each, what) for each in self.heliostats]
             for value in values:
                 if value is not None and values.count(value) > 1:
-                    raise InputError(f"{at}: two heliostats have the {what} {value}; each its own")
+                    raise InputError(
+                        f"{at}: two heliostats have the {what} {value}; give each its own"
+                    )
         for what, number, low, high in (
             ("answer", self.answer, 0.001, 1.0),
             ("stored_answer", self.stored_answer, self.answer, 2.0),
@@ -125,7 +127,7 @@ class ClusterConfig:
         Raises
         ------
         UnknownNameError
-            If this cluster has none of that name.
+            If this cluster has no heliostat of that name.
         """
         for each in self.heliostats:
             if each.name == name:
@@ -141,18 +143,18 @@ def spread_phase(index: int, count: int) -> float:
     index
         Which cluster, 0 to ``count`` - 1.
     count
-        How many there are.
+        Number of clusters.
 
     Returns
     -------
     float
-        In s, 0 to below 1; neighbours are as far apart as may be.
+        In s, 0 to below 1; neighbours are as far apart as possible.
 
     Raises
     ------
     InputError
-        An index that is none of so many.
+        An index outside the range.
     """
     if not 0 <= index < count:
-        raise InputError(f"phase: cluster {index} is none of {count}; give 0 to {count - 1}")
+        raise InputError(f"phase: cluster {index} of {count}; give 0 to {count - 1}")
     return index / count

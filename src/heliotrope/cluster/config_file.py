@@ -1,4 +1,4 @@
-"""The cluster file (TOML), from which a cluster controller starts; its keys stand in another."""
+"""The cluster file (TOML), from which a cluster controller starts; its keys are in another file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +15,15 @@ from heliotrope.files.documents import read_document, read_toml
 from heliotrope.links.addresses import Keys, Table, url_parts
 from heliotrope.sun import Site
 
-_CHRONY = "the computer's clock is kept by chronyd now"
-#: Keys of ``[time]`` up to the first edition, and what to do instead.
+_CHRONY = "chronyd now keeps the computer's clock"
+#: Keys of ``[time]`` in the first edition, and what to do instead.
 _OLD_TIME = {
-    "source": f"{_CHRONY}, from a receiver too: remove the key, or state error_s for a clock that "
-    "you vouch for",
+    "source": f"{_CHRONY}, also from a receiver: remove the key, or state error_s for a clock "
+    "that you vouch for",
     "url": f'{_CHRONY}: give the receiver\'s port to gpsd, and write gpsd = "localhost"',
     "baud_rate": f"{_CHRONY}: give the baud rate to gpsd, and remove the key",
-    "latency_s": f"{_CHRONY}: state the receiver's latency as offset of chronyd's refclock, and "
-    "remove the key",
+    "latency_s": f"{_CHRONY}: state the receiver's latency as the offset of chronyd's refclock, "
+    "and remove the key",
     "system_tolerance_s": "clock and receiver may always be 2 s apart; remove the key",
     "ntp": "the kernel is asked unless error_s is stated; remove the key",
     "drift_ppm": "the kernel's bound grows by 500 ppm; remove the key",
@@ -47,13 +47,13 @@ class BusTable(Table):
     """``[bus]``: the serial port to the heliostats."""
 
     url: str = Field(min_length=1, description="`/dev/ttyUSB0` or `socket://host:port`.")
-    baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits in a second.")
+    baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="Bits per second.")
     echo: bool = Field(False, description="The adapter hears its own frames.")
     answer_s: float = Field(
         0.05,
         ge=0.001,
         le=1.0,
-        description="Longest time from the end of a question to the whole answer.",
+        description="Time limit from the end of a question to the whole answer.",
     )
     stored_answer_s: float = Field(
         0.6, ge=0.001, le=2.0, description="The same where flash is written before the answer."
@@ -68,13 +68,16 @@ class PlantTable(Table):
         description="`tcp://host:port`, `mqtt://host:port/prefix`, or `mqtts://…` with TLS.",
     )
     authority: str | None = Field(
-        None, description="PEM file of who signs the other end's certificate: TLS for `tcp://`."
+        None,
+        description="PEM file of the other end's certificate authority: TLS for `tcp://`.",
     )
-    username: str | None = Field(None, description="At the MQTT broker; password: the keys' file.")
+    username: str | None = Field(
+        None, description="For the MQTT broker; its password is in the key file."
+    )
 
 
 class TimeTable(Table):
-    """``[time]``: the computer's clock, and how far it is believed."""
+    """``[time]``: the computer's clock, and how far it is trusted."""
 
     error_s: float | None = Field(
         None,
@@ -91,11 +94,15 @@ class TimeTable(Table):
 class PollingTable(Table):
     """``[polling]``."""
 
-    steps_every_s: int = Field(1, ge=1, le=60, description="Between questions for step counts.")
-    silence_s: float = Field(
-        10.0, ge=2.0, le=3600.0, description="A heliostat not heard for so long is reported."
+    steps_every_s: int = Field(
+        1, ge=1, le=60, description="Interval between requests for step counts."
     )
-    phase_s: float = Field(0.0, ge=0.0, lt=1.0, description="Of the seconds, after those of GPS.")
+    silence_s: float = Field(
+        10.0, ge=2.0, le=3600.0, description="A heliostat silent for longer is reported."
+    )
+    phase_s: float = Field(
+        0.0, ge=0.0, lt=1.0, description="Delay of each second after that of GPS."
+    )
 
 
 class SafetyTable(Table):
@@ -105,7 +112,7 @@ class SafetyTable(Table):
         0.0,
         ge=0.0,
         le=86400.0,
-        description="Most that the plant may grant; above 0 only with a hard-wired emergency line.",
+        description="Longest the plant may grant; above 0 only with a hard-wired emergency line.",
     )
     emergency_line: str = Field(
         "", description="File whose first byte is 1 while current flows in the line (GPIO)."
@@ -118,7 +125,7 @@ class HeliostatTable(Table):
     name: str = Field(min_length=1, description="As the plant knows it.")
     address: int = Field(ge=1, le=65534, description="On the bus.")
     serial: int | None = Field(
-        None, ge=0, le=0xFFFFFFFF, description="Of its local controller, to be found by."
+        None, ge=0, le=0xFFFFFFFF, description="Serial number of its local controller."
     )
 
 
@@ -127,8 +134,8 @@ class ClusterDocument(Table):
 
     format: Literal["heliotrope-cluster"]
     version: Literal[1]
-    name: str = Field(min_length=1, description="Of the cluster, as the plant knows it.")
-    keys: str = Field("", description="File of the keys, beside this one.")
+    name: str = Field(min_length=1, description="Name of the cluster, as the plant knows it.")
+    keys: str = Field("", description="Key file, beside this one.")
     state: str = Field(
         "", description="File for epoch and editions, beside this one; default NAME.state.json."
     )
@@ -150,14 +157,14 @@ TABLES: tuple[type[Table], ...] = (
 
 @dataclass(frozen=True)
 class Installation:
-    """A cluster as it is installed: what it is, and where its ports lead.
+    """A cluster as it is installed: its configuration, and where its ports lead.
 
     Attributes
     ----------
     config
         See `ClusterConfig`.
     bus_url, bus
-        Of the serial port.
+        URL and settings of the serial port.
     plant
         ``[plant]``.
     scheme, host, port, prefix
@@ -165,13 +172,13 @@ class Installation:
     plant_key, password
         Of the link; of the MQTT broker.
     error
-        Bound of the clock's error that the operator vouches for, s; None: the kernel's is asked.
+        Bound of the clock's error that the operator vouches for, s; None: the kernel's is used.
     gpsd
         Host and port of gpsd; None: there is none.
     state
         File for epoch and editions.
     emergency_line
-        File of the line's GPIO; None: there is no line.
+        GPIO file of the emergency line; None: there is no line.
     """
 
     config: ClusterConfig
@@ -191,7 +198,7 @@ class Installation:
 
 
 def read_cluster(path: str | Path) -> Installation:
-    """Return the cluster of a TOML file and its keys.
+    """Return the cluster described by a TOML file and its key file.
 
     Raises
     ------
@@ -211,7 +218,7 @@ def read_cluster(path: str | Path) -> Installation:
 
 
 def _refuse_old(path: Path) -> None:
-    """Refuse keys of a former format with what to write instead."""
+    """Refuse keys of a former format, and say what to write instead."""
     time = read_toml(path, "a cluster file").get("time")
     for key in time if isinstance(time, dict) else ():
         if key in _OLD_TIME:

@@ -1,12 +1,12 @@
 """The cluster controller: master of one bus with up to 32 heliostats.
 
 Every second it broadcasts session, time and sun (`_broadcast`), asks each local controller for its
-state in the order of addresses (`_polling`), does what the plant has ordered meanwhile (`_work`:
+state in the order of addresses (`_polling`), carries out the plant's orders meanwhile (`_work`:
 `_emergencies`, then `_orders`, then `_questions`), and reports to the plant (`_plant_link`). One
 task alone uses the bus, so frames go out in the order of their numbers; a second listens to the
 plant; a third talks to it and may wait for it.
 
-The field is safe without anybody: the sun is sent only while the plant's lease (and the autonomy
+The field is safe when left alone: the sun is sent only while the plant's lease (and the autonomy
 it grants) lasts, the time is sound, and no row of the safety table demands otherwise (`_watch`).
 Without the sun every local controller defocuses by itself. At a start nothing moves: the cluster
 waits for a lease, and then for a command.
@@ -51,7 +51,7 @@ _STEER = 0.1
 
 
 class Cluster:
-    """A cluster controller; see the head of this module.
+    """A cluster controller; see the docstring of this module.
 
     Parameters
     ----------
@@ -137,10 +137,10 @@ class Cluster:
         Raises
         ------
         LinkError
-            If it runs already.
+            If it is already running.
         """
         if self._running:
-            raise LinkError(f"cluster {self.config.name}: it runs already")
+            raise LinkError(f"cluster {self.config.name}: it is already running")
         self._running = True
         try:
             async with asyncio.TaskGroup() as group:
@@ -164,7 +164,7 @@ class Cluster:
             await self._ended.wait()
 
     async def _master(self) -> None:
-        """Do one second after the other: the only task that uses the bus."""
+        """Work through one second after the other: the only task that uses the bus."""
         due = self._clock.monotonic()
         present = self._time.time()
         if present.usable:
@@ -178,7 +178,7 @@ class Cluster:
                 await self._exchange.broadcast("DEFOCUS", urgent=True)
 
     async def _serve_until(self, due: float) -> None:
-        """Do what is ordered until the next second begins; an emergency wakes it at once."""
+        """Carry out orders until the next second begins; an emergency wakes it at once."""
         while not self._closing.is_set() and (left := due - self._clock.monotonic()) > 0.0:
             if self._work.ready():
                 await self._work.serve()
@@ -212,7 +212,7 @@ class Cluster:
     def _next_due(self, begin: float, present: Time) -> float:
         ahead = 0.0
         if present.usable:
-            # Where this second should have begun by the time, within half a second.
+            # When this second should have begun by the time, within half a second.
             ahead = (present.gps_s - self.config.phase + 0.5) % 1.0 - 0.5
         return begin + 1.0 - max(-_STEER, min(_STEER, ahead))
 

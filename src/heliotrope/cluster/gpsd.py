@@ -1,8 +1,8 @@
-"""A satellite receiver as gpsd tells of it: position, fix, and a second opinion on the time.
+"""A satellite receiver as reported by gpsd: position, fix, and a second opinion on the time.
 
-gpsd reads the receiver and feeds chrony, which keeps the computer's clock (docs/how-to/time.md).
-The cluster takes its time from that clock. It listens to gpsd only to show the receiver's state
-and to notice when clock and receiver contradict each other.
+gpsd reads the receiver and feeds chrony, which disciplines the computer's clock
+(docs/how-to/time.md). The cluster takes its time from that clock. It listens to gpsd only to show
+the receiver's state and to notice when clock and receiver contradict each other.
 
 `Reader` turns bytes of gpsd's JSON protocol into a `Receiver` without any input or output; `Gpsd`
 keeps a connection open and feeds one.
@@ -22,17 +22,17 @@ from heliotrope.links.link import Backoff, until_closed
 
 PORT = 2947
 _WATCH = b'?WATCH={"enable":true,"json":true};\n'
-#: A line of gpsd has a few kB at most; a longer one is not gpsd's.
+#: A line from gpsd has a few kB at most; a longer one does not come from gpsd.
 _LONGEST_LINE = 65536
-#: Mode of a TPV report from which on there is a fix, and with height.
+#: Lowest modes of a TPV report with a fix, and with height.
 _FIX_2D, _FIX_3D = 2, 3
 #: A fix older than this counts as lost, s.
 _FRESH = 5.0
-#: The quickest of this many reports tells how far the clock is ahead: any may be read late.
+#: The quickest of this many reports shows how far the clock is ahead: any may be read late.
 _REPORTS = 10
 #: A missing fix is a problem after this long, s: opening the receiver takes a moment.
 _PATIENCE = 10.0
-#: A connection silent for this long is opened anew, s: gpsd reports at least once a second.
+#: A connection silent for this long is reopened, s: gpsd reports at least once a second.
 _SILENCE = 30.0
 _OPEN_LIMIT = 3.0
 _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
@@ -81,16 +81,16 @@ class Receiver:
 
 
 class Reader:
-    """Reads gpsd's JSON lines.
+    """A parser of gpsd's JSON lines.
 
     Attributes
     ----------
     receiver
         As last reported.
     error
-        What gpsd last complained of, "" if nothing.
+        Last error reported by gpsd, "" if none.
     refused
-        Count of lines that are not gpsd's.
+        Count of lines that do not come from gpsd.
     """
 
     def __init__(self) -> None:
@@ -124,7 +124,7 @@ class Reader:
         return False
 
     def _take_fix(self, report: dict[str, Any]) -> bool:
-        """Take a TPV report; whether it tells a time that was not told before."""
+        """Take a TPV report; return whether its time is new."""
         mode = int(report.get("mode", 0))
         device = str(report.get("device", self.receiver.device))
         if mode < _FIX_2D or "time" not in report:
@@ -200,7 +200,7 @@ class Gpsd:
         return f"{where}: the receiver has no fix; does its antenna see the sky?"
 
     def hear(self, data: bytes) -> None:
-        """Take bytes of gpsd that have just come."""
+        """Take bytes just received from gpsd."""
         reader = self._reader
         if reader.feed(data):
             now = self._clock.monotonic()

@@ -1,7 +1,8 @@
-"""What a cluster must not forget over a restart: its epoch, and the editions it has used.
+"""State of a cluster that outlasts a restart: its epoch, and the editions it has used.
 
-Both only rise. Written beside and renamed, so that a power cut leaves the old file or the new one.
-Editions are reserved in blocks: what is on disk is never below what was used.
+Both only rise. The file is written beside the old one and renamed, so that a power cut leaves
+the old file or the new one. Editions are reserved in blocks: the edition on disk is never below
+one that was used.
 """
 
 import json
@@ -20,9 +21,9 @@ class Kept:
     Parameters
     ----------
     path
-        The file; None: nothing is kept, for simulation.
+        The file; None: nothing is stored, for simulation.
     epoch, edition
-        What was used before where there is no file.
+        Last values used, if there is no file.
 
     Attributes
     ----------
@@ -32,7 +33,7 @@ class Kept:
     Raises
     ------
     FormatError
-        A file that is there and holds something else.
+        If the file has other content.
     """
 
     def __init__(self, path: Path | None, epoch: int = 0, edition: int = 0) -> None:
@@ -43,12 +44,12 @@ class Kept:
         self._reserved = self._edition
 
     def start(self, at_least: int) -> int:
-        """Return the epoch of a new run, above all before and not below ``at_least``.
+        """Return the epoch of a new run, above all earlier ones and not below ``at_least``.
 
         Raises
         ------
         OSError
-            If it cannot be kept.
+            If it cannot be stored.
         """
         epoch = max(self.epoch + 1, at_least) & _LARGEST
         self._write(epoch, self._reserved)
@@ -61,7 +62,7 @@ class Kept:
         Raises
         ------
         OSError
-            If it cannot be kept; it is then not used either.
+            If it cannot be stored; it is then not used either.
         """
         edition = max(self._edition, above) + 1
         if edition > self._reserved:

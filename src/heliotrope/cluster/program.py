@@ -1,7 +1,8 @@
-"""A cluster of a cluster file: its sources of time, its emergency line, and its run in a process.
+"""A cluster made from its cluster file: sources of time, emergency line, and a run in a process.
 
-`heliotrope cluster` runs one in a process of its own. Where the bus is at the plant's machine the
-plant runs it (`LocalCluster`): the same program, with a link in memory in place of a network.
+`heliotrope cluster` runs one in a process of its own. Where the bus is connected to the plant's
+machine, the plant runs the same program with a link in memory instead of a network
+(`LocalCluster`).
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
     Raises
     ------
     InputError
-        If the kernel is to be asked and cannot be.
+        If the kernel's bound is needed but not available.
     """
     gpsd = None if installation.gpsd is None else Gpsd(clock, *installation.gpsd)
     if installation.error is not None:
@@ -37,9 +38,9 @@ def time_of(installation: Installation, clock: Clock) -> TimeKeeper:
 
 
 def line_of(file: Path | None) -> Callable[[], bool] | None:
-    """Return whether current flows in the emergency line of a GPIO file; None: there is no line.
+    """Return a function for whether current flows in a GPIO file's line; None: there is no line.
 
-    What cannot be read is an open line.
+    A file that cannot be read counts as an open line.
     """
     if file is None:
         return None
@@ -54,16 +55,16 @@ def line_of(file: Path | None) -> Callable[[], bool] | None:
 
 
 class LocalCluster:
-    """A cluster whose bus is at the plant's machine.
+    """A cluster whose bus is connected to the plant's machine.
 
     Parameters
     ----------
     path
-        Of its cluster file; what it says of the plant is not used.
+        Path of its cluster file; the table ``[plant]`` is not used.
     name, members
         As the plant knows them.
     clock
-        Of the plant.
+        Clock of the plant.
 
     Attributes
     ----------
@@ -77,7 +78,7 @@ class LocalCluster:
     Raises
     ------
     FormatError
-        If the file is of another cluster, or its heliostats are not the plant's.
+        If the file is for another cluster, or its heliostats are not the plant's.
     """
 
     def __init__(self, path: Path, name: str, members: tuple[str, ...], clock: Clock) -> None:
@@ -85,7 +86,7 @@ class LocalCluster:
         config = installation.config
         found = {member.name for member in config.heliostats}
         if config.name != name:
-            raise FormatError(path, f"it is of cluster {config.name}, not of {name}", "name")
+            raise FormatError(path, f"it is for cluster {config.name}, not for {name}", "name")
         if found != set(members):
             odd = min(found ^ set(members))
             where = "the plant file" if odd in members else "this file"

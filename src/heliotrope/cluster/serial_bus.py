@@ -1,13 +1,13 @@
-"""The bus of a cluster: RS485 through serialx, with this side as its one master.
+"""The bus of a cluster: RS485 through serialx, with this side as its only master.
 
-One transaction at a time: wait until the bus has been quiet for a gap, send, hear the answer.
-What the answer is, the caller's codec says (`complete`); here it is bytes. Urgent frames
-(defocus, stow) go next, before all that waits. A frame whose turn comes after its expiry is
+One transaction at a time: wait until the bus has been quiet for a gap, send, read the answer.
+The caller's codec decides what an answer is (`complete`); here it is bytes. Urgent frames
+(defocus, stow) go next, before all that wait. A frame whose turn comes after its expiry is
 dropped.
 
-The adapter turns its driver on and off by itself. Some hear their own frames: with ``echo`` the
-frame is taken back out of what came, and one that came back altered (two spoke at once) spoils
-its transaction. Bytes that nobody asked for are thrown away before each frame.
+The adapter switches its driver by itself. Some adapters hear their own frames: with ``echo`` the
+frame is removed from the received bytes, and an altered echo (two spoke at once) spoils
+its transaction. Unrequested bytes are discarded before each frame.
 
 Ports: a device ("/dev/ttyUSB0"), or a serial server in the network ("socket://10.0.0.7:4001").
 """
@@ -45,18 +45,18 @@ class BusSettings:
     Parameters
     ----------
     baud_rate
-        Bits in a second; a character has ten.
+        Bits per second; a character has ten.
     gap
         Silence before a frame, in s; None: 3.5 characters, at least 1.75 ms, as on Modbus.
     gap_ends
-        A gap after its bytes ends an answer: for the thesis's packets of 12 bytes. Needs a port
-        without a network in between, which makes gaps of its own.
+        A gap ends an answer: for the thesis's 12-byte packets. Needs a port without a network in
+        between, because a network adds gaps of its own.
     echo
         The adapter hears its own frames.
     first_pause, longest_pause
-        Between attempts to open the port, in s.
+        Pauses between attempts to open the port, in s.
     open_limit
-        For opening it, in s.
+        Time limit for opening it, in s.
 
     Raises
     ------
@@ -101,11 +101,11 @@ class BusStatistics:
     Attributes
     ----------
     sent, answered, silent
-        Frames sent; of those with an answer asked for: bytes came, none did.
+        Frames sent; requests with bytes in answer; requests without.
     dropped, expired
         Not sent: no port; the turn came too late.
     stray
-        Bytes that nobody asked for.
+        Unrequested bytes.
     spoilt
         Frames whose echo came back altered or not at all.
     opened, failures, reconnects
@@ -133,13 +133,13 @@ def ends_in_zero(data: bytes) -> bool:
 
 
 def _never(data: bytes) -> bool:
-    """Leave it to the gap."""
+    """Return False: the gap ends the answer."""
     del data
     return False
 
 
 class _Port(asyncio.Protocol):
-    """What came from a port, and when; what the adapter heard of itself is taken out."""
+    """Received bytes of a port and their time, without the adapter's own echo."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -152,7 +152,7 @@ class _Port(asyncio.Protocol):
         self.problem = ""
 
     def data_received(self, data: bytes) -> None:
-        """Keep what came."""
+        """Store received bytes."""
         self.last_at = self._clock.monotonic()
         mine = min(len(data), len(self.echo))
         if data[:mine] == self.echo[:mine]:
@@ -183,7 +183,7 @@ class SerialBus:
     Parameters
     ----------
     url
-        Of the port; see the head of this module.
+        URL of the port; see the docstring of this module.
     clock
         Its monotonic time measures gaps and expiries.
     settings
@@ -213,12 +213,12 @@ class SerialBus:
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open; who is alive on the bus only answers tell."""
+        """Whether the port is open; only answers show which nodes are alive."""
         return self._port is not None
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the bus is closed for good."""
         return self._closing.is_set()
 
     async def opened(self) -> None:
@@ -230,7 +230,7 @@ class SerialBus:
             await self._opened.wait()
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the bus for good."""
         self._closing.set()
         self._opened.set()
 
@@ -242,10 +242,10 @@ class SerialBus:
         Raises
         ------
         LinkError
-            If it runs already.
+            If it is already running.
         """
         if self._running:
-            raise LinkError(f"bus {self._url}: it runs already")
+            raise LinkError(f"bus {self._url}: it is already running")
         self._running = True
         try:
             await until_closed(self._closing, self._keep())
@@ -300,11 +300,11 @@ class SerialBus:
         Parameters
         ----------
         frame
-            With whatever ends it.
+            With its terminator.
         expires
             By the monotonic clock; if its turn comes later, it is dropped.
         urgent
-            Next, before all that waits.
+            Next, before all that wait.
 
         Raises
         ------
@@ -330,25 +330,25 @@ class SerialBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return what is answered.
+        """Send a frame and return the answer.
 
         Parameters
         ----------
         frame
-            With whatever ends it.
+            With its terminator.
         timeout
             For the whole answer, from the end of the frame, in s.
         expires, urgent
             As in `transmit`.
         complete
-            Says of the bytes that have come so far whether they are the answer; None: of the
-            wire, `ends_in_zero`, unless gaps end an answer.
+            Returns whether the bytes received so far are the whole answer; None: that of the wire,
+            `ends_in_zero`, unless gaps end an answer.
 
         Returns
         -------
         bytes
             What came, whole or not; b"" if nothing did or the frame was not sent (see
-            ``statistics``). Only the codec can tell whether it is an answer.
+            ``statistics``). Only the codec can decide whether it is an answer.
 
         Raises
         ------
@@ -409,7 +409,7 @@ class SerialBus:
         return False
 
     async def _hear(self, port: _Port, end: float, complete: Callable[[bytes], bool]) -> bytes:
-        """Return what comes until it is complete, until a gap, or until ``end``."""
+        """Return the bytes received until they are complete, until a gap, or until ``end``."""
         while True:
             answer = bytes(port.data)
             until = end

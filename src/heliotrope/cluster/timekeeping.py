@@ -1,15 +1,15 @@
 """The time of a cluster, with a bound of its error and its source.
 
 The sun moves 73 µrad in a second: a mirror that follows the sun of a wrong time misses by as much.
-A cluster therefore never has a bare time but a `Time`, which is an interval (`Time.error`).
+A cluster therefore always uses a `Time`, which is an interval (`Time.error`).
 
-The computer's clock is kept by chrony (or another NTP program), from a satellite receiver with a
-pulse, from time servers, or from both. The kernel carries the bound of the clock's error: chrony
-renews it, and between renewals it grows by 0.5 ms a second. `SystemTime` uses that bound.
+The computer's clock is disciplined by chrony (or another NTP program), from a satellite receiver
+with a pulse, from time servers, or from both. The kernel carries the bound of the clock's error:
+chrony renews it, and between renewals it grows by 0.5 ms a second. `SystemTime` uses that bound.
 
-A `Time` is only told. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so a jump,
-forward or back, extends nothing; `Steadiness` detects a jump by comparison with the monotonic
-clock.
+A `Time` is for information only. Leases, deadlines and expiries rest on `Clock.monotonic` alone, so
+a jump, forward or back, extends nothing; `Steadiness` detects a jump by comparison with the
+monotonic clock.
 """
 
 import asyncio
@@ -26,13 +26,13 @@ from heliotrope.links.clock import GPS_EPOCH, Clock, gps_seconds, sleep_until
 
 Quality = Literal["gps", "system", "holdover", "none"]
 
-#: An earlier time is not believed: a computer without a battery for its clock starts in the past.
+#: An earlier time is not believed: a computer without a clock battery starts in the past.
 NOT_BEFORE = datetime(2026, 1, 1, tzinfo=UTC)
 #: adjtimex(2) returns this for a clock that is not synchronised.
 _TIME_ERROR = 5
 #: Index of the bound of the clock's error in ``struct timex``, counted in longs; in µs.
 _MAXERROR = 3
-#: Two oscillators are believed to run alike within this: twice what NTP slews at most.
+#: Two oscillators are assumed to agree in rate within this: twice the largest slew of NTP.
 _SLEW = 1e-3
 #: The kernel lets the bound of a clock grow by this ratio (MAXFREQ, 500 ppm), once a second.
 _GROWTH = 500e-6
@@ -48,7 +48,7 @@ CONTRADICTION = 2.0
 
 @dataclass(frozen=True)
 class Time:
-    """A time and what is known of it.
+    """A time, its error bound and its source.
 
     Attributes
     ----------
@@ -59,8 +59,8 @@ class Time:
     error
         Bound of the error of both, s; infinite: unknown.
     quality
-        "gps": a clock that is kept, confirmed by a receiver with a fix; "system": a clock that is
-        kept; "holdover": nobody has kept it for a while, and its bound grows; "none": unusable.
+        "gps": a disciplined clock, confirmed by a receiver with a fix; "system": a disciplined
+        clock; "holdover": not disciplined for a while, so its bound grows; "none": unusable.
     jumped
         The clock was set, forward or back, within the last seconds: intervals between times
         before and after are meaningless.
@@ -82,9 +82,9 @@ class Time:
 
 
 class TimeKeeper(Protocol):
-    """Where a cluster has its time from.
+    """A cluster's source of time.
 
-    ``run`` belongs into a TaskGroup of the owner (or use `link.running`); it ends when the keeper
+    ``run`` belongs in a TaskGroup of the owner (or use `link.running`); it ends when the keeper
     is closed. ``time`` may be called at any instant, before ``run`` and after ``close`` too.
     """
 
@@ -93,7 +93,7 @@ class TimeKeeper(Protocol):
         ...
 
     async def run(self) -> None:
-        """Keep it until closed."""
+        """Run until closed."""
         ...
 
     async def close(self) -> None:
@@ -107,11 +107,11 @@ class Steadiness:
     Parameters
     ----------
     clock
-        Its monotonic time is the measure.
+        Its monotonic time is the reference.
     tolerance
-        A step up to this is no jump, s. Slewing (up to 1 ms in a second) never is.
+        A step up to this is not a jump, s. Slewing (up to 1 ms in a second) never is.
     settle
-        How long a jump is told, s.
+        How long a jump is reported, s.
 
     Raises
     ------
@@ -152,7 +152,7 @@ class Steadiness:
 
 
 def kernel_bound() -> float:
-    """Return the kernel's bound of the error of its clock in s, infinite if nobody keeps it.
+    """Return the kernel's bound of its clock's error in s, infinite if the clock is undisciplined.
 
     chronyd (with ``rtcsync``, as packaged) and ntpd state the bound, the root distance to their
     source, whenever they correct the clock. Between corrections the kernel adds 0.5 ms a second.
@@ -161,14 +161,14 @@ def kernel_bound() -> float:
     Raises
     ------
     InputError
-        On a system that cannot be asked.
+        On a system that does not offer the bound.
     """
     ask = getattr(ctypes.CDLL(None, use_errno=True), "adjtimex", None)
     timex = (ctypes.c_long * 128)()  # zeros ask and change nothing; larger than any struct timex
     state = -1 if ask is None else int(ask(timex))
     if state < 0:
         raise InputError(
-            "time: this system does not say whether its clock is synchronised; state its error "
+            "time: this system does not report whether its clock is synchronised; state its error "
             "with error_s"
         )
     return math.inf if state == _TIME_ERROR else 1e-6 * timex[_MAXERROR]
@@ -177,8 +177,8 @@ def kernel_bound() -> float:
 class _Bound:
     """The kernel's bound, carried on through a restart of the program that renews it.
 
-    chronyd declares the clock unsynchronised when it starts. The oscillator knows nothing of that:
-    unless the clock is set meanwhile, the bound of before goes on growing.
+    chronyd declares the clock unsynchronised when it starts. That does not disturb the oscillator:
+    unless the clock is set meanwhile, the previous bound goes on growing.
     """
 
     def __init__(self, ask: Callable[[], float]) -> None:
@@ -208,18 +208,18 @@ class SystemTime:
     Parameters
     ----------
     clock
-        Its ``utc`` is told, its ``monotonic`` is the measure of jumps.
+        Its ``utc`` is the time, its ``monotonic`` the reference for jumps.
     error
         Bound of the clock's error that the operator vouches for, s; used without ``bound``.
     settle
-        How long a jump is told, s.
+        How long a jump is reported, s.
     tolerance
-        A step up to this is no jump, s.
+        A step up to this is not a jump, s.
     bound
-        Returns the bound of the clock's error in s, infinite if nobody keeps it: `kernel_bound`.
-        None: ``error`` holds always.
+        Returns the bound of the clock's error in s, infinite if it is undisciplined:
+        `kernel_bound`. None: ``error`` holds always.
     gpsd
-        A receiver that must not contradict the clock; run and closed with this.
+        A receiver that must not contradict the clock; run and closed with this object.
 
     Raises
     ------
@@ -248,7 +248,7 @@ class SystemTime:
 
     @property
     def jumps(self) -> int:
-        """How often the clock was set since this was made."""
+        """Number of times the clock was set since this object was made."""
         return self._steadiness.jumps
 
     def time(self) -> Time:
@@ -265,21 +265,21 @@ class SystemTime:
         if utc < NOT_BEFORE:
             return math.inf, "none", f"the computer's clock says {utc:%Y-%m-%d}: it was never set"
         if error == math.inf:
-            return math.inf, "none", "nobody keeps the computer's clock; is chronyd running?"
+            return math.inf, "none", "the computer's clock is not disciplined; is chronyd running?"
         if error > LARGEST_ERROR:
             return math.inf, "none", _old(error, f", more than {LARGEST_ERROR:g} s")
         ahead = None if self._gpsd is None else self._gpsd.ahead
         if ahead is not None and abs(ahead) > CONTRADICTION:
             note = (
                 f"the computer's clock is {ahead:+.1f} s from the receiver, more than "
-                f"{CONTRADICTION:g} s: one of them is wrong; chronyc sources tells what chronyd "
+                f"{CONTRADICTION:g} s: one of them is wrong; chronyc sources shows what chronyd "
                 "goes by"
             )
             return math.inf, "none", note
         if self._bound is not None and now - self._bound.renewed_at > _FRESH:
             return error, "holdover", _old(error, "")
         if self._bound is not None and not self._bound.kept:
-            return error, "holdover", "nobody keeps the computer's clock; is chronyd running?"
+            return error, "holdover", "the computer's clock is not disciplined; is chronyd running?"
         problem = "" if self._gpsd is None else self._gpsd.problem
         return error, "system" if ahead is None else "gps", problem
 
@@ -311,7 +311,7 @@ class SystemTime:
 def _old(error: float, limit: str) -> str:
     return (
         f"the computer's clock may be off by {error:.2g} s{limit}: chronyd has lost its sources; "
-        "chronyc sources tells why"
+        "chronyc sources shows why"
     )
 
 

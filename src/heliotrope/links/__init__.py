@@ -1,9 +1,9 @@
-"""Links between the plant and its clusters: messages that arrive fresh or not at all.
+"""Links between the plant and its clusters: a message arrives fresh or not at all.
 
-`Link` is the protocol of one end; `link` says what it promises. `CarriedLink` is its one
-implementation, over a `Carrier`: within a process (`memory_pair`), TCP (`tcp_link`, `TcpServer`) or
-an MQTT broker (module ``mqtt``, which needs the extra ``control``). `Conversation` seals each
-message in an envelope that proves its age without a common clock.
+`Link` is the protocol of one end; its module ``link`` states the guarantees. `CarriedLink` is the
+one implementation, over a `Carrier`: in the same process (`memory_pair`), TCP (`tcp_link`,
+`TcpServer`) or an MQTT broker (module ``mqtt``, which needs the extra ``control``). `Conversation`
+seals each message in an envelope that proves its age without a common clock.
 
 `encode` and `decode` turn messages (`Lease`, `Command`, `Status`, …) into bytes and back.
 `Clock` measures every limit; `run_virtual` runs a program in virtual time.

@@ -1,7 +1,7 @@
-"""Strict tables, URLs of links and files of keys, as the files of plants and clusters have them.
+"""Strict tables, URLs of links and key files, shared by the files of plants and clusters.
 
-Addresses and limits may be shared and kept under version control; keys may not. They stand in a
-file of their own that nobody else may read.
+Addresses and limits may be shared and kept under version control; keys may not. Keys stand in a
+separate file that only its owner may read.
 """
 
 import string
@@ -24,7 +24,7 @@ _PORTS = {"tcp": None, "mqtt": 1883, "mqtts": 8883}
 
 
 class Table(BaseModel):
-    """A table of a file: unknown keys are refused."""
+    """A table of a configuration file: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -35,12 +35,12 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
     Parameters
     ----------
     path, where
-        File and place of the URL, for the error.
+        File and place of the URL, for the error message.
 
     Raises
     ------
     FormatError
-        If it is not a URL of a link, or lacks a part.
+        If it is not the URL of a link, or a part is missing.
     """
     try:
         parts = urlsplit(url)
@@ -62,14 +62,14 @@ def url_parts(path: Path, url: str, where: str) -> tuple[str, str, int, str]:
 
 
 class Keys:
-    """A keys' file: ``plant``, ``password`` and a table of keys, all in hexadecimal.
+    """A key file: ``plant``, ``password`` and a table of keys; keys are hexadecimal.
 
     Parameters
     ----------
     path
-        None: there is no file, and no key.
+        None: there is no file, and there are no keys.
     table
-        Name of the table: "heliostats" of a cluster, "clusters" of a plant.
+        Name of the table: "heliostats" in a cluster's file, "clusters" in a plant's.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Keys:
     Raises
     ------
     FormatError
-        A file that others may read, or a value that is not a key.
+        If others may read the file, or a value is not a key.
     """
 
     def __init__(self, path: Path | None, table: str) -> None:
@@ -90,9 +90,9 @@ class Keys:
         self.members: dict[str, bytes] = {}
         if path is None:
             return
-        # An empty file has no keys; members without one are refused later.
+        # An empty file has no keys; members without a key are refused later.
         empty = path.is_file() and path.stat().st_size == 0
-        raw = {} if empty else read_toml(path, "a file of keys")
+        raw = {} if empty else read_toml(path, "a key file")
         if path.stat().st_mode & _OTHERS:
             mode = path.stat().st_mode & 0o777
             raise FormatError(path, f"others may read it (mode {mode:o}); run chmod 600 on it")
@@ -111,7 +111,7 @@ class Keys:
         text = value if isinstance(value, str) else ""
         good = set(text) <= set(string.hexdigits) and len(text) % 2 == 0
         if not (good and _SHORTEST_KEY <= len(text) // 2 <= _LONGEST_KEY):
-            # The value is not shown: it would stand in a log.
+            # The value is not shown: it would end up in a log.
             raise FormatError(
                 self._path,
                 f"a key of {len(text)} characters; give {_SHORTEST_KEY} to "

@@ -1,12 +1,12 @@
-"""Clocks: real, by hand and virtual; and the GPS scale of seconds, which no leap second bends.
+"""Clocks (real, manual and virtual), and the GPS scale of seconds, which has no leap seconds.
 
-Everything in `control` that judges time is given a `Clock`. Its `monotonic` decides (leases,
-deadlines, expiries); its `utc` only tells. Waiting is asyncio's business: a wait may end early
-or late, so whoever waited reads the clock again (`sleep_until`).
+All code that judges time is given a `Clock`. Decisions (leases, deadlines, expiries) rest on
+`monotonic`; `utc` is for information only. A wait of asyncio may end early or late, so code that
+has waited reads the clock again (`sleep_until`).
 
-`VirtualLoop` is an event loop whose time runs only when nothing is left to do now. It takes its
-ready callbacks in an order drawn by its seed, since no code may depend on an order that asyncio
-happens to keep; the same seed gives the same run.
+The time of a `VirtualLoop` advances only when nothing is left to do now. It takes ready callbacks
+in a random order drawn from its seed, because no code may depend on the order that asyncio happens
+to keep; the same seed gives the same run.
 """
 
 import asyncio
@@ -25,7 +25,7 @@ T = TypeVar("T")
 GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
 WEEK = 604800
 
-#: GPS minus UTC in s, from a date on. IERS Bulletin C announces changes half a year ahead.
+#: GPS minus UTC in s, from each date on. IERS Bulletin C announces changes half a year ahead.
 LEAP_SECONDS = (
     (datetime(1980, 1, 6, tzinfo=UTC), 0), (datetime(1981, 7, 1, tzinfo=UTC), 1),
     (datetime(1982, 7, 1, tzinfo=UTC), 2), (datetime(1983, 7, 1, tzinfo=UTC), 3),
@@ -38,20 +38,20 @@ LEAP_SECONDS = (
     (datetime(2012, 7, 1, tzinfo=UTC), 16), (datetime(2015, 7, 1, tzinfo=UTC), 17),
     (datetime(2017, 1, 1, tzinfo=UTC), 18),
 )  # fmt: skip
-#: Up to this date the table is known to be complete (IERS leap-seconds.list); after it, a leap
-#: second may have come that it lacks.
+#: The table is known to be complete up to this date (IERS leap-seconds.list); after it, a leap
+#: second may be missing.
 LEAP_SECONDS_VALID_UNTIL = datetime(2027, 6, 28, tzinfo=UTC)
 
 
 class Clock(Protocol):
-    """What tells the time."""
+    """A source of monotonic time and UTC."""
 
     def monotonic(self) -> float:
-        """Return seconds since some instant; it never runs backwards and knows no jumps."""
+        """Return seconds since some instant; never runs backwards, never jumps."""
         ...
 
     def utc(self) -> datetime:
-        """Return what the system takes for the time, in UTC; it may be wrong, and may jump."""
+        """Return the system's UTC; it may be wrong, and may jump."""
         ...
 
 
@@ -60,7 +60,7 @@ class SystemClock:
 
     Notes
     -----
-    On Linux the monotonic time is CLOCK_BOOTTIME, which goes on while the machine sleeps:
+    On Linux the monotonic time is CLOCK_BOOTTIME, which continues while the machine sleeps.
     CLOCK_MONOTONIC does not, and would stretch a lease by the length of the sleep.
     """
 
@@ -77,17 +77,17 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock whose time comes from elsewhere, for simulation and tests.
+    """A clock driven from outside, for simulation and tests.
 
     Parameters
     ----------
     source
-        Gives the monotonic seconds: the `time` of a `VirtualLoop`; None: a clock that
-        stands until `advance` is called.
+        Returns the monotonic seconds, such as `time` of a `VirtualLoop`; None: the clock stands
+        still until `advance` is called.
     start
-        UTC at the moment of making.
+        UTC when the clock is made.
     rate
-        Seconds of this clock for each second of the source: an oscillator that is off.
+        Seconds of this clock for each second of the source; not 1 for an oscillator that is off.
     """
 
     def __init__(
@@ -112,11 +112,11 @@ class VirtualClock:
         return self._begin + self._rate * (self._source() - self._begin)
 
     def utc(self) -> datetime:
-        """Return UTC: the start, what has passed since, and what was jumped."""
+        """Return UTC: the start, plus the time passed, plus all jumps."""
         return self._start + timedelta(seconds=self.monotonic() - self._begin + self._jumped)
 
     def advance(self, seconds: float) -> None:
-        """Let time pass, where the clock has no source of its own.
+        """Let time pass; only for a clock without a source.
 
         Raises
         ------
@@ -128,14 +128,14 @@ class VirtualClock:
         self._by_hand += seconds
 
     def jump(self, seconds: float) -> None:
-        """Set UTC forward (or back) without any time passing, as somebody at the keyboard may."""
+        """Set UTC forward (or back) without letting time pass, as a person at the keyboard may."""
         self._jumped += seconds
 
 
 async def sleep_until(clock: Clock, instant: float) -> None:
-    """Wait until `clock` has reached `instant`, in s of its monotonic time."""
+    """Wait until `clock` reaches `instant`, in s of its monotonic time."""
     while (left := instant - clock.monotonic()) > 0.0:
-        # What rounding leaves over would not move a virtual clock on.
+        # A remainder left by rounding would not advance a virtual clock.
         await asyncio.sleep(max(left, 1e-6))
 
 
@@ -148,7 +148,7 @@ def leap_seconds(utc: datetime) -> int:
     Raises
     ------
     TimeError
-        A time without a zone, or before the GPS scale began.
+        A time without a time zone, or before the GPS scale began.
     """
     if utc.tzinfo is None:
         raise TimeError(f"{utc} has no time zone; give UTC")
@@ -164,8 +164,8 @@ def gps_seconds(utc: datetime) -> float:
     Parameters
     ----------
     utc
-        After 1980, with a time zone. Right within the validity of the table of leap seconds
-        (`LEAP_SECONDS_VALID_UNTIL`); later it may be late by a second or more.
+        After 1980, with a time zone. Exact while the table of leap seconds is valid
+        (`LEAP_SECONDS_VALID_UNTIL`); later the result may be low by a second or more.
     """
     count = leap_seconds(utc)
     return (utc - GPS_EPOCH).total_seconds() + count
@@ -174,7 +174,7 @@ def gps_seconds(utc: datetime) -> float:
 def utc_of_gps(seconds: float) -> datetime:
     """Return UTC of GPS seconds: the inverse of `gps_seconds`.
 
-    A leap second itself (23:59:60), which a datetime cannot hold, gives the last microsecond
+    A leap second itself (23:59:60), which a datetime cannot represent, gives the last microsecond
     before it.
     """
     for since, count in reversed(LEAP_SECONDS):
@@ -193,7 +193,7 @@ def gps_week(utc: datetime) -> tuple[int, int]:
 
 
 def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> datetime:
-    """Return UTC of a GPS week, which may have lost its upper bits.
+    """Return UTC of a GPS week whose upper bits may be missing.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
     time_of_week_ms
         0 to 604,799,999.
     not_before
-        A time known to be past; the first week that fits and is not older is taken.
+        A time known to be past; the result is the first matching week that is not older.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
 
 
 class _Drawn(deque[asyncio.Handle]):
-    """Ready callbacks, taken in an order drawn by chance."""
+    """Ready callbacks, taken in random order."""
 
     def __init__(self, chance: random.Random) -> None:
         super().__init__()
@@ -238,7 +238,7 @@ class _Drawn(deque[asyncio.Handle]):
 
 
 class _NoWait(selectors.SelectSelector):
-    """Waits for nothing: when asked to, it lets the loop's time run instead."""
+    """A selector that never waits: it advances the loop's time instead."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -256,8 +256,7 @@ class _NoWait(selectors.SelectSelector):
         found = super().select(0.0)
         if not found and timeout is None:
             raise RuntimeError(
-                "virtual time stands still: every task waits for something that nothing is left "
-                "to bring about"
+                "virtual time stands still: every task waits, and no timer is left to wake one"
             )
         if not found and timeout is not None:
             self.now += max(0.0, timeout)
@@ -265,14 +264,14 @@ class _NoWait(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """An event loop in virtual time; see the head of this module.
+    """An event loop in virtual time; see the docstring of this module.
 
     Parameters
     ----------
     seed
-        Of the order of ready callbacks; None: first in, first out, as asyncio does it.
+        Seed of the order of ready callbacks; None: first in, first out, as in asyncio.
     start
-        Of `time`, in s.
+        First value of `time`, in s.
 
     Raises
     ------
@@ -285,7 +284,7 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         self._no_wait.now = start
         super().__init__(self._no_wait)
         if seed is not None:
-            # asyncio offers no public way to order callbacks; a test holds that this one works.
+            # asyncio offers no public way to order callbacks; a test checks that this one works.
             self._ready = _Drawn(random.Random(seed))
 
     def time(self) -> float:
@@ -308,7 +307,7 @@ def run_virtual(
     *,
     start: datetime = datetime(2026, 6, 21, 10, tzinfo=UTC),
 ) -> T:
-    """Run a coroutine to its end in virtual time, and return what it gives.
+    """Run a coroutine to its end in virtual time, and return its result.
 
     Parameters
     ----------

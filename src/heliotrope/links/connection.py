@@ -1,4 +1,4 @@
-"""The one implementation of a link: it connects, beats, watches and reconnects over a carrier."""
+"""The one implementation of a link: connects, sends heartbeats, supervises and reconnects."""
 
 import asyncio
 import contextlib
@@ -26,21 +26,21 @@ from heliotrope.links.link import (
 
 
 class Carrier(Protocol):
-    """What carries envelopes: opened and closed again and again by one `CarriedLink`.
+    """A transport for envelopes; one `CarriedLink` opens and closes it again and again.
 
-    Only `LinkLostError` and OSError (and, while it opens, LinkError) come out of it.
+    It raises only `LinkLostError` and OSError (and LinkError while it opens).
     """
 
     async def open(self) -> bytes:
-        """Connect, and return the key of this connection; cancelled when it takes too long."""
+        """Connect, and return the key of this connection; cancelled if it takes too long."""
         ...
 
     async def ready(self) -> None:
-        """Wait until what is written now goes out at once."""
+        """Wait until the next write would go out at once."""
         ...
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Hand an envelope to the transport; ``lifetime`` in s tells it what to throw away."""
+        """Hand an envelope to the transport, which may discard it after ``lifetime`` s."""
         ...
 
     async def read(self) -> bytes:
@@ -48,7 +48,7 @@ class Carrier(Protocol):
         ...
 
     async def close(self) -> None:
-        """Disconnect at once; what has not gone out is thrown away."""
+        """Disconnect at once; what has not gone out is discarded."""
         ...
 
 
@@ -58,19 +58,19 @@ class CarriedLink:
     Parameters
     ----------
     name
-        Whom it leads to, for people.
+        Name of the other end, for people.
     carrier
-        Made for this link alone.
+        Used by this link only.
     clock
         Its monotonic time decides everything; expiries are given in it.
     settings
         See `LinkSettings`.
     statistics
-        Where to count, if the carrier counts too.
+        Counters to use, if the carrier counts too.
     seed
-        Of the pauses and of the sessions' numbers, for simulation; None: from the system.
+        Seed of the pauses and of the session numbers, for simulation; None: from the system.
     patient
-        The carrier waits for the other end to come: no limit of time, and no pauses.
+        The carrier waits for the other end to connect: no time limit, and no pauses.
     """
 
     def __init__(
@@ -105,42 +105,42 @@ class CarriedLink:
 
     @property
     def name(self) -> str:
-        """Whom it leads to."""
+        """Name of the other end."""
         return self._name
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and heard us, within the deadline."""
+        """Whether the other end was alive, and heard this end, within the deadline."""
         return self._open and self._until(-math.inf) > self._clock.monotonic()
 
     def _until(self, opened: float) -> float:
         """Return when the connection ends unless something is heard."""
-        # What it has heard of us it tells with its own beat, up to a period later.
+        # The other end reports what it has heard with its own heartbeat, up to a period later.
         heard = max(opened, self._talk.heard_at) + self._settings.period
         return min(max(opened, self._talk.alive_at), heard) + self._settings.deadline
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the link is closed for good."""
         return self._closing.is_set()
 
     @property
     def silent_for(self) -> float:
-        """How long ago the other end was surely alive, in s; infinite if it never was."""
+        """Time since the other end was certainly alive, in s; infinite if it never was."""
         return self._heart.silent_for
 
     @property
     def problem(self) -> str:
-        """Why it is not connected, "" if it is."""
+        """Why the link is not connected, "" if it is."""
         return "" if self.connected else self._problem
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since it was made."""
+        """Counts since the link was made."""
         return self._statistics
 
     async def close(self) -> None:
-        """Close it for good: what waits in it is dropped, and ``run`` ends."""
+        """Close the link for good: waiting messages are dropped, and ``run`` ends."""
         self._closing.set()
         self._inbox.close()
         self._up.set()
@@ -157,7 +157,7 @@ class CarriedLink:
         return await self._inbox.get()
 
     async def established(self) -> None:
-        """Wait until it is connected.
+        """Wait until the link is connected.
 
         Raises
         ------
@@ -180,21 +180,21 @@ class CarriedLink:
         data
             At most `LinkSettings.largest` bytes.
         expires
-            By the monotonic clock: it is delivered before that or not at all. Every motion
-            command has one. None: it does not expire, but waits for nothing either.
+            By the monotonic clock: the message is delivered before that or not at all. Every motion
+            command has one. None: the message does not expire, but is not held either.
         hold
-            Wait for a connection until it expires. Nothing is held unless the caller says so,
-            and what is held is held by the caller's own waiting, in no queue.
+            Wait for a connection until the message expires. Nothing is held unless the caller asks
+            for it, and then only while the caller waits: there is no queue.
 
         Raises
         ------
         InputError
-            A message that is too large, held without an expiry, or whose expiry is too far ahead.
+            A message that is too large, is held without an expiry, or expires too far ahead.
         LinkClosedError
             When the link is closed.
         """
         self._check(data, expires, hold)
-        # Who waits longer than the deadline waits for a transport that is no more.
+        # After the deadline the connection is gone, so waiting longer is useless.
         patience = self._settings.deadline
         if expires is not None:
             patience = max(0.0, expires - self._clock.monotonic())
@@ -246,10 +246,10 @@ class CarriedLink:
         Raises
         ------
         LinkError
-            If it runs already.
+            If it is already running.
         """
         if self._running:
-            raise LinkError(f"link to {self._name}: it runs already")
+            raise LinkError(f"link to {self._name}: it is already running")
         self._running = True
         try:
             await until_closed(self._closing, self._keep())
@@ -291,8 +291,8 @@ class CarriedLink:
             await self._carrier.close()
 
     async def _until_lost(self, part: Coroutine[None, None, None], lost: asyncio.Event) -> None:
-        # It raises nothing: a TaskGroup that fails in the instant in which it is cancelled
-        # forgets the latter (before Python 3.13), and the link would not close.
+        # It raises nothing: a TaskGroup that fails at the instant of its cancellation loses the
+        # cancellation (before Python 3.13), and the link would not close.
         try:
             await part
         except (LinkLostError, OSError) as error:
@@ -314,7 +314,7 @@ class CarriedLink:
                 self._up.set()
 
     async def _beat(self) -> None:
-        # What cannot go out within a period is not made up for; the watch ends such a line.
+        # A heartbeat that cannot go out within a period is skipped; the watch ends such a line.
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(self._settings.period), self._sending:
                 await self._carrier.ready()
@@ -327,4 +327,4 @@ class CarriedLink:
         limit = f"for {self._settings.deadline:g} s"
         if self._talk.alive_at + self._settings.deadline > self._clock.monotonic():
             raise LinkLostError(f"the other end has not heard us {limit}")
-        raise LinkLostError(f"no heartbeat of the other end {limit}")
+        raise LinkLostError(f"no heartbeat from the other end {limit}")

@@ -1,14 +1,15 @@
 """Envelopes of a link: order, freshness and authenticity, without any transport.
 
-How a receiver knows the age of a message without a common clock: every envelope tells the
-sender's monotonic time, and which of the *receiver's* times the sender heard last, and how long
-ago. It was therefore sent after that time of the receiver's own clock: an upper limit of its
-age, good to a path's delay, whatever the wall clocks say. Between two such proofs the best of
-them is carried on with the sender's own times, less what two clocks may drift apart.
+A receiver knows the age of a message without a common clock. Every envelope carries the sender's
+monotonic time, the latest of the *receiver's* times that the sender has heard, and how long ago it
+heard that. The envelope was therefore sent after that time of the receiver's own clock, which
+bounds its age, to within the delay of the path, whatever the wall clocks say. Between two such
+proofs the best of them is carried forward with the sender's own times, less the drift that two
+clocks may have.
 
-Liveness is judged by the same limit: heartbeats that were held up and come in a bunch renew
-nothing. A copy, a message of an earlier connection and one's own message come back carry the
-wrong count or the wrong session, and are refused.
+Liveness is judged by the same bound: heartbeats that were held up and arrive in a bunch renew
+nothing. A copy, a message of an earlier connection and a reflected message carry the wrong count
+or the wrong session, and are refused.
 """
 
 import hmac
@@ -22,14 +23,14 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import LinkSettings, Statistics
 
 _BEAT, _DATA = 0x11, 0x12
-#: Kind; sender's session; the session it has heard; count; sender's time; the time it has heard
-#: last, and how long ago; time to live (0: no expiry). Times in µs.
+#: Kind; sender's session; session it has heard; count; sender's time; latest time it has heard,
+#: and how long ago; time to live (0: no expiry). Times in µs.
 _HEADER = struct.Struct("<BQQQQQII")
 _MAC_SIZE = 16
 _LONGEST = 0xFFFFFFFF
 #: Bytes that an envelope adds to a message.
 OVERHEAD = _HEADER.size + _MAC_SIZE
-#: Two clocks are believed to run alike within this: twice what NTP slews at most.
+#: Two clocks are assumed to agree in rate within this: twice the largest slew of NTP.
 _DRIFT = 1e-3
 
 
@@ -51,25 +52,25 @@ class Conversation:
     Parameters
     ----------
     clock
-        Only its monotonic time is used. The other end has another.
+        Only its monotonic time is used. The other end has its own clock.
     settings
         `LinkSettings.horizon` and `largest` are used here.
     statistics
-        Where to count.
+        Counters to use.
     entropy
-        Gives random bytes, for the numbers of sessions.
+        Returns random bytes, for session numbers.
 
     Attributes
     ----------
     alive_at
-        A time at which the other end was surely alive, by our clock.
+        A time at which the other end was certainly alive, by our clock.
     heard_at
-        A time of ours that the other end surely heard.
+        A time of our clock that the other end has certainly heard.
 
     Notes
     -----
-    The MAC is HMAC-SHA256 cut to 16 bytes. Without a key it still detects damage.
-    A session is made anew for each connection, so that nothing of an older one is taken.
+    The MAC is HMAC-SHA256 truncated to 16 bytes. Without a key it still detects damage.
+    Each connection has a new session, so that nothing from an older one is accepted.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class Conversation:
         self.restart(b"")
 
     def restart(self, key: bytes) -> None:
-        """Begin a new session under a key; nothing of the old one counts any more."""
+        """Begin a new session under a key; nothing of the old session is accepted any more."""
         self._key = key
         self._session = int.from_bytes(self._entropy(8), "little") or 1
         self._count = 0
@@ -96,14 +97,14 @@ class Conversation:
         self.heard_at = -math.inf
 
     def beats(self) -> list[bytes]:
-        """Return heartbeats to send: one, or two while somebody new asks to be heard."""
+        """Return the heartbeats to send: one, or two while a new session asks to be heard."""
         known = [peer for peer in (self._peer, self._candidate) if peer is not None]
         self._candidate = None
         ends: list[_Peer | None] = [*known] or [None]
         return [self._seal(_BEAT, peer, 0, b"") for peer in ends]
 
     def data(self, message: bytes, expires: float | None) -> bytes:
-        """Return the envelope of a message that goes out now.
+        """Return the envelope of a message that is sent now.
 
         Raises
         ------
@@ -131,15 +132,15 @@ class Conversation:
         return header + message + mac
 
     def feed(self, envelope: bytes) -> tuple[tuple[bytes, float] | None, bool]:
-        """Take an envelope as it came.
+        """Take an envelope as it arrived.
 
         Returns
         -------
         arrival
-            The message and its expiry by our clock (infinite for none); None for a heartbeat,
-            and for whatever is not to be delivered, which is counted.
+            The message and its expiry by our clock (infinite if it has none); None for a heartbeat
+            and for an envelope that is not to be delivered, which is counted.
         prompt
-            Whether a heartbeat should go out at once, since the other end waits for it.
+            Whether a heartbeat should be sent at once because the other end waits for it.
         """
         now = self._clock.monotonic()
         self._statistics.last_received = now
@@ -171,7 +172,7 @@ class Conversation:
         return (body[_HEADER.size :], expires), first
 
     def _unproved(self, kind: int, session: int, stamp: int, count: int, now: float) -> bool:
-        """Take what does not show that its sender has heard us: it may be of any age."""
+        """Take an envelope of unknown age: it does not show that its sender has heard us."""
         if kind == _DATA:
             self._statistics.refused += 1
             return False
@@ -182,14 +183,14 @@ class Conversation:
         return new
 
     def _take(self, session: int, count: int, proof: float, now: float) -> _Peer | None:
-        """Return whom an envelope comes from, None if it is not to be taken."""
+        """Return the sender of an envelope, None if the envelope is not acceptable."""
         peer = self._peer
         if peer is not None and peer.session == session:
             if count > peer.count:
                 return peer
             self._statistics.repeated += 1
             return None
-        # Somebody new is believed if it heard us later than the old one was alive.
+        # A new session is believed if it heard us later than the old one was alive.
         if proof > now or (peer is not None and proof <= self.alive_at):
             self._statistics.refused += 1
             return None
@@ -197,7 +198,7 @@ class Conversation:
         return self._peer
 
     def _learn(self, peer: _Peer, stamp: int, count: int, proof: float, now: float) -> float:
-        """Note an envelope that is taken, and return when it was sent at the earliest."""
+        """Record an accepted envelope, and return the earliest time at which it was sent."""
         kept = peer.bound - _DRIFT * (now - peer.bound_at)
         peer.bound, peer.bound_at = max(proof - stamp / 1e6, kept), now
         peer.stamp, peer.at, peer.count = stamp, now, count

@@ -1,8 +1,8 @@
-"""Links within one process, with faults drawn by a seed: the default, and the twin's.
+"""Links within one process, with faults drawn from a seed: the default, and the twin's.
 
-The two ends speak the same envelopes as over a network, so heartbeats, expiry and reconnection
-are the real ones. Messages that are under way lie in a heap ordered by the time at which they
-are due, so the order of the event loop's callbacks does not alter theirs.
+The two ends exchange the same envelopes as over a network, so heartbeats, expiry and reconnection
+are the real ones. Messages under way lie in a heap ordered by arrival time, so the order of the
+event loop's callbacks does not change the order of messages.
 """
 
 import asyncio
@@ -19,20 +19,20 @@ from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
 
 @dataclass(frozen=True)
 class Faults:
-    """What a line does to the envelopes on it.
+    """Faults that a line applies to envelopes.
 
     Parameters
     ----------
     loss, duplication, reordering, corruption
-        Chances, 0 to 1, for each envelope: to be lost; to come twice; to be overtaken; to have
-        one bit inverted.
+        Probability, 0 to 1, that an envelope is lost; arrives twice; is overtaken; has one bit
+        inverted.
     delay
         Shortest and longest time under way, in s.
 
     Raises
     ------
     InputError
-        A chance outside 0 to 1, or a negative or reversed delay.
+        A probability outside 0 to 1, or a negative or reversed delay.
     """
 
     loss: float = 0.0
@@ -45,7 +45,7 @@ class Faults:
         for name in ("loss", "duplication", "reordering", "corruption"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
-                raise InputError(f"faults: a chance of {name} of {value}; give 0 to 1")
+                raise InputError(f"faults: the probability of {name} is {value}; give 0 to 1")
         low, high = self.delay
         if not 0.0 <= low <= high < float("inf"):
             raise InputError(
@@ -87,7 +87,7 @@ class _Lane:
         return bytes(damaged)
 
     def take(self) -> bytes | float | None:
-        """Return the next envelope, or when it is due, or None."""
+        """Return the next envelope, or the time at which it is due, or None."""
         if not self._under_way:
             return None
         due = self._under_way[0][0]
@@ -101,16 +101,16 @@ class _Lane:
 
 
 class MemoryLine:
-    """A line between two ends, and its faults, which may be changed while it is used.
+    """A line between two ends, and its faults, which may be changed while it is in use.
 
     Parameters
     ----------
     clock
-        Of the line; the ends may have other ones.
+        Clock of the line; the ends may have others.
     faults
-        What happens to each envelope.
+        Faults applied to each envelope.
     seed
-        Of the faults.
+        Seed of the faults.
 
     Attributes
     ----------
@@ -131,16 +131,16 @@ class MemoryLine:
         )
 
     def cut(self, *, first_to_second: bool = True, second_to_first: bool = True) -> None:
-        """Lose all that is sent from now on, in one direction or both; nobody is told."""
+        """Lose everything sent from now on, in one direction or both; neither end is notified."""
         self.lanes[0].cut = first_to_second
         self.lanes[1].cut = second_to_first
 
     def heal(self) -> None:
-        """End a partition; what is under way goes on, what was lost stays lost."""
+        """End a partition; envelopes under way go on, lost ones stay lost."""
         self.cut(first_to_second=False, second_to_first=False)
 
     def drop(self) -> None:
-        """Break the connection as a reset does: both ends notice, what is under way is lost."""
+        """Break the connection as a reset does: both ends notice, envelopes under way are lost."""
         self.generation += 1
         for lane in self.lanes:
             lane.clear()
@@ -155,18 +155,18 @@ class MemoryLine:
         settings: LinkSettings | None = None,
         seed: int = 0,
     ) -> CarriedLink:
-        """Return a new link at one end, as for a program that starts there anew.
+        """Return a new link at one end, as for a program that restarts there.
 
         Parameters
         ----------
         place
-            0 or 1. What was at that end before must have ended.
+            0 or 1. The previous link at that end must have ended.
         name
-            Whom it leads to.
+            Name of the other end.
         clock
-            Of this end.
+            Clock of this end.
         settings, seed
-            As of `memory_pair`.
+            As in `memory_pair`.
         """
         return CarriedLink(name, _MemoryCarrier(self, place), clock, settings, seed=seed)
 
@@ -191,24 +191,24 @@ class _MemoryCarrier:
             raise LinkLostError("the line was dropped")
 
     async def ready(self) -> None:
-        """Nothing to wait for."""
+        """Return at once: there is nothing to wait for."""
         self._check()
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Put an envelope on its way; a line knows neither lifetimes nor confirmations."""
+        """Put an envelope on its way; the line ignores lifetime and confirmation."""
         del lifetime, confirmed
         self._check()
         self._out.put(envelope, self._line.faults)
 
     async def read(self) -> bytes:
-        """Wait until an envelope has come through."""
+        """Wait for the next envelope."""
         while True:
             self._check()
             self._in.news.clear()
             item = self._in.take()
             if isinstance(item, bytes):
                 return item
-            # At least a microsecond: what rounding leaves over would not move a virtual clock.
+            # At least 1 µs: a remainder left by rounding would not advance a virtual clock.
             left = None if item is None else max(1e-6, item - self._in.clock.monotonic())
             try:
                 async with asyncio.timeout(left):
@@ -217,7 +217,7 @@ class _MemoryCarrier:
                 continue
 
     async def close(self) -> None:
-        """Leave; the other end hears nothing of it but silence."""
+        """Disconnect; the other end notices only silence."""
         self._generation = -1
 
 
@@ -235,17 +235,17 @@ def memory_pair(
     Parameters
     ----------
     clock
-        Of the line and, unless ``clocks`` are given, of both ends.
+        Clock of the line and, unless ``clocks`` are given, of both ends.
     names
-        Of the first and of the second end; each link is called after where it leads.
+        Names of the first and the second end; each link bears the name of the end it leads to.
     faults
         None: a perfect line.
     seed
-        Of the faults, the pauses and the sessions: the same seed gives the same run.
+        Seed of faults, pauses and sessions: the same seed gives the same run.
     settings
-        Of both ends.
+        Settings of both ends.
     clocks
-        Of the first and of the second end, if they differ.
+        Clocks of the first and the second end, if they differ.
     """
     line = MemoryLine(clock, faults, seed)
     first, second = clocks or (clock, clock)

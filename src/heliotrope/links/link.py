@@ -1,22 +1,22 @@
 """Links between the plant and its clusters: messages of bytes, fresh or not at all.
 
-A `Link` carries datagrams between two ends. What it promises:
+A `Link` carries datagrams between two ends. It guarantees:
 
 - A message arrives whole, unaltered, in order, at most once, or not at all.
 - A message with an expiry is never delivered after it: not from a queue, not from a broker that
-  was frozen, not from a socket's buffer. Nothing is kept for an end that is not there.
-- `connected` means: the other end was alive within the deadline, and heard this one within the
-  deadline and a period. It rests on heartbeats of our own alone, whatever the transport beneath
-  believes.
+  was frozen, not from a socket's buffer. Nothing is kept for an end that is absent.
+- `connected` means that the other end was alive within the deadline, and heard this one within the
+  deadline and a period. It rests on our own heartbeats alone, whatever state the transport reports.
 
-`CarriedLink` (carried.py) is the one implementation; what differs (memory, TCP, MQTT) is its
-`Carrier`. How a receiver knows a message's age without a common clock stands in conversation.py.
-A bus is no link: it has one master, and what answers, answers at once (`Bus`, serial_bus.py).
+`CarriedLink` (connection.py) is the one implementation; memory, TCP and MQTT differ only in their
+`Carrier`. envelope.py explains how a receiver knows a message's age without a common clock.
+A bus is not a link: it has one master, and a node that answers does so at once (`Bus`,
+`cluster.serial_bus`).
 
 ::
 
     HeliotropeError
-    └── LinkError             a link that cannot be had, or is no more
+    └── LinkError             a link cannot be made, or no longer exists
         ├── LinkLostError     a connection is gone; the link makes another by itself
         └── LinkClosedError   the link was closed for good
 """
@@ -36,11 +36,11 @@ from heliotrope.links.clock import Clock
 
 
 class LinkError(HeliotropeError):
-    """A link that cannot be had, or is no more."""
+    """A link cannot be made, or no longer exists."""
 
 
 class LinkLostError(LinkError):
-    """One connection is gone; the link makes another by itself."""
+    """A connection is gone; the link makes another by itself."""
 
 
 class LinkClosedError(LinkError):
@@ -48,10 +48,10 @@ class LinkClosedError(LinkError):
 
 
 class Outcome(enum.Enum):
-    """What became of a message at its sender; the receiver's judgement comes on top.
+    """Fate of a message at its sender; the receiver may still refuse it.
 
-    SENT says that the transport took it in time (with MQTT: that the broker confirmed it).
-    After anything else the caller may send anew; the old message will not be delivered late.
+    SENT: the transport took it in time (with MQTT: the broker confirmed it).
+    After any other result the caller may send it again; the first message will not arrive late.
     """
 
     SENT = "sent"
@@ -70,14 +70,14 @@ class Statistics:
     dropped, expired
         Not sent: not connected; could not go out in time.
     late, overflowed
-        Not delivered: older than their expiry; the oldest of a full queue.
+        Not delivered: older than their expiry; dropped as the oldest of a full queue.
     repeated, refused, retained
-        Not delivered: duplicates and what was overtaken; what is damaged, forged or not of this
+        Not delivered: duplicates and overtaken messages; damaged, forged or of another
         conversation; kept by a broker from before.
     opened, failures, reconnects
         Connections made; attempts that failed; connections made after the first.
     last_received
-        When the last envelope of any kind came, in s of the monotonic clock.
+        When the last envelope of any kind arrived, in s of the monotonic clock.
     """
 
     sent: int = 0
@@ -102,21 +102,21 @@ class LinkSettings:
     Parameters
     ----------
     period
-        Between heartbeats, in s.
+        Time between heartbeats, in s.
     deadline
-        Of silence, after which the other end counts as gone, in s; at least twice the period.
+        Silence after which the other end counts as gone, in s; at least twice the period.
         The plant's lease to a cluster is 3 s, so the default leaves half of it.
     capacity
-        Messages received that may wait for the caller; beyond it the oldest is dropped.
+        Received messages that may wait for the caller; beyond it the oldest is dropped.
     largest
-        Bytes of a message.
+        Size limit of a message, in bytes.
     horizon
-        Longest time to an expiry that is believed, in s.
+        Longest time to an expiry that is accepted, in s.
     open_limit
-        For making a connection, in s.
+        Time limit for making a connection, in s.
     first_pause, longest_pause
-        Between attempts to connect, in s: doubled each time, and drawn between half of it and all
-        of it, so that a field of clusters does not come back in step.
+        Pauses between attempts to connect, in s: doubled each time, and drawn between half and all
+        of that, so that the clusters of a field do not reconnect in step.
 
     Raises
     ------
@@ -152,40 +152,40 @@ class LinkSettings:
 
 
 class Link(Protocol):
-    """One end of a link; see the head of this module for what it promises.
+    """One end of a link; see the docstring of this module for its guarantees.
 
-    ``run`` belongs into a TaskGroup of the owner (or use `running`); it ends when the link is
+    ``run`` belongs in a TaskGroup of the owner (or use `running`); it ends when the link is
     closed. ``receive`` has one caller at a time.
     """
 
     @property
     def name(self) -> str:
-        """Whom it leads to."""
+        """Name of the other end."""
         ...
 
     @property
     def connected(self) -> bool:
-        """Whether the other end was alive, and heard us, within the deadline."""
+        """Whether the other end was alive, and heard this end, within the deadline."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the link is closed for good."""
         ...
 
     @property
     def silent_for(self) -> float:
-        """How long ago the other end was surely alive, in s; infinite if it never was."""
+        """Time since the other end was certainly alive, in s; infinite if it never was."""
         ...
 
     @property
     def problem(self) -> str:
-        """Why it is not connected, "" if it is."""
+        """Why the link is not connected, "" if it is."""
         ...
 
     @property
     def statistics(self) -> Statistics:
-        """Counts since it was made."""
+        """Counts since the link was made."""
         ...
 
     async def run(self) -> None:
@@ -195,7 +195,7 @@ class Link(Protocol):
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> Outcome:
-        """Send a message, by ``expires`` of the monotonic clock or not at all."""
+        """Send a message by ``expires`` of the monotonic clock, or not at all."""
         ...
 
     async def receive(self) -> bytes:
@@ -203,21 +203,21 @@ class Link(Protocol):
         ...
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the link for good."""
         ...
 
 
 class Bus(Protocol):
-    """A bus with one master, this one: a frame out, what answers in."""
+    """A bus whose only master is this side: it sends a frame and reads the answer."""
 
     @property
     def connected(self) -> bool:
-        """Whether the port is open; who is alive on the bus only answers tell."""
+        """Whether the port is open; only answers show which nodes are alive."""
         ...
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the bus is closed for good."""
         ...
 
     async def run(self) -> None:
@@ -233,17 +233,17 @@ class Bus(Protocol):
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return what is answered, b"" if nothing is."""
+        """Send a frame and return the answer, b"" if there is none."""
         ...
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> Outcome:
-        """Send a frame that nobody answers."""
+        """Send a frame that is not answered."""
         ...
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the bus for good."""
         ...
 
 
@@ -251,7 +251,7 @@ class Bus(Protocol):
 
 
 class Backoff:
-    """Pauses between attempts: doubled each time, bounded, drawn by chance.
+    """Random pauses between attempts, doubled each time up to a limit.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ class Backoff:
         self._pause = first
 
     def reset(self) -> None:
-        """Begin anew, after a success."""
+        """Begin again with the first pause, after a success."""
         self._pause = self._first
 
     def next(self) -> float:
@@ -279,14 +279,14 @@ class Backoff:
 
 
 class Heartbeat:
-    """Sends in a steady rhythm, and knows how long the other side was silent.
+    """A steady rhythm of sending, and a record of the other side's silence.
 
     Parameters
     ----------
     clock
         Its monotonic time decides.
     period, deadline
-        Between beats; of silence; in s.
+        Time between beats, and limit of silence, in s.
     """
 
     def __init__(self, clock: Clock, period: float, deadline: float) -> None:
@@ -299,27 +299,27 @@ class Heartbeat:
     def heard(self, at: float | None = None) -> None:
         """Note that the other side was alive, now or at an instant of the clock.
 
-        Time never goes back here: news older than what is known renews nothing.
+        Time never goes back here: news older than the latest renews nothing.
         """
         now = self._clock.monotonic()
         self._heard = max(self._heard, now if at is None else min(at, now))
 
     @property
     def silent_for(self) -> float:
-        """How long ago the other side was alive, in s; infinite if it never was."""
+        """Time since the other side was alive, in s; infinite if it never was."""
         return self._clock.monotonic() - self._heard
 
     @property
     def alive(self) -> bool:
-        """Whether it was alive within the deadline."""
+        """Whether the other side was alive within the deadline."""
         return self.silent_for <= self._deadline
 
     def prompt(self) -> None:
-        """Beat at once, and go on from there."""
+        """Beat at once, and continue the rhythm from there."""
         self._now.set()
 
     async def run(self, beat: Callable[[], Awaitable[object]]) -> None:
-        """Call ``beat`` every period until cancelled; beats that were missed are not made up."""
+        """Call ``beat`` every period until cancelled; missed beats are not made up."""
         while True:
             self._now.clear()
             due = self._clock.monotonic() + self._period
@@ -334,7 +334,7 @@ class Heartbeat:
 
 
 class Inbox:
-    """What was received and not yet taken: bounded, and nothing in it outlives its expiry."""
+    """Received messages not yet taken: a bounded queue in which nothing outlives its expiry."""
 
     def __init__(self, clock: Clock, capacity: int, statistics: Statistics) -> None:
         self._clock = clock
@@ -353,7 +353,7 @@ class Inbox:
         self._news.set()
 
     def close(self) -> None:
-        """Wake up who waits."""
+        """Wake the task that waits."""
         self._closed = True
         self._news.set()
 
@@ -363,7 +363,7 @@ class Inbox:
         Raises
         ------
         LinkClosedError
-            When the box is closed; what is left in it is not delivered.
+            When the box is closed; messages left in it are not delivered.
         """
         while not self._closed:
             while self._items:
@@ -381,14 +381,14 @@ class Inbox:
 
 
 async def received(link: Link) -> AsyncIterator[bytes]:
-    """Give a link's messages one after the other, until it is closed."""
+    """Yield a link's messages one after the other, until it is closed."""
     with contextlib.suppress(LinkClosedError):
         while True:
             yield await link.receive()
 
 
 async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]) -> None:
-    """Run parts side by side until an event is set, then cancel them; if one fails all end."""
+    """Run parts side by side until an event is set, then cancel them; if one fails, all end."""
     async with asyncio.TaskGroup() as group:
         tasks = [group.create_task(part) for part in parts]
         await closing.wait()
@@ -397,7 +397,7 @@ async def until_closed(closing: asyncio.Event, *parts: Coroutine[Any, Any, None]
 
 
 class Runs(Protocol):
-    """What is run and closed: a `Link`, a `Bus`, a server."""
+    """Something that is run and closed: a `Link`, a `Bus`, a server."""
 
     async def run(self) -> None:
         """Run until closed."""
@@ -410,7 +410,7 @@ class Runs(Protocol):
 
 @contextlib.asynccontextmanager
 async def running(*parts: Runs) -> AsyncIterator[None]:
-    """Run links, buses and servers beside a block, and close them at its end."""
+    """Run links, buses and servers during a block, and close them at its end."""
     failure: Exception | None = None
     async with asyncio.TaskGroup() as group:
         for part in parts:

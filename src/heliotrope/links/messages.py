@@ -1,14 +1,14 @@
-"""What the plant and its clusters say to each other over a `Link`.
+"""Messages between the plant and its clusters, sent over a `Link`.
 
-A message is one line of JSON, then, after a newline, a block of bytes (empty but for STATUS
-and PARAMETERS). The line names its kind and holds its fields; unknown fields are ignored, so that
+A message is one line of JSON, a newline, and a block of bytes (empty except in STATUS and
+PARAMETERS). The line names the kind and holds the fields. Unknown fields are ignored, so that
 a newer plant can talk to an older cluster; an unknown kind is refused with its name.
 
 Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`, `Acknowledge`.
 Cluster to plant: `Status`, `Progress`, `Alarm`, `Answer`.
 
-Whatever moves a mirror towards the receiver carries the authority's token and is sent with an
-expiry of the link; `Emergency` needs neither, and is taken from anyone.
+Every message that moves a mirror towards the receiver carries the token of the command authority
+and is sent with an expiry of the link; `Emergency` needs neither, and is accepted from anyone.
 """
 
 import dataclasses
@@ -28,9 +28,9 @@ from heliotrope.safety import Alarm, Severity
 VERSION = 1
 
 #: One row for each heliostat of a cluster, in the order of its configuration. ``heard_ms`` is the
-#: age of its STATUS when the row was written (2^32 - 1: none has come, and the row says nothing);
+#: age of its STATUS when the row was written (2^32 - 1: none has come, and the row means nothing);
 #: states and flags as in `lcu.names`. ``steps_ms`` is the age of its step counts and goals, which
-#: may be asked for less often.
+#: may be requested less often.
 NODE = np.dtype(
     [
         ("state", "u1"),
@@ -55,11 +55,11 @@ NEVER = 0xFFFFFFFF
 
 
 class ProtocolError(HeliotropeError):
-    """A message that is none, or that this side doesn't know."""
+    """Bytes that are not a message, or a message that this side doesn't know."""
 
 
 class Stage(Enum):
-    """How far a command has come, for one heliostat; the last three are final."""
+    """Stage of a command at one heliostat; the last three are final."""
 
     ACCEPTED = "accepted"  # by the cluster
     SENT = "sent"  # on the bus
@@ -71,10 +71,10 @@ class Stage(Enum):
 
 @dataclass(frozen=True)
 class Lease:
-    """The plant is there, and commands through this token (0: nobody may command).
+    """The plant is present, and commands under this token (0: nobody may command).
 
-    The cluster goes on for ``lifetime`` s from when it arrives, and for ``autonomy`` s more. How
-    long it may be under way is limited by the expiry that it is sent with.
+    The cluster may go on for ``lifetime`` s after its arrival, and for ``autonomy`` s more. Its
+    expiry on the link limits how long it may be under way.
     """
 
     kind: ClassVar[str] = "lease"
@@ -87,8 +87,8 @@ class Lease:
 class Command:
     """A command of the wire, by its name and values, to heliostats by name ((): all).
 
-    ``identity`` returns in every `Progress`. ``lifetime`` in s, from when it arrives at the
-    cluster; it arrives within the expiry that it is sent with, or not at all.
+    ``identity`` is repeated in every `Progress`. ``lifetime`` in s counts from the arrival at the
+    cluster; the command arrives before its expiry on the link, or not at all.
     """
 
     kind: ClassVar[str] = "command"
@@ -102,7 +102,7 @@ class Command:
 
 @dataclass(frozen=True)
 class Emergency:
-    """DEFOCUS or STOW, to heliostats by name ((): all): from anyone, always, before all else."""
+    """DEFOCUS or STOW, to heliostats by name ((): all): accepted from anyone, before all else."""
 
     kind: ClassVar[str] = "emergency"
     identity: str
@@ -112,9 +112,9 @@ class Emergency:
 
 @dataclass(frozen=True)
 class Parameters:
-    """Items of the journal of one heliostat (`lcu.journal.ITEMS`), to be stored there.
+    """Items of one heliostat's journal (`lcu.journal.ITEMS`), to be stored there.
 
-    ``sizes`` tells how ``block`` falls into the items' bytes; ``lifetime`` as of `Command`.
+    ``sizes`` gives the size of each item in ``block``; ``lifetime`` as in `Command`.
     """
 
     kind: ClassVar[str] = "parameters"
@@ -171,7 +171,7 @@ class Ask:
 
 @dataclass(frozen=True)
 class Acknowledge:
-    """A person acknowledges a latched row of the cluster's safety table (an `Alarm` of it).
+    """A person acknowledges a latched row of the cluster's safety table, shown by an `Alarm`.
 
     ``role`` is the name of a `safety.Role`. `Progress` says DONE, or REFUSED and why.
     """
@@ -185,11 +185,11 @@ class Acknowledge:
 
 @dataclass(frozen=True)
 class Status:
-    """Once a second: the cluster and all its heliostats.
+    """State of the cluster and all its heliostats, sent once a second.
 
-    ``names``, in the order of the rows, is given in the first message of a connection and in
-    every tenth after it, as each may be lost; else it is ().
-    ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` how far it may be off.
+    ``names``, in the order of the rows, is sent in the first message of a connection and in
+    every tenth after it, as each may be lost; otherwise it is ().
+    ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     """
 
@@ -211,11 +211,11 @@ class Status:
         Raises
         ------
         ProtocolError
-            If the block is no whole number of rows.
+            If the block is not a whole number of rows.
         """
         if len(self.block) % NODE.itemsize:
             raise ProtocolError(
-                f"status of {self.cluster}: {len(self.block)} bytes are no rows of {NODE.itemsize}"
+                f"status of {self.cluster}: {len(self.block)} bytes are not rows of {NODE.itemsize}"
             )
         return np.frombuffer(self.block, dtype=NODE)
 
@@ -224,7 +224,7 @@ class Status:
 class Progress:
     """A stage that a command has reached; ``text`` says why it was refused or failed.
 
-    Without a heliostat it is about the whole command.
+    Without a heliostat it concerns the whole command.
     """
 
     kind: ClassVar[str] = "progress"
@@ -236,7 +236,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Answer:
-    """What was asked; ``data`` is plain JSON, ``block`` stored bytes."""
+    """The answer to `Ask`; ``data`` is plain JSON, ``block`` stored bytes."""
 
     kind: ClassVar[str] = "answer"
     identity: str
@@ -283,12 +283,12 @@ def encode(message: Message) -> bytes:
 
 
 def decode(data: bytes) -> Message:
-    """Return the message of some bytes.
+    """Return the message encoded in some bytes.
 
     Raises
     ------
     ProtocolError
-        If they are none, or of a kind or version that this side doesn't know.
+        If they are not a message, or of a kind or version that this side doesn't know.
     """
     line, _, block = data.partition(b"\n")
     try:
@@ -319,7 +319,7 @@ def _no_number(text: str) -> float:
     raise ValueError(text)
 
 
-# What follows is made once: each cluster sends and takes several messages in a second.
+# The tables below are made once: each cluster sends and takes several messages a second.
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 _DECODER = json.JSONDecoder(parse_constant=_no_number)
 
@@ -344,7 +344,7 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str)
 
 
-#: By type of a field: returns its value from that of JSON, None if it is not of that type.
+#: For each type of a field: a function that converts its JSON value, None if the type is wrong.
 _READERS: dict[Any, Callable[[Any], Any]] = {
     Stage: lambda value: next((stage for stage in Stage if stage.value == value), None),
     Severity: lambda value: Severity.read(value) if isinstance(value, str) else None,
@@ -357,7 +357,7 @@ _READERS: dict[Any, Callable[[Any], Any]] = {
     tuple[float, ...]: _list_of(_is_number),
     Mapping[str, Any]: lambda value: value if isinstance(value, dict) else None,
 }
-#: Of each kind: names, types and readers of the fields of its line.
+#: For each kind: names, types and converters of the fields of its line.
 _FIELDS: dict[str, tuple[tuple[str, Any, Callable[[Any], Any]], ...]] = {
     kind: tuple(
         (each.name, each.type, _READERS[each.type])

@@ -1,22 +1,22 @@
 """Links over an MQTT broker (Mosquitto), version 5 of the protocol.
 
-Each cluster has two topics, one for each direction, and a third that only informs::
+Each cluster has two topics, one for each direction, and a third for information only::
 
     PREFIX/CLUSTER/down      plant to cluster
     PREFIX/CLUSTER/up        cluster to plant
     PREFIX/CLUSTER/status    "online", and as the last will of the cluster "offline"; retained
 
 Messages go with QoS 1, never retained, and with their remaining time as message expiry, so that
-the broker throws away what it holds too long; it counts in whole seconds and not while it is
-frozen, so the receiver judges again (conversation.py). Sessions begin clean and end with the
+the broker discards what it holds too long. The broker counts in whole seconds, and not while it is
+frozen, so the receiver judges again (envelope.py). Sessions begin clean and end with the
 connection: nothing is kept for a cluster that is away. A retained message on the way up or down
-is nobody's order of now; it is refused and counted.
+is not a current order; it is refused and counted.
 
 Nothing rests on the status, on the last will or on MQTT's keepalive: a broker that is frozen
 keeps its connections. Our heartbeats pass through the broker to the other end and back, and
 their absence ends a connection.
 
-Nagle's algorithm is switched off at this end; the broker needs ``set_tcp_nodelay true``, else it
+Nagle's algorithm is switched off at this end; the broker needs ``set_tcp_nodelay true``, or it
 adds up to 40 ms to a small message.
 """
 
@@ -38,14 +38,14 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.link import LinkError, LinkLostError, LinkSettings, Statistics
 
-#: Messages in a row that the broker may leave unconfirmed before the connection is given up.
-#: Below the 20 from which on paho would keep messages back, to send them later.
+#: Consecutive messages that the broker may leave unconfirmed before the connection is given up.
+#: Below 20, the number from which paho would keep messages back and send them later.
 _UNCONFIRMED = 10
-#: Time for the last words of a connection, in s.
+#: Time limit for saying goodbye at the end of a connection, in s.
 _GOODBYE = 0.5
 #: aiomqtt waits without a limit of its own; the link sets the limits (`asyncio.timeout`). Before
-#: Python 3.12 `asyncio.wait_for`, which aiomqtt limits with, forgets a cancellation that comes in
-#: the instant of the answer: the heartbeat went on, and a link could not be closed.
+#: Python 3.12 `asyncio.wait_for`, which aiomqtt uses for limits, loses a cancellation that comes
+#: at the instant of the answer: the heartbeat went on, and a link could not be closed.
 _NO_LIMIT = math.inf
 #: Messages between the socket and the link, which takes them at once.
 _WAITING = 1000
@@ -53,18 +53,18 @@ _WAITING = 1000
 
 @dataclass(frozen=True)
 class Broker:
-    """Where the broker is, and how it knows us.
+    """Address of the broker, and our credentials there.
 
     Parameters
     ----------
     host, port
-        As usual 1883, with TLS 8883.
+        Usually port 1883, with TLS 8883.
     username, password
         None: the broker asks for none.
     tls
-        None: in clear; `heliotrope.links.tcp.client_tls` makes one from files.
+        None: unencrypted; `heliotrope.links.tcp.client_tls` makes one from files.
     keepalive_s
-        MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clear up.
+        MQTT's own, in whole seconds. Nothing rests on it; it lets the broker clean up.
     """
 
     host: str
@@ -101,9 +101,9 @@ def _ends(prefix: str, cluster: str, *, plant: bool) -> _Ends:
 
 
 class _MqttCarrier:
-    """One connection to the broker after the other, each with a client of its own.
+    """Successive connections to the broker, each with a new client.
 
-    A client that is used again would send again what was left unconfirmed: late.
+    A client used again would send again, and late, whatever was left unconfirmed.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class _MqttCarrier:
             await client.__aenter__()
             await client.subscribe(
                 self._ends.into,
-                # The flag of retained messages is wanted even where they come as they are sent.
+                # The retained flag must be kept even on messages forwarded as they are published.
                 options=SubscribeOptions(qos=1, noLocal=True, retainAsPublished=True),
             )
             if self._reports:
@@ -163,7 +163,7 @@ class _MqttCarrier:
         except (aiomqtt.MqttError, ValueError) as error:
             await _discard(client)
             raise LinkError(
-                f"broker {self._broker.host}:{self._broker.port} does not let us in ({error})"
+                f"broker {self._broker.host}:{self._broker.port} refuses the connection ({error})"
             ) from None
         except BaseException:
             await _discard(client)
@@ -178,13 +178,13 @@ class _MqttCarrier:
         return self._client
 
     async def ready(self) -> None:
-        """Nothing to wait for, unless the broker no longer confirms."""
+        """Return at once, unless the broker no longer confirms messages."""
         self._connected()
         if self._unconfirmed >= _UNCONFIRMED:
             raise LinkLostError(f"the broker left {_UNCONFIRMED} messages unconfirmed")
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Publish; with ``confirmed`` return when the broker has it."""
+        """Publish; with ``confirmed`` return when the broker has the message."""
         properties = None
         if lifetime is not None:
             properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
@@ -201,7 +201,7 @@ class _MqttCarrier:
             self._unconfirmed = 0
 
     async def read(self) -> bytes:
-        """Wait for the next envelope that was sent to us as such."""
+        """Wait for the next envelope that was not retained."""
         while True:
             try:
                 message = await anext(aiter(self._connected().messages))
@@ -228,10 +228,10 @@ class _MqttCarrier:
 
 
 def _write_while_open(client: paho.Client) -> None:
-    """Have the loop write for a client, but never to the number of a socket that is closed.
+    """Have the loop write for a client, but never to the number of a closed socket.
 
-    aiomqtt asks the loop for it by that number, some time later; by then it may be nobody's, or
-    another connection's.
+    aiomqtt asks the loop for it by that number, some time later; by then the number may be
+    unused, or belong to another connection.
     """
     loop = asyncio.get_running_loop()
 
@@ -253,13 +253,13 @@ def _refuse_socket(client: paho.Client, userdata: object, sock: "paho.SocketLike
 
 
 async def _discard(client: aiomqtt.Client) -> None:
-    """End whatever is left of a client.
+    """End what is left of a client.
 
     aiomqtt leaves the socket, its callbacks and a task behind when it gives up waiting for the
     broker's answer or is cancelled meanwhile, and has no public way to end them.
     """
     inner = client._client  # noqa: SLF001
-    # The thread that connects may still be at it; it closes what it gets.
+    # The connecting thread may still be running; it closes the socket that it gets.
     inner.on_socket_open = _refuse_socket
     await asyncio.sleep(0)  # what it has asked of the loop so far is done now
     inner._sock_close()  # noqa: SLF001
@@ -267,7 +267,7 @@ async def _discard(client: aiomqtt.Client) -> None:
     if task is not None:
         task.cancel()
         await asyncio.wait([task])
-    # Why it ended was told where it was noticed; nobody asks these futures any more.
+    # The cause was reported where it was noticed; nothing awaits these futures any more.
     for future in (client._connected, client._disconnected):  # noqa: SLF001
         if future.done() and not future.cancelled():
             future.exception()
@@ -294,22 +294,22 @@ def mqtt_link(
     cluster
         Name of the cluster, one level of a topic.
     key
-        That both ends share: messages under another key are refused, whoever the broker lets in.
+        Shared by both ends: messages under another key are refused, whatever the broker admits.
         b"": none; damage is still detected.
     clock, settings
         As in `CarriedLink`.
     plant
-        Which end this is.
+        Whether this end is the plant's.
 
     Raises
     ------
     InputError
-        Names that make no topic.
+        Names that cannot form a topic.
     """
     settings = settings or LinkSettings()
     statistics = Statistics()
     ends = _ends(prefix, cluster, plant=plant)
     carrier = _MqttCarrier(broker, ends, key, statistics, settings.open_limit, reports=not plant)
     name = f"cluster {cluster}" if plant else "plant"
-    where = f"{name} by {broker.host}:{broker.port}"
+    where = f"{name} via {broker.host}:{broker.port}"
     return CarriedLink(where, carrier, clock, settings, statistics)

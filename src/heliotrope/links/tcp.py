@@ -1,18 +1,18 @@
 """Links over TCP: a server for the plant, a client for each cluster.
 
-Frames are a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the
-next frame after lost bytes, which TCP does not have; a length is refused before anything of the
-frame is kept. A length above the limit ends the connection.
+A frame is a length of 4 bytes (big-endian) and an envelope. COBS would let a reader find the
+next frame after lost bytes, but TCP loses none. A length above the limit is refused before anything
+of the frame is kept, and ends the connection.
 
 Handshake, each step one frame: server, 32 random bytes; client, 32 random bytes, its proof and
 its name; server, its proof. A proof is HMAC-SHA256 of a label, both random numbers and the name
-under the key that both share, so neither a recording nor a reflection passes. The envelopes that
-follow are sealed with a key derived in the same way. It proves who speaks and that nothing was
-altered; it hides nothing: for that there is TLS.
+under the shared key, so neither a recording nor a reflection passes. The envelopes that
+follow are sealed with a key derived in the same way. This authenticates both ends and detects any
+alteration; it encrypts nothing: TLS does that.
 
 Nothing may be delivered late, so no data waits in this process: an envelope is made when the
-transport has nothing left to write, and a closed connection throws away what it holds. What the
-kernel holds meanwhile is the receiver's to judge (conversation.py).
+transport has nothing left to write, and a closed connection discards what it holds. The receiver
+judges the age of data that waited in the kernel (envelope.py).
 """
 
 import asyncio
@@ -34,20 +34,20 @@ from heliotrope.links.link import LinkError, LinkLostError, LinkSettings
 
 _NONCE, _PROOF = 32, 32
 _LONGEST_NAME = 64
-#: Longest frame that is taken from somebody who has not proved anything yet.
+#: Longest frame accepted from a client that has not yet proved its identity.
 _GREETING = _NONCE + _PROOF + _LONGEST_NAME
 _SHORTEST_KEY = 16
 _LENGTH = 4
 #: Frames that may wait in a connection before it stops reading its socket.
 _WAITING = 64
-#: Kernel's send buffer, bytes: small, since what lies in it can no longer be taken back.
+#: Kernel's send buffer, bytes: small, since data in it can no longer be taken back.
 _SEND_BUFFER = 65536
-#: Connections that may be in their handshake at a time.
+#: Connections that may be in their handshake at the same time.
 _NEWCOMERS = 64
 
 
 class _Pipe(asyncio.Protocol):
-    """A connection as frames: bytes in, frames out, nothing else."""
+    """A connection as frames: bytes in, frames out."""
 
     def __init__(self, largest: int, arrived: "asyncio.Queue[_Pipe] | None" = None) -> None:
         self.largest = largest
@@ -62,7 +62,7 @@ class _Pipe(asyncio.Protocol):
         self._gone = asyncio.Event()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Set the socket up, and report to the server, if there is one."""
+        """Configure the socket, and report to the server, if there is one."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         transport.set_write_buffer_limits(high=0)
@@ -75,15 +75,15 @@ class _Pipe(asyncio.Protocol):
             try:
                 self._arrived.put_nowait(self)
             except asyncio.QueueFull:
-                self.lose("too many connections at once are in their handshake")
+                self.lose("too many connections are in their handshake at once")
 
     def data_received(self, data: bytes) -> None:
-        """Cut what came into frames."""
+        """Cut received bytes into frames."""
         self._buffer += data
         while not self._lost and len(self._buffer) >= _LENGTH:
             size = int.from_bytes(self._buffer[:_LENGTH], "big")
             if size > self.largest:
-                self.lose(f"a frame of {size} bytes came; at most {self.largest} are taken")
+                self.lose(f"received a frame of {size} bytes; the limit is {self.largest}")
                 return
             if len(self._buffer) < _LENGTH + size:
                 break
@@ -96,15 +96,15 @@ class _Pipe(asyncio.Protocol):
             self._transport.pause_reading()
 
     def pause_writing(self) -> None:
-        """Called by the transport: the socket takes no more."""
+        """Pause writing: the transport's buffer is full."""
         self._writable.clear()
 
     def resume_writing(self) -> None:
-        """Called by the transport: everything has gone out."""
+        """Resume writing: the transport's buffer is empty."""
         self._writable.set()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Called by the transport: that was all."""
+        """Note that the transport has ended."""
         self._lost = self._lost or (str(exc) if exc else "the other end closed the connection")
         self._transport = None
         self._gone.set()
@@ -173,16 +173,16 @@ def check_key(name: str, key: bytes) -> None:
 
 
 async def _introduce(pipe: _Pipe, name: str, key: bytes) -> bytes:
-    """Say who we are, and return the key of the connection: the client's side."""
+    """Authenticate both ends, and return the key of the connection: the client's side."""
     server, client, title = await pipe.read(), secrets.token_bytes(_NONCE), name.encode()
     if len(server) != _NONCE:
-        raise LinkError("what answers there does not speak this protocol")
+        raise LinkError("the program that answers there does not speak this protocol")
     pipe.write(client + _proof(key, b"client", server, client, title) + title)
     try:
         answer = await pipe.read()
     except LinkLostError as lost:
         raise LinkError(
-            f"the server does not take cluster {name} ({lost}); compare name and key on both sides"
+            f"the server refuses cluster {name} ({lost}); compare name and key on both sides"
         ) from None
     if not hmac.compare_digest(answer, _proof(key, b"server", server, client, title)):
         raise LinkError(f"the server does not know the key of cluster {name}; it is not ours")
@@ -190,13 +190,13 @@ async def _introduce(pipe: _Pipe, name: str, key: bytes) -> bytes:
 
 
 async def _greet(pipe: _Pipe, keys: Mapping[str, bytes], largest: int) -> tuple[str, bytes]:
-    """Find out who comes, and return its name and the key of the connection: the server's side."""
+    """Authenticate the client, and return its name and the connection's key: the server's side."""
     server = secrets.token_bytes(_NONCE)
     pipe.write(server)
     frame = await pipe.read()
     client, proof, title = frame[:_NONCE], frame[_NONCE : _NONCE + _PROOF], frame[_NONCE + _PROOF :]
     name = title.decode(errors="replace")
-    # An unknown name is computed like a known one, so that the time taken tells nothing.
+    # An unknown name takes the same computation as a known one, so that timing reveals nothing.
     key = keys.get(name, b"")
     right = hmac.compare_digest(
         proof, _proof(key or bytes(_SHORTEST_KEY), b"client", server, client, title)
@@ -212,14 +212,14 @@ async def _greet(pipe: _Pipe, keys: Mapping[str, bytes], largest: int) -> tuple[
 
 
 class _TcpCarrier:
-    """Carries envelopes over pipes that somebody else connects."""
+    """A carrier over pipes that are connected elsewhere."""
 
     def __init__(self, connect: Callable[[], Awaitable[tuple[_Pipe, bytes]]]) -> None:
         self._connect = connect
         self._pipe: _Pipe | None = None
 
     async def open(self) -> bytes:
-        """Get a pipe whose other end has proved who it is, and its key."""
+        """Return a pipe whose other end is authenticated, and its key."""
         self._pipe, key = await self._connect()
         return key
 
@@ -233,7 +233,7 @@ class _TcpCarrier:
         await self._connected().ready()
 
     async def write(self, envelope: bytes, lifetime: float | None, *, confirmed: bool) -> None:
-        """Write an envelope; TCP knows neither lifetimes nor confirmations."""
+        """Write an envelope; TCP ignores lifetime and confirmation."""
         del lifetime, confirmed
         self._connected().write(envelope)
 
@@ -250,7 +250,7 @@ class _TcpCarrier:
 
 @dataclass(frozen=True)
 class _Client:
-    """Connects to the server."""
+    """A carrier that connects to the server."""
 
     host: str
     port: int
@@ -272,7 +272,7 @@ class _Client:
 
 
 class _Slot:
-    """Where a cluster's connection waits for its link; a new one ends the one before."""
+    """The place where a cluster's connection waits for its link; a new one ends the previous."""
 
     def __init__(self) -> None:
         self._offer: tuple[_Pipe, bytes] | None = None
@@ -280,9 +280,9 @@ class _Slot:
         self._offered = asyncio.Event()
 
     def offer(self, pipe: _Pipe, key: bytes) -> None:
-        """Take over a connection that has proved to be this cluster's."""
+        """Take over an authenticated connection of this cluster."""
         if self._last is not None:
-            self._last.lose("the cluster connected anew")
+            self._last.lose("the cluster connected again")
         self._last = pipe
         self._offer = (pipe, key)
         self._offered.set()
@@ -296,7 +296,7 @@ class _Slot:
         return offer
 
     async def clear(self) -> None:
-        """Close what was not taken."""
+        """Close a connection that was not taken."""
         if self._offer is not None:
             await self._offer[0].close()
             self._offer = None
@@ -317,13 +317,13 @@ def tcp_link(
     Parameters
     ----------
     host, port
-        Of the plant's server.
+        Address of the plant's server.
     name, key
-        Of this cluster, as the plant knows them.
+        Name and key of this cluster, as the plant knows them.
     clock, settings
         As in `CarriedLink`.
     tls
-        See `client_tls`; None: in clear, authenticated but not hidden.
+        See `client_tls`; None: authenticated but not encrypted.
 
     Raises
     ------
@@ -342,11 +342,11 @@ class TcpServer:
     Parameters
     ----------
     host, port
-        Where to listen; port 0: a free one, see ``port``.
+        Where to listen; port 0: any free port, shown by ``port``.
     keys
         Name and key of each cluster; at least 16 bytes each.
     clock, settings
-        As in `CarriedLink`; `LinkSettings.open_limit` is the time for the handshake.
+        As in `CarriedLink`; `LinkSettings.open_limit` is the time limit of the handshake.
     tls
         See `server_tls`.
 
@@ -357,9 +357,9 @@ class TcpServer:
     port
         Where it listens, 0 before it does.
     refused
-        Connections that did not pass the handshake.
+        Count of connections that did not pass the handshake.
     last_refusal
-        Why the last of them did not.
+        Why the last of them was refused.
 
     Raises
     ------
@@ -399,7 +399,7 @@ class TcpServer:
         self._closing = asyncio.Event()
 
     async def listening(self) -> None:
-        """Wait until it listens."""
+        """Wait until the server listens."""
         await self._listening.wait()
 
     async def close(self) -> None:
@@ -489,14 +489,15 @@ def _trust(context: ssl.SSLContext, authority: str | Path) -> None:
 def server_tls(
     certificate: str | Path, key: str | Path, authority: str | Path | None = None
 ) -> ssl.SSLContext:
-    """Return the server's TLS from PEM files.
+    """Return the server's TLS context from PEM files.
 
     Parameters
     ----------
     certificate, key
         The server's own.
     authority
-        Who signed the clusters' certificates; None: clusters need none (they have their keys).
+        Authority that signed the clusters' certificates; None: clusters need no certificate, as
+        they have keys.
 
     Raises
     ------
@@ -517,12 +518,12 @@ def client_tls(
     certificate: str | Path | None = None,
     key: str | Path | None = None,
 ) -> ssl.SSLContext:
-    """Return a cluster's TLS from PEM files.
+    """Return a cluster's TLS context from PEM files.
 
     Parameters
     ----------
     authority
-        Who signed the server's certificate; nobody else is trusted.
+        Authority that signed the server's certificate; no other is trusted.
     certificate, key
         The cluster's own, both or neither.
 

@@ -43,7 +43,7 @@ class MqttTable(Table):
 
     url: str = Field(min_length=1, description="`mqtt://host:port/prefix`, or `mqtts://…` (TLS).")
     username: str | None = Field(
-        None, description="At the broker; the password stands in the keys' file."
+        None, description="For the broker; the password is in the key file."
     )
     authority: str | None = Field(
         None,
@@ -240,7 +240,7 @@ def _check(found: LinksFile) -> None:
             raise FormatError(
                 path,
                 "a cluster that connects over TCP proves itself by its key; put one into the "
-                "keys' file, table [clusters]",
+                "key file, table [clusters]",
                 f"clusters.{name}",
             )
         if how not in ("tcp", "mqtt") and not (path.parent / how).is_file():
