@@ -19,11 +19,11 @@ import numpy as np
 
 from benchmarks._run import BenchmarkError, Call, Result, Row, timed
 from heliotrope.airborne.evaluate.detection import decode
-from heliotrope.airborne.evaluate.reading import Seen, look, read_photo
+from heliotrope.airborne.evaluate.reading import PhotoReading, look, read_photo
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.simulate.rendering import render_flight
 from heliotrope.airborne.simulate.simulation import Errors, Flight, fly, hover_grid, look_counts
-from heliotrope.airborne.standing import Standing, standing
+from heliotrope.airborne.standing import MirrorPoses, standing
 from heliotrope.field.example import azimuth_elevation
 from heliotrope.field.heliostats import Facets, Heliostats
 
@@ -73,15 +73,15 @@ def _photos(flight: Flight, folder: Path) -> list[Photo]:
     ]
 
 
-def _count(seen: Seen) -> tuple[int, int]:
+def _count(seen: PhotoReading) -> tuple[int, int]:
     return len(seen.mirror), len(seen.spot)
 
 
-def _work(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[int, int]:
+def _work(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[int, int]:
     return _count(read_photo(photo, camera, stand))
 
 
-def _rate(processes: int, count: int, photo: Photo, camera: LedCamera, stand: Standing) -> float:
+def _rate(processes: int, count: int, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> float:
     """Return photographs a second with this many processes, without their start."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         warm = [pool.submit(_work, photo, camera, stand) for _ in range(2 * processes)]

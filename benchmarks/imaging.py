@@ -31,7 +31,7 @@ from heliotrope.imaging.synthetic.rendering import (
 )
 from heliotrope.imaging.synthetic.rendering import render as render_scene
 from heliotrope.imaging.targets.rectify import rectify
-from heliotrope.imaging.targets.view import View
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.optics.mirror_image import gaussian_beam
 
 #: Greatest time from a photograph to a sighting, in times of its decoding.
@@ -80,7 +80,7 @@ def _contenders(path: Path, targets: tuple[Target, ...]) -> dict[str, Call]:
     if view is None or not any(r.good for r in photograph.readings):
         raise BenchmarkError(f"{path}: its spot is not found, so there is nothing to time")
 
-    def malan(known: View) -> object:
+    def malan(known: FaceView) -> object:
         picture = rectify(frame, known)
         return threshold_centroid(picture, from_frame(picture))
 

@@ -27,11 +27,11 @@ from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.spots.background import EmptyTarget
 from heliotrope.imaging.spots.quality import Expectation
 from heliotrope.imaging.synthetic.rendering import (
-    Lens,
+    LensEffects,
     Paint,
     Rendered,
     Scene,
@@ -284,7 +284,7 @@ def plain(rng: Rng, place: World) -> Case:
         bits=int(rng.choice([8, 12])),
         colour=bool(rng.random() < 0.3),
     )
-    lens = Lens(defocus=rng.uniform(0.6, 1.5), veil=rng.uniform(0.0, 0.04))
+    lens = LensEffects(defocus=rng.uniform(0.6, 1.5), veil=rng.uniform(0.0, 0.04))
     scene = Scene(
         place.camera,
         (TARGET,),
@@ -612,7 +612,7 @@ def look(
     without: Frame | None = None,
 ) -> Photograph:
     """Read a frame."""
-    settings = Settings(
+    settings = PhotographSettings(
         expectations={"target": drawn.expected},
         gamma=drawn.gamma,
         empty={} if model is None else {"target": model},

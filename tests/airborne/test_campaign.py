@@ -16,13 +16,13 @@ from heliotrope.airborne.evaluate import campaign, reading
 from heliotrope.airborne.evaluate.campaign import Campaign
 from heliotrope.airborne.evaluate.detection import decode
 from heliotrope.airborne.evaluate.folder import FlightData, natural_key
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import LedCamera, read_photos
 from heliotrope.airborne.plan.stations import read_stations
 from heliotrope.airborne.simulate.rendering import write_photo
 from heliotrope.airborne.simulate.simulation import Errors, hover_grid, install, look_counts
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
 from heliotrope.cli.drone.simulate import simulate as simulate_command
 from heliotrope.errors import FormatError, InputError, UnknownNameError
@@ -270,8 +270,8 @@ def test_an_offset_far_beyond_what_was_said_is_told() -> None:
 def bare(name: str, heliostats: list[int], lens: LedCamera) -> FlightData:
     """A flight whose one photograph shows all corners of its heliostats."""
     count = len(heliostats)
-    seen = Seen(name, mirror=np.arange(count), corners=np.zeros((count, 4, 2)))
-    stand = Standing(
+    seen = PhotoReading(name, mirror=np.arange(count), corners=np.zeros((count, 4, 2)))
+    stand = MirrorPoses(
         ("",) * count, np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros((count, 4, 3))
     )
     shapes = (ideal(MIRRORS, 0),) * count

@@ -11,12 +11,12 @@ from heliotrope.airborne.evaluate.evaluation import evaluate
 from heliotrope.airborne.evaluate.folder import FlightData
 from heliotrope.airborne.evaluate.identification import expected_feet
 from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
-from heliotrope.airborne.evaluate.reading import Seen, look
+from heliotrope.airborne.evaluate.reading import PhotoReading, look
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal, measured_normal
 from heliotrope.airborne.simulate import rendering
 from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
-from heliotrope.airborne.standing import Standing, standing
+from heliotrope.airborne.standing import MirrorPoses, standing
 from heliotrope.errors import InputError
 from support.drone_case import camera, flight
 
@@ -28,8 +28,8 @@ PRIORS = Priors(offset=0.005, position=0.005)
 class Night:
     flown: Flight
     exact: Reflections
-    stand: Standing
-    seen: tuple[Seen, ...]
+    stand: MirrorPoses
+    seen: tuple[PhotoReading, ...]
 
     def shape(self, row: int):
         return ideal(self.flown.heliostats, row)
@@ -39,7 +39,7 @@ class Night:
 def night() -> Night:
     flown = flight(Errors(), columns=3, rows=3, step=0.6, lens=camera(640, 480))
     exact = exact_reflections(flown)
-    scene = rendering.Scene(flown.truth, flown.shapes, 0.0, rendering.dark())
+    scene = rendering.FlightScene(flown.truth, flown.shapes, 0.0, rendering.dark())
     stand = standing(flown.heliostats, flown.counts)
     seen = []
     for k, (taken, told) in enumerate(zip(flown.taken, flown.recorded, strict=True)):
@@ -113,7 +113,7 @@ def test_a_dark_flight_stands_beside_the_others(night: Night) -> None:
     shapes = tuple(night.shape(row) for row in range(20))
     field = (flown.camera, night.stand, heliostats, flown.counts, shapes)
     dark = FlightData("dark", flown.recorded, *field, seen=night.seen)
-    broken = tuple(Seen(s.name, "nothing: at all") for s in night.seen)
+    broken = tuple(PhotoReading(s.name, "nothing: at all") for s in night.seen)
     found = evaluate_campaign([dark, replace(dark, name="none", seen=broken)], PRIORS)
     assert found.flights[0] is not None
     assert found.flights[1] is None

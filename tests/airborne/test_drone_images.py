@@ -15,13 +15,13 @@ from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.detection import decode, find_outlines, find_patches, find_spots
 from heliotrope.airborne.evaluate.identification import identify
 from heliotrope.airborne.evaluate.orientation import measure_field, rotation_between
-from heliotrope.airborne.evaluate.reading import Seen, look, read_photo
+from heliotrope.airborne.evaluate.reading import PhotoReading, look, read_photo
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import ideal
 from heliotrope.airborne.photo import Photo, read_camera, read_photos, rotation_of_gimbal
 from heliotrope.airborne.simulate import rendering
 from heliotrope.airborne.simulate.simulation import Errors, Flight, exact_reflections
-from heliotrope.airborne.standing import Standing, standing
+from heliotrope.airborne.standing import MirrorPoses, standing
 from heliotrope.cli.drone.evaluate import evaluate as evaluate_command
 from heliotrope.cli.drone.rtk import rtk as rtk_command
 from heliotrope.cli.drone.simulate import simulate as simulate_command
@@ -39,8 +39,8 @@ class Case:
     flown: Flight
     exact: Reflections
     photos: tuple[Photo, ...]
-    stand: Standing
-    seen: tuple[Seen, ...]
+    stand: MirrorPoses
+    seen: tuple[PhotoReading, ...]
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_what_was_read_is_not_read_again(case: Case, tmp_path, monkeypatch) -> N
     told: list[tuple[int, int]] = []
     calls = []
 
-    def read(photo: Photo, *rest) -> Seen:
+    def read(photo: Photo, *rest) -> PhotoReading:
         calls.append(photo.name)
         return read_photo(photo, *rest)
 
@@ -209,7 +209,7 @@ def test_regular_field_without_edges_is_ambiguous() -> None:
     photo = Photo("a", None, np.array([0.3, 0.2, 60.0]), rotation_of_gimbal(0.0, -np.pi / 2, 0.0))
     grid = np.stack(np.meshgrid(np.arange(-18, 19), np.arange(-18, 19)), -1).reshape(-1, 2) * 3.0
     n = len(grid)
-    many = Standing(
+    many = MirrorPoses(
         tuple(str(i) for i in range(n)),
         np.pad(grid, ((0, 0), (0, 1))),
         np.repeat(np.eye(3)[None], n, 0),
@@ -233,7 +233,7 @@ def test_without_lamp_the_campaign_says_so(case: Case) -> None:
     shape = [ideal(case.flown.heliostats, i) for i in range(20)].__getitem__
     with pytest.raises(InputError, match="no reflection on the mirrors in 16 photographs"):
         evaluation.evaluate(case.photos, dark, case.flown.camera, case.stand, shape)
-    broken = [Seen(s.name, "nothing: at all") for s in case.seen]
+    broken = [PhotoReading(s.name, "nothing: at all") for s in case.seen]
     with pytest.raises(InputError, match="no photograph of 16 can be used; the first: DJI_0001"):
         evaluation.evaluate(case.photos, broken, case.flown.camera, case.stand, shape)
     with pytest.raises(InputError, match="three are needed"):
@@ -242,7 +242,7 @@ def test_without_lamp_the_campaign_says_so(case: Case) -> None:
 
 def test_one_bad_photograph_does_not_stop_the_others(case: Case) -> None:
     shape = [ideal(case.flown.heliostats, i) for i in range(20)].__getitem__
-    mixed = (Seen(case.seen[0].name, "nothing: here"), *case.seen[1:])
+    mixed = (PhotoReading(case.seen[0].name, "nothing: here"), *case.seen[1:])
     found = evaluation.evaluate(case.photos, mixed, case.flown.camera, case.stand, shape)
     assert found.problems == ("DJI_0001.JPG: nothing: here",)
     assert len(found.photos) == 15
@@ -354,7 +354,7 @@ def test_a_few_mirrors_in_a_wide_frame() -> None:
     flown = flight(Errors(), 1, 1, heliostats=few, lens=camera(1600, 1200))
     flown.camera.matrix[:2, :2] *= 0.5
     stand = standing(few, flown.counts)
-    scene = rendering.Scene(flown.truth, flown.shapes)
+    scene = rendering.FlightScene(flown.truth, flown.shapes)
     picture = rendering.render(scene, flown.camera, flown.taken[0], exact_reflections(flown), 1)
     seen = look(picture, flown.recorded[0], flown.camera, stand)
     assert seen.problem == ""
@@ -363,7 +363,7 @@ def test_a_few_mirrors_in_a_wide_frame() -> None:
 
 def test_same_seed_same_picture() -> None:
     flown = flight(Errors(), columns=1, rows=1, lens=camera(400, 300))
-    scene = rendering.Scene(flown.truth, flown.shapes, conditions=rendering.night())
+    scene = rendering.FlightScene(flown.truth, flown.shapes, conditions=rendering.night())
     lamp = exact_reflections(flown)
     first, again, other = (
         rendering.render(scene, flown.camera, flown.taken[0], lamp, s) for s in (1, 1, 2)
@@ -381,7 +381,7 @@ def test_night_and_motion_are_read_too(case: Case, tmp_path) -> None:
     lamp = case.exact.take(np.flatnonzero(case.exact.photo == 0))
     moving = rendering.Conditions(motion=(2.0, 1.0))
     for conditions, fewest in ((rendering.night(), 14), (moving, 18)):
-        scene = rendering.Scene(flown.truth, flown.shapes, conditions=conditions)
+        scene = rendering.FlightScene(flown.truth, flown.shapes, conditions=conditions)
         picture = rendering.render(scene, flown.camera, flown.taken[0], lamp, 5)
         seen = read_photo(picture_of(case, tmp_path, picture), flown.camera, case.stand)
         assert seen.problem == ""

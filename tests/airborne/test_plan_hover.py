@@ -12,7 +12,7 @@ from heliotrope.airborne.plan.calibration_points import (
     directions,
 )
 from heliotrope.airborne.plan.hover import (
-    Mirrors,
+    HoverMirrors,
     Pattern,
     Sampling,
     face,
@@ -45,7 +45,7 @@ TOWARDS = direction(np.radians(35.0), np.radians(40.0))
 
 def _faced(
     plant: Plant, distance: float = 150.0, rows: slice = slice(0, 40)
-) -> tuple[Mirrors, FloatArray, FloatArray]:
+) -> tuple[HoverMirrors, FloatArray, FloatArray]:
     """Mirrors of a corner of the field that look at one point, with their vertices."""
     all_mirrors = mirrors(plant)
     group = plant.groups["azel"].take(np.arange(len(plant))[rows])
@@ -57,7 +57,9 @@ def _faced(
     return some, facing.vertex, point
 
 
-def _pattern(some: Mirrors, vertex: FloatArray, point: FloatArray, sampling: Sampling) -> Pattern:
+def _pattern(
+    some: HoverMirrors, vertex: FloatArray, point: FloatArray, sampling: Sampling
+) -> Pattern:
     return pattern(vertex, some.corners, some.slopes, some.facet_area, point, TOWARDS, sampling)
 
 

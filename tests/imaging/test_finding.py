@@ -17,7 +17,7 @@ from heliotrope.geometry import FloatArray, rotation
 from heliotrope.imaging.files import read_image
 from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.synthetic.rendering import (
-    Lens,
+    LensEffects,
     Rendered,
     Scene,
     Sensor,
@@ -30,7 +30,7 @@ from heliotrope.imaging.synthetic.rendering import (
     render,
 )
 from heliotrope.imaging.targets.finding import FoundTarget, find_targets, symmetries
-from heliotrope.imaging.targets.view import View
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.optics.mirror_image import gaussian_beam
 from support.data import juelich
 
@@ -52,12 +52,12 @@ def plain() -> Rendered:
 
 
 def only(
-    frame: Frame, target: Target = TARGET, camera: Camera | None = None, *previous: View
+    frame: Frame, target: Target = TARGET, camera: Camera | None = None, *previous: FaceView
 ) -> FoundTarget:
     return find_targets(frame, (target,), camera, previous)[0]
 
 
-def view_of(found: FoundTarget) -> View:
+def view_of(found: FoundTarget) -> FaceView:
     assert found.found, found.reason
     assert found.view is not None
     assert found.reason == ""
@@ -152,9 +152,11 @@ LIGHTS: dict[str, dict[str, object]] = {
         "beams": (Thrown("target", gaussian_beam((-3.3, 3.3), 0.8, power=4e3), 3.0),),
         "sensor": Sensor(exposure=8e-4),
     },
-    "flare": {"lens": Lens(veil=0.35, ghost=0.5, ghost_at=(130.0, 100.0), ghost_radius=40.0)},
-    "out of focus": {"lens": Lens(defocus=2.0)},
-    "shaken": {"lens": Lens(shake=(5.0, -2.0))},
+    "flare": {
+        "lens": LensEffects(veil=0.35, ghost=0.5, ghost_at=(130.0, 100.0), ghost_radius=40.0)
+    },
+    "out of focus": {"lens": LensEffects(defocus=2.0)},
+    "shaken": {"lens": LensEffects(shake=(5.0, -2.0))},
     "dusk": {"sensor": Sensor(exposure=1e-4, gain=8.0, read_noise=20.0)},
     "dark": {"sensor": Sensor(exposure=1.5e-4)},
     "twelve bits": {"sensor": Sensor(exposure=1e-4, bits=12)},
@@ -177,7 +179,8 @@ def test_light_and_focus_move_nothing(light: str) -> None:
 def test_flare_and_blur_are_measured_at_the_marks() -> None:
     clear = only(plain().frame)
     veiled, soft = (
-        only(render(scene(lens=lens), 3).frame) for lens in (Lens(veil=0.5), Lens(defocus=2.5))
+        only(render(scene(lens=lens), 3).frame)
+        for lens in (LensEffects(veil=0.5), LensEffects(defocus=2.5))
     )
 
     def contrast(found: FoundTarget) -> float:
@@ -456,7 +459,7 @@ def test_views_are_as_certain_as_they_say() -> None:
             beams=(Thrown("target", gaussian_beam(rng.uniform(-4, 4, 2), 0.8, power=3e3)),)
             if seed % 2
             else (),
-            lens=Lens(veil=rng.uniform(0.0, 0.3)),
+            lens=LensEffects(veil=rng.uniform(0.0, 0.3)),
         )
         frame = render(lit, seed).frame
         for _ in range(2):
@@ -539,7 +542,7 @@ def test_real_targets_are_found_in_photographs() -> None:
     # One that is not there, with marks like theirs, as the half of their face might be.
     other = example_target(center=(60.0, 0.0, 40.0), name="other")
     targets = (*read_tower(juelich() / "tower-measurements.json").targets, other)
-    views: dict[str, View] = {}
+    views: dict[str, FaceView] = {}
     for path, name in _photographs():
         frame = read_image(path)
         results = {f.target.name: f for f in find_targets(frame, targets)}

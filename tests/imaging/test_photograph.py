@@ -10,11 +10,11 @@ import pytest
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.imaging.memory import Memory
-from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.spots.background import EmptyTarget
 from heliotrope.imaging.spots.quality import REASONS, Expectation
 from heliotrope.imaging.synthetic.rendering import (
-    Lens,
+    LensEffects,
     Paint,
     Rendered,
     Scene,
@@ -47,13 +47,13 @@ def beam(
 
 
 def scene(*beams: Thrown, level: float = 0.6, **changes: object) -> Scene:
-    known: dict[str, object] = {"paint": PAINT, "lens": Lens(defocus=0.8), **changes}
+    known: dict[str, object] = {"paint": PAINT, "lens": LensEffects(defocus=0.8), **changes}
     return exposed(Scene(CAMERA, (TARGET,), beams, **known), level)  # type: ignore[arg-type]
 
 
 def read(rendered: Rendered, **changes: object) -> Photograph:
     without = changes.pop("without", None)
-    settings = Settings(**changes)  # type: ignore[arg-type]
+    settings = PhotographSettings(**changes)  # type: ignore[arg-type]
     frame = None if without is None else without.frame  # type: ignore[attr-defined]
     return read_photograph(rendered.frame, [TARGET], CAMERA, settings=settings, without=frame)
 
@@ -234,12 +234,15 @@ FAULTS: dict[str, tuple[Callable[[], Scene], Expectation]] = {
     "uncertain": (lambda: scene(beam(strength=900.0), level=3.0), Expectation()),
     "flare": (
         lambda: scene(
-            beam(strength=100.0), level=0.3, lens=Lens(defocus=0.8, veil=1.0),
+            beam(strength=100.0), level=0.3, lens=LensEffects(defocus=0.8, veil=1.0),
             surroundings=Surroundings(sky=1400.0),
         ),
         Expectation(),
     ),
-    "moved": (lambda: scene(beam(), lens=Lens(defocus=0.8, shake=(16.0, 4.0))), Expectation()),
+    "moved": (
+        lambda: scene(beam(), lens=LensEffects(defocus=0.8, shake=(16.0, 4.0))),
+        Expectation(),
+    ),
     "smeared": (lambda: scene(beam(motion=(3.2, 1.0))), KNOWN),
     "lopsided": (lambda: scene(beam(), beam((2.1, -1.2), 0.4, 0.3, 30.0)), Expectation()),
 }  # fmt: skip
@@ -261,7 +264,7 @@ def test_what_is_wrong_is_named(name: str) -> None:
 def test_out_of_focus_is_no_stray_light() -> None:
     camera = example_camera(TARGET, 200.0, (1600, 1200))
     for defocus, names in ((3.0, set()), (15.0, {"out of focus"})):
-        shown = replace(scene(beam()), camera=camera, lens=Lens(defocus=defocus))
+        shown = replace(scene(beam()), camera=camera, lens=LensEffects(defocus=defocus))
         photograph = read_photograph(render(shown, 11).frame, [TARGET], camera)
         (reading,) = photograph.readings
         assert {reason.name for reason in reading.reasons} == names
@@ -272,7 +275,7 @@ def test_light_that_the_empty_frame_did_not_have_passes_for_nothing_else(seed: i
     """A reflection in the lens, and a shadow that came meanwhile: right, or refused."""
     rng = np.random.default_rng([9, seed])
     at = tuple(rng.uniform((350.0, 250.0), (650.0, 500.0)).tolist())
-    stray = Lens(defocus=0.8, ghost=rng.uniform(0.3, 1.0), ghost_at=at, ghost_radius=60.0)
+    stray = LensEffects(defocus=0.8, ghost=rng.uniform(0.3, 1.0), ghost_at=at, ghost_radius=60.0)
     shade = Shadow(tuple(rng.uniform(-2.0, 2.0, 2).tolist()), rng.uniform(0.0, 6.0), left=0.5)
     late = scene(beam((-1.5, -1.5)), lens=stray, shadow=shade)
     told = {"target": _bright(1.0)}
@@ -288,7 +291,7 @@ def test_clouds_and_second_beams_are_told_by_power() -> None:
 
 
 def test_a_target_that_is_not_there_says_why() -> None:
-    hidden = replace(scene(beam()), lens=Lens(defocus=45.0))
+    hidden = replace(scene(beam()), lens=LensEffects(defocus=45.0))
     (reading,) = read(render(hidden, 12)).readings
     assert [reason.name for reason in reading.reasons] == ["target not found"]
     assert reading.found.reason
@@ -302,7 +305,7 @@ def test_nothing_but_a_good_frame_is_good() -> None:
 
 
 def test_an_empty_frame_of_something_else_is_refused() -> None:
-    blank = render(replace(scene(), lens=Lens(defocus=45.0)), 14)
+    blank = render(replace(scene(), lens=LensEffects(defocus=45.0)), 14)
     with pytest.raises(InputError, match="give an empty frame of the same camera"):
         read(render(scene(beam()), 13), without=blank)
 

@@ -13,7 +13,7 @@ from heliotrope.field.marks import Mark
 from heliotrope.geometry import FloatArray, direction
 from heliotrope.imaging.synthetic import _painting
 from heliotrope.imaging.synthetic.rendering import (
-    Lens,
+    LensEffects,
     Paint,
     Rendered,
     Scene,
@@ -41,7 +41,7 @@ CAMERA = example_camera(TARGET, size=(640, 480), distortion=0.02)
 PLAIN = Paint(wear=0.0, stains=0, panels=(1, 1))
 BARE = replace(TARGET, marks=())
 ALONE = Surroundings(wall=(0.0, 0.0, 0.0, 0.0), sky=0.0, texture=0.0, clutter=0)
-SHARP = Lens(defocus=0.0, veil=0.0)
+SHARP = LensEffects(defocus=0.0, veil=0.0)
 
 
 def scene(*beams: Thrown, **changes: object) -> Scene:
@@ -147,7 +147,7 @@ def test_a_wide_beam_is_bent_by_lens_and_perspective_as_it_must_be() -> None:
 def test_marks_are_seen_where_their_points_project(kind: str) -> None:
     rng = np.random.default_rng(2)
     places = rng.uniform(-3.5, 3.5, (6, 2))
-    lens = Lens(defocus=0.6, veil=0.0)
+    lens = LensEffects(defocus=0.6, veil=0.0)
     for k, place in enumerate(places):
         mark = Mark("m", kind, TARGET.point(place), 0.25, turn=0.3 * k)
         bright, dark = (
@@ -176,7 +176,7 @@ def test_the_border_covers_pixels_by_their_exact_areas() -> None:
 
 
 def test_pixels_see_the_plane_where_its_points_project() -> None:
-    plane = _painting.background(scene()).planes[0]
+    plane = _painting.painted_scene(scene()).planes[0]
     rows, columns = np.mgrid[3:480:61, 5:640:71]
     seen = np.stack([plane.u[rows, columns], plane.v[rows, columns]], axis=-1)
     pixels = project(CAMERA, TARGET.point(seen))
@@ -184,7 +184,11 @@ def test_pixels_see_the_plane_where_its_points_project() -> None:
 
 
 def test_blur_and_shake_leave_places_alone() -> None:
-    for lens in (Lens(2.5), Lens(2.5, disc=True), Lens(1.2, shake=(7.0, -4.0))):
+    for lens in (
+        LensEffects(2.5),
+        LensEffects(2.5, disc=True),
+        LensEffects(1.2, shake=(7.0, -4.0)),
+    ):
         spread = point_spread(lens)
         assert spread.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(spread, spread[::-1, ::-1], atol=1e-15)
@@ -194,10 +198,10 @@ def test_blur_and_shake_leave_places_alone() -> None:
         )
         found = centre_of(light_of(rendered))
         np.testing.assert_allclose(found, rendered.beams[0].pixel, rtol=0, atol=0.01)
-    disc = point_spread(Lens(3.0, disc=True))
+    disc = point_spread(LensEffects(3.0, disc=True))
     x = np.indices(disc.shape)[1] - disc.shape[1] // 2
     assert np.sum(disc * x**2) == pytest.approx(3.0**2 / 4.0, rel=0.05)
-    trail = point_spread(Lens(0.0, shake=(12.0, 0.0)))
+    trail = point_spread(LensEffects(0.0, shake=(12.0, 0.0)))
     x = np.arange(trail.shape[1]) - trail.shape[1] // 2
     assert trail.sum(axis=0) @ x**2 == pytest.approx(12.0**2 / 12.0, rel=0.05)
 
@@ -273,7 +277,7 @@ def test_two_targets_on_one_wall() -> None:
     with_beam, without = (light_of(render(x, 0, level=True)) for x in (s, replace(s, beams=())))
     found = centre_of(with_beam - without)
     np.testing.assert_allclose(found, project(camera, lower.point((0.2, 0.1))), atol=0.02)
-    planes = _painting.background(s)
+    planes = _painting.painted_scene(s)
     total = sum(p.share for p in planes.planes)
     assert np.max(total) <= 1.0 + 1e-5
     assert len(render(s, 0).marks) == 16
@@ -437,9 +441,9 @@ def test_the_example_camera_frames_the_target() -> None:
         (lambda: Surroundings(texture=0.9), "texture 0.9"),
         (lambda: Shadow(left=2.0), "left 2.0"),
         (lambda: Shadow(softness=-1.0), "softness"),
-        (lambda: Lens(defocus=-1.0), "defocus -1.0 px"),
-        (lambda: Lens(veil=2.0), "veil 2.0"),
-        (lambda: Lens(ghost_radius=0.0), "ghost"),
+        (lambda: LensEffects(defocus=-1.0), "defocus -1.0 px"),
+        (lambda: LensEffects(veil=2.0), "veil 2.0"),
+        (lambda: LensEffects(ghost_radius=0.0), "ghost"),
         (lambda: Sensor(gain=0.0), "gain 0.0"),
         (lambda: Sensor(read_noise=-1.0), "read_noise -1.0"),
         (lambda: Sensor(offset=1.0), "offset 1.0"),

@@ -9,7 +9,14 @@ from heliotrope.field.camera import Camera, project
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.synthetic.scenes import example_camera, example_target
-from heliotrope.imaging.targets.view import View, distort, faces, fit_view, homography, unknown_lens
+from heliotrope.imaging.targets.view import (
+    FaceView,
+    distort,
+    faces,
+    fit_view,
+    homography,
+    unknown_lens,
+)
 
 TARGET = example_target()
 FACE = faces((TARGET,))[0]
@@ -27,13 +34,13 @@ def seen(noise: float = 0.0, seed: int = 0, camera: Camera = CAMERA) -> FloatArr
 
 def fitted(
     pixels: FloatArray, deviation: float, lens: Camera | None = None, marks: FloatArray = MARKS
-) -> View:
+) -> FaceView:
     covariance = np.broadcast_to(deviation**2 * np.eye(2), (len(pixels), 2, 2))
     unknown = unknown_lens(CAMERA.size)
     return fit_view(FACE, FACE.plane(marks), pixels, covariance, lens or unknown, lens is not None)
 
 
-def off(view: View, camera: Camera = CAMERA) -> FloatArray:
+def off(view: FaceView, camera: Camera = CAMERA) -> FloatArray:
     """Errors over the target, m, (81,)."""
     found = view.to_plane(project(camera, GRID))
     return np.asarray(np.linalg.norm(found - FACE.plane(GRID), axis=-1))

@@ -15,13 +15,13 @@ The package itself holds what all three share: mirrors and their poses, photogra
 from heliotrope.airborne.mirror import MirrorShape, ideal, measured_normal, rectangle, tiled
 from heliotrope.airborne.photo import LedCamera, Photo, read_camera, read_photos, write_camera
 from heliotrope.airborne.slopes import read_slopes, write_slopes
-from heliotrope.airborne.standing import Standing, read_commands, write_commands
+from heliotrope.airborne.standing import MirrorPoses, read_commands, write_commands
 
 __all__ = [
     "LedCamera",
+    "MirrorPoses",
     "MirrorShape",
     "Photo",
-    "Standing",
     "ideal",
     "measured_normal",
     "read_camera",

@@ -21,7 +21,7 @@ from heliotrope.geometry import FloatArray, as_float
 
 
 @dataclass(frozen=True)
-class Standing:
+class MirrorPoses:
     """Poses of N mirrors, true or expected.
 
     Attributes
@@ -51,10 +51,10 @@ class Standing:
         turned = np.einsum("nij,nkj->nki", self.rotation, self.outline)
         return as_float(self.vertex[:, None, :] + turned)
 
-    def take(self, rows: npt.ArrayLike) -> "Standing":
+    def take(self, rows: npt.ArrayLike) -> "MirrorPoses":
         """Return the mirrors at ``rows``, in that order."""
         index = np.asarray(rows, dtype=np.intp).reshape(-1)
-        return Standing(
+        return MirrorPoses(
             tuple(self.names[i] for i in index),
             self.vertex[index],
             self.rotation[index],
@@ -62,13 +62,13 @@ class Standing:
         )
 
 
-def standing(heliostats: Heliostats, counts: npt.ArrayLike) -> Standing:
+def standing(heliostats: Heliostats, counts: npt.ArrayLike) -> MirrorPoses:
     """Return the poses of calibrated heliostats at drive counts (N, D)."""
     turned, vertex = orientation(heliostats.calibrated, counts)
-    return Standing(heliostats.names, vertex, turned, outline(heliostats))
+    return MirrorPoses(heliostats.names, vertex, turned, outline(heliostats))
 
 
-def join_standing(parts: Sequence[Standing]) -> Standing:
+def join_standing(parts: Sequence[MirrorPoses]) -> MirrorPoses:
     """Return several groups of mirrors as one, in the order given.
 
     Raises
@@ -78,7 +78,7 @@ def join_standing(parts: Sequence[Standing]) -> Standing:
     """
     if not parts:
         raise InputError("no mirror is commanded; list those that the photographs show")
-    return Standing(
+    return MirrorPoses(
         tuple(name for p in parts for name in p.names),
         np.concatenate([p.vertex for p in parts]),
         np.concatenate([p.rotation for p in parts]),

@@ -207,7 +207,7 @@ def _job(
     from heliotrope.imaging.campaign import Job
     from heliotrope.imaging.files import read_image
     from heliotrope.imaging.memory import Memory
-    from heliotrope.imaging.photograph import Settings
+    from heliotrope.imaging.photograph import PhotographSettings
     from heliotrope.imaging.targets.teaching import read_pictures
 
     names = [t.name for t in place.targets]
@@ -233,7 +233,7 @@ def _job(
         targets=place.targets,
         origin=(place.site.latitude_deg, place.site.longitude_deg, place.site.height),
         camera=known,
-        settings=Settings(pictures=taught, empty=known_empty.models),
+        settings=PhotographSettings(pictures=taught, empty=known_empty.models),
         crop=crop,
         target=target,
         annotated=annotated,

@@ -26,7 +26,7 @@ from heliotrope.imaging.lens import (
 from heliotrope.imaging.log import Entry, Log, read_log
 from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.motion import (
-    Motion,
+    FrameMotion,
     MotionDetector,
     MotionSettings,
     detect_motion,
@@ -34,9 +34,9 @@ from heliotrope.imaging.motion import (
 )
 from heliotrope.imaging.photograph import (
     Photograph,
+    PhotographSettings,
     PlacedSpot,
-    Reading,
-    Settings,
+    TargetReading,
     read_crop,
     read_photograph,
 )
@@ -51,21 +51,21 @@ __all__ = [
     "Entry",
     "Expectation",
     "Frame",
+    "FrameMotion",
     "Job",
     "Lens",
     "Limits",
     "Log",
     "Memory",
-    "Motion",
     "MotionDetector",
     "MotionSettings",
     "Outcome",
     "Photograph",
+    "PhotographSettings",
     "PlacedSpot",
-    "Reading",
     "Reason",
-    "Settings",
     "Source",
+    "TargetReading",
     "annotate",
     "average",
     "calibrate_chessboard",

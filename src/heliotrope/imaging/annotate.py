@@ -4,7 +4,7 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.photograph import LookedAt, Photograph, PlacedSpot, Reading
+from heliotrope.imaging.photograph import LookedAt, Photograph, PlacedSpot, TargetReading
 
 # Blue, green, red: bluish green, vermilion, sky blue, yellow of Okabe and Ito.
 GOOD, BAD, FACE, OTHER = (115, 158, 0), (0, 94, 213), (233, 180, 86), (66, 228, 240)
@@ -92,7 +92,7 @@ class _Sheet:
             ]
             self.line(self.seen(face, np.concatenate(sides)), FACE)
 
-    def marks(self, reading: Reading) -> None:
+    def marks(self, reading: TargetReading) -> None:
         import cv2
 
         for mark in reading.found.marks:
@@ -158,7 +158,7 @@ class _Sheet:
         self.picture = np.concatenate([self.picture, strip])
 
 
-def _said(reading: Reading) -> list[str]:
+def _said(reading: TargetReading) -> list[str]:
     name = reading.found.target.name
     if not reading.found.found:
         return [f"{name}: not found: {reading.found.reason}"]

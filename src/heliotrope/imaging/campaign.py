@@ -23,13 +23,13 @@ from heliotrope.imaging.log import Entry, Log, beside
 from heliotrope.imaging.photograph import (
     LookedAt,
     Photograph,
+    PhotographSettings,
     PlacedSpot,
-    Reading,
-    Settings,
+    TargetReading,
     read_crop,
     read_photograph,
 )
-from heliotrope.imaging.targets.view import View
+from heliotrope.imaging.targets.view import FaceView
 from heliotrope.sun import Site, vector
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ class Job:
     targets: tuple[Target, ...]
     origin: Origin
     camera: Camera | None = None
-    settings: Settings = field(default_factory=Settings)
+    settings: PhotographSettings = field(default_factory=PhotographSettings)
     crop: bool = False
     target: str = ""
     annotated: Path | None = None
@@ -119,7 +119,7 @@ class Outcome:
     time: datetime | None = None
     time_deviation: float = float("nan")
     annotated: Path | None = None
-    views: tuple[View, ...] = ()
+    views: tuple[FaceView, ...] = ()
     faces: tuple[LookedAt, ...] = ()
 
 
@@ -149,7 +149,7 @@ def look(
     path: Path,
     job: Job,
     entry: Entry | None = None,
-    previous: Sequence[View] = (),
+    previous: Sequence[FaceView] = (),
 ) -> Outcome:
     """Read one frame.
 
@@ -216,7 +216,7 @@ def _target(job: Job, name: str, path: Path) -> Target:
     raise UnknownNameError("target", name, [t.name for t in job.targets])
 
 
-def meant(photograph: Photograph, target: str) -> tuple[Reading | None, str]:
+def meant(photograph: Photograph, target: str) -> tuple[TargetReading | None, str]:
     """Return the reading that counts and why it cannot be trusted ("" if it can).
 
     Parameters
@@ -242,7 +242,7 @@ def meant(photograph: Photograph, target: str) -> tuple[Reading | None, str]:
     return None, "no target was found: " + "; ".join(sorted(texts))
 
 
-def _why(reading: Reading) -> str:
+def _why(reading: TargetReading) -> str:
     return "; ".join(f"{r.name}: {r.text}" for r in reading.reasons)
 
 
@@ -259,7 +259,7 @@ def document(photograph: Photograph, origin: Origin, annotated: Path | None) -> 
     }
 
 
-def _reading(reading: Reading, origin: Origin) -> dict[str, Any]:
+def _reading(reading: TargetReading, origin: Origin) -> dict[str, Any]:
     found = reading.found
     entry: dict[str, Any] = {
         "target": found.target.name,

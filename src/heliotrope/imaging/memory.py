@@ -22,7 +22,8 @@ class Memory:
     ::
 
         memory = Memory.load("empty")
-        photograph = read_photograph(frame, targets, settings=Settings(empty=memory.models))
+        settings = PhotographSettings(empty=memory.models)
+        photograph = read_photograph(frame, targets, settings=settings)
         memory.learn(photograph.faces)
         memory.save("empty")
     """
@@ -35,7 +36,7 @@ class Memory:
 
     @property
     def models(self) -> Mapping[str, EmptyTarget]:
-        """By the names of their targets, for `heliotrope.imaging.photograph.Settings`."""
+        """By the names of their targets, for `heliotrope.imaging.photograph.PhotographSettings`."""
         return self._models
 
     def learn(self, faces: Iterable[LookedAt]) -> None:

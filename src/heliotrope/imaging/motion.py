@@ -67,7 +67,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Motion:
+class FrameMotion:
     """The change between two frames.
 
     Attributes
@@ -152,7 +152,7 @@ def detect_motion(
     after: Frame | Pixels,
     mask: npt.ArrayLike | None = None,
     settings: MotionSettings = DEFAULT,
-) -> Motion:
+) -> FrameMotion:
     """Return what moved between two frames of a fixed camera.
 
     Parameters
@@ -384,20 +384,20 @@ def _tile_shift(a: _Image, b: _Image) -> tuple[int, float, float] | None:
 # -- difference ------------------------------------------------------------------------
 
 
-def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettings) -> Motion:
+def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettings) -> FrameMotion:
     if problem := _exposed(one, "first") or _exposed(two, "second"):
-        return Motion(problem=problem)
+        return FrameMotion(problem=problem)
     wanted, ratio = _expected(one, two)
     if not 1.0 / settings.max_ratio <= ratio <= settings.max_ratio:
         text = f"the brightness changed by {ratio:.3g}, the limit is {settings.max_ratio:g}"
-        return Motion(brightness_ratio=ratio, problem=text)
+        return FrameMotion(brightness_ratio=ratio, problem=text)
     believed = _register(wanted, two.image)
     found = believed or (0.0, 0.0)
     edge = max(_MOST_EDGE, 0.0 if believed else _UNSURE / one.factor)
     shift = (found[0] * one.factor, found[1] * one.factor)
     if math.hypot(*shift) > settings.max_shift_px:
         text = f"the camera moved by {math.hypot(*shift):.1f} of {settings.max_shift_px:g} px"
-        return Motion(shift_px=shift, brightness_ratio=ratio, problem=text)
+        return FrameMotion(shift_px=shift, brightness_ratio=ratio, problem=text)
     parts = _difference(one, two, wanted, found, ratio)
     counts = np.ones(wanted.shape, np.uint8) if mask is None else mask
     threshold = _threshold(places := int(np.count_nonzero(counts)), settings)
@@ -411,7 +411,7 @@ def _compare(one: _View, two: _View, mask: _Image | None, settings: MotionSettin
     area = sum(region.area_px for region, _ in regions)
     if area > 0.5 * places * one.factor**2:
         problem = "more than half of the frame changed: another scene, or another light"
-    return Motion(
+    return FrameMotion(
         moved=bool(regions) and not problem,
         significance=float(max(high.max(), -low.min())),
         threshold=threshold,
@@ -612,7 +612,7 @@ class MotionDetector:
         self._background: _View | None = None
         self._learnt = self._refused = 0
 
-    def update(self, frame: Frame | Pixels) -> tuple[MotionState, Motion]:
+    def update(self, frame: Frame | Pixels) -> tuple[MotionState, FrameMotion]:
         """Compare the next frame with the background.
 
         Raises InputError if the mask does not fit, or if the frame size changed.
@@ -621,9 +621,9 @@ class MotionDetector:
         mask = _mask(self._mask, view)
         if self._background is None:
             if problem := _exposed(view, "first"):
-                return MotionState.UNUSABLE, Motion(problem=problem)
+                return MotionState.UNUSABLE, FrameMotion(problem=problem)
             self._background, self._learnt, self._refused = view, 1, 0
-            return MotionState.WARMING_UP, Motion(brightness_ratio=1.0)
+            return MotionState.WARMING_UP, FrameMotion(brightness_ratio=1.0)
         motion = _compare(self._background, view, mask, self._settings)
         if motion.problem:
             self._refused += 1
@@ -634,7 +634,7 @@ class MotionDetector:
             return MotionState.WARMING_UP, motion
         return MotionState.MOVING if motion.moved else MotionState.STILL, motion
 
-    def _learn(self, view: _View, motion: Motion) -> None:
+    def _learn(self, view: _View, motion: FrameMotion) -> None:
         """Adjust the background to the frame's light, then add the frame."""
         assert self._background is not None
         old, _ = _expected(self._background, view)

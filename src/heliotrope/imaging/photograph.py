@@ -18,7 +18,7 @@ from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
 from heliotrope.imaging.spots.spot import Spot, find_spots
 from heliotrope.imaging.targets.finding import FoundTarget, Pictures, find_targets
 from heliotrope.imaging.targets.rectify import ACROSS, Rectified, from_crop, rectify
-from heliotrope.imaging.targets.view import Face, View
+from heliotrope.imaging.targets.view import Face, FaceView
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
@@ -70,7 +70,7 @@ class PlacedSpot:
 
 
 @dataclass(frozen=True)
-class Reading:
+class TargetReading:
     """One target of a photograph.
 
     Attributes
@@ -129,11 +129,11 @@ class Photograph:
     """
 
     frame: Frame
-    readings: tuple[Reading, ...]
+    readings: tuple[TargetReading, ...]
     beside: tuple[PlacedSpot, ...] = ()
     faces: tuple[LookedAt, ...] = ()
 
-    def reading(self, target: str) -> Reading:
+    def reading(self, target: str) -> TargetReading:
         """Return the reading of a target by name.
 
         Raises
@@ -147,13 +147,13 @@ class Photograph:
         raise InputError(f"target {target} was not searched for in {self.frame.name}")
 
     @property
-    def views(self) -> tuple[View, ...]:
+    def views(self) -> tuple[FaceView, ...]:
         """How the faces lie in the frame; the next frame is searched there first."""
         return tuple(f.picture.view for f in self.faces if f.picture.view is not None)
 
 
 @dataclass(frozen=True)
-class Settings:
+class PhotographSettings:
     """How photographs are read.
 
     Attributes
@@ -187,8 +187,8 @@ def read_photograph(
     targets: Sequence[Target],
     camera: Camera | None = None,
     *,
-    settings: Settings | None = None,
-    previous: Sequence[View] = (),
+    settings: PhotographSettings | None = None,
+    previous: Sequence[FaceView] = (),
     without: Frame | None = None,
 ) -> Photograph:
     """Find the targets of a photograph and the beams on them.
@@ -209,7 +209,7 @@ def read_photograph(
         A frame of the same camera without the beam.
     """
     with _one_thread().limit(limits=1, user_api="blas"):
-        return _read(frame, targets, camera, settings or Settings(), previous, without)
+        return _read(frame, targets, camera, settings or PhotographSettings(), previous, without)
 
 
 @lru_cache(maxsize=1)
@@ -224,13 +224,13 @@ def _read(
     frame: Frame,
     targets: Sequence[Target],
     camera: Camera | None,
-    chosen: Settings,
-    previous: Sequence[View],
+    chosen: PhotographSettings,
+    previous: Sequence[FaceView],
     without: Frame | None,
 ) -> Photograph:
     given, frame = frame, linear(frame, chosen.gamma)
     found = find_targets(frame, targets, camera, previous, chosen.pictures)
-    readings = {f.target.name: Reading(f, (), (_missing(f),)) for f in found if not f.found}
+    readings = {f.target.name: TargetReading(f, (), (_missing(f),)) for f in found if not f.found}
     beside: list[PlacedSpot] = []
     faces: list[LookedAt] = []
     grey = np.ascontiguousarray(frame.grey)
@@ -251,7 +251,9 @@ def _read(
     return Photograph(given, ordered, tuple(beside), tuple(faces))
 
 
-def read_crop(frame: Frame, target: Target, settings: Settings | None = None) -> Photograph:
+def read_crop(
+    frame: Frame, target: Target, settings: PhotographSettings | None = None
+) -> Photograph:
     """Find the beam in a picture that shows exactly one target.
 
     Parameters
@@ -263,7 +265,7 @@ def read_crop(frame: Frame, target: Target, settings: Settings | None = None) ->
     settings
         How to read.
     """
-    chosen = settings or Settings()
+    chosen = settings or PhotographSettings()
     picture = _trimmed(from_crop(linear(frame, chosen.gamma), target), _LEAST_RIM)
     with _one_thread().limit(limits=1, user_api="blas"):
         seen, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
@@ -326,8 +328,8 @@ def _missing(found: FoundTarget) -> Reason:
     return Reason("target not found", float("nan"), float("nan"), found.reason)
 
 
-def _views(found: Sequence[FoundTarget]) -> list[View]:
-    views: list[View] = []
+def _views(found: Sequence[FoundTarget]) -> list[FaceView]:
+    views: list[FaceView] = []
     for result in found:
         if result.view is not None and not any(result.view is v for v in views):
             views.append(result.view)
@@ -335,7 +337,7 @@ def _views(found: Sequence[FoundTarget]) -> list[View]:
 
 
 def _empty_picture(
-    without: Frame, view: View, camera: Camera | None, chosen: Settings
+    without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings
 ) -> Rectified:
     """Return the face in the frame without the beam, searched again: the camera may move."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
@@ -349,7 +351,7 @@ def _empty_picture(
 
 
 def _read_face(
-    picture: Rectified, chosen: Settings, empty: Rectified | None, gathered: float
+    picture: Rectified, chosen: PhotographSettings, empty: Rectified | None, gathered: float
 ) -> tuple[LookedAt, list[PlacedSpot]]:
     """Read one face; ``gathered`` is exposure times gain, s."""
     background = _background(picture, chosen, empty)
@@ -361,7 +363,9 @@ def _read_face(
     return LookedAt(picture, background, odd), spots
 
 
-def _background(picture: Rectified, chosen: Settings, empty: Rectified | None) -> Background:
+def _background(
+    picture: Rectified, chosen: PhotographSettings, empty: Rectified | None
+) -> Background:
     way = chosen.background
     names = [t.name for t in picture.face.targets]
     model = next((m for m in chosen.empty.values() if m.fits(picture)), None)
@@ -419,8 +423,8 @@ def _target_at(face: Face, point: FloatArray) -> Target | None:
 
 
 def _reading(
-    found: FoundTarget, on_face: Sequence[PlacedSpot], seen: LookedAt, chosen: Settings
-) -> Reading:
+    found: FoundTarget, on_face: Sequence[PlacedSpot], seen: LookedAt, chosen: PhotographSettings
+) -> TargetReading:
     name = found.target.name
     expected = chosen.expectations.get(name, Expectation())
     own = [s for s in on_face if s.target is not None and s.target.name == name]
@@ -439,4 +443,4 @@ def _reading(
         own[0].flux if own else float("nan"),
         seen.unexplained,
     )
-    return Reading(found, tuple(own), tuple(reasons))
+    return TargetReading(found, tuple(own), tuple(reasons))

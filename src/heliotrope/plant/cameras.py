@@ -24,7 +24,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.memory import Memory
-from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.sources import FolderSource, Source, VideoSource, open_source
 from heliotrope.imaging.targets.teaching import read_pictures
 from heliotrope.links.clock import Clock
@@ -181,7 +181,7 @@ class RealCameras:
         for camera, targets in _watching(design.cameras, design.targets):
             eye = _Eye(camera, targets, Feed(sources(camera, folder, self._stop)))
             self._eyes |= {target.name: eye for target in targets}
-        self._settings = Settings(pictures=read_pictures(folder, design.targets))
+        self._settings = PhotographSettings(pictures=read_pictures(folder, design.targets))
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
         """Begin to take frames; ``on_alarm`` hears of cameras that fall silent and come back."""

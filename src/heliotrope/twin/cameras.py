@@ -18,7 +18,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, reflect
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.photograph import Photograph, Settings, read_photograph
+from heliotrope.imaging.photograph import Photograph, PhotographSettings, read_photograph
 from heliotrope.imaging.synthetic.rendering import render
 from heliotrope.imaging.synthetic.scenes import Scene, Thrown, exposed
 from heliotrope.links.clock import Clock, sleep_until
@@ -297,7 +297,7 @@ class RenderedCamera:
         scenes: Sequence[Scene],
         *,
         optics: Optics | None = None,
-        settings: Settings | None = None,
+        settings: PhotographSettings | None = None,
         seed: int = 0,
         threads: int = 0,
     ) -> None:
@@ -309,7 +309,7 @@ class RenderedCamera:
                     f"{len(scene.beams)} beams; give one target and no beam: mirrors throw them"
                 )
         self._sight, self._scenes = sight, {s.targets[0].name: s for s in scenes}
-        self._optics, self._settings = optics or Optics(), settings or Settings()
+        self._optics, self._settings = optics or Optics(), settings or PhotographSettings()
         self._chance = np.random.default_rng(seed)
         self._pool = ThreadPoolExecutor(threads, "camera") if threads else None
         self._views, self._empty = Views(), dict[str, Frame]()

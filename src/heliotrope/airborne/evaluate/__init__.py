@@ -8,7 +8,7 @@ by itself: `read_many`, `evaluate`, `measure_field`, `to_sightings`.
 from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
-from heliotrope.airborne.evaluate.evaluation import Evaluation, evaluate
+from heliotrope.airborne.evaluate.evaluation import FlightEvaluation, evaluate
 from heliotrope.airborne.evaluate.flight import CampaignResult, FlightResult, evaluate_flight
 from heliotrope.airborne.evaluate.folder import FlightData, open_flights
 from heliotrope.airborne.evaluate.orientation import (
@@ -18,7 +18,7 @@ from heliotrope.airborne.evaluate.orientation import (
     measure_field,
     rotation_between,
 )
-from heliotrope.airborne.evaluate.reading import Seen, read_many, read_photo
+from heliotrope.airborne.evaluate.reading import PhotoReading, read_many, read_photo
 from heliotrope.airborne.evaluate.reflections import (
     Reflections,
     read_reflections,
@@ -37,16 +37,16 @@ __all__ = [
     "Budget",
     "Campaign",
     "CampaignResult",
-    "Evaluation",
     "FlightData",
+    "FlightEvaluation",
     "FlightResult",
     "MeasuredFlight",
     "Orientation",
     "Orientations",
+    "PhotoReading",
     "Priors",
     "Reflections",
     "RtkCheck",
-    "Seen",
     "Together",
     "check_rtk",
     "evaluate",

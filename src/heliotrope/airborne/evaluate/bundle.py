@@ -34,7 +34,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, cross_matrix, rotation
 
@@ -128,7 +128,7 @@ class State:
     rotation: FloatArray
     error: FloatArray
     offset: FloatArray
-    stand: Standing
+    stand: MirrorPoses
     survey: FloatArray
 
     @property
@@ -251,7 +251,7 @@ def adjust(
     recorded: npt.ArrayLike,
     sigma: npt.ArrayLike,
     rotations: npt.ArrayLike,
-    stand: Standing,
+    stand: MirrorPoses,
     corners: Corners,
     priors: Priors | None = None,
     *,
@@ -428,7 +428,7 @@ def jacobian_matrix(
 
 
 def _step(
-    layout: _Layout, state: State, start: Standing, moved: FloatArray, step: FloatArray
+    layout: _Layout, state: State, start: MirrorPoses, moved: FloatArray, step: FloatArray
 ) -> tuple[State, FloatArray]:
     own = step[: layout.offset].reshape(-1, 6)
     total = moved + step[layout.mirror : layout.survey].reshape(-1, _OF_MIRROR)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from heliotrope.airborne.evaluate.bundle import Priors
-from heliotrope.airborne.evaluate.evaluation import Evaluation, evaluate
+from heliotrope.airborne.evaluate.evaluation import FlightEvaluation, evaluate
 from heliotrope.airborne.evaluate.folder import FlightData
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera
@@ -40,7 +40,7 @@ class Campaign:
         Number of adjustments.
     """
 
-    flights: tuple[Evaluation | None, ...]
+    flights: tuple[FlightEvaluation | None, ...]
     problems: tuple[tuple[str, ...], ...]
     offset: FloatArray
     offset_covariance: FloatArray
@@ -87,7 +87,7 @@ def evaluate_campaign(flights: Sequence[FlightData], priors: Priors | None = Non
     InputError
         If no flight gives a reflection.
     """
-    found: list[Evaluation | None] = [None] * len(flights)
+    found: list[FlightEvaluation | None] = [None] * len(flights)
     problems = [tuple(flight.unused()) for flight in flights]
     # The error of a single flight is raised as it is.
     usable = [k for k, f in enumerate(flights) if f.corners or f.dark or len(flights) == 1]
@@ -151,7 +151,7 @@ def _alike(one: LedCamera, other: LedCamera) -> bool:
     )
 
 
-def _together(flights: Sequence[FlightData], priors: Priors | None) -> Evaluation:
+def _together(flights: Sequence[FlightData], priors: Priors | None) -> FlightEvaluation:
     """Evaluate several flights as one, with a mirror for each heliostat and pose."""
     if len(flights) == 1:
         one = flights[0]
@@ -174,7 +174,7 @@ def _together(flights: Sequence[FlightData], priors: Priors | None) -> Evaluatio
     return evaluate(photos, seen, flights[0].camera, stand, shape, priors=priors, owner=owner)
 
 
-def _parts(flights: Sequence[FlightData], joint: Evaluation) -> list[Evaluation]:
+def _parts(flights: Sequence[FlightData], joint: FlightEvaluation) -> list[FlightEvaluation]:
     """Return the flights of a joint evaluation, each with its own rows and photographs."""
     if len(flights) == 1:
         return [joint]
@@ -204,7 +204,7 @@ def _parts(flights: Sequence[FlightData], joint: Evaluation) -> list[Evaluation]
     return parts
 
 
-def common_offset(done: Sequence[Evaluation], prior: float) -> tuple[FloatArray, FloatArray]:
+def common_offset(done: Sequence[FlightEvaluation], prior: float) -> tuple[FloatArray, FloatArray]:
     """Return the groups' mean offset weighted by accuracy, m, and its covariance, m².
 
     The prior, of standard deviation ``prior``, counts once.

@@ -18,7 +18,7 @@ _TICK = 4.0
 
 
 @dataclass(frozen=True)
-class Element:
+class SvgElement:
     """One element of a drawing: its SVG tag, attributes, tooltip and text."""
 
     tag: str
@@ -55,7 +55,7 @@ class Panel:
     across: str = ""
     up: str = ""
     labels: tuple[str, ...] = ()
-    parts: list[Element] = field(default_factory=list)
+    parts: list[SvgElement] = field(default_factory=list)
 
     def equal(self) -> "Panel":
         """Widen one range so that both axes have the same scale; returns the panel."""
@@ -84,7 +84,7 @@ class Panel:
         """Draw a line through points (n,)."""
         way = " ".join(f"{a:.1f},{b:.1f}" for a, b in self.place(x, y))
         drawn = {"points": way, "fill": "none", "stroke": colour, "stroke-width": width}
-        self.parts.append(Element("polygon" if closed else "polyline", drawn))
+        self.parts.append(SvgElement("polygon" if closed else "polyline", drawn))
 
     def dots(
         self,
@@ -100,7 +100,7 @@ class Panel:
         fill = "white" if hollow else colour
         for k, (a, b) in enumerate(self.place(x, y)):
             drawn = {"cx": f"{a:.1f}", "cy": f"{b:.1f}", "r": size, "fill": fill, "stroke": colour}
-            self.parts.append(Element("circle", drawn, tips[k] if tips else ""))
+            self.parts.append(SvgElement("circle", drawn, tips[k] if tips else ""))
 
     def crosses(
         self, x: npt.ArrayLike, y: npt.ArrayLike, colour: str, tips: Sequence[str] = ()
@@ -109,7 +109,7 @@ class Panel:
         for k, (a, b) in enumerate(self.place(x, y)):
             way = f"M{a - 4:.1f} {b - 4:.1f}l8 8m-8 0l8 -8"
             drawn = {"d": way, "stroke": colour, "stroke-width": 1.6, "fill": "none"}
-            self.parts.append(Element("path", drawn, tips[k] if tips else ""))
+            self.parts.append(SvgElement("path", drawn, tips[k] if tips else ""))
 
     def arrows(self, x: npt.ArrayLike, y: npt.ArrayLike, step: npt.ArrayLike, colour: str) -> None:
         """Draw arrows from points (n,) by steps (n, 2), px to the right and up."""
@@ -126,7 +126,7 @@ class Panel:
                 f"M{a:.1f} {b:.1f}l{dx:.1f} {-up:.1f}l{left[0]:.1f} {left[1]:.1f}"
                 f"m{-left[0]:.1f} {-left[1]:.1f}l{right[0]:.1f} {right[1]:.1f}"
             )
-            self.parts.append(Element("path", {"d": way, "fill": "none", "stroke": colour}))
+            self.parts.append(SvgElement("path", {"d": way, "fill": "none", "stroke": colour}))
 
     def bars(self, edges: npt.ArrayLike, heights: npt.ArrayLike, colour: str) -> None:
         """Draw a histogram of n + 1 edges and n heights."""
@@ -135,18 +135,18 @@ class Panel:
             wide, tall = f"{low[k + 1, 0] - top[0]:.1f}", f"{low[k, 1] - top[1]:.1f}"
             corner = {"x": f"{top[0]:.1f}", "y": f"{top[1]:.1f}"}
             drawn = {**corner, "width": wide, "height": tall, "fill": colour}
-            self.parts.append(Element("rect", drawn))
+            self.parts.append(SvgElement("rect", drawn))
 
     def text(self, x: float, y: float, text: str, colour: str = "#666") -> None:
         """Write beside a point."""
         a, b = self.place(x, y)
         place = {"x": f"{a + 4:.1f}", "y": f"{b - 4:.1f}", "fill": colour}
-        self.parts.append(Element("text", place, text=text))
+        self.parts.append(SvgElement("text", place, text=text))
 
-    def frame(self) -> list[Element]:
+    def frame(self) -> list[SvgElement]:
         """Return the frame with its ticks and texts."""
         size = {"x": self.left, "y": self.top, "width": self.width, "height": self.height}
-        found = [Element("rect", {**size, "fill": "none", "stroke": "#888"})]
+        found = [SvgElement("rect", {**size, "fill": "none", "stroke": "#888"})]
         low = self.top + self.height
         across = [(float(k), text) for k, text in enumerate(self.labels)] or numbered(*self.x, 6)
         for value, text in across:
@@ -164,7 +164,7 @@ class Panel:
             a, b = self.left - 34.0, self.top + 0.5 * self.height
             turned = {"x": a, "y": b, "text-anchor": "middle"}
             turned["transform"] = f"rotate(-90 {a:g} {b:g})"
-            found.append(Element("text", turned, text=self.up))
+            found.append(SvgElement("text", turned, text=self.up))
         return found
 
 
@@ -208,10 +208,10 @@ def numbered(low: float, high: float, most: int) -> list[tuple[float, str]]:
     return [(k * step, f"{k * step:.{digits}f}".replace("-", "−")) for k in range(first, last + 1)]
 
 
-def _tick(x: float, y: float, dx: float, dy: float) -> Element:
-    return Element("path", {"d": f"M{x:.1f} {y:.1f}l{dx:g} {dy:g}", "stroke": "#888"})
+def _tick(x: float, y: float, dx: float, dy: float) -> SvgElement:
+    return SvgElement("path", {"d": f"M{x:.1f} {y:.1f}l{dx:g} {dy:g}", "stroke": "#888"})
 
 
-def _text(x: float, y: float, text: str, anchor: str) -> list[Element]:
+def _text(x: float, y: float, text: str, anchor: str) -> list[SvgElement]:
     place = {"x": f"{x:.1f}", "y": f"{y:.1f}", "text-anchor": anchor}
-    return [Element("text", place, text=text)] if text else []
+    return [SvgElement("text", place, text=text)] if text else []

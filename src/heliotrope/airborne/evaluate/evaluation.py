@@ -15,10 +15,10 @@ import numpy.typing as npt
 from heliotrope.airborne.evaluate.bundle import Adjusted, Corners, Priors, State, adjust, residuals
 from heliotrope.airborne.evaluate.night import turn_together
 from heliotrope.airborne.evaluate.rays import ShapeOf, spot_reflections
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
@@ -31,7 +31,7 @@ _AGREE = 1.15
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class FlightEvaluation:
     """Result of the photographs of a pose.
 
     Attributes
@@ -57,9 +57,9 @@ class Evaluation:
 
     photos: tuple[Photo, ...]
     recorded: tuple[Photo, ...]
-    seen: tuple[Seen, ...]
+    seen: tuple[PhotoReading, ...]
     adjusted: Adjusted
-    stand: Standing
+    stand: MirrorPoses
     place_covariance: FloatArray
     reflections: Reflections
     problems: tuple[str, ...]
@@ -67,14 +67,14 @@ class Evaluation:
 
 def evaluate(
     photos: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     shape: ShapeOf,
     *,
     priors: Priors | None = None,
     owner: npt.ArrayLike | None = None,
-) -> Evaluation:
+) -> FlightEvaluation:
     """Return the reflections of a pose and the exterior orientation of its photographs.
 
     Parameters
@@ -124,7 +124,7 @@ def evaluate(
             f"no reflection on the mirrors in {len(used)} photographs; check that the lamp was on "
             "and that the mirrors were commanded towards the drone (commands.csv)"
         )
-    return Evaluation(
+    return FlightEvaluation(
         tuple(places),
         tuple(recorded),
         tuple(used),
@@ -138,13 +138,13 @@ def evaluate(
 
 def _evaluate_dark(
     recorded: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     shape: ShapeOf,
     priors: Priors,
     problems: tuple[str, ...],
-) -> Evaluation:
+) -> FlightEvaluation:
     """Evaluate a dark flight: attitudes from the lights alone, positions from RTK."""
     start = [p.moved(p.position, s.rotation) for p, s in zip(recorded, seen, strict=True)]
     found = turn_together(start, seen, camera, stand, shape)
@@ -170,7 +170,7 @@ def _evaluate_dark(
         0,
         True,
     )
-    return Evaluation(
+    return FlightEvaluation(
         found.photos,
         tuple(recorded),
         tuple(seen),
@@ -182,7 +182,7 @@ def _evaluate_dark(
     )
 
 
-def corners_of(seen: Sequence[Seen]) -> Corners:
+def corners_of(seen: Sequence[PhotoReading]) -> Corners:
     """Return the corners found in photographs, for the adjustment."""
     parts = []
     for k, one in enumerate(seen):
@@ -208,9 +208,9 @@ def corners_of(seen: Sequence[Seen]) -> Corners:
 
 def adjust_photos(
     recorded: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     priors: Priors,
     owner: npt.ArrayLike | None = None,
 ) -> Adjusted:

@@ -10,7 +10,7 @@ import numpy as np
 from heliotrope.airborne.evaluate.budget import Budget
 from heliotrope.airborne.evaluate.bundle import Priors
 from heliotrope.airborne.evaluate.campaign import Campaign, evaluate_campaign
-from heliotrope.airborne.evaluate.evaluation import Evaluation
+from heliotrope.airborne.evaluate.evaluation import FlightEvaluation
 from heliotrope.airborne.evaluate.folder import FlightData, open_flights
 from heliotrope.airborne.evaluate.orientation import measure_field
 from heliotrope.airborne.evaluate.reading import read_many
@@ -44,7 +44,7 @@ class FlightResult:
     """
 
     data: FlightData
-    evaluation: Evaluation
+    evaluation: FlightEvaluation
     measured: MeasuredFlight
 
     def label(self, name: str) -> str:
@@ -157,11 +157,11 @@ def evaluate_flight(
     order:
 
     1. ``folder.open_flights``: photographs, camera and commands become a ``FlightData``.
-    2. ``reading.read_many``: each photograph is read, and what it shows is a ``Seen``.
+    2. ``reading.read_many``: each photograph is read, and what it shows is a ``PhotoReading``.
        ``reading.read_photo``, ``detection.find_patches``, ``identification.identify``,
        ``detection.find_outlines``, ``detection.find_spots``.
     3. ``campaign.evaluate_campaign``: flights that share heliostats go together.
-    4. ``evaluation.evaluate``: one adjustment, and its ``Evaluation``.
+    4. ``evaluation.evaluate``: one adjustment, and its ``FlightEvaluation``.
     5. ``bundle.adjust``: all corners give the exterior orientations and RTK's offset.
     6. ``rays.spot_reflections``: spots become ``Reflections`` on mirrors.
     7. ``orientation.measure_field``: reflections become ``Orientations`` with their accuracy.
@@ -236,7 +236,7 @@ def _read(
     return replace(flight, seen=seen)
 
 
-def _measure(flight: FlightData, found: Evaluation, budget: Budget) -> FlightResult:
+def _measure(flight: FlightData, found: FlightEvaluation, budget: Budget) -> FlightResult:
     """Measure the mirrors of one flight where the photographs showed them to stand."""
     orientations = measure_field(
         found.reflections,

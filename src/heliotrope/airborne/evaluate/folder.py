@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.mirror import MirrorShape, ideal
 from heliotrope.airborne.photo import SUFFIXES, LedCamera, Photo, read_camera, read_photos
 from heliotrope.airborne.slopes import read_slopes
-from heliotrope.airborne.standing import Standing, join_standing, read_commands, standing
+from heliotrope.airborne.standing import MirrorPoses, join_standing, read_commands, standing
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
@@ -47,12 +47,12 @@ class FlightData:
     name: str
     photos: tuple[Photo, ...]
     camera: LedCamera
-    stand: Standing
+    stand: MirrorPoses
     heliostat: npt.NDArray[np.intp]
     counts: FloatArray
     shapes: tuple[MirrorShape, ...]
     problems: tuple[str, ...] = ()
-    seen: tuple[Seen, ...] = ()
+    seen: tuple[PhotoReading, ...] = ()
 
     def shape(self, row: int) -> MirrorShape:
         """Return the surface of a mirror."""

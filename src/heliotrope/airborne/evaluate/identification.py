@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne.evaluate.detection import Picture, Spots, find_spots
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray, as_float, rotation
 
@@ -62,7 +62,7 @@ class Identified:
 
 
 def expected_size(
-    camera: LedCamera, photo: Photo, stand: Standing
+    camera: LedCamera, photo: Photo, stand: MirrorPoses
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Return the sides of mirrors as a photograph shows them, px, and which may be in it, (M,).
 
@@ -98,7 +98,9 @@ def nearest_rotation(ways: FloatArray, rays: FloatArray) -> FloatArray:
     return as_float(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
 
 
-def identify(camera: LedCamera, photo: Photo, stand: Standing, patches: FloatArray) -> Identified:
+def identify(
+    camera: LedCamera, photo: Photo, stand: MirrorPoses, patches: FloatArray
+) -> Identified:
     """Return which mirrors the patches show, and the attitude of the camera.
 
     Parameters
@@ -207,7 +209,7 @@ def _choose(
     tried: list[_Tried],
     photo: Photo,
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     rows: Rows,
     patches: int,
 ) -> Identified:
@@ -263,7 +265,7 @@ def is_dark(picture: Picture) -> bool:
     return bool(np.median(picture[::8, ::8]) < DARK_READING)
 
 
-def expected_feet(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[FloatArray, Rows]:
+def expected_feet(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[FloatArray, Rows]:
     """Return where mirrors in expected poses show the lamp, (K, 3), and their rows, (K,)."""
     between = photo.position + 0.5 * (photo.led_position(camera) - photo.position)
     local = np.einsum("nji,nj->ni", stand.rotation, between - stand.vertex)
@@ -275,7 +277,7 @@ def expected_feet(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[Flo
 
 
 def find_lights(
-    picture: Picture, photo: Photo, camera: LedCamera, stand: Standing
+    picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses
 ) -> tuple[Identified, Spots]:
     """Return the attitude of the camera, and the spots with their mirrors (rows of ``stand``).
 
@@ -304,7 +306,7 @@ def find_lights(
     return replace(found, mirror=rows[found.mirror]), named
 
 
-def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: Standing) -> Rows:
+def _mirrors_of(plane: FloatArray, photo: Photo, turn: FloatArray, stand: MirrorPoses) -> Rows:
     """Return the mirror that each light lies on, -1 for none."""
     ways = np.concatenate([plane, np.ones((len(plane), 1))], axis=-1) @ turn.T
     start = np.einsum("nji,nj->ni", stand.rotation, photo.position - stand.vertex)

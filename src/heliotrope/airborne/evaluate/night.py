@@ -20,11 +20,11 @@ import numpy.typing as npt
 from heliotrope.airborne.evaluate.identification import BESIDE, FEWEST, nearest_rotation
 from heliotrope.airborne.evaluate.orientation import differences, turned
 from heliotrope.airborne.evaluate.rays import ShapeOf, spot_reflections
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import measured_normal
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float, rotation
 
@@ -52,7 +52,7 @@ class Turned:
     """
 
     photos: tuple[Photo, ...]
-    stand: Standing
+    stand: MirrorPoses
     reflections: Reflections
     common: FloatArray
 
@@ -81,9 +81,9 @@ class Turned:
 
 def turn_together(
     photos: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     shape: ShapeOf,
 ) -> Turned:
     """Return attitudes and mirrors that agree with all lights of a flight.
@@ -105,7 +105,7 @@ def turn_together(
         If fewer than four mirrors show the lamp.
     """
 
-    def found_by(photos: Sequence[Photo], mirrors: Standing) -> Reflections:
+    def found_by(photos: Sequence[Photo], mirrors: MirrorPoses) -> Reflections:
         # The common turn moves lights beside the mirrors they lie on.
         return spot_reflections(photos, seen, camera, mirrors, shape, beside=BESIDE)
 
@@ -132,13 +132,13 @@ def turn_together(
     return Turned(tuple(now), mirrors, found_by(now, mirrors), common)
 
 
-def _lever(stand: Standing, rows: Rows) -> FloatArray:
+def _lever(stand: MirrorPoses, rows: Rows) -> FloatArray:
     normal = stand.rotation[rows, :, 2]
     return as_float(len(rows) * np.eye(3) - normal.T @ normal)
 
 
 def _attitudes(
-    photos: Sequence[Photo], found: Reflections, stand: Standing, shape: ShapeOf
+    photos: Sequence[Photo], found: Reflections, stand: MirrorPoses, shape: ShapeOf
 ) -> list[Photo]:
     """Turn each photograph so that its lights are seen along the normals of the mirrors."""
     seen, wanted = np.empty((len(found), 3)), np.empty((len(found), 3))
@@ -165,7 +165,7 @@ def _attitudes(
     return turns
 
 
-def _orientations(stand: Standing, found: Reflections, shape: ShapeOf) -> Standing:
+def _orientations(stand: MirrorPoses, found: Reflections, shape: ShapeOf) -> MirrorPoses:
     """Turn each mirror by the median difference of its lights."""
     turns = stand.rotation.copy()
     for row in np.unique(found.heliostat).tolist():
@@ -176,8 +176,8 @@ def _orientations(stand: Standing, found: Reflections, shape: ShapeOf) -> Standi
 
 
 def _as_commanded(
-    photos: Sequence[Photo], mirrors: Standing, stand: Standing, rows: Rows
-) -> tuple[list[Photo], Standing]:
+    photos: Sequence[Photo], mirrors: MirrorPoses, stand: MirrorPoses, rows: Rows
+) -> tuple[list[Photo], MirrorPoses]:
     """Turn everything together so that the mirrors stand as commanded on average."""
     off = np.cross(stand.rotation[rows, :, 2], mirrors.rotation[rows, :, 2])
     common = np.linalg.solve(_lever(stand, rows), off.sum(axis=0))

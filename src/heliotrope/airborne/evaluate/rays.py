@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.evaluate.reflections import Reflections, join, reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.geometry import FloatArray, as_float
 
 ShapeOf = Callable[[int], MirrorShape]
@@ -20,9 +20,9 @@ SPOT_FLOOR = 0.15
 
 def spot_reflections(
     photos: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     shape: ShapeOf,
     *,
     shifts: FloatArray | None = None,

@@ -33,7 +33,7 @@ from heliotrope.airborne.evaluate.identification import (
     quad_area,
 )
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import HeliotropeError
 from heliotrope.field.camera import undistort
 from heliotrope.geometry import FloatArray
@@ -64,7 +64,7 @@ def _no_rows() -> Rows:
 
 
 @dataclass(frozen=True)
-class Seen:
+class PhotoReading:
     """What one photograph shows: M mirrors and S spots.
 
     Attributes
@@ -131,7 +131,7 @@ class Seen:
         write_file(path, lambda stream: np.savez_compressed(stream, allow_pickle=False, **values))
 
     @classmethod
-    def load(cls, path: Path) -> "Seen":
+    def load(cls, path: Path) -> "PhotoReading":
         """Return what `save` wrote."""
         with np.load(path, allow_pickle=False) as stored:
             values = {f.name: stored[f.name] for f in fields(cls)}
@@ -148,7 +148,7 @@ class Seen:
 # -- one photograph --------------------------------------------------------------------
 
 
-def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
+def read_photo(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
     """Return what a photograph's file shows.
 
     Parameters
@@ -161,14 +161,14 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
         All mirrors in their expected poses.
     """
     if photo.path is None:
-        return Seen(photo.name, "unreadable: there is no file")
+        return PhotoReading(photo.name, "unreadable: there is no file")
     try:
         picture = decode(photo.path)
     except HeliotropeError as error:
-        return Seen(photo.name, f"unreadable: {error}")
+        return PhotoReading(photo.name, f"unreadable: {error}")
     height, width = picture.shape[:2]
     if (width, height) != camera.size:
-        return Seen(
+        return PhotoReading(
             photo.name,
             f"unreadable: {width} × {height} px, but the camera file says "
             f"{camera.size[0]} × {camera.size[1]} px; give the file of this camera",
@@ -176,21 +176,21 @@ def read_photo(photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
     return look(picture, photo, camera, stand)
 
 
-def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
+def look(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
     """Return what a decoded picture shows, as `read_photo` does."""
     side, near = expected_size(camera, photo, stand)
     if not near.any():
-        return Seen(photo.name, "wrong_field: no mirror of the field can be in it")
+        return PhotoReading(photo.name, "wrong_field: no mirror of the field can be in it")
     typical = float(np.median(side[near]))
     if typical < SMALLEST:
-        return Seen(
+        return PhotoReading(
             photo.name,
             f"small: mirrors are {typical:.0f} px across, less than {SMALLEST:.0f}; "
             "fly closer or use a longer lens",
         )
     clipped = float((picture[::8, ::8] >= 254).all(axis=2).mean())
     if clipped > 0.5:
-        return Seen(
+        return PhotoReading(
             photo.name, f"overexposed: {100 * clipped:.0f} % of it is clipped; shorten the exposure"
         )
     found = Identified(photo.rotation, _no_rows(), _no_rows(), "nothing: no patches")
@@ -204,17 +204,17 @@ def look(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> 
     if found.reason:
         if is_dark(picture):
             return _lights(picture, photo, camera, stand)
-        return Seen(photo.name, found.reason)
+        return PhotoReading(photo.name, found.reason)
     return _measure(picture, photo, camera, stand, found)
 
 
 def _measure(
-    picture: Picture, photo: Photo, camera: LedCamera, stand: Standing, found: Identified
-) -> Seen:
+    picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses, found: Identified
+) -> PhotoReading:
     """Return the corners and spots of the mirrors that were identified."""
     rows, expected = _in_frame(photo.moved(photo.position, found.rotation), camera, stand)
     if not len(rows):
-        return Seen(photo.name, "nothing: no mirror is completely in the frame")
+        return PhotoReading(photo.name, "nothing: no mirror is completely in the frame")
     size = np.sqrt(quad_area(expected))
     reach = float(np.clip(0.12 * np.median(size), 2.0, 6.0))
     first = find_outlines(picture, expected, reach, profiles=16)
@@ -227,7 +227,7 @@ def _measure(
     outline = np.where(good[:, None, None], lines.corners, expected)
     spots, reasons = find_spots(picture, outline)
     if all(r.startswith("overexposed") for r in reasons):
-        return Seen(
+        return PhotoReading(
             photo.name,
             f"overexposed: all {len(rows)} mirrors are clipped; shorten the exposure",
         )
@@ -237,7 +237,7 @@ def _measure(
     ]
     corners = np.full(lines.corners.shape, np.nan)
     corners[good] = undistort(camera, lines.corners[good])
-    return Seen(
+    return PhotoReading(
         name=photo.name,
         rotation=_attitude(found.rotation, photo, stand, rows, corners),
         mirror=rows,
@@ -252,13 +252,13 @@ def _measure(
     )
 
 
-def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) -> Seen:
+def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> PhotoReading:
     """Return the lamp's spots in a photograph too dark to show the mirrors."""
     found, spots = find_lights(picture, photo, camera, stand)
     if found.reason:
-        return Seen(photo.name, found.reason)
+        return PhotoReading(photo.name, found.reason)
     rows = np.unique(spots.mirror)
-    return Seen(
+    return PhotoReading(
         name=photo.name,
         rotation=found.rotation,
         mirror=rows,
@@ -273,7 +273,7 @@ def _lights(picture: Picture, photo: Photo, camera: LedCamera, stand: Standing) 
     )
 
 
-def _in_frame(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[Rows, FloatArray]:
+def _in_frame(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[Rows, FloatArray]:
     """Return the mirrors with all corners in the frame, and those corners, px."""
     pixels = photo.pixels(camera, stand.corners)
     width, height = camera.size
@@ -287,7 +287,7 @@ def _in_frame(photo: Photo, camera: LedCamera, stand: Standing) -> tuple[Rows, F
 
 
 def _attitude(
-    start: FloatArray, photo: Photo, stand: Standing, rows: Rows, corners: FloatArray
+    start: FloatArray, photo: Photo, stand: MirrorPoses, rows: Rows, corners: FloatArray
 ) -> FloatArray:
     """Return the rotation that fits all corners best."""
     seen = np.isfinite(corners).all(axis=-1)
@@ -306,13 +306,13 @@ def _attitude(
 def read_many(
     photos: Sequence[Photo],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     *,
     processes: int = 1,
     client: "Client | None" = None,
     keep: Path | None = None,
     progress: Progress | None = None,
-) -> tuple[Seen, ...]:
+) -> tuple[PhotoReading, ...]:
     """Return what photographs show, in their order.
 
     Parameters
@@ -333,7 +333,7 @@ def read_many(
     progress
         Called with (done, all).
     """
-    found: dict[int, Seen] = {}
+    found: dict[int, PhotoReading] = {}
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
         base = _digest(camera, stand)
@@ -359,10 +359,10 @@ def read_many(
 def _read(
     photos: Sequence[Photo],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     processes: int,
     client: "Client | None",
-) -> Iterator[tuple[int, Seen]]:
+) -> Iterator[tuple[int, PhotoReading]]:
     if client is not None:
         from distributed import as_completed as completed
 
@@ -387,11 +387,11 @@ def _read(
             yield k, read_photo(photo, camera, stand)
 
 
-def _read_shared(photo: Photo, shared: tuple[LedCamera, Standing]) -> Seen:
+def _read_shared(photo: Photo, shared: tuple[LedCamera, MirrorPoses]) -> PhotoReading:
     return read_photo(photo, *shared)
 
 
-def _digest(camera: LedCamera, stand: Standing) -> bytes:
+def _digest(camera: LedCamera, stand: MirrorPoses) -> bytes:
     size, lens = np.array(camera.size), (camera.matrix, camera.distortion)
     parts = (size, *lens, stand.vertex, stand.rotation, stand.outline)
     return b"".join(np.ascontiguousarray(p, dtype=np.float64).tobytes() for p in parts)
@@ -405,11 +405,11 @@ def _mark(photo: Photo, base: bytes) -> str:
     return hashlib.sha256(base + recorded + file.encode()).hexdigest()[:32]
 
 
-def _kept(path: Path) -> Seen | None:
+def _kept(path: Path) -> PhotoReading | None:
     if not path.exists():
         return None
     try:
-        return Seen.load(path)
+        return PhotoReading.load(path)
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         # Written by another version, or damaged: read the photograph again.
         return None

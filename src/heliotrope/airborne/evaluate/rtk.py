@@ -10,9 +10,9 @@ import numpy as np
 
 from heliotrope.airborne.evaluate.bundle import Priors, adjust
 from heliotrope.airborne.evaluate.evaluation import adjust_photos, corners_of, disagrees
-from heliotrope.airborne.evaluate.reading import Seen
+from heliotrope.airborne.evaluate.reading import PhotoReading
 from heliotrope.airborne.photo import LedCamera, Photo
-from heliotrope.airborne.standing import Standing
+from heliotrope.airborne.standing import MirrorPoses
 from heliotrope.errors import InputError
 from heliotrope.geometry import FloatArray, as_float
 
@@ -50,9 +50,9 @@ class RtkCheck:
 
 def check_rtk(
     photos: Sequence[Photo],
-    seen: Sequence[Seen],
+    seen: Sequence[PhotoReading],
     camera: LedCamera,
-    stand: Standing,
+    stand: MirrorPoses,
     priors: Priors | None = None,
 ) -> tuple[RtkCheck, tuple[str, ...]]:
     """Return how RTK positions scatter about those from the images alone.

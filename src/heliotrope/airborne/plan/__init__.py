@@ -7,8 +7,8 @@ with `write_plan`. Waypoint files are read and written by
 
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
 from heliotrope.airborne.plan.calibration_points import PointSelection
-from heliotrope.airborne.plan.clusters import Clusters
-from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station, camera_target
+from heliotrope.airborne.plan.clusters import HeliostatClusters
+from heliotrope.airborne.plan.flight import CameraTarget, Craft, HoverStation, Sortie, camera_target
 from heliotrope.airborne.plan.flight_files import FORMATS, read_airspace, write_plan
 from heliotrope.airborne.plan.flight_plan import FlightPlan, PlanSettings, plan_flight
 from heliotrope.airborne.plan.hover import Sampling
@@ -20,9 +20,10 @@ __all__ = [
     "FORMATS",
     "Airspace",
     "CameraTarget",
-    "Clusters",
     "Craft",
     "FlightPlan",
+    "HeliostatClusters",
+    "HoverStation",
     "KeepOut",
     "Mission",
     "PlanSettings",
@@ -30,7 +31,6 @@ __all__ = [
     "PointSelection",
     "Sampling",
     "Sortie",
-    "Station",
     "camera_target",
     "plan_flight",
     "read_airspace",

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from heliotrope.airborne.plan.airspace import Airspace
 from heliotrope.airborne.plan.clusters import tour
-from heliotrope.airborne.plan.hover import Facing, Mirrors, Sampling, face
+from heliotrope.airborne.plan.hover import Facing, HoverMirrors, Sampling, face
 from heliotrope.calibration.fit.residuals import linearise
 from heliotrope.calibration.plan.planning import (
     CandidateSightings,
@@ -125,7 +125,7 @@ def directions(selection: PointSelection) -> FloatArray:
 
 
 def calibration_points(
-    mirrors: Mirrors,
+    mirrors: HoverMirrors,
     rows: npt.NDArray[np.intp],
     middle: Mechanism,
     aim: npt.ArrayLike,
@@ -210,7 +210,7 @@ def _free(
     airspace: Airspace,
     points: FloatArray,
     towards: FloatArray,
-    mirrors: Mirrors,
+    mirrors: HoverMirrors,
     rows: npt.NDArray[np.intp],
     sampling: Sampling,
 ) -> npt.NDArray[np.bool_]:

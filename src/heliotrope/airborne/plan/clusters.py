@@ -26,7 +26,7 @@ _EVEN = 0.02
 
 
 @dataclass(frozen=True)
-class Clusters:
+class HeliostatClusters:
     """A partition of N heliostats into K clusters.
 
     Attributes
@@ -97,7 +97,7 @@ def ground_areas(position: npt.ArrayLike) -> FloatArray:
 
 def clusters(
     position: npt.ArrayLike, *, size: float = 100.0, max_radius: float = np.inf
-) -> Clusters:
+) -> HeliostatClusters:
     """Return round clusters of equal area.
 
     Parameters
@@ -223,7 +223,7 @@ def _along_curve(flat: FloatArray) -> npt.NDArray[np.intp]:
     return np.argsort(place, kind="stable")
 
 
-def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) -> Clusters:
+def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) -> HeliostatClusters:
     # Number without gaps, in case a cell stayed empty.
     of = np.unique(of, return_inverse=True)[1].astype(np.intp)
     number = np.bincount(of)
@@ -235,4 +235,4 @@ def _described(of: npt.NDArray[np.intp], place: FloatArray, area: FloatArray) ->
     spread = np.bincount(of, weights=area * away**2) / whole
     # Include the spread of each heliostat's own ground, so that a lone one has some.
     spread += np.bincount(of, weights=area**2) / whole / (2.0 * np.pi)
-    return Clusters(of, center, whole, radius, whole / (2.0 * np.pi) / spread)
+    return HeliostatClusters(of, center, whole, radius, whole / (2.0 * np.pi) / spread)

@@ -78,7 +78,7 @@ class Craft:
 
 
 @dataclass(frozen=True)
-class Station:
+class HoverStation:
     """One cluster in one pose.
 
     Attributes
@@ -108,7 +108,7 @@ class Station:
 
 
 @dataclass(frozen=True)
-class Visit:
+class StationVisit:
     """Hover points of a station flown in one go.
 
     Attributes
@@ -157,7 +157,7 @@ class Sortie:
     start: float
     end: float
     home: FloatArray
-    visits: tuple[Visit, ...]
+    visits: tuple[StationVisit, ...]
     back: FloatArray
 
     @property
@@ -171,7 +171,7 @@ class _Ways:
     """Routes between stations and homes, each found once."""
 
     airspace: Airspace
-    stations: Sequence[Station]
+    stations: Sequence[HoverStation]
     labels: Sequence[str]
     known: dict[tuple[int, int, int], FloatArray]
     #: Durations of the way home, by drone and station.
@@ -207,7 +207,7 @@ class _Ways:
 
 
 def fly(
-    stations: Sequence[Station],
+    stations: Sequence[HoverStation],
     order: Sequence[int],
     airspace: Airspace,
     home: FloatArray,
@@ -281,7 +281,7 @@ def grouped(clusters: Sequence[int], place: dict[int, list[int]], size: int) -> 
 def _one(
     drone: int,
     rows: Sequence[int],
-    stations: Sequence[Station],
+    stations: Sequence[HoverStation],
     home: FloatArray,
     craft: Craft,
     ways: _Ways,
@@ -300,7 +300,7 @@ class _Work:
     """State of one drone's work."""
 
     drone: int
-    stations: Sequence[Station]
+    stations: Sequence[HoverStation]
     home: FloatArray
     craft: Craft
     ways: _Ways
@@ -308,7 +308,7 @@ class _Work:
     #: When each cluster's last photograph was taken.
     seen: dict[int, float]
     sorties: list[Sortie]
-    visits: list[Visit]
+    visits: list[StationVisit]
     now: float = 0.0
     start: float = 0.0
     place: FloatArray | None = None
@@ -343,7 +343,7 @@ class _Work:
                 continue
             end = begin + count * step
             wait = begin - self.now - travel
-            self.visits.append(Visit(row, first, first + count, approach, begin, end, wait))
+            self.visits.append(StationVisit(row, first, first + count, approach, begin, end, wait))
             first += count
             self.now, self.place, self.row = end, camera[first - 1], row
         self.seen[station.cluster] = self.now
@@ -407,7 +407,7 @@ class Timeline:
 
 
 def _delay(
-    sortie: Sortie, stations: Sequence[Station], craft: Craft, others: Sequence[Timeline]
+    sortie: Sortie, stations: Sequence[HoverStation], craft: Craft, others: Sequence[Timeline]
 ) -> float:
     """Return the delay with which a sortie stays clear of other drones, s."""
     line = timeline([sortie], stations, craft, sortie.drone)
@@ -426,7 +426,7 @@ def _delay(
 
 
 def timeline(
-    sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft, drone: int
+    sorties: Sequence[Sortie], stations: Sequence[HoverStation], craft: Craft, drone: int
 ) -> Timeline:
     """Return the path of one drone through all its sorties."""
     time, place = [0.0], []
@@ -456,7 +456,7 @@ def timeline(
     return Timeline(np.array(time), np.array(place))
 
 
-def separation(sorties: Sequence[Sortie], stations: Sequence[Station], craft: Craft) -> float:
+def separation(sorties: Sequence[Sortie], stations: Sequence[HoverStation], craft: Craft) -> float:
     """Return the least distance of two drones, m, checked every second; infinite for one drone."""
     drones = sorted({s.drone for s in sorties})
     if len(drones) < 2:

@@ -14,9 +14,9 @@ from heliotrope.airborne.plan.calibration_points import (
     PointSelection,
     calibration_points,
 )
-from heliotrope.airborne.plan.clusters import Clusters, clusters, tour
-from heliotrope.airborne.plan.flight import CameraTarget, Craft, Sortie, Station
-from heliotrope.airborne.plan.hover import Mirrors, Sampling, mirrors, pattern
+from heliotrope.airborne.plan.clusters import HeliostatClusters, clusters, tour
+from heliotrope.airborne.plan.flight import CameraTarget, Craft, HoverStation, Sortie
+from heliotrope.airborne.plan.hover import HoverMirrors, Sampling, mirrors, pattern
 from heliotrope.calibration.uncertainty import suns_of_year
 from heliotrope.errors import InputError
 from heliotrope.field.plant import Plant
@@ -108,11 +108,11 @@ class FlightPlan:
 
     plant: Plant
     settings: PlanSettings
-    mirrors: Mirrors
-    clusters: Clusters
+    mirrors: HoverMirrors
+    clusters: HeliostatClusters
     labels: tuple[str, ...]
     points: tuple[CalibrationPoints, ...]
-    stations: tuple[Station, ...]
+    stations: tuple[HoverStation, ...]
     sorties: tuple[Sortie, ...]
     homes: FloatArray
     separation: float
@@ -208,7 +208,7 @@ def plan_flight(
     digits = len(str(len(found)))
     labels = tuple(f"C{k + 1:0{digits}d}" for k in range(len(found)))
     suns = suns_of_year(plant.site, 2026)
-    look, stations = [], list[Station]()
+    look, stations = [], list[HoverStation]()
     for k in range(len(found)):
         if progress is not None:
             progress(k, len(found))
@@ -245,7 +245,7 @@ def plan_flight(
 
 def _look(
     plant: Plant,
-    all_mirrors: Mirrors,
+    all_mirrors: HoverMirrors,
     center: FloatArray,
     rows: npt.NDArray[np.intp],
     suns: FloatArray,
@@ -290,16 +290,16 @@ def _model(mechanism: Mechanism) -> str:
 
 
 def _stations(
-    all_mirrors: Mirrors,
+    all_mirrors: HoverMirrors,
     rows: npt.NDArray[np.intp],
     look: CalibrationPoints,
     cluster: int,
     settings: PlanSettings,
-) -> list[Station]:
+) -> list[HoverStation]:
     speed = all_mirrors.drives.table[rows][..., SLOTS["speed"]]
     travel = flight.mirror_travel(look.facing.counts, speed)
     return [
-        Station(
+        HoverStation(
             cluster,
             k,
             pattern(
@@ -317,7 +317,9 @@ def _stations(
     ]
 
 
-def _check_patterns(stations: list[Station], labels: tuple[str, ...], airspace: Airspace) -> None:
+def _check_patterns(
+    stations: list[HoverStation], labels: tuple[str, ...], airspace: Airspace
+) -> None:
     """Refuse patterns that leave the permitted airspace."""
     sizes = np.array([len(s.pattern) for s in stations])
     free = airspace.free(np.concatenate([s.pattern.camera for s in stations]))

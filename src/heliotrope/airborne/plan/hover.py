@@ -80,7 +80,7 @@ class Sampling:
 
 
 @dataclass(frozen=True)
-class Mirrors:
+class HoverMirrors:
     """Properties of all N heliostats of a plant that hover patterns depend on.
 
     Attributes
@@ -109,7 +109,7 @@ class Mirrors:
         return len(self.names)
 
 
-def mirrors(plant: Plant) -> Mirrors:
+def mirrors(plant: Plant) -> HoverMirrors:
     """Return the mirrors of a plant, group by group.
 
     Raises
@@ -149,7 +149,7 @@ def mirrors(plant: Plant) -> Mirrors:
         slope = normal[..., :2] / normal[..., 2:]
         slopes.append(np.pad(slope, (*missing, (0, 0)), constant_values=np.nan))
         areas.append(4.0 * np.linalg.norm(normal, axis=-1).min(axis=1))
-    return Mirrors(
+    return HoverMirrors(
         plant.names,
         plant.armature,
         plant.drives,
@@ -336,7 +336,7 @@ def pattern(
     facing_vertex
         Vertices of the mirrors facing ``point``, ENU metres, (n, 3).
     corners, slopes, facet_area
-        See `Mirrors`, for the n mirrors.
+        See `HoverMirrors`, for the n mirrors.
     point, direction
         Point that the mirrors face, and the normal of the plane, (3,).
     sampling

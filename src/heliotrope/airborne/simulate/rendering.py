@@ -21,7 +21,7 @@ from heliotrope.airborne.evaluate.reflections import Reflections
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.airborne.photo import LedCamera, Photo, gimbal_of_rotation, write_camera
 from heliotrope.airborne.simulate.simulation import Flight, exact_reflections
-from heliotrope.airborne.standing import Standing, write_commands
+from heliotrope.airborne.standing import MirrorPoses, write_commands
 from heliotrope.errors import InputError
 from heliotrope.field.camera import undistort
 from heliotrope.files.text import write_file
@@ -103,7 +103,7 @@ def dark(led: float = 6.0) -> Conditions:
 
 
 @dataclass(frozen=True)
-class Scene:
+class FlightScene:
     """Content of a photograph.
 
     Attributes
@@ -116,14 +116,14 @@ class Scene:
         Light, lens and sensor.
     """
 
-    stand: Standing
+    stand: MirrorPoses
     shapes: Sequence[MirrorShape]
     ground: float = 0.0
     conditions: Conditions = field(default_factory=Conditions)
 
 
 def render(
-    scene: Scene, camera: LedCamera, photo: Photo, lamp: Reflections, seed: int = 0
+    scene: FlightScene, camera: LedCamera, photo: Photo, lamp: Reflections, seed: int = 0
 ) -> Picture:
     """Return the photograph, blue-green-red, uint8 (H, W, 3).
 
@@ -171,7 +171,7 @@ def _texture() -> Light:
     return np.asarray(rough / rough.std(), np.float32)
 
 
-def _ground(camera: LedCamera, photo: Photo, scene: Scene) -> Light:
+def _ground(camera: LedCamera, photo: Photo, scene: FlightScene) -> Light:
     import cv2
 
     width, height = camera.size
@@ -205,7 +205,7 @@ def _ground(camera: LedCamera, photo: Photo, scene: Scene) -> Light:
     return np.asarray(light[..., None] * np.array(GROUND_TINT, np.float32), np.float32)
 
 
-def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: Scene) -> None:
+def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene) -> None:
     sun = scene.conditions.sun
     if sun is None or sun[1] <= 0.05:
         return
@@ -218,7 +218,7 @@ def _shadows(image: Light, camera: LedCamera, photo: Photo, scene: Scene) -> Non
             _cover(image, seen, np.zeros(3), 0.55)
 
 
-def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: Scene, row: int) -> None:
+def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, row: int) -> None:
     shape, turned = scene.shapes[row], scene.stand.rotation[row]
     vertex = scene.stand.vertex[row]
     away = photo.position - vertex
@@ -277,7 +277,7 @@ def _shrunk(outline: FloatArray, by: float) -> FloatArray:
 
 
 def _spot(
-    image: Light, camera: LedCamera, photo: Photo, scene: Scene, lamp: Reflections, k: int
+    image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, lamp: Reflections, k: int
 ) -> None:
     row, facet = int(lamp.heliostat[k]), lamp.facet[k : k + 1]
     point = scene.shapes[row].point_at(facet, lamp.xy[k : k + 1])[0]
@@ -439,7 +439,7 @@ def render_flight(
     place.mkdir(parents=True, exist_ok=True)
     exact = exact_reflections(flight)
     ground = float(np.median(flight.heliostats.position[:, 2]))
-    scene = Scene(flight.truth, flight.shapes, ground, light)
+    scene = FlightScene(flight.truth, flight.shapes, ground, light)
     write_camera(place / "camera.toml", flight.camera)
     write_commands(place / "commands.csv", flight.heliostats.names, flight.counts)
     for k, (taken, recorded) in enumerate(zip(flight.taken, flight.recorded, strict=True)):

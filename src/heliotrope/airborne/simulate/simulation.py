@@ -18,7 +18,7 @@ from heliotrope.airborne.evaluate.reflections import Reflections, join, reflecti
 from heliotrope.airborne.mirror import MirrorShape, ideal, reflection_points
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.slopes import smooth_slopes
-from heliotrope.airborne.standing import Standing, standing
+from heliotrope.airborne.standing import MirrorPoses, standing
 from heliotrope.errors import InputError
 from heliotrope.field.camera import look_at
 from heliotrope.field.heliostats import Heliostats
@@ -93,7 +93,7 @@ class Flight:
     camera: LedCamera
     heliostats: Heliostats
     counts: FloatArray
-    truth: Standing
+    truth: MirrorPoses
     shapes: tuple[MirrorShape, ...]
     taken: tuple[Photo, ...]
     recorded: tuple[Photo, ...]

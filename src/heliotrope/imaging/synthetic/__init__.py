@@ -7,7 +7,7 @@ Nothing that reads real photographs imports this room. Begin with `example_targe
 
 from heliotrope.imaging.synthetic.rendering import BeamTruth, MarkTruth, Rendered, render
 from heliotrope.imaging.synthetic.scenes import (
-    Lens,
+    LensEffects,
     Paint,
     Scene,
     Sensor,
@@ -21,7 +21,7 @@ from heliotrope.imaging.synthetic.scenes import (
 
 __all__ = [
     "BeamTruth",
-    "Lens",
+    "LensEffects",
     "MarkTruth",
     "Paint",
     "Rendered",

@@ -37,7 +37,7 @@ class Plane:
 
 
 @dataclass(frozen=True)
-class Background:
+class PaintedScene:
     """The part without light and beams: planes, and the sky's share and relative light."""
 
     planes: tuple[Plane, ...]
@@ -45,7 +45,7 @@ class Background:
 
 
 @dataclass(frozen=True)
-class View:
+class SceneKey:
     """A camera and targets, compared by their effect on the picture."""
 
     key: tuple[object, ...]
@@ -67,7 +67,7 @@ def _key(camera: Camera, targets: tuple[Target, ...]) -> tuple[object, ...]:
     return (*parts, *(as_float(array).tobytes() for array in arrays))
 
 
-def background(scene: Scene) -> Background:
+def painted_scene(scene: Scene) -> PaintedScene:
     """Return the constant part of a scene, cached for the last four combinations.
 
     Raises
@@ -75,27 +75,27 @@ def background(scene: Scene) -> Background:
     InputError
         If the camera has no pose, or does not see the front of a target.
     """
-    view = View(_key(scene.camera, scene.targets), scene.camera, scene.targets)
+    view = SceneKey(_key(scene.camera, scene.targets), scene.camera, scene.targets)
     return _painted(view, scene.paint, scene.surroundings, scene.lens.base)
 
 
 @lru_cache(maxsize=4)
-def _painted(view: View, paint: Paint, around: Surroundings, blur: float) -> Background:
+def _painted(view: SceneKey, paint: Paint, around: Surroundings, blur: float) -> PaintedScene:
     areas, walls, free = _areas(view, around.wall, blur)
     planes = []
     for k, target in enumerate(view.targets):
-        u, v = _plane_map(View(_key(view.camera, (target,)), view.camera, (target,)))
+        u, v = _plane_map(SceneKey(_key(view.camera, (target,)), view.camera, (target,)))
         brush = _Brush(view.camera, target, blur)
         white = _paint_target(brush, paint, (u, v, areas[k]), k)
         grey = _paint_wall(brush, around, (u, v, walls[k]), k)
         reflectance: Image = areas[k] * white + walls[k] * grey
         planes.append(Plane(u, v, areas[k] + walls[k], reflectance))
-    return Background(tuple(planes), free * _sky(view.camera.size[::-1], around))
+    return PaintedScene(tuple(planes), free * _sky(view.camera.size[::-1], around))
 
 
 @lru_cache(maxsize=4)
 def _areas(
-    view: View, wall: tuple[float, float, float, float], blur: float
+    view: SceneKey, wall: tuple[float, float, float, float], blur: float
 ) -> tuple[list[Image], list[Image], Image]:
     """Return the shares of pixels covered by targets, their walls, and the sky, (H, W) each."""
     camera, shape = view.camera, view.camera.size[::-1]
@@ -160,7 +160,7 @@ def soft_coverage(polygons: list[FloatArray], shape: tuple[int, int], blur: floa
 
 
 @lru_cache(maxsize=4)
-def _plane_map(view: View) -> tuple[Image, Image]:
+def _plane_map(view: SceneKey) -> tuple[Image, Image]:
     """Return the places of pixels, metres right of and above the target's centre, (H, W) each."""
     from scipy.interpolate import RectBivariateSpline
 

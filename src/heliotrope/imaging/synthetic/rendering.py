@@ -17,9 +17,9 @@ from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.imaging.frame import Frame, Pixels
 from heliotrope.imaging.synthetic._kernels import ambient_field, expose, sample_plane
-from heliotrope.imaging.synthetic._painting import Image, Plane, background, mark_shapes
+from heliotrope.imaging.synthetic._painting import Image, Plane, mark_shapes, painted_scene
 from heliotrope.imaging.synthetic.scenes import (
-    Lens,
+    LensEffects,
     Paint,
     Scene,
     Sensor,
@@ -35,7 +35,7 @@ from heliotrope.optics.mirror_image import deposit
 
 __all__ = [
     "BeamTruth",
-    "Lens",
+    "LensEffects",
     "MarkTruth",
     "Paint",
     "Rendered",
@@ -173,16 +173,16 @@ def render(
     InputError
         If the camera has no pose, or does not see the front of a target.
     """
-    stays = background(scene)
-    ambient = stays.sky * np.float32(scene.surroundings.sky)
+    static = painted_scene(scene)
+    ambient = static.sky * np.float32(scene.surroundings.sky)
     seen: list[tuple[slice, slice, Image]] = []
     thrown = [replace(t, beam=t.beam.swept(t.motion)) for t in scene.beams]
     beams = np.zeros_like(ambient)
-    for plane in stays.planes:
+    for plane in static.planes:
         _add_ambient(scene, plane, ambient)
     for one in thrown:
         index = [t.name for t in scene.targets].index(one.target)
-        rows, columns, light = _beam_image(scene, stays.planes[index], index, one)
+        rows, columns, light = _beam_image(scene, static.planes[index], index, one)
         beams[rows, columns] += light
         seen.append((rows, columns, light))
     readings = _through_lens(scene, ambient, beams)
@@ -269,7 +269,7 @@ def _through_lens(scene: Scene, ambient: Image, beams: Image) -> Image:
     return level
 
 
-def _blurred(image: Image, lens: Lens) -> Image:
+def _blurred(image: Image, lens: LensEffects) -> Image:
     import cv2
 
     moved = float(np.hypot(*lens.shake))
@@ -288,7 +288,7 @@ def _bell(sigma: float) -> FloatArray:
     return as_float(value / value.sum())
 
 
-def point_spread(lens: Lens) -> FloatArray:
+def point_spread(lens: LensEffects) -> FloatArray:
     """Return the kernel (K, K) of a lens's disc or Gaussian with its shake; symmetric, sum 1."""
     from scipy.signal import convolve2d
 
@@ -310,7 +310,7 @@ def point_spread(lens: Lens) -> FloatArray:
     return as_float(spread / spread.sum())
 
 
-def _add_ghost(level: Image, lens: Lens) -> None:
+def _add_ghost(level: Image, lens: LensEffects) -> None:
     height, width = level.shape[:2]
     x = np.exp(-0.5 * ((np.arange(width) - lens.ghost_at[0]) / lens.ghost_radius) ** 2)
     y = np.exp(-0.5 * ((np.arange(height) - lens.ghost_at[1]) / lens.ghost_radius) ** 2)

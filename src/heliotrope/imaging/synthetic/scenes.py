@@ -121,7 +121,7 @@ class Shadow:
 
 
 @dataclass(frozen=True)
-class Lens:
+class LensEffects:
     """Blur and stray light of a frame.
 
     Attributes
@@ -165,7 +165,7 @@ class Lens:
         return min(self.defocus, 0.6)
 
     @property
-    def rest(self) -> "Lens":
+    def rest(self) -> "LensEffects":
         """The blur that remains for the frame."""
         if self.disc:
             return self
@@ -285,7 +285,7 @@ class Scene:
     cloud: float = 1.0
     paint: Paint = field(default_factory=Paint)
     surroundings: Surroundings = field(default_factory=Surroundings)
-    lens: Lens = field(default_factory=Lens)
+    lens: LensEffects = field(default_factory=LensEffects)
     sensor: Sensor = field(default_factory=Sensor)
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from heliotrope.imaging.targets.finding import FoundMark, FoundTarget, find_targ
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.imaging.targets.rectify import Rectified, from_crop, rectify
 from heliotrope.imaging.targets.teaching import (
-    Sight,
+    TargetView,
     Taught,
     TaughtPoint,
     Wish,
@@ -23,17 +23,17 @@ from heliotrope.imaging.targets.teaching import (
     teach,
     write_taught,
 )
-from heliotrope.imaging.targets.view import Face, View, faces, fit_view
+from heliotrope.imaging.targets.view import Face, FaceView, faces, fit_view
 
 __all__ = [
     "Face",
+    "FaceView",
     "FoundMark",
     "FoundTarget",
     "Rectified",
-    "Sight",
+    "TargetView",
     "Taught",
     "TaughtPoint",
-    "View",
     "Wish",
     "faces",
     "find_targets",

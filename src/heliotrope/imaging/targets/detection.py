@@ -84,7 +84,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Outlines:
+class DarkParts:
     """Parts of a frame that are darker than their surroundings.
 
     Attributes
@@ -217,7 +217,7 @@ def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
     return Lightened(small, closed, reduction)
 
 
-def outlines(light: Lightened, ratio: float) -> Outlines:
+def outlines(light: Lightened, ratio: float) -> DarkParts:
     """Return the parts of a frame that are darker than ``ratio`` of their surroundings."""
     import cv2
 
@@ -249,7 +249,7 @@ def outlines(light: Lightened, ratio: float) -> Outlines:
     profile = _profiles(mask, middle, covariance)
     # Pixel centres are whole numbers in both the reduced and the full frame.
     middle = reduction * (middle + 0.5) - 0.5
-    return Outlines(middle, reduction**2 * covariance, profile)
+    return DarkParts(middle, reduction**2 * covariance, profile)
 
 
 def _moments(
@@ -278,7 +278,7 @@ def _moments(
     return center, np.stack(rows, axis=-2)
 
 
-def candidates(seen: Outlines, drawn: Sequence[Drawing]) -> Candidates:
+def candidates(seen: DarkParts, drawn: Sequence[Drawing]) -> Candidates:
     """Return at most 60 outlines that look like one of the drawings, the best first."""
     profiles = np.stack([d.profile for d in drawn])
     spectrum = np.einsum("prk,drk->pdk", seen.profile, profiles.conj())

@@ -18,7 +18,14 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.targets import constellation, detection
 from heliotrope.imaging.targets.refinement import Refined, locate, refine
-from heliotrope.imaging.targets.view import Face, View, faces, fit_view, homography, unknown_lens
+from heliotrope.imaging.targets.view import (
+    Face,
+    FaceView,
+    faces,
+    fit_view,
+    homography,
+    unknown_lens,
+)
 
 Pictures = Mapping[str, FloatArray]
 
@@ -115,14 +122,14 @@ class FoundTarget:
     found: bool
     reason: str
     marks: tuple[FoundMark, ...] = ()
-    view: View | None = None
+    view: FaceView | None = None
 
 
 def find_targets(
     frame: Frame,
     targets: Sequence[Target],
     camera: Camera | None = None,
-    previous: Sequence[View] = (),
+    previous: Sequence[FaceView] = (),
     pictures: Pictures | None = None,
 ) -> list[FoundTarget]:
     """Return where each target is in a frame, or why it was not found.
@@ -147,7 +154,7 @@ def find_targets(
     turned camera from an upright one. Without a pose or an earlier view, the more upright
     solution is taken.
     """
-    look = Look(frame, camera, pictures or {})
+    look = FrameSearch(frame, camera, pictures or {})
     searches = []
     for face in faces(tuple(targets)):
         marks, plane = face_marks(face)
@@ -182,7 +189,7 @@ def _one(a: Mark, b: Mark) -> bool:
 # -- attempts --------------------------------------------------------------------------
 
 
-class Look:
+class FrameSearch:
     """One frame, with intermediate results that all faces share."""
 
     def __init__(self, frame: Frame, camera: Camera | None, pictures: Pictures) -> None:
@@ -192,7 +199,7 @@ class Look:
         self.camera = camera if camera is not None and camera.size == frame.size else None
         self.lens = self.camera or unknown_lens(frame.size)
         self._light: dict[int, detection.Lightened] = {}
-        self._outlines: dict[tuple[int, float], detection.Outlines] = {}
+        self._outlines: dict[tuple[int, float], detection.DarkParts] = {}
         self._tags: dict[int, dict[tuple[int, int], list[FloatArray]]] = {}
 
     @cached_property
@@ -206,7 +213,7 @@ class Look:
         scaled = self.grey.astype(np.float32) * np.float32(255.0 / top)
         return np.asarray(np.minimum(scaled, 255.0), dtype=np.uint8)
 
-    def outlines(self, reduction: int, ratio: float) -> detection.Outlines:
+    def outlines(self, reduction: int, ratio: float) -> detection.DarkParts:
         """Return the dark parts of the frame, computed once for all faces."""
         key = (reduction, ratio)
         if reduction not in self._light:
@@ -254,7 +261,7 @@ class Attempt:
         Why the places of some targets remain unknown, by name.
     """
 
-    view: View | None
+    view: FaceView | None
     seen: dict[int, tuple[FloatArray, FloatArray]]
     used: tuple[int, ...]
     reasons: dict[int, str]
@@ -278,7 +285,7 @@ class _Seen:
 class Search:
     """The search for one face in one frame."""
 
-    def __init__(self, look: Look, face: Face, marks: list[Mark], plane: FloatArray) -> None:
+    def __init__(self, look: FrameSearch, face: Face, marks: list[Mark], plane: FloatArray) -> None:
         self.look, self.face, self.marks, self.plane = look, face, marks, plane
         self.tags = look.tags(marks)
         self.extent = float(np.ptp(face.span, axis=0).max())
@@ -338,7 +345,7 @@ class Search:
                     seen.corners[k] = found[0] + _square(mark) @ scales[k].T
         return seen
 
-    def _refine(self, view: View, used: list[int]) -> _Seen:
+    def _refine(self, view: FaceView, used: list[int]) -> _Seen:
         seen = _Seen({}, {}, {}, {})
         pixels, scales = view.to_pixels(self.plane), view.scale(self.plane)
         for k, mark in enumerate(self.marks):
@@ -376,7 +383,7 @@ class Search:
 
     # -- fitting -----------------------------------------------------------------------
 
-    def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[View | None, list[int]]:
+    def _fit(self, seen: _Seen, known: FloatArray | None) -> tuple[FaceView | None, list[int]]:
         """Fit a view to the marks seen, leaving out strays, the worst first."""
         used = list(seen.places)
         while True:
@@ -482,7 +489,7 @@ class Search:
         names = ", ".join(self.marks[k].name for k in used)
         return f"only {len(used)} of its {total} marks were seen: {names}; {needed} are needed"
 
-    def _problem(self, view: View, used: list[int], seen: _Seen, known: bool) -> str:
+    def _problem(self, view: FaceView, used: list[int], seen: _Seen, known: bool) -> str:
         """Return why a view cannot be trusted; empty if it can."""
         needed = self._needed(view, known)
         if self._points_of(used) < needed:
@@ -501,13 +508,13 @@ class Search:
     def _points_of(self, used: list[int]) -> int:
         return sum(4 if self.marks[k].kind == "tag" else 1 for k in used)
 
-    def _needed(self, view: View, known: bool) -> int:
+    def _needed(self, view: FaceView, known: bool) -> int:
         """Return the number of points that a view needs."""
         least = FEWEST if known or len(self.marks) <= ALONE else ALONE
         share = SHARE if known else SHARE_ALONE
         return max(least, int(np.ceil(share * len(self.expected(view)))))
 
-    def expected(self, view: View) -> list[int]:
+    def expected(self, view: FaceView) -> list[int]:
         """Return the marks that the frame should show."""
         return self.within(view.to_pixels(self.plane))
 
@@ -516,7 +523,7 @@ class Search:
         inside = (pixels >= 0.0) & (pixels <= np.array(self.look.size) - 1.0)
         return [int(k) for k in np.flatnonzero(inside.all(axis=-1))]
 
-    def _impossible(self, view: View) -> bool:
+    def _impossible(self, view: FaceView) -> bool:
         corners = np.concatenate([self.face.plane(t.corners) for t in self.face.targets])
         depth = np.column_stack([corners, np.ones(len(corners))]) @ view.H_norm_plane[2]
         if (depth * depth[0] <= 0.0).any():
@@ -554,7 +561,7 @@ class Search:
             return f"other shapes lie where its marks should: one is explained to {explained:.0%}"
         return ""
 
-    def _dark(self, view: View, used: list[int], seen: _Seen) -> str:
+    def _dark(self, view: FaceView, used: list[int], seen: _Seen) -> str:
         """Return why the space between the marks is not paint, which is lighter; empty if it is."""
         flat = ("corner", "tee", "square", "disc")
         shown = [k for k in used if k in seen.looks and self.marks[k].kind in flat]
@@ -579,7 +586,9 @@ class Search:
             return ""
         return f"only {lighter:.0%} of the area between its marks is lighter than the marks"
 
-    def _levels(self, view: View, shown: list[int], seen: _Seen) -> tuple[FloatArray, FloatArray]:
+    def _levels(
+        self, view: FaceView, shown: list[int], seen: _Seen
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the brightness of marks and of their surroundings, (K,) each."""
         inner = []
         for k in shown:
@@ -602,7 +611,7 @@ class Search:
         values = self.look.grey[np.where(inside, row, 0), np.where(inside, column, 0)]
         return np.where(inside, values.astype(np.float64), np.nan)
 
-    def _vague(self, view: View, used: list[int]) -> dict[str, str]:
+    def _vague(self, view: FaceView, used: list[int]) -> dict[str, str]:
         """Return by name why the marks seen do not determine some targets."""
         parts = [
             self.plane[k] + (_square(self.marks[k]) if self.marks[k].kind == "tag" else 0.0)
@@ -628,7 +637,7 @@ class Search:
                 )
         return found
 
-    def _shown(self, view: View, target: Target) -> bool:
+    def _shown(self, view: FaceView, target: Target) -> bool:
         """Return whether the frame shows any part of a target."""
         part = np.stack(np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 9)), -1).reshape(-1, 2)
         corners = self.face.plane(target.corners)
@@ -674,7 +683,7 @@ def _crossing(corners: FloatArray) -> FloatArray:
 # -- the search for a face -------------------------------------------------------------
 
 
-def _earlier(face: Face, previous: Sequence[View], look: Look) -> View | None:
+def _earlier(face: Face, previous: Sequence[FaceView], look: FrameSearch) -> FaceView | None:
     for view in previous:
         if _same(view.face, face) and view.lens.size == look.size:
             return view
@@ -688,7 +697,7 @@ def _same(a: Face, b: Face) -> bool:
 class _Face:
     """The search for one face."""
 
-    def __init__(self, search: Search, previous: View | None) -> None:
+    def __init__(self, search: Search, previous: FaceView | None) -> None:
         self.search, self.previous = search, previous
         self.best: Attempt | None = None
         #: Number of shapes that look like one of its marks.
@@ -789,7 +798,7 @@ class _Face:
         text = "" if settled.view is None else self._elsewhere(settled, settled.view)
         return replace(settled, view=None, text=text) if text else settled
 
-    def _elsewhere(self, attempt: Attempt, view: View) -> str:
+    def _elsewhere(self, attempt: Attempt, view: FaceView) -> str:
         """Return why what was seen may be another target of the face; empty if it cannot."""
         search = self.search
         marks, plane, targets = search.marks, search.plane, search.face.targets
@@ -813,7 +822,7 @@ class _Face:
                     return f"this may be {names}; name the targets that the camera sees"
         return ""
 
-    def _settled(self, attempt: Attempt, view: View) -> Attempt:
+    def _settled(self, attempt: Attempt, view: FaceView) -> Attempt:
         """Return the attempt, among turns with like marks, that shows most or is more upright."""
         search, up = self.search, self._up()
         middle = search.plane.mean(axis=0)
@@ -977,7 +986,7 @@ def _share(each: _Face, attempt: Attempt) -> float:
     return len(attempt.used) / len(each.search.marks)
 
 
-def _covers(a: View, b: View) -> bool:
+def _covers(a: FaceView, b: FaceView) -> bool:
     """Return whether the middle of face b is seen on face a."""
     place = a.to_plane(b.to_pixels(b.face.span.mean(axis=0)))
     low, high = a.face.span

@@ -11,7 +11,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame, Image
 from heliotrope.imaging.targets.finding import face_marks
 from heliotrope.imaging.targets.marks import polygons
-from heliotrope.imaging.targets.view import Face, View, faces
+from heliotrope.imaging.targets.view import Face, FaceView, faces
 
 Mask = npt.NDArray[np.bool_]
 
@@ -55,7 +55,7 @@ class Rectified:
     surface: Mask
     marks: Mask
     clipped: Image
-    view: View | None = None
+    view: FaceView | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -97,7 +97,7 @@ class Rectified:
         return x.astype(np.float32), y.astype(np.float32)
 
 
-def rectify(frame: Frame, view: View, grey: Image | None = None) -> Rectified:
+def rectify(frame: Frame, view: FaceView, grey: Image | None = None) -> Rectified:
     """Return a face of a frame on a grid of metres.
 
     Parameters
@@ -189,7 +189,7 @@ def _at_least(brightness: Image, limit: float) -> Image:
     return np.asarray(top if brightness.dtype == np.uint8 else top.astype(np.uint8))
 
 
-def _places(view: View, first: FloatArray, step: float, shape: tuple[int, int]) -> Image:
+def _places(view: FaceView, first: FloatArray, step: float, shape: tuple[int, int]) -> Image:
     """Return the frame's pixels (H, W, 2) of a grid.
 
     Computed at every eighth pixel and interpolated, which errs by some thousandths of a pixel.

@@ -611,7 +611,7 @@ def fit_marks(
 
 
 @dataclass(frozen=True)
-class Sight:
+class TargetView:
     """A camera's view of a target.
 
     Attributes
@@ -638,7 +638,7 @@ class Sight:
     marks: int
 
 
-def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
+def sights(camera: Camera, targets: Sequence[Target]) -> list[TargetView]:
     """Return the views of a camera's targets, or of all, that face it and are in its frame."""
     from heliotrope.field.camera import project
 
@@ -664,7 +664,9 @@ def sights(camera: Camera, targets: Sequence[Target]) -> list[Sight]:
         if area > 0.0:
             oblique = float(np.arccos(min(facing, 1.0)))
             count = int(_held(camera, project(camera, marks)).sum())
-            found.append(Sight(target.name, distance, area**-0.5, oblique, float(share), count))
+            found.append(
+                TargetView(target.name, distance, area**-0.5, oblique, float(share), count)
+            )
     return found
 
 

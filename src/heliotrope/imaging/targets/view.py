@@ -89,7 +89,7 @@ def _meet(a: Target, b: Target) -> bool:
 
 
 @dataclass(frozen=True)
-class View:
+class FaceView:
     """How a face lies in a frame.
 
     Attributes
@@ -196,7 +196,7 @@ def fit_view(
     covariance: FloatArray,
     lens: Camera,
     lens_known: bool,
-) -> View:
+) -> FaceView:
     """Return the view with the greatest posterior probability.
 
     Parameters
@@ -250,7 +250,7 @@ def fit_view(
     distortion[0] = float(k1)
     fitted = replace(lens, distortion=distortion)
     miss = distort(fitted, _apply(H, plane)) - pixels
-    return View(
+    return FaceView(
         face=face,
         lens=fitted,
         H_norm_plane=H,
