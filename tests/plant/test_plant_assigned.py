@@ -86,7 +86,7 @@ def test_the_old_file_stays_until_the_new_one_is_whole(
         ('{"version": 1, "AIM": 3}', "AIM: no points by name; remove the file"),
         (
             '{"version": 1, "AIM": {"A": [1.0, NaN, 0.0]}}',
-            r"AIM of A: \[1.0, nan, 0.0\] is no point",
+            r"AIM of A: \[1.0, nan, 0.0\] is not a point",
         ),
         ('{"version": 1, "AIM": {"A": [1.0]}}', r"AIM of A: \[1.0\] is not a point in ENU, m"),
     ],
@@ -119,7 +119,7 @@ def test_standby_points_where_beams_burn_an_eye_are_refused(tmp_path: Path) -> N
                 plant.standby(OPERATOR, token, dict.fromkeys(names, balcony))
             text = str(refused.value)
             assert text.startswith("STANDBY P1A (and 17 more): at rest its beam shines on the pl")
-            assert "times what burns an eye; choose another standby point" in text
+            assert "times the limit for eye burns; choose another standby point" in text
             assert np.isnan(plant.standbys).all()
             # One flat mirror is no more than a look at the sun; what rests there already counts.
             resting: list[str] = []

@@ -257,7 +257,7 @@ def test_who_is_not_at_standby_stays_where_it_is(tmp_path: Path) -> None:
             await whole.run(OPERATOR, token, NAME, "target")
         bench.clusters["pod-2"].age_ms[:] = 9000
         await bench.wait(5.0)
-        with pytest.raises(RefusedError, match=r"P2A: not heard for \d+ s; nothing can be done"):
+        with pytest.raises(RefusedError, match=r"P2A: not heard for \d+ s; it cannot be commanded"):
             await whole.run(ENGINEER, token, NAME, "target")
 
     bench = cycle(tmp_path, scene, state=states.STOWED)

@@ -103,7 +103,7 @@ def test_only_one_plant_writes(tmp_path: Path) -> None:
     with pytest.raises(AuditError, match="another process writes to it"):
         JsonLines(tmp_path / "a.jsonl", AT)
     audit.close()
-    with pytest.raises(AuditError, match=r"Is a directory; give a file to write"):
+    with pytest.raises(AuditError, match=r"Is a directory; give a writable file"):
         JsonLines(tmp_path, AT)
 
 
@@ -139,8 +139,8 @@ def test_a_full_disk_is_no_confirmation(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"who": "Egon"}, "'accepted' of record 1 does not fit"),
-        ({"event": "result", "result": "failed", "finished": "x"}, "'result' of record 1 does not"),
+        ({"who": "Egon"}, "'accepted' of record 1 contradicts"),
+        ({"event": "result", "result": "failed", "finished": "x"}, "of record 1 contradicts"),
         ({"event": "result", "identity": "9", "result": "x", "finished": "x"}, "of record 9"),
         ({"identity": "5", "colour": "blue"}, "line 3: no record: .*colour"),
     ],

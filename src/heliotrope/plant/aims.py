@@ -14,7 +14,7 @@ from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.tracking import Status, Tracking, track
 from heliotrope.optics import Hazard, Mirrors, beams, crossing, find_entries, glare_at, sweep
 
-#: Length over which a beam that nothing stops is followed, m.
+#: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
 
 
@@ -27,7 +27,7 @@ def spread(vertices: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     Parameters
     ----------
     vertices
-        Of the heliostats, ENU, m, (N, 3).
+        Vertices of the mirrors, ENU, m, (N, 3).
     points
         Aim points, ENU, m, (P, 3) or (3,).
 
@@ -55,7 +55,7 @@ def default_aims(
     Parameters
     ----------
     design
-        A heliostat without an aim of its own gets the centre of the first receiver.
+        The plant; a heliostat without an aim of its own gets the centre of the first receiver.
     names, vertices
         Heliostats and their places, ENU, m, (N, 3).
     points
@@ -80,14 +80,14 @@ def default_aims(
 
 
 class BeamCheck:
-    """Finds the beams that may not go where they are wanted, by mirrors and keep-out volumes.
+    """Check of beams, by their mirrors, against keep-out volumes and eyes.
 
     Parameters
     ----------
     design
         The plant, with calibrated mechanisms.
     names
-        Of the N heliostats, in the order of all arrays here.
+        The N heliostats, in the order of all arrays here.
     volumes
         Keep-out volumes; None: those of the design.
     eyes
@@ -133,7 +133,7 @@ class BeamCheck:
         counts: FloatArray | None = None,
     ) -> Tracking:
         """Return the poses for aims (K, 3) of heliostats (K,), those nearest to counts (K, 2)."""
-        # At night nothing moves; the pose for a sun overhead shows the beam's way as well.
+        # At night nothing moves; the pose for an overhead sun shows the beam's way just as well.
         source = sun if sun[2] > 0.0 else np.array([0.0, 0.0, 1.0])
         return track(
             Armature(self.armature.table[rows]),
@@ -157,17 +157,17 @@ class BeamCheck:
         Parameters
         ----------
         rows
-            Of the heliostats, (K,).
+            Rows of the heliostats, (K,).
         aims
             ENU, m, (K, 3).
         sun
             Unit vector, (3,).
         start
-            Points where their beams are now, (K, 3), NaN where at none: the sweep from there is
-            proven as well.
+            Points at which their beams are now, ENU, m, (K, 3), NaN without one. The sweep from
+            there is checked as well.
         stopped
-            A surface at the aim (receiver, target) stops the beam. A beam at a standby point goes
-            on beyond it.
+            Whether a surface at the aim (receiver, target) stops the beam. A beam at a standby
+            point goes on beyond it.
         """
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -201,7 +201,7 @@ class BeamCheck:
         rows, points
             Heliostats (K,) and their new standby points, ENU, m, (K, 3).
         standbys
-            Standby points of all heliostats before, (N, 3); NaN where there is none.
+            Present standby points of all heliostats, (N, 3); NaN where there is none.
         sun
             Unit vector, (3,).
         """
@@ -222,9 +222,9 @@ class BeamCheck:
             for row in np.intersect1d(known[lit], rows):
                 found.setdefault(
                     self.names[row],
-                    f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where a "
-                    f"look into the beams is {seen.burn[eye]:.2g} times what burns an eye; choose "
-                    "another standby point",
+                    f"at rest its beam shines on the place {_point(self.eyes[eye])} m, where the "
+                    f"light of all beams is {seen.burn[eye]:.2g} times the limit for eye burns; "
+                    "choose another standby point",
                 )
         return found
 
@@ -236,11 +236,11 @@ class BeamCheck:
         Parameters
         ----------
         rows
-            Of the heliostats, (K,).
+            Rows of the heliostats, (K,).
         counts
             Step counts of their axes, (K, 2).
         aims, sun
-            As of `problems`.
+            As in `problems`.
         """
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
@@ -264,7 +264,7 @@ class BeamCheck:
         Parameters
         ----------
         rows, aims, sun
-            As of `problems`.
+            As in `problems`.
         radius
             Angle by which the beams leave their aims, rad. Nothing stops them there.
         """
@@ -296,11 +296,11 @@ class BeamCheck:
         Parameters
         ----------
         rows
-            Of the heliostats, (K,).
+            Rows of the heliostats, (K,).
         path
             Angles that the axes pass, rad, (K, W, 2).
         sun
-            As of `problems`.
+            As in `problems`.
         """
         found: dict[str, str] = {}
         if len(rows) and self.volumes and sun[2] > 0.0:

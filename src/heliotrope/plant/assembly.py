@@ -1,4 +1,4 @@
-"""A plant put together from its design, its ports and its settings, and run.
+"""Assembly of a plant from its design, its ports and its settings.
 
 The same assembly runs a real plant and a simulated one: what differs is passed in as `Ports`.
 A cluster that does not answer or a camera that gives no frame raises an alarm; the plant goes on
@@ -35,30 +35,30 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.safety import alarms
 
-#: A calibration that removes what a quick installation leaves.
+#: A calibration that removes the errors of a quick installation.
 CYCLE = CycleSettings(shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"))
 #: Age from which a silent heliostat is not waited for at the end, s.
 SILENT = 10.0
 #: Period of reading the sensors, s.
 _SENSED = 0.5
-#: States that no order leads to stow from: people have to see to the heliostat.
+#: States from which no order leads to stow: people have to see to the heliostat.
 _STUCK = (states.FAULT, states.LOCKED, states.UNCONFIGURED)
 
 
 class MachineTables(Enum):
-    """What the local controllers hold of the machine tables of the plant file."""
+    """Whether the local controllers hold the machine tables of the plant file."""
 
-    #: Nobody knows; they keep what they hold, and the plant assumes nothing.
+    #: Unknown: they keep the tables that they hold, and the plant assumes nothing.
     UNKNOWN = "unknown"
     #: They hold them already, as simulated boards do.
     HELD = "held"
-    #: They are compared, and those that hold others are written.
+    #: The plant compares them, and writes those that differ.
     WRITTEN = "written"
 
 
 @dataclass(frozen=True)
 class AssemblySettings:
-    """How a plant is to work.
+    """Settings of a plant at work.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class AssemblySettings:
     cycle
         Calibration.
     machines
-        What local controllers hold of the plant file's machine tables.
+        Whether the local controllers hold the plant file's machine tables.
     """
 
     work: AutomaticSettings = field(default_factory=AutomaticSettings)
@@ -86,16 +86,16 @@ class PlantAssembly:
     design
         Site, heliostats with their clusters, receivers, targets, cameras.
     ports
-        What it is connected to.
+        Its connections.
     settings
-        How it is to work.
+        Its settings.
 
     Attributes
     ----------
     plant, operations, logbook
         See their classes.
     schedule
-        Says which heliostat is calibrated next; None: nothing is calibrated.
+        Schedule of calibration; None: nothing is calibrated.
 
     Raises
     ------
@@ -146,7 +146,7 @@ class PlantAssembly:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Heliostats, in the order of the plant's field."""
+        """The heliostats, in the order of the plant's field."""
         return self.plant.field.names
 
     def _seen(self, cameras: Cameras) -> list[str]:
@@ -164,7 +164,7 @@ class PlantAssembly:
         return _WhereAwake(self.schedule, cameras)
 
     def _rest_on_machines(self) -> None:
-        """Take the standby points of the plant file for all that were assigned none."""
+        """Take the standby points of the plant file for all heliostats that were assigned none."""
         for row, name in enumerate(self.names):
             rest_on(self.plant.standbys[row : row + 1], self.design.machine(name).standby)
 

@@ -1,9 +1,9 @@
-"""Aims and standby points of heliostats, assigned by people and kept over a restart of the plant.
+"""Aims and standby points of heliostats, assigned by people and kept across restarts of the plant.
 
 A plant that has forgotten where its beams are cannot prove where they may go. So points are on the
-disk before the commands that assign them are sent. `Assigned` is what the plant needs of a store.
-`AssignedFile` is one small file, written beside and renamed, so that the old one or the new one is
-always there.
+disk before the commands that assign them are sent. `Assigned` is the protocol of their store.
+`AssignedFile` is one small file, written under another name and renamed, so that the old or the new
+file is always there.
 """
 
 import json
@@ -38,7 +38,7 @@ class Assigned(Protocol):
         ...
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Store all points in place of those before; they are on the disk when this returns."""
+        """Replace the stored points; the new ones are on the disk when this returns."""
         ...
 
 
@@ -48,7 +48,7 @@ class AssignedFile:
     Parameters
     ----------
     path
-        Created at the first assignment.
+        The file, created at the first assignment.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -90,7 +90,7 @@ class AssignedFile:
         return {name: tuple(point) for name, point in rows.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Store all points in place of those before.
+        """Replace the stored points.
 
         Raises
         ------
@@ -122,9 +122,9 @@ class Points:
     Parameters
     ----------
     names
-        Of the heliostats.
+        Names of the heliostats.
     store
-        None: the points do not outlive the plant.
+        Store of the points; None: they do not outlive the plant.
 
     Attributes
     ----------

@@ -1,8 +1,8 @@
 """The audit: exactly one record of every accepted command, with who, what, when and the result.
 
 A record is begun before its command is sent; a command whose record cannot be begun is not
-accepted. DEFOCUS and STOW never wait: they are sent first, and writing their records is tried until
-it succeeds. `Audit` is what the plant needs of a store; `JsonLines` is one file.
+accepted. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they
+are written. `Audit` is the protocol of a store, and `JsonLines` a store in one file.
 
 The file holds two lines for each record, "accepted" and "result", both appended and synced to the
 disk. `read` puts them together. A line torn by a loss of power is skipped and counted; a record
@@ -49,11 +49,11 @@ class Record:
     heliostats
         Names; () for all.
     at
-        When it was accepted, UTC, ISO 8601.
+        Time of acceptance, UTC, ISO 8601.
     note
         Reason or details.
     result, finished
-        The result and when it was known; "" before.
+        The result and its time; "" before.
     """
 
     identity: str
@@ -84,7 +84,7 @@ class Audit(Protocol):
         ...
 
     def close(self) -> None:
-        """Close it."""
+        """Close the store."""
         ...
 
 
@@ -94,7 +94,7 @@ class JsonLines:
     Parameters
     ----------
     path
-        Created if it does not exist. One process at a time may have it.
+        Created if it does not exist. Only one process at a time may hold it.
     started
         UTC, written to records that are ended now because the plant had stopped.
 
@@ -125,7 +125,7 @@ class JsonLines:
             raise
         self._open = {record.identity for record in records if not record.result}
         self._known = {record.identity for record in records}
-        #: Count of lines torn by a loss of power. If the last one has no end, the next line must
+        #: Number of lines torn by a loss of power. If the last is unfinished, the next line must
         #: not continue it.
         self.torn = torn
         self._torn = not _ends_with_newline(self._file)
@@ -210,7 +210,7 @@ def _ends_with_newline(file: int) -> bool:
 
 
 def read(path: str | Path) -> tuple[list[Record], int]:
-    """Return the records of a file in the order of their beginning, and the count of torn lines.
+    """Return the records of a file in the order of acceptance, and the number of torn lines.
 
     Raises
     ------

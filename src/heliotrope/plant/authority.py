@@ -2,8 +2,9 @@
 
 One person at a time holds the command authority. With it comes a token of 32 bits, which the plant
 sends to its clusters with every lease, and they to their local controllers: a command with another
-token moves nothing. Each change of holder makes a new token, so that nothing an earlier holder left
-under way still takes effect. An authority that is not renewed expires; another person may break it.
+token moves nothing. Each change of holder makes a new token, so that no command of an earlier
+holder that is still under way takes effect. An authority that is not renewed expires; another
+person may break it.
 
 DEFOCUS and STOW need no authority, no role and no token.
 """
@@ -23,7 +24,7 @@ __all__ = ["OPERATOR_COMMANDS", "Authority", "Grant", "Person", "RefusedError", 
 
 
 class Role(IntEnum):
-    """What a person may do; a higher role may do all that a lower one may."""
+    """The role of a person; a higher role may do all that a lower one may."""
 
     VIEWER = 0
     OPERATOR = 1
@@ -36,11 +37,11 @@ class Role(IntEnum):
 
     @property
     def acknowledges_as(self) -> safety.Role:
-        """The role in the safety table, where an engineer acts as supervisor; not for a viewer."""
+        """The role in the safety table, where an engineer acts as supervisor; a viewer has none."""
         return {Role.OPERATOR: safety.Role.OPERATOR, Role.ENGINEER: safety.Role.SUPERVISOR}[self]
 
 
-#: Commands that an operator may give; all others of the wire need an engineer.
+#: Wire commands that an operator may give; all others need an engineer.
 OPERATOR_COMMANDS = frozenset(
     {
         "APPROACH",
@@ -64,7 +65,7 @@ class Person:
     Parameters
     ----------
     name
-        As the audit records it.
+        Name as the audit records it.
     role
         See `Role`.
 
@@ -82,12 +83,12 @@ class Person:
             raise InputError("person: the name is empty; the audit must record who commands")
 
     def must_be(self, needed: Role, what: str) -> None:
-        """Refuse ``what`` to a person whose role is too low.
+        """Refuse a command to a person whose role is too low; ``what`` names the command.
 
         Raises
         ------
         RefusedError
-            If it is.
+            If it is too low.
         """
         if self.role < needed:
             raise refusals.ROLE_TOO_LOW.error(
@@ -121,11 +122,11 @@ class Authority:
     Parameters
     ----------
     clock
-        Its monotonic time decides.
+        Clock of the plant.
     lifetime
-        How long it lasts without being renewed, s.
+        Life of the authority without renewal, s.
     entropy
-        Random bytes, for the tokens.
+        Source of random bytes for the tokens.
 
     Raises
     ------
@@ -158,7 +159,7 @@ class Authority:
 
     @property
     def token(self) -> int:
-        """The token that clusters accept commands with; 0 while nobody may command."""
+        """The token that clusters accept commands with; 0 while nobody holds the authority."""
         grant = self.grant
         return 0 if grant is None else grant.token
 
@@ -211,7 +212,7 @@ class Authority:
         Raises
         ------
         RefusedError
-            If the person does not have it, or no longer has it.
+            If the person does not have it, or has lost it.
         """
         grant = self._checked(person, token)
         self._last_kept = self._clock.monotonic()

@@ -1,4 +1,4 @@
-"""No beam enters a keep-out volume: commands are proven before they are sent, beams are watched."""
+"""Beams stay out of keep-out volumes: commands are proven before they are sent, beams watched."""
 
 from collections.abc import Callable, Sequence
 
@@ -29,7 +29,7 @@ _TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
 
 
 class BeamError(RefusedError):
-    """A command that would bring beams where none may be.
+    """The refusal of a command that would bring beams where none may be.
 
     Attributes
     ----------
@@ -47,22 +47,22 @@ class BeamError(RefusedError):
 
 
 class BeamWatch:
-    """Proves that a command brings no beam into a keep-out volume, and watches the beams.
+    """Proof that a command brings no beam into a keep-out volume, and watch over the beams.
 
-    The watch sees what a proof cannot: counts that are not true, parameters that changed, a local
-    controller that does something else. Heliostats that move are looked at each second, the
-    others in turn. The way from stow is the local controller's own.
+    The watch sees errors that a proof cannot: false counts, changed parameters, a local controller
+    that disobeys. Heliostats that move are looked at each second, the others in turn. The way from
+    stow is the local controller's own.
 
     Parameters
     ----------
     check
         Mirrors and keep-out volumes.
     field
-        Where the axes stand.
+        State of the field, with the positions of the axes.
     points
         Assigned aims and standby points.
     sun
-        Gives the unit vector to the sun now, (3,).
+        Returns the unit vector to the sun now, (3,).
 
     Attributes
     ----------
@@ -112,7 +112,7 @@ class BeamWatch:
         if not self._check.volumes or name not in ("JOG", "GOTO", "DIAGNOSE", "IDLE"):
             return heliostats, {}
         rows = np.array([self._field.place(n) for n in heliostats], dtype=np.intp)
-        # The local controller decides for a heliostat of which nothing is known here.
+        # A heliostat without known counts is left to its local controller.
         rows = rows[np.isfinite(self._field.counted_at[rows])]
         light = self._sun()
         wrong: dict[str, str] = {}

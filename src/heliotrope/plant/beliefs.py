@@ -1,7 +1,7 @@
-"""What the plant believes of its mirrors: the one owner of calibrations and of their sightings.
+"""The plant's beliefs about its mirrors: the one owner of calibrations and their sightings.
 
-A new `HeliostatCalibration` is taken here once; everybody who acts on it has subscribed: beam
-checks and wanted parameters (the controller), automatic control, schedule, store and pages. A
+A new `HeliostatCalibration` is taken here once and passed to all subscribers: the controller (beam
+checks and wanted parameters), automatic control, the schedule, the store and the pages. A
 calibration recalled from the store comes the same way.
 """
 
@@ -17,23 +17,23 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.chain import Mechanism
 
-#: Keeps sightings of a heliostat on a target; returns their numbers, (M,), 0 where not kept.
+#: Stores sightings of a heliostat on a target; returns their numbers, (M,), 0 where it failed.
 Numbering = Callable[[str, str, Sightings], Identities]
 Subscriber = Callable[[HeliostatCalibration], None]
 
 
 @dataclass(frozen=True)
 class Seen:
-    """The M sightings known of one heliostat, in the order of time.
+    """The M known sightings of one heliostat, in order of time.
 
     Attributes
     ----------
     sightings
         With heliostat row 0.
     identities
-        Numbers given by the store; 0 for a sighting that is not kept, (M,).
+        Numbers given by the store; 0 for a sighting that is not stored, (M,).
     targets
-        Names, M.
+        Name of the target of each, M.
     missed
         Beam error under the mechanism believed when it was taken, rad, (M,); NaN if recalled.
     """
@@ -64,13 +64,13 @@ class Beliefs:
         self._number: Numbering = _unkept
 
     def subscribe(self, subscriber: Subscriber, *, held: bool = True) -> None:
-        """Call back with each new calibration, and (``held``) at once with those believed now."""
+        """Call a function with each new calibration and, if ``held``, now with the current ones."""
         self._subscribers.append(subscriber)
         for record in self._records.values() if held else ():
             subscriber(record)
 
     def number_with(self, numbering: Numbering) -> None:
-        """Let a store keep and number the sightings that are noted."""
+        """Let a store keep and number new sightings."""
         self._number = numbering
 
     # -- looking -------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ class Beliefs:
     def present(self, heliostat: str) -> Mechanism:
         """Return the mechanism that is believed now, batch shape (1,).
 
-        Before the first calibration it is that of the plant file, with its parameters.
+        Before the first calibration it is the mechanism of the plant file, with its parameters.
         """
         record = self._records.get(heliostat)
         if record is not None:
@@ -127,7 +127,7 @@ class Beliefs:
         return self._seen[heliostat]
 
     def take(self, record: HeliostatCalibration) -> None:
-        """Believe a calibration from now on, and tell all subscribers."""
+        """Make a calibration the current one, and pass it to all subscribers."""
         self._records[record.heliostat] = record
         for subscriber in self._subscribers:
             subscriber(record)
@@ -139,7 +139,7 @@ class Beliefs:
         identities: Identities,
         targets: Sequence[str],
     ) -> None:
-        """Take up a calibration and its sightings as they were kept before a restart."""
+        """Restore a calibration and its sightings from before a restart."""
         if len(sightings):
             unknown = np.full(len(sightings), np.nan)
             self._seen[record.heliostat] = Seen(sightings, identities, tuple(targets), unknown)

@@ -33,7 +33,7 @@ from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.safety import Alarm, alarms
 
-#: Longest wait for a photograph, and the time between looks for its frame, s.
+#: Longest wait for a photograph, and the time between checks for its frame, s.
 PATIENCE, _LOOK = 15.0, 0.05
 #: Time until a source that failed is opened again, s.
 _AGAIN = 5.0
@@ -132,18 +132,18 @@ class _Eye:
 
 
 class RealCameras:
-    """All cameras of a plant, as the port `plant.ports.Cameras` asks for them.
+    """All cameras of a plant: the port `plant.ports.Cameras`.
 
     Parameters
     ----------
     design
-        The first camera that names a target serves it.
+        The plant; the first camera that names a target serves it.
     folder
         Folder of the plant file.
     clock
         Clock of the plant.
     memory
-        Folder in which models of empty targets are kept; None: they are learnt anew.
+        Folder in which models of empty targets are kept; None: they are learnt again at each start.
     patience
         Longest wait for a frame, s.
     sources
@@ -184,7 +184,7 @@ class RealCameras:
         self._settings = PhotographSettings(pictures=read_pictures(folder, design.targets))
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Begin to take frames; ``on_alarm`` hears of cameras that fall silent and come back."""
+        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or comes back."""
         self._on_alarm = on_alarm
         for feed in {id(eye.feed): eye.feed for eye in self._eyes.values()}.values():
             feed.start()
@@ -195,7 +195,7 @@ class RealCameras:
         Raises
         ------
         InputError
-            They cannot be written.
+            If they cannot be written.
         """
         self._stop.set()
         for eye in self._eyes.values():
@@ -225,7 +225,7 @@ class RealCameras:
         return target not in self.silent
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the beam that is seen on a target; the camera does not know whose it is.
+        """Return the beam seen on a target; the camera cannot tell which heliostat it belongs to.
 
         Raises
         ------
@@ -304,7 +304,7 @@ def _dated(frame: Frame, camera: Camera) -> datetime:
     """Return the earliest instant at which a frame may have been exposed."""
     if frame.time is None:
         raise InputError(
-            f"camera {camera.name}: {frame.name} says no time with a zone; let the camera write "
+            f"camera {camera.name}: {frame.name} has no time with a zone; let the camera write "
             "one, as its name (2026-06-21T10-00-00Z) or in EXIF"
         )
     unsure = _LATE if math.isnan(frame.time_deviation) else frame.time_deviation

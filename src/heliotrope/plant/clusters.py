@@ -107,7 +107,7 @@ class Clusters:
     links
         By name of the cluster.
     clock
-        Its monotonic time decides.
+        Clock of the plant.
     counters
         Count refused messages.
 
@@ -170,7 +170,7 @@ class Clusters:
     def ask(
         self, end: ClusterEnd, what: str, take: Callable[[Answer], None], heliostat: str = ""
     ) -> None:
-        """Ask a cluster something; ``take`` is called with its answer, if one comes."""
+        """Send a question to a cluster; ``take`` is called with its answer, if one comes."""
         now = self._clock.monotonic()
         self._awaited = {i: a for i, a in self._awaited.items() if now - a[0] < ANSWER_PATIENCE}
         identity = self.number(what)
@@ -178,12 +178,12 @@ class Clusters:
         end.post(Ask(identity, what, heliostat), QUESTION_LIFE)
 
     def take_answer(self, answer: Answer) -> None:
-        """Hand an answer to whoever asked.
+        """Hand an answer to the part that asked.
 
         Raises
         ------
         ProtocolError
-            If the answer makes no sense.
+            If the answer cannot be read.
         """
         _, take = self._awaited.pop(answer.identity, (math.nan, None))
         if take is not None:

@@ -1,7 +1,7 @@
-"""The plant: the central controller of a field of clusters.
+"""The plant controller: the central controller of a field of clusters.
 
-It knows the state of every heliostat and how old that knowledge is, holds the one command
-authority, accepts commands of people, sends them to the clusters and follows them to their end,
+It knows the state of every heliostat and the age of that knowledge, holds the one command
+authority, accepts people's commands, sends them to the clusters and follows them to their end,
 renews each cluster's lease every second, watches the safety table, and proves an emergency.
 
 A command is accepted or refused at once (`RefusedError`, with the reason). An accepted command has
@@ -80,11 +80,11 @@ class PlantController:
     design
         Site, heliostats, receivers, targets.
     links
-        By name of the cluster; run by the owner, as by a `TcpServer`.
+        Links by name of the cluster; the owner runs them, for example by a `TcpServer`.
     clock
-        Its monotonic time decides everything.
+        Clock of the plant; everything is timed by its monotonic time.
     audit
-        Of accepted commands.
+        Audit of accepted commands.
     clusters
         Names of the heliostats of each cluster; None: the design's.
     settings
@@ -98,7 +98,7 @@ class PlantController:
     table
         Rows of the safety table; None: the defaults at the autonomy of the settings.
     entropy
-        Random bytes, for tokens and identities.
+        Source of random bytes for tokens and identities.
     on_alarm
         Called with each alarm.
 
@@ -109,7 +109,7 @@ class PlantController:
     beams
         Mirrors and keep-out volumes; see `BeamCheck`.
     alarms
-        The last ones, oldest first.
+        The last alarms, oldest first.
     aims, standbys
         Assigned points, ENU, m, (N, 3); NaN where there is none.
 
@@ -173,7 +173,7 @@ class PlantController:
         self._closing = asyncio.Event()
 
     def _guarded(self, rows: Iterable[Condition]) -> Sentinel:
-        """Return what watches the safety table and obeys it."""
+        """Return the sentinel, with the plant's own readings of the safety table."""
         readings = PlantReadings(
             self.field, self.authority, self._orders, self._ways, self.sun_vector
         )
@@ -215,7 +215,7 @@ class PlantController:
         return Lease(self.authority.token, self.settings.lease, self.settings.autonomy)
 
     def _greet(self, end: ClusterEnd) -> None:
-        """Begin with a cluster that has connected."""
+        """Repeat orders to a cluster that has connected, and compare its parameters."""
         self._sentinel.greet(end.name)
         for name in end.members:
             self._sync.compare(name)
@@ -277,7 +277,7 @@ class PlantController:
         if self._on_alarm is not None:
             self._on_alarm(alarm)
 
-    # -- what it knows ---------------------------------------------------------------------
+    # -- state -----------------------------------------------------------------------------
 
     def now(self) -> float:
         """Return the monotonic time, s."""
@@ -304,7 +304,7 @@ class PlantController:
 
     @property
     def waiting(self) -> int:
-        """Count of heliostats that wait to join the receiver."""
+        """Number of heliostats that wait to join the receiver."""
         return len(self._joining)
 
     @property
@@ -327,7 +327,7 @@ class PlantController:
         if self._sentinel.order is not None:
             self._sentinel.order.take_flux(share, self.now())
 
-    # -- anybody ---------------------------------------------------------------------------
+    # -- open to anybody -------------------------------------------------------------------
 
     def defocus(self, who: str, heliostats: Sequence[str] = ()) -> Ticket:
         """Take the beams of some heliostats, or of all, off the receiver now; anybody may."""
@@ -457,7 +457,7 @@ class PlantController:
         Parameters
         ----------
         person, token
-            The giver, with the token of the command authority.
+            The person commanding, and the token of the command authority.
         name, values
             As in `lcu.messages`; for AIM and STANDBY see `aim` and `standby`.
         heliostats
@@ -499,7 +499,7 @@ class PlantController:
         Parameters
         ----------
         person, token
-            The giver, with the token of the command authority.
+            The person commanding, and the token of the command authority.
         heliostat
             Name.
         counts
@@ -536,7 +536,7 @@ class PlantController:
         Parameters
         ----------
         person, token
-            The giver, with the token of the command authority.
+            The person commanding, and the token of the command authority.
         points
             ENU, m, (3,), by name.
 
@@ -554,7 +554,7 @@ class PlantController:
     def parameters(
         self, person: Person, token: int, heliostat: str, items: Mapping[str, bytes]
     ) -> Ticket:
-        """Push items of the journal (see `board_items`) to one heliostat, and want them from now.
+        """Push items of the journal (see `board_items`) to one heliostat, and keep them wanted.
 
         Raises
         ------
@@ -572,7 +572,7 @@ class PlantController:
         return ticket
 
     def _believe(self, record: HeliostatCalibration) -> None:
-        """Check beams by a new calibration, and want it of the local controller."""
+        """Use a new calibration in the beam checks and in the wanted parameters."""
         mechanism = self.beliefs.present(record.heliostat)[0]
         row = self.field.place(record.heliostat)
         self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)

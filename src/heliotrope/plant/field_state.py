@@ -34,13 +34,13 @@ class HeliostatState:
     name, cluster
         Names.
     age
-        Of everything below, s; infinite if it was never heard.
+        Age of the values below, s; infinite if never heard.
     live
-        The age is below the limit. If not, ``state`` is "" and the rest means nothing.
+        Whether the age is below the limit. If not, ``state`` is "" and the rest means nothing.
     state, fault, flags
         In words.
     counts, goals
-        Steps of the two axes, and where they are going, (2,).
+        Steps of the two axes, and their goals, (2,).
     """
 
     name: str
@@ -84,9 +84,9 @@ class FieldState:
     rows
         Last known rows of dtype `NODE`, (N,); use `values`, which masks stale rows.
     heard
-        When each row was true, monotonic s, (N,); minus infinity if never heard.
+        Time at which each row was true, monotonic s, (N,); minus infinity if never heard.
     counted_at
-        When its step counts and goals were true.
+        The same of its step counts and goals.
 
     Raises
     ------
@@ -158,7 +158,7 @@ class FieldState:
         return np.array([r if r >= 0 and self.cluster[r] == c else -1 for r in rows], np.intp)
 
     def _note_failures(self, mine: npt.NDArray[np.intp], new: npt.NDArray[Any], at: float) -> None:
-        """Note heliostats that failed: in FAULT, or silent while their cluster reports."""
+        """Note failed heliostats: in FAULT, or silent while their cluster reports."""
         known = np.isfinite(self.heard[mine])
         before = self.rows["state"][mine] == states.FAULT
         faulty = known & ~before & (new["state"] == states.FAULT)

@@ -1,4 +1,4 @@
-"""Heliostats that wait to join the receiver: at a bounded rate, and none after waiting too long."""
+"""The queue of heliostats that join the receiver, at a bounded rate and after a bounded wait."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from heliotrope.safety import JoinLimiter
 
 @dataclass
 class Job:
-    """The part of a command that brings heliostats to the receiver.
+    """A command that brings heliostats to the receiver, and those of them that still wait.
 
     Attributes
     ----------
@@ -21,7 +21,7 @@ class Job:
     waiting
         Heliostats still to be sent.
     until
-        When they are given up, monotonic s.
+        Time at which they are given up, monotonic s.
     """
 
     ticket: Ticket
@@ -33,7 +33,7 @@ class Job:
 
 
 class JoinQueue:
-    """First come, first served, as fast as a `JoinLimiter` admits."""
+    """The waiting heliostats: first come, first served, as fast as a `JoinLimiter` admits."""
 
     def __init__(self, rate: float, burst: int) -> None:
         self._limiter = JoinLimiter(rate, burst)
@@ -66,7 +66,7 @@ class JoinQueue:
         return admitted
 
     def drop(self, text: str, heliostats: frozenset[str] | None = None, name: str = "") -> None:
-        """Give up all waiting heliostats, or some, or those of one command, because of ``text``."""
+        """Give up waiting heliostats: all, some, or those of one command; ``text`` says why."""
         for job in self._jobs:
             if name in ("", job.name):
                 self._fail(job, text, heliostats)
@@ -81,10 +81,10 @@ class JoinQueue:
 
 
 class Joiner:
-    """Sends heliostats whose turn has come, if the way of their beams is clear now.
+    """The sending of heliostats whose turn has come, if the way of their beams is clear now.
 
-    The sun has moved since the aim was accepted, and the heliostat may point anywhere: what is
-    proven here is the sweep from where it points to its aim, at the moment it begins.
+    The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep
+    from its present direction to its aim is proven at the moment it begins.
 
     Parameters
     ----------

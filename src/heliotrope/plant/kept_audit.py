@@ -3,7 +3,7 @@
 `KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both on a `store.Keeper`. A
 command's record is committed and synced before the command is sent. The commit stops the event loop
 for some milliseconds, at most for `PATIENCE` or `POINTS_PATIENCE`, which is within every lease.
-`KeptAudit.confirm` does not wait: it goes by what the store did last.
+`KeptAudit.confirm` does not wait: it relies on the store's last answer.
 """
 
 import math
@@ -25,8 +25,8 @@ from heliotrope.store.records import AuditEntry, StoreError
 
 T = TypeVar("T")
 
-#: Longest wait for a commit, s: of a record, and of points. Those of a whole field (10,000 points)
-#: take 0.1 s.
+#: Longest wait for the commit of a record, and of points, s. Those of a whole field (10,000
+#: points) take 0.1 s.
 PATIENCE = 1.0
 POINTS_PATIENCE = 2.0
 #: A store that has confirmed nothing for this time cannot be relied on, s.
@@ -43,15 +43,15 @@ class KeptAudit:
     keeper
         Open; it stays open when the audit is closed.
     clock
-        The machine's: its monotonic time decides how long the store may be silent. (The clock of
-        a simulated plant may run faster than the disk.)
+        The machine's clock: its monotonic time bounds the silence of the store. (The clock of a
+        simulated plant may run faster than the disk.)
     started
         UTC, written to records that are ended now because the plant had stopped.
 
     Attributes
     ----------
     ended
-        Count of those records.
+        Number of those records.
 
     Raises
     ------
@@ -160,7 +160,7 @@ class KeptPoints:
         return {kind: dict(places) for kind, places in self._kept.items()}
 
     def keep(self, points: Mapping[str, Places]) -> None:
-        """Store all points in place of those before; they are on the disk when this returns.
+        """Replace the stored points; the new ones are on the disk when this returns.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class KeptPoints:
 
 
 def _room(keeper: Keeper) -> str:
-    """Return why the disk has no room, "" if it has."""
+    """Return why the disk has no room, "" if it has room."""
     file = keeper.database.file
     if file is None:
         return ""

@@ -2,8 +2,8 @@
 
 A cluster is reached in one of three ways: it connects to this plant over TCP, it meets the plant
 at an MQTT broker, or its bus is at this machine and its cluster file is given. In the last case
-whoever builds the plant runs the cluster's program in this process (`cluster.program`) and adds its
-link. Keys stand in a file of their own that nobody else may read.
+the program that builds the plant also runs the cluster's program in this process
+(`cluster.program`) and adds its link. Keys stand in a file of their own that nobody else may read.
 """
 
 import ssl
@@ -74,7 +74,7 @@ TABLES: tuple[type[Table], ...] = (LinksDocument, TcpTable, MqttTable)
 
 @dataclass(frozen=True)
 class LinksFile:
-    """A links file as read.
+    """A links file after reading.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class LinksFile:
     password: str = field(repr=False)
 
     def check(self, homes: Mapping[str, tuple[str, ...]]) -> None:
-        """Check that it names every cluster of a plant and no other.
+        """Check that the file names every cluster of a plant and no other.
 
         Parameters
         ----------
@@ -123,7 +123,7 @@ class LinksFile:
                 )
 
     def build(self, homes: Mapping[str, tuple[str, ...]], clock: Clock) -> "PlantLinks":
-        """Return the plant's ends of the links, with all that has to run beside them.
+        """Return the plant's ends of the links, and everything that has to run beside them.
 
         Raises
         ------
@@ -182,7 +182,7 @@ class PlantLinks:
     links
         Links over TCP and MQTT, by cluster.
     parts
-        What has to run beside the plant.
+        Tasks to run beside the plant.
     local
         Cluster files of clusters whose bus is at this machine, by cluster; they have no link yet.
     server
@@ -209,7 +209,7 @@ def read_links(path: str | Path) -> LinksFile:
     Raises
     ------
     FormatError
-        Something cannot be used; the text names file, place, value and limit.
+        If it cannot be used; the text names file, place, value and limit.
     """
     path = Path(path)
     document = read_document(path, "links", LinksDocument, TABLES)

@@ -34,27 +34,27 @@ class _Under:
 
 
 class PlantOrders:
-    """Accepts commands: writes their records, sends their messages, follows their tickets.
+    """Accepted commands: their records, their messages and their tickets.
 
     Parameters
     ----------
     clock
-        Of the plant.
+        Clock of the plant.
     audit
-        Where records are kept.
+        Store of the records.
     clusters
         Their links carry the messages.
     prefix
-        Of identities; no two runs of a plant may have the same one.
+        Prefix of identities; no two runs of a plant may have the same one.
     lifetime, patience
         Time allowed until a command is acknowledged, and from then until it is done, s.
 
     Attributes
     ----------
     confirmed_at
-        When the audit last confirmed that it can write, monotonic s.
+        Last time that the audit confirmed that it can write, monotonic s.
     problem
-        Why it cannot, "" if it can.
+        Why it cannot write, "" if it can.
     """
 
     def __init__(
@@ -105,12 +105,12 @@ class PlantOrders:
         values, heliostats, note
             For the record and the ticket.
         late
-            The record may be written later: DEFOCUS and STOW wait for nothing.
+            Whether the record may be written later: DEFOCUS and STOW wait for nothing.
 
         Raises
         ------
         AuditError
-            If the record could not be written, unless it may be ``late``.
+            If the record could not be written and may not be ``late``.
         """
         self._number += 1
         who, role, what = record
@@ -127,7 +127,7 @@ class PlantOrders:
         return ticket
 
     def note(self, who: str, role: str, what: str, note: str) -> None:
-        """Record something that is done at once, such as a change of the command authority."""
+        """Record an action that is complete at once, such as a change of the command authority."""
         ticket = self.accept((who, role, what), (), (), note, late=True)
         del self._open[ticket.identity]
         self._owe_result(ticket.identity, "done")
@@ -154,7 +154,7 @@ class PlantOrders:
         token: int,
         lifetime: float | None = None,
     ) -> None:
-        """Send a command to some heliostats of a ticket; ``lifetime`` in s replaces the usual."""
+        """Send a command to some heliostats of a ticket; ``lifetime``, s, replaces the usual."""
         life = self._lifetime if lifetime is None else lifetime
         for end, part in self._clusters.parts(heliostats):
             identity = self._begin(ticket, end, part)
@@ -223,7 +223,7 @@ class PlantOrders:
 
         return told
 
-    # What comes back.
+    # Reports of clusters.
 
     def take(self, cluster: str, progress: Progress) -> tuple[Ticket, tuple[str, ...]] | None:
         """Take a cluster's report; return its ticket and heliostats, None if neither is known."""
@@ -238,7 +238,7 @@ class PlantOrders:
         return under.ticket, part
 
     def beat(self, now: float) -> None:
-        """End what was not answered in time; record the results of tickets that have ended."""
+        """End commands that were not answered in time; record the results of ended tickets."""
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)

@@ -1,4 +1,4 @@
-"""Parameters of local controllers, kept as they are wanted: compared at connection, then pushed."""
+"""Parameters of local controllers: compared with the wanted ones at connection, then pushed."""
 
 import asyncio
 import math
@@ -30,7 +30,7 @@ AGAIN = 30.0
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
-    """Return the items in an answer to ``stored``; none if the cluster could not tell them.
+    """Return the items in an answer to ``stored``; none if the cluster could not read them.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def stored_items(answer: Answer) -> dict[str, bytes]:
 
 
 class ParameterSync:
-    """Compares what local controllers store with what is wanted, and pushes what differs.
+    """Comparison of the stored parameters with the wanted ones, and the push of those that differ.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class ParameterSync:
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
         self._clusters, self._tell = clusters, tell
-        #: Heliostats to be compared, and when, monotonic s.
+        #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         self._tickets: dict[str, Ticket] = {}
         self._tried: dict[str, float] = {}
@@ -107,15 +107,15 @@ class ParameterSync:
                 answer = await future
         except TimeoutError:
             late = f"nothing within {timeout:g} s; check that it is live"
-            raise refusals.NOT_TOLD.error(heliostat=heliostat, problem=late) from None
+            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=late) from None
         items = stored_items(answer)
         if not items:
             problem = answer.data.get("error", "nothing is stored")
-            raise refusals.NOT_TOLD.error(heliostat=heliostat, problem=problem)
+            raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=problem)
         return checksums(items)
 
     def beat(self, now: float, token: int, allowed: bool) -> None:
-        """Ask and push what is due; nothing is pushed unless ``allowed``."""
+        """Ask for and push what is due; nothing is pushed unless ``allowed``."""
         for name, ticket in list(self._tickets.items()):
             if ticket.finished:
                 del self._tickets[name]

@@ -27,7 +27,7 @@ class Cameras(Protocol):
     """The cameras of a plant's targets."""
 
     def start(self, on_alarm: Callable[[Alarm], None]) -> None:
-        """Begin to take frames; ``on_alarm`` hears of cameras that fall silent and come back."""
+        """Begin to take frames; ``on_alarm`` is called when a camera falls silent or comes back."""
         ...
 
     def close(self) -> None:
@@ -53,7 +53,7 @@ class Cameras(Protocol):
         ...
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what is seen now of a heliostat's beam on the target."""
+        """Return what a new photograph shows of a heliostat's beam on the target."""
         ...
 
     def view(self, target: str) -> CameraView:
@@ -70,13 +70,13 @@ class Sensors(Protocol):
         ...
 
     def read(self) -> Readings:
-        """Return what has changed since the last call; it may block, and runs in a thread."""
+        """Return the changes since the last call; it may block, and runs in a thread."""
         ...
 
 
 @dataclass(frozen=True)
 class Ports:
-    """What a plant is connected to.
+    """The connections of a plant.
 
     Attributes
     ----------
@@ -85,23 +85,23 @@ class Ports:
     clock
         Clock of the plant.
     audit
-        Where commands are recorded before they are sent.
+        Records of commands, written before the commands are sent.
     cameras
         None: nothing is calibrated.
     sensors
         None: no reading comes from outside.
     records
-        Where sightings, events and holds outlast the program; None: nowhere.
+        Store of sightings, events and holds; None: they end with the program.
     assigned
-        Where assigned aims and standby points outlast the program; None: nowhere.
+        Store of assigned aims and standby points; None: they end with the program.
     beside
-        Makes what runs beside the plant and begins before it: links, clusters of this machine, a
-        simulated field.
+        Makes the programs that begin before the plant and run beside it: links, clusters of this
+        machine, a simulated field.
     truth
-        Gives the true tracking error of each heliostat, rad, (N,), in the order of the plant's
-        field; None where nobody knows it, as in every real plant.
+        Returns the true tracking error of each heliostat, rad, (N,), in the order of the plant's
+        field; None where it is unknown, as in every real plant.
     facts
-        Gives what the summary shows besides, by name.
+        Returns further rows of the summary, by name.
     """
 
     links: Mapping[str, Link]

@@ -27,9 +27,9 @@ class Refusal:
     name
         Unique.
     meaning
-        When a command is refused so.
+        Circumstances in which a command is refused.
     text
-        What people read, with fields to be filled in.
+        Text for people, with fields to be filled in.
     remedy
         What to do: a sentence.
     """
@@ -77,7 +77,7 @@ HOLDER_OUTRANKS = Refusal(
 )
 REASON_MISSING = Refusal(
     "reason missing",
-    "Something that the audit must explain is done without a reason.",
+    "A command that needs a reason in the audit is given without one.",
     "{what}: a reason is needed; give one",
     "Give a reason.",
 )
@@ -95,7 +95,7 @@ NOT_RECORDED = Refusal(
 )
 BEAM_REFUSED = Refusal(
     "beam",
-    "A beam would enter a keep-out volume, burn an eye, or cannot reach the point.",
+    "A beam would enter a keep-out volume or burn an eye, or it cannot reach the point.",
     "{what} {heliostat}{more}: {reason}",
     "Choose another point, or leave out the heliostat that the text names.",
 )
@@ -107,14 +107,14 @@ NOT_ACKNOWLEDGED = Refusal(
 )
 ONE_HELIOSTAT = Refusal(
     "one heliostat",
-    "A command that can only be right for one heliostat is given to several.",
-    "{what}: {count} heliostats; what is true of one is not true of another, give one heliostat",
+    "A command whose values are true of one heliostat only is given to several.",
+    "{what}: {count} heliostats; step counts differ from one to the next, give one heliostat",
     "Repeat the command for each heliostat.",
 )
-NOT_TOLD = Refusal(
+NO_ANSWER = Refusal(
     "no answer",
-    "A local controller does not tell what it stores.",
-    "{heliostat}: no answer to what it stores: {problem}",
+    "A local controller does not report its stored parameters.",
+    "{heliostat}: its stored parameters cannot be read: {problem}",
     "Check that the heliostat is live, and ask again.",
 )
 

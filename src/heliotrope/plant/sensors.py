@@ -1,8 +1,8 @@
 """Readings of the safety table from files, written by whatever program reads the sensors.
 
-A file holds one number in the unit of its row, and is written anew with each reading (beside, then
-renamed). A file that is not written anew gives no new reading: after some seconds its row counts as
-in the worst case, as if the sensor were gone. See `safety.conditions`.
+A file holds one number in the unit of its row, and is replaced with each reading (written under
+another name, then renamed). A file that is not replaced gives no new reading: after some seconds
+its row counts the worst case, as if the sensor were gone. See `safety.conditions`.
 """
 
 import math
@@ -13,7 +13,7 @@ from pathlib import Path
 from heliotrope.plant.emergency import OWN_READINGS
 from heliotrope.safety import CONDITIONS, Watcher, watched_by
 
-#: Readings that have to come from outside.
+#: Readings that must come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS
 #: Longest text of a number, bytes.
 _LONGEST = 64
@@ -28,7 +28,7 @@ class Readings:
     values
         New values, by reading.
     problems
-        Why a reading cannot be read, by reading; "" where it can be read again.
+        Why a reading cannot be read, by reading; "" once it can be read again.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class SensorFiles:
         self._problems: dict[str, str] = {}
 
     def read(self) -> Readings:
-        """Look at all files; return what is new."""
+        """Read all files; return the changes."""
         found = Readings()
         for name, path in self._files.items():
             problem = ""
@@ -71,7 +71,7 @@ class SensorFiles:
                         found.values[name] = value
                     self._written[name] = written
                 else:
-                    problem = f"{path}: {value} is no reading; write one finite number"
+                    problem = f"{path}: {value} is not a reading; write one finite number"
             except OSError as error:
                 problem = f"{path}: cannot be read ({error.strerror})"
             except ValueError:

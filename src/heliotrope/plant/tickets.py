@@ -28,7 +28,7 @@ class Ticket:
     Attributes
     ----------
     identity
-        Of its record in the audit.
+        Identity of its record in the audit.
     name, heliostats
         The command and its heliostats.
     refusals
@@ -49,7 +49,7 @@ class Ticket:
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
         self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)
-        #: When each heliostat is given up at its present stage, monotonic s.
+        #: Time at which each heliostat is given up at its present stage, monotonic s.
         self._until = np.full(len(self.heliostats), math.inf)
         self._patience = patience
         self._news = asyncio.Event()
@@ -75,7 +75,7 @@ class Ticket:
             self._news.set()
 
     def block(self, refusals: Mapping[str, str]) -> None:
-        """End it for heliostats whose beams may not go there."""
+        """End the ticket for heliostats whose beams may not go there."""
         self.blocked.update(refusals)
         for name, text in refusals.items():
             self.advance((name,), Stage.FAILED, text)
@@ -86,7 +86,7 @@ class Ticket:
         self._until[np.array(rows, dtype=np.intp)] = until
 
     def expire(self, now: float) -> None:
-        """End it for heliostats that have not answered in time."""
+        """End the ticket for heliostats that have not answered in time."""
         late = np.flatnonzero((self._stage < FINAL) & (now >= self._until))
         for i in late:
             acknowledged = self._stage[i] == RANK[Stage.ACKNOWLEDGED]
@@ -104,7 +104,7 @@ class Ticket:
 
     @property
     def finished(self) -> bool:
-        """Whether it has ended for every heliostat."""
+        """Whether the command has ended for every heliostat."""
         return bool((self._stage >= FINAL).all())
 
     @property

@@ -40,7 +40,7 @@ class EmergencyOrder:
     at
         Monotonic s.
     ticket
-        Its stages, heliostat by heliostat.
+        Ticket with the stage of each heliostat.
     """
 
     def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
@@ -52,7 +52,7 @@ class EmergencyOrder:
 
     @property
     def proof(self) -> Proof:
-        """Its proof so far."""
+        """The proof so far."""
         if self._told or self._ready:
             self._proof = self._proof.with_news(acknowledged=self._told, done=self._ready)
             self._told, self._ready = {}, {}
@@ -79,7 +79,7 @@ class EmergencyOrder:
         return self.proof.report(now)
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
-        """Return those of some heliostats that have not acknowledged the order."""
+        """Return which of some heliostats have not acknowledged the order."""
         return tuple(name for name in heliostats if not self.is_acknowledged(name))
 
     def take_stage(self, heliostats: tuple[str, ...], stage: Stage, now: float) -> None:

@@ -1,8 +1,8 @@
-"""What the plant does by itself to keep the field safe: watch, order, repeat, prove.
+"""The plant's own safety actions: watch the table, order, repeat, prove.
 
 An emergency of the whole field begins when the table demands DEFOCUS or STOW of the field, or when
-a person calls it. It ends when nothing demands it any more: the causes have gone and are
-acknowledged, and a person's call is withdrawn.
+a person orders it. It ends when nothing demands it any more: the causes have gone and are
+acknowledged, and a person's order is withdrawn.
 """
 
 import math
@@ -24,17 +24,17 @@ from heliotrope.safety import Act, Alarm
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
-#: The plant itself, as a record names it: who, in which role.
+#: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
 
 class Sentinel:
-    """Obeys the safety table and carries emergencies through to their proof.
+    """Obedience to the safety table, and every emergency up to its proof.
 
     Parameters
     ----------
     clock
-        Its monotonic time decides.
+        Clock of the plant.
     table
         The plant's rows of the safety table.
     field, orders, joining, authority
@@ -119,7 +119,8 @@ class Sentinel:
     def _obey_heliostats(self, now: float) -> None:
         """Hold heliostats where they are; without a command authority, defocus them instead.
 
-        A heliostat that is on its way off, which its state may not show yet, is not stopped.
+        A heliostat that has been sent off the receiver is not stopped, even if its state does not
+        show the order yet.
         """
         token = self._authority.token
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
@@ -167,7 +168,7 @@ class Sentinel:
         return ticket
 
     def greet(self, cluster: str) -> None:
-        """Tell a cluster that has connected what was ordered while it was away."""
+        """Send a cluster that has connected the order that it missed."""
         self._acts.pop(cluster, None)
         self._repeat_order([cluster])
 
@@ -188,12 +189,12 @@ class Sentinel:
     def take_progress(
         self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress
     ) -> None:
-        """Take a cluster's report on a ticket, if it is that of the order."""
+        """Take a cluster's report on a ticket, if it is the order's ticket."""
         if self.order is not None and ticket is self.order.ticket:
             self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
-        """Take what a cluster's new status shows of the order."""
+        """Update the proof of the order from a cluster's new status."""
         order = self.order
         if order is None or not self.on:
             return

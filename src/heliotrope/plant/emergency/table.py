@@ -42,7 +42,7 @@ OWN_READINGS = frozenset(
         "node_fault_share",
     }
 )
-#: Rows that follow from an emergency; alone they keep none going.
+#: Rows that follow from an emergency; by themselves they keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
 #: Pause between two computations of the sun's elevation, s.
 SUN_PERIOD = 5.0
@@ -56,12 +56,12 @@ class PlantReadings:
     field, authority, orders, beams
         Of the plant.
     sun
-        Gives the unit vector to the sun now, (3,).
+        Returns the unit vector to the sun now, (3,).
 
     Attributes
     ----------
     names
-        Of the readings.
+        Names of the readings.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class PlantReadings:
         Parameters
         ----------
         proof
-            Of the emergency order that holds, None if there is none.
+            Proof of the emergency order in force; None if there is none.
         called
             Whether a person has ordered an emergency and not withdrawn it.
         now
@@ -111,16 +111,16 @@ class PlantReadings:
 
 
 class TableWatch:
-    """Evaluates the rows of the safety table that the plant watches.
+    """Evaluation of the rows of the safety table that the plant watches.
 
     Parameters
     ----------
     rows
-        The table as `safety.conditions` gives it and the plant adjusted it.
+        The table of `safety.conditions`, with the plant's adjustments.
     readings
-        Those that the plant makes itself.
+        Readings that the plant makes itself.
     clusters
-        Names.
+        Names of the clusters.
     sensors
         Names of the readings that come from sensors, by `put`.
     now
@@ -131,10 +131,10 @@ class TableWatch:
     rows
         Names of the rows that are evaluated.
     unwatched
-        Names of the rows without a reading: they are not evaluated, and whoever runs the plant
-        must know them.
+        Names of the rows without a reading: they are not evaluated, and the operator must know
+        them.
     actions
-        Of the last evaluation, the strongest first.
+        Actions of the last evaluation, the strongest first.
 
     Raises
     ------
@@ -228,14 +228,14 @@ class TableWatch:
         }
 
     def caused(self) -> bool:
-        """Whether more than the consequences of an emergency demands one for the field."""
+        """Whether a row other than the consequences of an emergency demands one for the field."""
         return any(
             a.scope is Scope.FIELD and a.act >= Act.DEFOCUS and a.condition not in CONSEQUENCES
             for a in self.actions
         )
 
     def reasons(self, least: Act, cluster: str = "") -> str:
-        """Return what demands at least an act of the field or a cluster, in words; "" if none."""
+        """Return, in words, which rows demand at least an act of the field or a cluster."""
         texts = [
             a.text
             for a in self.actions

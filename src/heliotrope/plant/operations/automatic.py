@@ -1,8 +1,8 @@
 """Automatic control: the field raised, calibrated target by target, and stowed before the night.
 
-It commands as a person of its own. It takes the command authority while nobody else has it, and
-gives way at once. It moves only heliostats that are *wanted*: what a person stows, defocuses or
-locks is not, nor is anything after an emergency, until a person gives it back.
+It commands under a name of its own. It takes the command authority while nobody else has it, and
+gives way at once. It moves only *wanted* heliostats. A heliostat that a person stows, defocuses or
+locks is not wanted until a person gives it back; after an emergency, none is.
 """
 
 import asyncio
@@ -29,15 +29,15 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
 
-#: The person in whose name it commands.
+#: The person under whose name it commands.
 AUTOMATIC = Person("automatic control", Role.ENGINEER)
 _UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING, states.DEFOCUSED)
 _READY = (states.IDLE, states.TRACKING)
-#: The sun is looked at this often, s.
+#: Time between checks of the sun's elevation, s.
 _SUN_EVERY = 30.0
-#: After a person has given the command authority back, this long passes before it is taken, s.
+#: Wait after a person has given the command authority back, before it is taken, s.
 _COURTESY = 5.0
-#: The errors of the field are predicted this often, s.
+#: Time between predictions of the field's errors, s.
 _LOOK_EVERY = 10.0
 
 
@@ -60,7 +60,7 @@ class AutomaticSettings:
     patience
         Time before the same command is given again, s.
     margin
-        Standard deviations by which beams never calibrated must miss the targets.
+        Standard deviations by which an uncalibrated beam must miss the targets.
     events
         Age at which events, and alarms that are over and acknowledged, are removed, days.
     """
@@ -92,9 +92,9 @@ class AutomaticControl:
     Attributes
     ----------
     book
-        How well each heliostat is calibrated.
+        Book of calibrations.
     truth
-        Errors that a twin knows.
+        True errors, known to a twin only.
     holds
         Heliostats that people keep out of calibration, by name.
     installed
@@ -138,7 +138,7 @@ class AutomaticControl:
         if cycle is not None:
             self._keeping.recall()
 
-    # -- what people say -------------------------------------------------------------------
+    # -- people's requests -----------------------------------------------------------------
 
     @property
     def model(self) -> tuple[str, ...]:
@@ -174,7 +174,7 @@ class AutomaticControl:
         self._stopped = True
 
     async def halt(self, limit: float = 5.0) -> None:
-        """Give everything up, and wait for visits under way to end, ``limit`` s at most."""
+        """Give up all work, and wait for visits under way to end, ``limit`` s at most."""
         self._raising.wanted[:] = self._on = False
         self.give_way()
         until = self._plant.now() + limit
@@ -187,7 +187,7 @@ class AutomaticControl:
         if self._has_authority():
             self._plant.release_authority(AUTOMATIC, self._token)
 
-    # -- what is shown ---------------------------------------------------------------------
+    # -- views -----------------------------------------------------------------------------
 
     def held_rows(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats are held, (N,)."""
@@ -228,7 +228,7 @@ class AutomaticControl:
                     group.create_task(self._again(f"target {target.name}", visits, 1.0))
 
     async def _again(self, name: str, part: Callable[[], Awaitable[None]], pause: float) -> None:
-        """Do a part of the work again and again; a failure is told, and ends nothing."""
+        """Repeat a part of the work; a failure raises an alarm and ends nothing."""
         failed = False
         # A cancelled visit brings its beam home, and may end with another error then.
         while not self._stopped:
@@ -258,7 +258,7 @@ class AutomaticControl:
         return grant is not None and grant.holder == AUTOMATIC and grant.token == self._token
 
     def _why_not(self) -> str:
-        """Return why nothing is calibrated now, "" if it is."""
+        """Return why nothing is calibrated now, "" if calibration may run."""
         if self._calibrating is None:
             return "there is no camera"
         if not self._on:
@@ -266,7 +266,7 @@ class AutomaticControl:
         return self._why_idle()
 
     def _why_idle(self) -> str:
-        """Return why nothing is moved now, "" if it may be."""
+        """Return why nothing is moved now, "" if heliostats may be moved."""
         if self._plant.emergency_on:
             return "an emergency is active"
         if not self._day:
@@ -277,7 +277,7 @@ class AutomaticControl:
         return ""
 
     async def _govern(self) -> None:
-        """Hold the authority while nobody else wants it; give up in an emergency; see the night."""
+        """Hold the authority while nobody else wants it; give up in an emergency and at night."""
         plant, wanted = self._plant, self._raising.wanted
         if plant.emergency_on:
             wanted[:] = False
@@ -337,7 +337,7 @@ class AutomaticControl:
         return visit
 
     async def _look(self) -> None:
-        """Predict errors anew, note the quality of the field, and tell whether records are kept."""
+        """Update predicted errors and the field's quality; raise or end the alarm of records."""
         self.book.refresh()
         self.book.point(self._utc(), self.truth.all())
         self._keeping.forget(self._utc(), self._settings.events)

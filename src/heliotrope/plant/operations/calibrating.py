@@ -19,12 +19,12 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.views import CalibrationEntry, Planned, Running
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
 
-#: The true errors are computed anew this often, s.
+#: Time between computations of the true errors, s.
 _TRUTH_EVERY = 5.0
 
 
 class Scheduling(Protocol):
-    """Says which heliostat is calibrated next."""
+    """The choice of the heliostat that is calibrated next."""
 
     def next(self, target: str, ready: npt.NDArray[np.bool_]) -> Planned | None:
         """Return the next of the ready heliostats (N,) for a free target, None if none is due."""
@@ -40,14 +40,14 @@ class Scheduling(Protocol):
 
 
 class TrueErrors:
-    """Tracking errors that a twin knows, computed every five seconds.
+    """True tracking errors, known to a twin only, computed every five seconds.
 
     Parameters
     ----------
     plant
-        Its clock counts.
+        The errors are timed by its clock.
     truth
-        Gives them, rad, (N,); None: nobody knows them.
+        Returns the errors, rad, (N,); None: they are unknown.
     """
 
     def __init__(self, plant: PlantController, truth: Callable[[], FloatArray] | None) -> None:
@@ -55,7 +55,7 @@ class TrueErrors:
         self._known: tuple[float, FloatArray] | None = None
 
     def all(self) -> FloatArray | None:
-        """Return the errors of all heliostats, rad, (N,); None if nobody knows them."""
+        """Return the errors of all heliostats, rad, (N,); None if they are unknown."""
         if self._truth is None:
             return None
         now = self._plant.now()
@@ -64,19 +64,19 @@ class TrueErrors:
         return self._known[1]
 
     def now(self, row: int) -> float:
-        """Return the present error of one heliostat, rad; NaN if nobody knows it."""
+        """Return the present error of one heliostat, rad; NaN if it is unknown."""
         self._known = None
         found = self.all()
         return math.nan if found is None else float(found[row])
 
 
 class Calibrating:
-    """Makes the visits, and tells what came of them.
+    """The visits of automatic calibration, and their results.
 
     Parameters
     ----------
     plant, log
-        The controller, and where results are told.
+        The controller, and the logbook for events.
     cycle
         Makes one visit.
     scheduler
@@ -84,7 +84,7 @@ class Calibrating:
     book, keeping
         Take the results.
     truth
-        Errors that a twin knows.
+        True errors, known to a twin only.
     """
 
     def __init__(

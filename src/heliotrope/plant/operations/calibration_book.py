@@ -1,4 +1,4 @@
-"""How well every heliostat is calibrated, for people: predicted and measured errors over time."""
+"""The calibration of every heliostat, for people: predicted and measured errors over time."""
 
 from collections import deque
 
@@ -12,9 +12,9 @@ from heliotrope.mechanism import parameters as parameter_table
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import CalibrationEntry, QualityPoint, SightingView
 
-#: Points of the quality over time, and results, to hold.
+#: Numbers of points of the quality over time, and of results, that are held.
 _POINTS, _RESULTS = 4000, 2000
-#: Heliostats whose priors tell the error of an uncalibrated one.
+#: Number of heliostats whose priors give the error of an uncalibrated one.
 _SAMPLE = 100
 
 
@@ -37,7 +37,7 @@ class CalibrationBook:
     model
         Names of the parameters.
     results, quality
-        The last ones, oldest first.
+        The last results and the last points of the quality, oldest first.
     failed
         Number of visits without a new calibration.
     """
@@ -123,7 +123,7 @@ class CalibrationBook:
         good = np.array(spread)[np.isfinite(spread)]
         return float(np.sqrt(np.mean(good**2))) if len(good) else 0.0
 
-    # -- looking ---------------------------------------------------------------------------
+    # -- views -----------------------------------------------------------------------------
 
     def history(self, name: str) -> tuple[SightingView, ...]:
         """Return the sightings of a heliostat since the start, oldest first."""

@@ -1,4 +1,4 @@
-"""What automatic control keeps over a restart: sightings, calibrations, visits and holds."""
+"""Records of automatic control that outlast a restart: sightings, calibrations, visits, holds."""
 
 import functools
 from collections.abc import Sequence
@@ -12,13 +12,13 @@ from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.operations.views import CalibrationEntry, Hold
 from heliotrope.store.records import Records, StoreError, VisitEntry
 
-#: Old events are removed this often, s.
+#: Time between removals of old events, s.
 _DAY = 86_400.0
 
 
 @runtime_checkable
 class Forgetting(Protocol):
-    """Records that can remove what is old."""
+    """Records whose old events can be removed."""
 
     def forget_events(self, before: float) -> None:
         """Remove events before a time, and alarms that were over and acknowledged by then."""
@@ -26,7 +26,7 @@ class Forgetting(Protocol):
 
 
 class Keeping:
-    """Keeps what the plant learns, and recalls it; without records it does nothing.
+    """The memory of what the plant learns, in a store; without a store it does nothing.
 
     It keeps and numbers sightings, and each new calibration, for the plant's beliefs.
 
@@ -37,12 +37,12 @@ class Keeping:
     beliefs
         Beliefs of the plant.
     records
-        Where everything is kept; None: nowhere.
+        The store; None: nothing is kept.
 
     Attributes
     ----------
     lost
-        The last failure to keep something, "" if the last attempt succeeded.
+        The last failure to keep a record, "" if the last attempt succeeded.
     """
 
     def __init__(self, names: Sequence[str], beliefs: Beliefs, records: Records | None) -> None:
@@ -81,7 +81,7 @@ class Keeping:
 
     def _keep(self, records: Records, record: HeliostatCalibration) -> None:
         if (record.sightings == 0).any():
-            return  # its sightings could not be kept, which `lost` tells
+            return  # its sightings could not be kept; `lost` says why
         try:
             records.record_calibration(record)
         except StoreError as error:

@@ -1,4 +1,4 @@
-"""Alarms, events and packets of a plant at work, as people look at them."""
+"""Alarms, events and packets of a plant at work, for people."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -16,32 +16,32 @@ from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, Pa
 from heliotrope.safety import Alarm, alarms
 from heliotrope.store.records import Event, Records
 
-#: Come each second: only the last of each cluster is kept.
+#: Messages that come each second: only the last of each cluster is kept.
 _STEADY = ("lease", "status")
 #: Longest text of a packet, letters.
 _LONGEST = 240
-#: Raised and ended by the evaluation of the table itself: there is nothing to acknowledge.
+#: Alarms that the evaluation of the table raises and ends itself: nothing to acknowledge.
 _UNACKNOWLEDGED = (alarms.TIME_WENT_BACK.name, alarms.UNKNOWN_READING.name)
-#: Is told once and mended by the plant itself.
+#: An alarm that is raised once and put right by the plant itself.
 _PASSING = (alarms.PARAMETERS_DIFFER.name,)
 
 
 class Logbook:
-    """What has happened.
+    """Alarms, events and packets.
 
     Parameters
     ----------
     clock
-        Of the plant.
+        Clock of the plant.
     records
-        Where alarms and events are kept besides; None: nowhere.
+        Store that keeps alarms and events as well; None: none does.
     events, packets
-        How many are held here.
+        Numbers of events and packets held here.
 
     Attributes
     ----------
     refused
-        Messages of each cluster that were none.
+        Number of unreadable messages of each cluster.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Logbook:
     # -- taking ----------------------------------------------------------------------------
 
     def tapped(self, links: Mapping[str, Link]) -> dict[str, Link]:
-        """Return links that tell this book what goes through them, to be given to the plant."""
+        """Return the links for the plant, which note every message in this book."""
         self._links.update(links)
         return {name: _Tapped(name, link, self) for name, link in links.items()}
 
@@ -80,7 +80,7 @@ class Logbook:
             self._packets.append((self._now(), cluster, way, data))
 
     def take_alarm(self, alarm: Alarm) -> None:
-        """Take an alarm of the plant or of a cluster; what ends by itself becomes an event."""
+        """Take an alarm of the plant or of a cluster; one that ends by itself becomes an event."""
         if alarm.condition in _PASSING:
             self.event("plant", alarm.subject, alarm.text)
             return
@@ -122,7 +122,7 @@ class Logbook:
             self._keep(self._records.record_event, Event(self._now(), kind, line))
 
     def _keep(self, keep: Any, *values: Any, **named: Any) -> None:
-        """Keep something; a store that is full or gone is an alarm, and stops nothing."""
+        """Keep a record; a store that is full or gone raises an alarm and stops nothing."""
         try:
             keep(*values, **named)
         except HeliotropeError as error:
@@ -144,7 +144,7 @@ class Logbook:
         if self._records is not None:
             self._keep(self._records.record_acknowledgement, condition, subject, who, self._now())
 
-    # -- looking ---------------------------------------------------------------------------
+    # -- views -----------------------------------------------------------------------------
 
     @staticmethod
     def is_plain(condition: str) -> bool:
@@ -153,11 +153,11 @@ class Logbook:
 
     @property
     def open_alarms(self) -> int:
-        """How many alarms are active or not acknowledged."""
+        """Number of alarms that are active or not acknowledged."""
         return sum(_open(row) for row in self._alarms.values())
 
     def alarms(self) -> tuple[AlarmRow, ...]:
-        """Return the alarms: those that are open first, then the newest."""
+        """Return the alarms: open ones first, then the newest."""
         rows = sorted(self._alarms.values(), key=lambda row: (not _open(row), -row.at))
         return tuple(rows[:500])
 
@@ -236,7 +236,7 @@ class Logbook:
 
 
 class _Tapped:
-    """A link that shows what goes through it."""
+    """A link that notes every message that passes through it."""
 
     def __init__(self, name: str, link: Link, book: Logbook) -> None:
         self.name, self._link, self._book = name, link, book
@@ -286,7 +286,7 @@ def _open(row: AlarmRow) -> bool:
 
 
 def _kind(data: bytes) -> str:
-    """Return the kind that a message says it is, without reading the rest of it."""
+    """Return the kind that a message names, without reading the rest of it."""
     head, _, rest = data.partition(b'"kind":"')
     return rest.partition(b'"')[0].decode("ascii", "replace") if len(head) < 8 else ""
 

@@ -2,8 +2,8 @@
 
 It turns the plant (`PlantController`) into plain values, made at most once a second and shared by
 all clients; passes on people's commands; and runs automatic control, which raises the field and
-calibrates it with every target's camera. A single failure of automatic control is told as an event
-or an alarm, and it goes on.
+calibrates it with every target's camera. A failure of one part of automatic control becomes an
+event or an alarm, and the rest goes on.
 
 People's commands go through here so that automatic control knows what they want: a heliostat that a
 person has stowed, defocused or locked stays so until a person gives it back.
@@ -49,19 +49,19 @@ from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
-#: Commands of people after which automatic control leaves heliostats alone, and those after which
-#: it has them again.
+#: People's commands after which automatic control leaves heliostats alone, and those that give them
+#: back to it.
 _AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
 _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
-#: The predicted flux is computed anew after this time, s.
+#: Time between predictions of the flux, s.
 _FLUX_EVERY = 5.0
 
 
 class Photographer(Protocol):
-    """Has photographs of targets for people to look at."""
+    """A source of photographs of targets for people."""
 
     def view(self, target: str) -> CameraView:
-        """Return the last one."""
+        """Return the last photograph."""
         ...
 
 
@@ -88,13 +88,13 @@ class Operations:
     scheduler
         Chooses the next heliostat; None: nothing is calibrated.
     records
-        Where everything is kept over a restart; None: nowhere.
+        Store of everything that outlasts a restart; None: nothing is kept.
     truth
-        Gives the tracking errors that a twin knows, rad, (N,); None: nobody knows them.
+        Returns the true tracking errors, known to a twin only, rad, (N,); None: they are unknown.
     settings
         Settings of automatic control.
     extra
-        Gives more rows of the summary, such as the speed of a twin.
+        Returns further rows of the summary, such as the speed of a twin.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Operations:
         """End automatic control; beams stay where they are, so stow the field first."""
         self._closing.set()
 
-    # -- what it is ------------------------------------------------------------------------
+    # -- the design ------------------------------------------------------------------------
 
     @property
     def design(self) -> Plant:
@@ -155,7 +155,7 @@ class Operations:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Heliostats, N, in the order of all arrays."""
+        """The N heliostats, in the order of all arrays."""
         return self.plant.field.names
 
     @property
@@ -165,7 +165,7 @@ class Operations:
 
     @property
     def positions(self) -> FloatArray:
-        """Where the heliostats stand, ENU, m, (N, 3)."""
+        """Positions of the heliostats, ENU, m, (N, 3)."""
         return self._viewer.positions
 
     @property
@@ -191,7 +191,7 @@ class Operations:
     # -- the field -------------------------------------------------------------------------
 
     def frame(self) -> FieldFrame:
-        """Return the whole field; the same frame for a second."""
+        """Return the whole field; the frame is made at most once a second."""
         return self._viewer.frame()
 
     def summary(self) -> Summary:
@@ -222,7 +222,7 @@ class Operations:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no such heliostat.
         """
         return self._viewer.heliostat(name)
 
@@ -233,13 +233,13 @@ class Operations:
     # -- light -----------------------------------------------------------------------------
 
     def sun(self) -> SunView:
-        """Return where the sun is."""
+        """Return the position of the sun."""
         at = self.plant.clock.utc()
         found = sun.position(at, self.design.site)
         return SunView(at, self.plant.sun_vector(), float(found.azimuth), float(found.elevation))
 
     def receiver_flux(self, name: str = "") -> FluxView:
-        """Return the predicted light on a receiver ("": the first), made every five seconds.
+        """Return the predicted flux on a receiver ("": the first), made every five seconds.
 
         Raises
         ------
@@ -257,7 +257,7 @@ class Operations:
             known = self._flux[receiver.name] = _Cached(now, view)
         return known.value
 
-    # -- what happens ----------------------------------------------------------------------
+    # -- alarms, events, packets -----------------------------------------------------------
 
     def alarms(self) -> tuple[AlarmRow, ...]:
         """Return the alarms: active or unacknowledged ones first, then the newest."""
@@ -270,7 +270,7 @@ class Operations:
     def packets(self, limit: int = 200, cluster: str = "") -> tuple[PacketRow, ...]:
         """Return the last messages on the links, newest first; of one cluster if it is named.
 
-        Of leases and statuses, which come each second, only the last of each cluster is kept.
+        Leases and statuses come each second; only the last of each cluster is kept.
         """
         return self.logbook.packets(limit, cluster)
 
@@ -281,12 +281,12 @@ class Operations:
         return self.automatic.view()
 
     def switch_calibration(self, person: Person, on: bool) -> None:
-        """Switch the automatic calibration on or off.
+        """Switch automatic calibration on or off.
 
         Raises
         ------
         RefusedError
-            To a viewer.
+            If the person is a viewer.
         """
         _operator(person, "calibration")
         self.automatic.switch(on)
@@ -318,7 +318,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            To a viewer; without a reason.
+            If the person is a viewer or gives no reason.
         UnknownNameError
             If there is no such heliostat.
         """
@@ -334,7 +334,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            To a viewer.
+            If the person is a viewer.
         UnknownNameError
             If there is no such heliostat.
         """
@@ -350,7 +350,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            If another person has it; to a viewer.
+            If another person has it, or the person is a viewer.
         """
         _operator(person, "authority")
         self.automatic.give_way()
@@ -373,12 +373,12 @@ class Operations:
         return grant
 
     def keep_authority(self, person: Person, token: int) -> Grant:
-        """Keep the command authority up; to be called every few seconds.
+        """Renew the command authority; to be called every few seconds.
 
         Raises
         ------
         RefusedError
-            If it is not theirs any more.
+            If the person no longer has it.
         """
         return self.plant.authority.keep(person, token)
 
@@ -388,7 +388,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            If it is not theirs.
+            If the person does not have it.
         """
         self.plant.release_authority(person, token)
         self._tell(person, "has given the command authority back", "authority")
@@ -421,7 +421,7 @@ class Operations:
         Raises
         ------
         UnknownNameError
-            If there is neither.
+            If there is no receiver or target of that name.
         """
         names = tuple(heliostats) or self.names
         if where in self.receivers:
@@ -440,21 +440,21 @@ class Operations:
         return ticket
 
     def stow(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Send heliostats (() for all) to stow; everybody may."""
+        """Send heliostats (() for all) to stow; anybody may."""
         ticket = self.plant.stow(person.name, heliostats)
         self._meant("STOW", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def defocus(self, person: Person, heliostats: Sequence[str] = ()) -> Ticket:
-        """Take beams off the receiver; everybody may."""
+        """Take beams off the receiver; anybody may."""
         ticket = self.plant.defocus(person.name, heliostats)
         self._meant("DEFOCUS", ticket.heliostats)
         self._told(person, ticket)
         return ticket
 
     def emergency(self, person: Person, act: str = "DEFOCUS", reason: str = "") -> EmergencyOrder:
-        """Order DEFOCUS or STOW of the whole field with proof; everybody may.
+        """Order DEFOCUS or STOW of the whole field with proof; anybody may.
 
         Raises
         ------
@@ -471,12 +471,12 @@ class Operations:
         return self._viewer.emergency()
 
     def withdraw(self, person: Person) -> None:
-        """Take an emergency order back.
+        """Withdraw an emergency order.
 
         Raises
         ------
         RefusedError
-            To a viewer.
+            If the person is a viewer.
         """
         self.plant.withdraw_emergency(person)
         self._tell(person, "emergency withdrawn", "command")
@@ -501,7 +501,7 @@ class Operations:
         Raises
         ------
         RefusedError
-            To a viewer.
+            If the person is a viewer.
         """
         _operator(person, "give back")
         names = tuple(heliostats) or self.names

@@ -15,7 +15,7 @@ from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import alarms
 
-#: A heliostat whose beam has no clear way is tried again after this time, s.
+#: Time before a heliostat whose beam has no clear way is tried again, s.
 _BLOCKED = 300.0
 
 Rows = npt.NDArray[np.intp]
@@ -23,22 +23,22 @@ Mask = npt.NDArray[np.bool_]
 
 
 class Raising:
-    """Brings wanted heliostats to the receiver, a few at a time.
+    """The way of wanted heliostats to the receiver, a few at a time.
 
     An uncalibrated beam goes to the receiver only if it would miss every target by a wide margin.
 
     Parameters
     ----------
     plant, log
-        The controller, and where blocked beams are told.
+        The controller, and the logbook for blocked beams.
     person
-        Commands in its name.
+        The person under whose name it commands.
     most
         Heliostats that leave stow, or go to the receiver, at a time.
     patience
         Time before the same command is given again, s.
     clearance
-        Tracking error that an uncalibrated beam must not miss targets by less than, rad.
+        Tracking error with which an uncalibrated beam must still miss all targets, rad.
     wanted
         Whether all heliostats are wanted from the start.
 
@@ -77,11 +77,11 @@ class Raising:
         self._busy_until[rows] = -math.inf
 
     def release(self, heliostat: str) -> None:
-        """Let a heliostat be commanded again at once: its visit to a target has ended."""
+        """Allow a new command to a heliostat at once: its visit to a target has ended."""
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
 
     def _clear_of_targets(self, clearance: float) -> Mask:
-        """Return which beams miss all targets on their way to the receiver uncalibrated, (N,)."""
+        """Return which uncalibrated beams miss all targets on their way to the receiver, (N,)."""
         plant, aims = self._plant, self._aims
         if not aims:
             return np.zeros(len(plant.field), dtype=np.bool_)
@@ -96,14 +96,14 @@ class Raising:
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
     async def step(self, token: int, visiting: Callable[[], frozenset[str]]) -> None:
-        """Command what may be commanded now.
+        """Give the commands that may be given now.
 
         Parameters
         ----------
         token
-            Of the command authority.
+            Token of the command authority.
         visiting
-            Gives the heliostats that visit targets now.
+            Returns the heliostats that visit targets now.
         """
         plant, now = self._plant, self._plant.now()
         self._look_at_blocked()
@@ -151,7 +151,7 @@ class Raising:
                 refusals = error.refusals
             else:
                 told = [self._plant.field.place(name) for name in names]
-                # Not again before something has come of it.
+                # They get no further command until their state changes or patience ends.
                 self._busy_until[told] = self._plant.now() + self._patience
                 self._told_in[told] = state
                 self._block(ticket.blocked, state)
@@ -169,7 +169,7 @@ class Raising:
             self._log.take_alarm(alarms.BEAM_BLOCKED.raised(name, reason=text))
 
     def _look_at_blocked(self) -> None:
-        """Tell which beams were blocked when their turn came, and which alarms are over."""
+        """Raise alarms of beams that were blocked when their turn came; end those that are over."""
         for ticket in [ticket for ticket in self._joins if ticket.finished]:
             self._joins.remove(ticket)
             self._block(ticket.blocked, states.IDLE)

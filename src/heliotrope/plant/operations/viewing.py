@@ -1,4 +1,4 @@
-"""What people see of a plant at work: the field as one table, one heliostat, an emergency."""
+"""Views of a plant at work: the field as one table, one heliostat, an emergency."""
 
 from typing import Any
 
@@ -20,20 +20,20 @@ from heliotrope.plant.operations.views import (
     ParameterView,
 )
 
-#: A frame is shown for this long, s of the plant's clock.
+#: Life of a frame, s of the plant's clock.
 _EVERY = 1.0
-#: In these states a beam is at its aim.
+#: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
 #: An aim this many half diagonals from the middle of a surface is still on it.
 _NEAR = 1.0
-#: Supply voltage of a board that has not told it yet, mV.
+#: Supply voltage of a board that has not reported it yet, mV.
 _UNTOLD = 0
-#: Names shown of the heliostats that have not carried out an emergency order.
+#: Number of names shown of the heliostats that have not carried out an emergency order.
 _SOME = 20
 
 
 class Viewer:
-    """Makes views of a plant under automatic control.
+    """The views of a plant under automatic control.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Viewer:
         )
 
     def _on(self, now: float) -> npt.NDArray[np.uint8]:
-        """Return where each beam is, as a place in `aim_names`, (N,)."""
+        """Return the place of each beam in `aim_names`, (N,)."""
         aims, found = self._plant.aims, np.zeros(len(self._plant.field), dtype=np.uint8)
         on = self._plant.field.among(_ON_AIM, now) & np.isfinite(aims).all(axis=-1)
         found[on] = len(self.aim_names) - 1
@@ -121,7 +121,7 @@ class Viewer:
         Raises
         ------
         UnknownNameError
-            If there is none of that name.
+            If there is no such heliostat.
         """
         plant, automatic = self._plant, self._automatic
         row = plant.field.place(name)

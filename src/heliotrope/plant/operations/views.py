@@ -49,7 +49,7 @@ class FieldFrame:
     held
         Whether a person keeps it out of calibration, bool, (N,).
     truth_error
-        Tracking error that a twin knows, rad, float32, (N,); None for a real plant.
+        True tracking error, known to a twin only, rad, float32, (N,); None for a real plant.
     """
 
     number: int
@@ -160,7 +160,7 @@ class HeliostatView:
     error
         Predicted tracking error, rad; NaN if never calibrated.
     truth_error
-        Tracking error that a twin knows, rad; NaN for a real plant.
+        True tracking error, known to a twin only, rad; NaN for a real plant.
     history
         Its sightings since the start, oldest first.
     results
@@ -318,16 +318,16 @@ class CalibrationEntry:
     heliostat, target
         Names.
     outcome
-        What became of it.
+        Whether the heliostat has a new calibration, or why not.
     before, after
-        Beam error over all sightings of the heliostat, as believed before and fitted, rad RMS; NaN
-        without a fit.
+        Beam error over all sightings of the heliostat, under the earlier calibration and after the
+        fit, rad RMS; NaN without a fit.
     measured
-        Beam error of the photographs of this visit, as believed before, rad RMS; NaN without.
+        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN without.
     predicted
         Predicted standard deviation of the normal after it, rad; NaN if never calibrated.
     truth_before, truth_after
-        Tracking error that a twin knows, rad; NaN for a real plant.
+        True tracking error, known to a twin only, rad; NaN for a real plant.
     sightings, new
         Sightings known of the heliostat, and how many of them this visit brought.
     text
@@ -370,7 +370,7 @@ class QualityPoint:
     median, percentile_90
         Median and 90th percentile of their predicted tracking error, rad.
     truth_median, truth_percentile_90
-        The same of the error that a twin knows; NaN for a real plant.
+        The same of the true error, known to a twin only; NaN for a real plant.
     """
 
     at: float
@@ -424,7 +424,7 @@ class CameraView:
     jpeg
         The picture with what was read in it drawn in; b"" before the first.
     reading
-        What was read in it, line by line.
+        The software's reading of it, line by line.
     centroid
         Of the beam, right of and above the target's centre, m; None if not seen.
     """
@@ -439,7 +439,7 @@ class CameraView:
 
 @dataclass(frozen=True)
 class Hold:
-    """A heliostat kept out of calibration: by whom, why, and since when (POSIX s)."""
+    """A heliostat kept out of calibration: the person, the reason, and the time (POSIX s)."""
 
     heliostat: str
     who: str

@@ -1,4 +1,4 @@
-"""ZERO: where the axes of one heliostat stand, as a person declares it."""
+"""ZERO: the position of one heliostat's axes, as a person declares it."""
 
 from collections.abc import Sequence
 
@@ -25,7 +25,7 @@ def zero(
     plant
         The controller.
     person, token
-        Who, with the token of the authority.
+        The person commanding, and the token of the command authority.
     heliostats
         The name of one.
     values

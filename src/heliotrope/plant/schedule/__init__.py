@@ -1,8 +1,8 @@
 """The schedule of calibration: which heliostat is photographed next, on which target.
 
-Begin with `Scheduler`: it answers from time, sun and states alone, so days are tried out in
-seconds. `PlantSchedule` runs it in a plant at work. `knowledge` holds how well each heliostat is
-known, `choice` finds the best visit of a moment.
+Begin with `Scheduler`: it decides from time, sun and states alone, so days are tried out in
+seconds. `PlantSchedule` runs it in a plant at work. `knowledge` holds the expected error of each
+heliostat, and `choice` finds the best visit of a moment.
 """
 
 from heliotrope.plant.schedule.choice import Assignment

@@ -22,13 +22,12 @@ from heliotrope.optics.beam import SUN_RADIUS
 from heliotrope.plant.schedule.knowledge import FieldKnowledge, Look
 from heliotrope.plant.schedule.settings import Settings, Weather
 
-#: Heliostats judged exactly at a time; chunks of a decision at most once one was found, and while
-#: none was.
+#: Heliostats judged exactly at a time; most chunks of a decision once a visit is found, and before.
 CHUNK, CHUNKS, MOST_CHUNKS = 64, 2, 6
-#: A heliostat that cannot be seen now, or to no gain, is judged again after this time, s: the sun
-#: moves by a degree in four minutes.
+#: A heliostat that cannot be seen now, or whose visit would gain nothing, is judged again after
+#: this time, s: the sun moves by a degree in four minutes.
 AGAIN = 300.0
-#: Places that a search for a beam looks at, at most.
+#: Most places at which a search looks for a beam.
 LOOKS = 25
 #: Slack of the screening, since a pivot is not at the foot of its heliostat, rad.
 SLACK = float(np.radians(4.0))
@@ -55,7 +54,7 @@ class Assignment:
     overdue
         Whether it was chosen for its age and not for its gain.
     reason
-        The same for people.
+        Why it was chosen, for people.
     """
 
     heliostat: str
@@ -190,14 +189,14 @@ class Moment:
 
 
 class Judge:
-    """Finds the best visit of a moment.
+    """The search for the best visit of a moment.
 
     Parameters
     ----------
     design, settings
         The plant, and the settings of the schedule.
     known
-        How well each heliostat is known.
+        Knowledge of the heliostats.
     names
         The heliostats.
 
@@ -206,7 +205,7 @@ class Judge:
     sights
         Lines of sight, by target.
     more
-        Whether the last decision found none without judging every candidate: ask again.
+        Whether the last decision found no visit but did not judge every candidate: ask again.
     """
 
     def __init__(
@@ -226,7 +225,7 @@ class Judge:
         self._again = {name: np.full(len(known), -np.inf) for name in self.sights}
 
     def of(self, known: FieldKnowledge) -> "Judge":
-        """Return a judge with other knowledge."""
+        """Return a copy that judges by other knowledge."""
         other = copy(self)
         other._known = known  # noqa: SLF001 - its own kind
         again = {name: until.copy() for name, until in self._again.items()}
@@ -255,7 +254,7 @@ class Judge:
         counts
             Counts of the drives, (N, 2), if known.
         weather
-            As far as it is measured.
+            Weather, as far as it is measured.
         """
         settings, self.more = self._settings, False
         closed = settings.closed(sun, weather or Weather())
@@ -366,8 +365,10 @@ class Judge:
                 continue
             k = int(np.argmax(np.where(free, value, -np.inf)))
             if best is None or value[k] > best.value:
-                told = self._told(moment, int(mine[k]), target, look, k, float(seen[k]), overdue)
-                best = Choice(float(value[k]), int(mine[k]), look.slope[k], told)
+                assignment = self._told(
+                    moment, int(mine[k]), target, look, k, float(seen[k]), overdue
+                )
+                best = Choice(float(value[k]), int(mine[k]), look.slope[k], assignment)
         return best
 
     def _told(

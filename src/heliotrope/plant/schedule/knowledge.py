@@ -1,4 +1,4 @@
-"""How well the heliostats of a plant are known, and how that fades with time.
+"""Knowledge of the heliostats of a plant, and its decay with time.
 
 The covariance of a heliostat's parameters is that of its calibration, or of the priors before the
 first. The zeros of the drives creep, so the covariance grows with the time since the calibration.
@@ -39,7 +39,7 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Look:
-    """What a visit of each of K heliostats to a target would bring, at one sun.
+    """The expected yield of a visit of each of K heliostats to a target, at one sun.
 
     Attributes
     ----------
@@ -66,14 +66,14 @@ class Look:
 
 
 class Knowledge:
-    """How well n heliostats of one group are known.
+    """Knowledge of n heliostats of one group.
 
     Parameters
     ----------
     heliostats
         A group of the design.
     aim
-        Where they aim in operation, ENU m, (3,).
+        Aim point in operation, ENU, m, (3,).
     site, year
         Place and calendar year of the suns that count.
     model
@@ -161,7 +161,7 @@ class Knowledge:
         sigma: float,
         counts: FloatArray | None = None,
     ) -> Look:
-        """Return what visits of heliostats to a target would bring.
+        """Return the expected yield of visits of heliostats to a target.
 
         Parameters
         ----------
@@ -201,7 +201,7 @@ class Knowledge:
         self._set(rows, now)
 
     def learn(self, row: int, record: HeliostatCalibration) -> None:
-        """Take a new calibration; parameters that it does not have stay as the prior says."""
+        """Take a new calibration; parameters that it does not have keep their prior."""
         covariance = self._prior[row].copy()
         shared = [name for name in self.names if name in record.names]
         mine = [self.names.index(name) for name in shared]
@@ -225,7 +225,7 @@ class Knowledge:
 
 
 class FieldKnowledge:
-    """How well all N heliostats of a plant are known, group by group, in one order of rows.
+    """Knowledge of all N heliostats of a plant, group by group, in one order of rows.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ class FieldKnowledge:
             )
             for group in groups
         ]
-        # Rows of the heliostats of each group, and the way back.
+        # Rows of the heliostats of each group, and the inverse.
         self._rows = [np.array([self.row[n] for n in g.names], dtype=np.intp) for g in groups]
         self.group, self._place = np.empty((2, count), dtype=np.intp)
         self.position, self.size = np.empty((count, 3)), np.empty((count, 2))
@@ -318,7 +318,7 @@ class FieldKnowledge:
         target: Target,
         counts: FloatArray | None,
     ) -> Look:
-        """Return what visits of heliostats of one group would bring; see `Knowledge.look`."""
+        """Return the expected yield of visits of heliostats of one group; see `Knowledge.look`."""
         settings, known = self._settings, self._groups[int(self.group[rows[0]])]
         return known.look(
             self._place[rows],

@@ -21,7 +21,7 @@ from heliotrope.plant.visits.settings import CycleSettings
 
 #: Age at which a plan is replaced, s, and how far it looks ahead.
 REPLAN, HORIZON = 120.0, timedelta(hours=16)
-#: Steps made of a new plan each time that it is asked for.
+#: Steps added to a new plan at each request.
 STEPS = 2
 #: A planned visit this late is no longer shown, s.
 _LATE = 60.0
@@ -47,19 +47,19 @@ def settings_for(cycle: CycleSettings, settings: Settings | None = None) -> Sett
 
 
 class PlantSchedule:
-    """Chooses heliostats by expected gain.
+    """Choice of heliostats by expected gain, in a running plant.
 
     Parameters
     ----------
     plant
-        Its clock, sun and rows count; the schedule learns each calibration that its `beliefs` take.
+        Source of time, sun and states; the schedule learns each calibration of its `beliefs`.
     scheduler
         With the ``names`` of ``plant.field``.
 
     Attributes
     ----------
     weather
-        As far as it is measured; set it when it changes.
+        Weather, as far as it is measured; set it when it changes.
     """
 
     def __init__(self, plant: PlantController, scheduler: Scheduler) -> None:
@@ -77,14 +77,14 @@ class PlantSchedule:
             # The target is free, so the visit there has ended without a result.
             if gone.target == target:
                 self.scheduler.cancel(gone.heliostat)
-        told = self.scheduler.next(
+        assignment = self.scheduler.next(
             self._plant.clock.utc(),
             self._plant.sun_vector(),
             self._states(ready),
             (target,),
             weather=self.weather,
         )
-        return None if told is None else _planned(told)
+        return None if assignment is None else _planned(assignment)
 
     def plan(self, ready: npt.NDArray[np.bool_], limit: int) -> Sequence[Planned]:
         """Return the coming visits; a new plan grows at each call while the old one is shown."""
@@ -96,7 +96,7 @@ class PlantSchedule:
             )
         if self._coming is not None:
             steps = list(islice(self._coming, STEPS))
-            self._draft += [_planned(told) for told in steps if told is not None]
+            self._draft += [_planned(assignment) for assignment in steps if assignment is not None]
             if len(steps) < STEPS or len(self._draft) >= limit:
                 self._plan, self._coming, self._made = tuple(self._draft), None, now
         shown = self._plan or tuple(self._draft)
@@ -117,6 +117,12 @@ class PlantSchedule:
         return _Ready(state, counts)
 
 
-def _planned(told: Assignment) -> Planned:
+def _planned(assignment: Assignment) -> Planned:
     # Pages show errors of the normal, half of those of the beam.
-    return Planned(told.heliostat, told.target, told.at, 0.5 * told.gain, told.reason)
+    return Planned(
+        assignment.heliostat,
+        assignment.target,
+        assignment.at,
+        0.5 * assignment.gain,
+        assignment.reason,
+    )

@@ -42,7 +42,7 @@ _STEP = 600.0
 
 @dataclass(frozen=True)
 class Visited:
-    """What became of an assignment.
+    """The result of an assignment.
 
     Attributes
     ----------
@@ -69,20 +69,20 @@ class Visited:
 
 @dataclass(frozen=True)
 class Finished:
-    """An assignment and what became of it."""
+    """An assignment and its result."""
 
     planned: Assignment
     visited: Visited
 
     @property
     def surprise(self) -> bool:
-        """Whether the beam was far more off than expected."""
+        """Whether the beam was much further off than expected."""
         return bool(self.visited.measured > SURPRISE * self.planned.predicted)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Finished visits beside the prediction.
+    """Finished visits compared with their prediction.
 
     Attributes
     ----------
@@ -163,7 +163,7 @@ class States(Protocol):
 
 
 class Scheduler:
-    """Says what to measure next.
+    """The schedule: chooses the next heliostat to photograph, and the target.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ class Scheduler:
     settings
         See `Settings`.
     now
-        The suns of its year count, and the age of uncalibrated heliostats begins then.
+        Beginning: the age of uncalibrated heliostats counts from here, and its year gives the suns.
     names
         Order of the heliostats in `States`; default that of the design.
 
@@ -185,7 +185,7 @@ class Scheduler:
     running
         Assignments under way, by heliostat.
     finished
-        The last visits beside what was expected of them.
+        The last visits, each with its assignment.
 
     Raises
     ------
@@ -216,12 +216,12 @@ class Scheduler:
         begin, year = _unix(now), now.astimezone(UTC).year
         self._known = FieldKnowledge(design, self.settings, self.names, begin, year)
         self._judge = Judge(design, self.settings, self._known, self.names)
-        # What the assignments under way are expected to tell, by heliostat.
+        # The expected information of the assignments under way, by heliostat.
         self._slopes: dict[str, FloatArray] = {}
         self._failures, self._learnt = np.zeros((2, len(self.names)), dtype=np.int64)
         self._retry = np.full(len(self.names), -np.inf)
 
-    # -- what is known ---------------------------------------------------------------------
+    # -- knowledge -------------------------------------------------------------------------
 
     def expected(self, now_utc: datetime) -> FloatArray:
         """Return the expected beam error over the year, rad RMS (2-D), (N,)."""
@@ -246,7 +246,7 @@ class Scheduler:
     def observe(self, heliostat: str, error: float, now_utc: datetime) -> bool:
         """Take a beam error seen in operation, rad; return whether it is a surprise.
 
-        If it is more than `SURPRISE` times the expected error the heliostat has changed, and its
+        An error above `SURPRISE` times the expected one means that the heliostat has changed: its
         expected error becomes the one seen.
 
         Raises
@@ -277,9 +277,9 @@ class Scheduler:
         holds: Collection[str] = (),
         weather: Weather | None = None,
     ) -> Assignment | None:
-        """Return what to measure now, and note that it is under way; None: nothing, see `reason`.
+        """Return the next assignment, and note it as under way; None if none is due, see `reason`.
 
-        Call `done` or `cancel` when it has ended; a new calibration is told by `learn` before.
+        Call `done` or `cancel` when it has ended, after `learn` if it gave a new calibration.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ class Scheduler:
         holds
             Heliostats to leave alone.
         weather
-            As far as it is measured.
+            Weather, as far as it is measured.
 
         Raises
         ------
@@ -314,9 +314,12 @@ class Scheduler:
         )
         if choice is None:
             return None
-        told = choice.assignment
-        self.running[told.heliostat], self._slopes[told.heliostat] = told, choice.slope
-        return told
+        assignment = choice.assignment
+        self.running[assignment.heliostat], self._slopes[assignment.heliostat] = (
+            assignment,
+            choice.slope,
+        )
+        return assignment
 
     def _ready(self, now: float, states: States | None, away: Collection[str]) -> Mask:
         ready = now >= self._retry
@@ -334,10 +337,10 @@ class Scheduler:
         left[[self._known.row[name] for name in names if name in self._known.row]] = False
         return left
 
-    # -- what became of it -----------------------------------------------------------------
+    # -- results ---------------------------------------------------------------------------
 
     def done(self, visited: Visited) -> Finished | None:
-        """Take the result of a visit; return it beside what was expected, if it was planned.
+        """Take the result of a visit; return it with its assignment, None if it was not planned.
 
         Raises
         ------
@@ -351,7 +354,7 @@ class Scheduler:
         if visited.calibrated:
             self._failures[row], self._retry[row] = 0, -np.inf
             if finished is not None and finished.surprise and self._learnt[row] > 1:
-                # The sightings from before the change say less than the covariance believes.
+                # Sightings from before the change are worth less than the covariance assumes.
                 self._known.doubt(row, (visited.measured / finished.planned.predicted) ** 2)
         else:
             self._failures[row] += 1
@@ -367,11 +370,11 @@ class Scheduler:
         self._slopes.pop(heliostat, None)
 
     def compared(self, since: datetime | None = None) -> Comparison:
-        """Compare the finished visits, from a time on, with their prediction."""
+        """Compare the visits finished since a time with their prediction."""
         begin = -np.inf if since is None else _unix(since)
         return compare(f for f in self.finished if f.visited.ended >= begin)
 
-    # -- what is to come -------------------------------------------------------------------
+    # -- plan ------------------------------------------------------------------------------
 
     def plan(
         self,
@@ -393,7 +396,7 @@ class Scheduler:
             Longest plan, visits: each takes as long as a decision.
         """
         coming = self.upcoming(now_utc, horizon, states, holds)
-        return list(islice((told for told in coming if told is not None), most))
+        return list(islice((assignment for assignment in coming if assignment is not None), most))
 
     def upcoming(
         self,
@@ -402,7 +405,7 @@ class Scheduler:
         states: States | None = None,
         holds: Collection[str] = (),
     ) -> Iterator[Assignment | None]:
-        """Yield the visits of `plan`, None between: each step is one decision at most."""
+        """Yield the visits of `plan`, None in between: each step is one decision at most."""
         now = _unix(now_utc)
         end, known = now + horizon.total_seconds(), self._known.copy()
         judge = self._judge.of(known)
@@ -414,16 +417,16 @@ class Scheduler:
                 known.assume(known.row[name], self._slopes[name], held.until)
         away = dict(self.running)
         while now < end:
-            away = {name: told for name, told in away.items() if told.until > now}
+            away = {name: assignment for name, assignment in away.items() if assignment.until > now}
             empty = [name for name, at in free.items() if at <= now]
             sun = solar.vector(datetime.fromtimestamp(now, UTC), self.design.site)
             ready = self._ready(now, states, (*holds, *away))
             choice, _ = judge.decide(now, sun, ready, empty, counts)
             if choice is not None:
-                told = choice.assignment
-                away[told.heliostat], free[told.target] = told, told.until
-                known.assume(choice.row, choice.slope, told.until)
-                yield told
+                assignment = choice.assignment
+                away[assignment.heliostat], free[assignment.target] = assignment, assignment.until
+                known.assume(choice.row, choice.slope, assignment.until)
+                yield assignment
             elif judge.more:
                 yield None
             else:
@@ -431,7 +434,7 @@ class Scheduler:
                 yield None
 
     def _later(self, now: float) -> float:
-        """Return when to look again: after a while, or when the sun is up."""
+        """Return when to decide again: after a while, or when the sun is up."""
         times = now + _STEP * np.arange(1, 145)
         up = solar.position(times, self.design.site).elevation >= self.settings.limits.min_elevation
         return float(times[np.argmax(up)]) if up.any() else float(times[-1])

@@ -1,4 +1,4 @@
-"""Settings of the schedule, and the weather that keeps photographs from being taken."""
+"""Settings of the schedule, and the weather that prevents photographs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ from heliotrope.geometry import FloatArray
 
 @dataclass(frozen=True)
 class Weather:
-    """What keeps photographs from being taken: NaN where nobody measures it.
+    """Weather that prevents photographs; NaN where it is not measured.
 
     Attributes
     ----------
@@ -33,34 +33,34 @@ def _default_limits() -> SightingLimits:
 
 @dataclass(frozen=True)
 class Settings:
-    """Of the schedule.
+    """Settings of the schedule.
 
     Attributes
     ----------
     model, priors
         Parameters that are learnt, and standard deviations that replace the table's.
     limits
-        Of sun, incidence and obliquity.
+        Limits of the sun, the incidence and the obliquity.
     shots, interval, sigma
         Photographs of a visit, s between them, and the standard deviation of a beam, rad.
     settle
-        Beside driving and photographs, s: until it stands still, answers, parameters.
+        Further time of a visit, s: until the mirror stands still, answers, parameters.
     look
-        A further look for a beam that is not on the target, s; None: nobody looks for it.
+        Time of a further look for a beam that is not on the target, s; None: there is no search.
     goal
         Expected beam error, rad RMS, below which a heliostat is left alone until it is due.
     worth
         Least share of the expected squared error that a visit must take away.
     most_age
-        A heliostat that was not calibrated for so long comes before all gains, s.
+        Age of a calibration from which its heliostat comes before all gains, s.
     retry
-        After a visit that failed, s; doubled each time, a day at most.
+        Wait after a visit that failed, s; doubled each time, a day at most.
     creep
-        Of the drives' zeros, rad in a day: the error grows with the root of time.
+        Creep of the drives' zeros in a day, rad: the error grows with the root of time.
     glare
         Least angle between the sun and a camera's line to its target, rad.
     most_hidden
-        Share of a mirror that neighbours may hide from the sun or from the target.
+        Largest share of a mirror that neighbours may hide from the sun or from the target.
     least_dni, most_wind
         W/m² and m/s.
     """

@@ -1,8 +1,8 @@
 """Visits of a heliostat to a calibration target.
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
-a search for the beam: `Centring`), fits them, and lets the plant believe what is better. `Visit` is
-the way there and back; `Camera` is what a plant needs of a camera.
+a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
+`Visit` is the way there and back; `Camera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult

@@ -1,8 +1,8 @@
 """The calibration cycle: from photographs of one mirror's beam to a better mirror.
 
 A heliostat goes to a calibration target, is photographed there, and returns. Its new sightings join
-those already known; all of them together are fitted once. If the fit is better than what was
-believed, it is pushed to the local controller, read back, and taken as the heliostat's calibration.
+those already known; all of them together are fitted once. A fit that is better than the present
+calibration is pushed to the local controller, read back, and taken as the heliostat's calibration.
 Nothing is pushed after too few sightings, a fit that did not converge, values far from what an
 installation can be, or a fit that misses by more than before: the heliostat then keeps what it has.
 """
@@ -42,7 +42,7 @@ from heliotrope.plant.visits.visit import Visit
 
 @dataclass(frozen=True)
 class CycleResult:
-    """What became of a cycle.
+    """The result of a cycle.
 
     Attributes
     ----------
@@ -57,10 +57,10 @@ class CycleResult:
     known, new
         Sightings known of the heliostat now, and how many of them this visit brought.
     measured
-        Beam error of this visit's photographs as it was believed before, rad RMS; NaN without.
+        Beam error of this visit's photographs under the earlier calibration, rad RMS; NaN without.
     before, after
-        Beam error over all sightings as it was believed before, and fitted, rad RMS; NaN without
-        a fit.
+        Beam error over all sightings under the earlier calibration and after the fit, rad RMS; NaN
+        without a fit.
     record
         The new calibration; None if nothing changed.
     """
@@ -79,7 +79,7 @@ class CycleResult:
 
 @dataclass(frozen=True)
 class _Fit:
-    """A fit beside what was believed: beam errors in rad RMS, and why it is not to be used."""
+    """A fit beside the present belief: beam errors, rad RMS, and why it is rejected, "" if not."""
 
     fitted: FieldFit
     nominal: Mechanism
@@ -94,18 +94,18 @@ class _Fit:
 
 
 class CalibrationCycle:
-    """Calibrates heliostats of a plant, one visit at a time.
+    """The calibration of heliostats of a plant, one visit at a time.
 
     Parameters
     ----------
     plant
         Running; its `beliefs` take the new calibrations.
     camera
-        Sees its targets.
+        Camera of its targets.
     settings
         See `CycleSettings`.
     centring
-        How to find and centre a beam that misses; None: photographs are taken where it is.
+        Search and centring of a beam that misses; None: photographs are taken where it is.
 
     Attributes
     ----------
@@ -132,22 +132,22 @@ class CalibrationCycle:
     ) -> CycleResult:
         """Calibrate one heliostat, and bring it back to where it was: standby, or its aim.
 
-        The person keeps the command authority up meanwhile. If it is lost the beam is taken off
-        the target, and nothing is changed.
+        The command authority must be kept up meanwhile. If it is lost the beam is taken off the
+        target, and nothing is changed.
 
         Parameters
         ----------
         person, token
-            An engineer, with the token of the authority.
+            An engineer, with the token of the command authority.
         heliostat, target
             Names.
         tell
-            Called with what is being done, in words.
+            Called with the name of each step.
 
         Raises
         ------
         RefusedError
-            If a command is refused, or the heliostat does not do what it was told.
+            If a command is refused, or the heliostat does not carry it out.
         UnknownNameError
             If there is no such heliostat or target.
         """
@@ -179,7 +179,7 @@ class CalibrationCycle:
         )
 
     async def _learn(self, visit: Visit, taken: Photographs) -> CycleResult:
-        """Fit all sightings once; push and take what is better."""
+        """Fit all sightings once; push and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         new = [self._sighting(shot, counts) for shot, counts in taken.used]
         known, rejected = beliefs.seen(name), tuple(taken.rejected)
@@ -205,7 +205,7 @@ class CalibrationCycle:
             )
         found = self._fit(name, every)
         if found.problem and not old:
-            # Nothing supports these sightings but a fit that makes no sense.
+            # No earlier sighting supports these, and their own fit makes no sense: drop them.
             text = f"unchanged: {found.problem}"
             return CycleResult(
                 name, found.outcome, text, rejected, 0, 0, np.nan, found.before, found.after
@@ -240,7 +240,7 @@ class CalibrationCycle:
     def _judge(
         self, fitted: FieldFit, before: float, after: float
     ) -> tuple[CalibrationOutcome, str]:
-        """Return what a fit is worth, and why it is not to be used, "" if it is."""
+        """Return the outcome of a fit, and why it is rejected, "" if it is not."""
         settings = self.settings
         ending = FitOutcome(int(fitted.outcome[0]))
         if ending is not FitOutcome.CONVERGED:
@@ -286,7 +286,7 @@ class CalibrationCycle:
         return record
 
     async def _push(self, visit: Visit, mechanism: Mechanism) -> tuple[str, ...]:
-        """Write what differs, and read it back."""
+        """Write the items that differ, and read them back."""
         plant, name = self._plant, visit.heliostat
         wanted = items_of(mechanism)
         missing = differing(wanted, await plant.stored(name))
@@ -301,7 +301,7 @@ class CalibrationCycle:
         left = differing(wanted, await plant.stored(name))
         if left:
             raise RefusedError(
-                f"{name}: {', '.join(left)} read back other than written; check its flash memory"
+                f"{name}: {', '.join(left)} differ when read back; check its flash memory"
             )
         if locked:
             await visit.command("UNLOCK")

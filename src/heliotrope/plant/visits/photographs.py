@@ -23,18 +23,18 @@ from heliotrope.plant.visits.visit import Visit
 
 #: Where the photographs after the first are taken: right and up, in turn.
 CORNERS = ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0))
-#: Photographs beyond those wanted: one or the other may be cut at the edge of the target.
+#: Spare photographs: some may be cut off at the edge of the target.
 _SPARE = 2
 #: An aim this close to the one before is not sent, m.
 _SAME = 0.05
 
-#: Told what is being done, in words.
+#: Called with the name of each step.
 Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Shot:
-    """What a photograph of a target shows of one beam.
+    """One beam as a photograph of a target shows it.
 
     Attributes
     ----------
@@ -55,10 +55,10 @@ class Shot:
 
 
 class Camera(Protocol):
-    """Takes photographs of targets and reads them."""
+    """A camera that photographs targets and reads the photographs."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return what is seen now of a heliostat's beam."""
+        """Return what a new photograph shows of a heliostat's beam."""
         ...
 
 
@@ -90,7 +90,7 @@ class Photographing(Protocol):
 
 
 class Plain:
-    """Photographs the beam where it is, without search or centring."""
+    """Photographs of the beam where it is, without search or centring."""
 
     def __init__(self, camera: Camera, settings: CycleSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -112,7 +112,7 @@ class Plain:
 
 
 class Centred:
-    """Searches for the beam, centres it, and photographs it at several places of the target."""
+    """Photographs of a beam that is searched for, centred, and moved over the target."""
 
     def __init__(self, camera: Camera, settings: CycleSettings, centring: Centring) -> None:
         self._camera, self._settings, self._centring = camera, settings, centring
@@ -159,7 +159,7 @@ class Centred:
         target = visit.target
         if np.linalg.norm(place) <= self._centring.near * min(target.width, target.height):
             return _Light(aim, aim, place)
-        tell("to the middle")
+        tell("centring")
         moved = np.asarray(aim - place @ target.axes)
         await visit.aim(moved)
         await visit.arrived(self._settings.arrival)
@@ -190,7 +190,7 @@ class Centred:
                 await visit.look()
 
     def _astray(self, target: Target, shot: Shot, aim: FloatArray, light: "_Light") -> str:
-        """Return why light is not the beam found first, "" if it is: a beam moves as its aim."""
+        """Return why light is not the beam found first, "" if it is: a beam moves with its aim."""
         place = seen(target, shot)
         if place is None:
             return "" if shot.reasons else "no light on the target"
@@ -198,10 +198,10 @@ class Centred:
         away = float(np.linalg.norm(place - expected))
         if away <= self._centring.astray * min(target.width, target.height):
             return ""
-        return f"light {away:.1f} m from where the aim went: another heliostat's beam"
+        return f"light {away:.1f} m from the expected place: another heliostat's beam"
 
     def _room(self, visit: Visit) -> float:
-        """Return how far a beam may be off the middle on both sides, m."""
+        """Return how far the beam may be moved off the middle, right and up, m."""
         target, plant, row = visit.target, visit.plant, visit.row
         group, place = plant.design.find(visit.heliostat)
         mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
@@ -232,7 +232,7 @@ async def _photograph(camera: Camera, visit: Visit) -> Shot:
 
 
 def seen(target: Target, shot: Shot) -> FloatArray | None:
-    """Return where a shot shows light, right of and above the aim point, m, (2,); None: nowhere."""
+    """Return where a shot shows light, right of and above the centre, m, (2,); None: nowhere."""
     if not np.isfinite(shot.point).all():
         return None
     place = target.plane_coordinates(shot.point)

@@ -1,4 +1,4 @@
-"""Settings of a visit: its photographs, the search for a beam, and what a fit must fulfil."""
+"""Settings of a visit: its photographs, the search for a beam, and the limits of a fit."""
 
 from dataclasses import dataclass
 
@@ -55,7 +55,7 @@ class CycleSettings:
 
 @dataclass(frozen=True)
 class Centring:
-    """How a beam that misses its target is found and centred.
+    """Settings of the search for a beam that misses its target, and of its centring.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class Centring:
         Light this far from where the aim has moved it belongs to another heliostat, as a share of
         the shorter side.
     looks
-        How often to search again if the first light belonged to another heliostat.
+        Number of searches, if the first light belongs to another heliostat.
     """
 
     pitch: float = 0.7

@@ -1,4 +1,4 @@
-"""A heliostat sent to a target by a person: there, while it is watched, and back to standby."""
+"""A heliostat's visit to a target: the way there, the observed stay, and the way back."""
 
 import asyncio
 from bisect import bisect_right
@@ -14,11 +14,11 @@ from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 
-#: A mirror has arrived when both axes are this close (rad) to where they go, in two rows running.
+#: A mirror has arrived when both axes are this close (rad) to their goals, in two rows running.
 ARRIVED = 3e-4
-#: After a command is done a mirror must be heard within this time, s.
+#: Longest silence of a mirror after a command is done, s.
 SILENT = 10.0
-#: Looks at the field, s apart.
+#: Time between looks at the field, s.
 _LOOK = 0.25
 
 
@@ -28,16 +28,17 @@ class Visit:
     Parameters
     ----------
     plant, person, token
-        On whose behalf every command is given.
+        The plant, the person under whose name commands are given, and the token of the command
+        authority.
     heliostat, target
-        Who, and where to.
+        Name of the heliostat, and the target.
 
     Attributes
     ----------
     row
-        Of the heliostat in the field.
+        Row of the heliostat in the field's table.
     away
-        Whether it was sent away from where it was.
+        Whether the heliostat has been sent to the target.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class Visit:
 
     @property
     def state(self) -> int:
-        """Its state now.
+        """Present state of the heliostat.
 
         Raises
         ------
@@ -62,11 +63,11 @@ class Visit:
         """
         if not self.plant.field.live(self.plant.now())[self.row]:
             shown = self.plant.field.of(self.heliostat, self.plant.now()).text
-            raise RefusedError(f"{shown}; nothing can be done with it")
+            raise RefusedError(f"{shown}; it cannot be commanded")
         return int(self.plant.field.rows["state"][self.row])
 
     async def obey(self, ticket: Ticket, limit: float) -> None:
-        """Wait until a command is done and the field's table shows what came after it.
+        """Wait until a command is done and the field's table shows a row from after its end.
 
         Raises
         ------
@@ -87,16 +88,16 @@ class Visit:
     async def command(
         self, name: str, values: tuple[float, ...] = (), limit: float = 120.0
     ) -> None:
-        """Give it a command and wait until that is done; see `obey`."""
+        """Give the heliostat a command and wait until it is done; see `obey`."""
         ticket = self.plant.command(self.person, self.token, name, (self.heliostat,), values)
         await self.obey(ticket, limit)
 
     async def aim(self, point: FloatArray, limit: float = 120.0) -> None:
-        """Give it an aim and wait until it has taken it; see `obey`."""
+        """Give the heliostat an aim and wait until it has taken it; see `obey`."""
         await self.obey(self.plant.aim(self.person, self.token, {self.heliostat: point}), limit)
 
     async def go(self, limit: float) -> None:
-        """Send it to the target and wait until it is there.
+        """Send the heliostat to the target and wait until it is there.
 
         Raises
         ------
@@ -116,7 +117,7 @@ class Visit:
         await self.arrived(limit)
 
     async def arrived(self, limit: float) -> None:
-        """Wait until it stays where it was sent; see `go`."""
+        """Wait until the heliostat stays where it was sent; see `go`."""
         until = self.plant.now() + limit
         since, seen = self.plant.now(), 0
         while seen < 2:
@@ -125,7 +126,7 @@ class Visit:
             await self.look()
             if self.state != states.TRACKING:
                 raise RefusedError(
-                    f"{self.heliostat} is {states.STATES[self.state]}, not TRACKING any more"
+                    f"{self.heliostat} is {states.STATES[self.state]}, no longer TRACKING"
                 )
             counted = float(self.plant.field.counted_at[self.row])
             if counted > since:
@@ -141,34 +142,34 @@ class Visit:
     async def look(self) -> None:
         """Let a little time pass, and note the counts if they are new."""
         await sleep_until(self.plant.clock, self.plant.now() + _LOOK)
-        # Counts may be asked for less often than the state: their own age tells when they hold.
+        # Counts may be polled less often than the state; their own age says when they were true.
         counted = float(self.plant.field.counted_at[self.row])
         node = self.plant.field.rows[self.row]
-        # The age of a row jitters with the way of its message: not every change is a new answer.
+        # The age of a row jitters with the delay of its message: not every change is a new answer.
         if np.isfinite(counted) and (not self._times or counted > self._times[-1] + _LOOK):
             self._times.append(counted)
             self._counts.append(np.array([node["primary"], node["secondary"]], dtype=np.float64))
 
     async def counts_at(self, instant: float, limit: float = 10.0) -> FloatArray:
-        """Return the step counts at an instant, between two rows that surround it, (2,).
+        """Return the step counts at an instant, between the rows before and after it, (2,).
 
         Raises
         ------
         RefusedError
-            If it was not heard before and within ``limit`` s after.
+            If it was not heard before, and within ``limit`` s after.
         """
         until = self.plant.now() + limit
         while not (len(self._times) > 1 and self._times[-1] >= instant):
             if self.plant.now() >= until:
                 raise RefusedError(
-                    f"{self.heliostat}: not heard within {limit:g} s of the photograph, so where "
-                    "it stood is not known"
+                    f"{self.heliostat}: not heard within {limit:g} s of the photograph, so its "
+                    "position in it is unknown"
                 )
             await self.look()
         after = bisect_right(self._times, instant)
         after = min(max(after, 1), len(self._times) - 1)
         if not self._times[0] <= instant:
-            raise RefusedError(f"{self.heliostat}: the photograph is older than all that is known")
+            raise RefusedError(f"{self.heliostat}: the photograph is older than all known counts")
         gap = self._times[after] - self._times[after - 1]
         share = (instant - self._times[after - 1]) / gap
         return np.asarray(
@@ -176,11 +177,11 @@ class Visit:
         )
 
     async def __aenter__(self) -> "Visit":
-        """Begin what ends with the heliostat at home."""
+        """Begin the visit; at its end the heliostat is brought home."""
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Bring it home. Who is cancelled ends as that, also if coming home is refused."""
+        """Bring it home. A cancelled visit ends as cancelled, even if coming home is refused."""
         try:
             await self.home()
         except RefusedError:
