@@ -7,11 +7,12 @@ One convention serves target cameras and drones. Camera axes are x right, y down
 
 A point ``local`` is seen at the normalised place ``(x/z, y/z)``, which the lens distorts (Brown
 and Conrady: k1, k2, p1, p2, k3), and ``matrix`` maps to pixels. The centre of the first pixel is
-(0, 0). OpenCV evaluates all of it; it is imported at the first use.
+(0, 0). OpenCV inverts the distortion; it is imported at the first use.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -173,22 +174,14 @@ def local_pixels(camera: Pinhole, local: npt.ArrayLike, reach: float = np.inf) -
     -------
     NaN for points behind the camera or beyond ``reach``.
     """
-    import cv2
-
-    given = as_float(local)
-    points = given.reshape(-1, 3)
-    if len(points) == 0:
-        return np.empty((*given.shape[:-1], 2))
-    depth = points[:, 2]
-    seen = np.asarray(depth > _NEAREST)
+    points = as_float(local)
+    depth = points[..., 2:]
+    ahead = depth > _NEAREST
+    plane = np.where(ahead, points[..., :2], np.nan) / np.where(ahead, depth, 1.0)
     if np.isfinite(reach):
-        far = np.hypot(points[seen, 0], points[seen, 1]) / depth[seen]
-        seen[seen] = far <= reach * _corner_tangent(camera)
-    safe = np.where(seen[:, None], points, [0.0, 0.0, 1.0])
-    zero = np.zeros(3)
-    pixels, _ = cv2.projectPoints(safe, zero, zero, camera.matrix, camera.distortion)
-    flat = np.where(seen[:, None], pixels.reshape(-1, 2), np.nan)
-    return as_float(flat.reshape(*given.shape[:-1], 2))
+        far = np.hypot(plane[..., :1], plane[..., 1:])
+        plane = np.where(far <= reach * _corner_tangent(camera), plane, np.nan)
+    return distort(camera, plane)
 
 
 def _corner_tangent(camera: Pinhole) -> float:
@@ -197,6 +190,30 @@ def _corner_tangent(camera: Pinhole) -> float:
     corners = np.array([[0, 0], [width, 0], [0, height], [width, height]]) - camera.matrix[:2, 2]
     plain = corners / np.diag(camera.matrix)[:2]
     return float(np.hypot(*plain.T).max())
+
+
+def distort(
+    camera: Pinhole, plane: npt.ArrayLike, distortion: Sequence[Any] | None = None
+) -> FloatArray:
+    """Return the pixels (..., 2) of normalised places x/z, y/z (..., 2), after Brown and Conrady.
+
+    Parameters
+    ----------
+    camera
+        Matrix and distortion.
+    plane
+        Places without distortion.
+    distortion
+        k1, k2, p1, p2, k3 instead of the camera's, each broadcast with the places.
+    """
+    place, matrix = as_float(plane), camera.matrix
+    x, y = place[..., 0], place[..., 1]
+    k1, k2, p1, p2, k3 = camera.distortion if distortion is None else distortion
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    v = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([matrix[0, 0] * u + matrix[0, 2], matrix[1, 1] * v + matrix[1, 2]], axis=-1)
 
 
 def project(camera: Camera, points: npt.ArrayLike) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.geometry import FloatArray, as_float, as_vectors, cross_matrix
+from heliotrope.optics.coverage import coverage
 
 #: Distortion models: terms of Brown and Conrady in each.
 MODELS: dict[str, tuple[int, ...]] = {
@@ -299,13 +300,9 @@ def _check_lens(lens: Lens, normals: FloatArray) -> None:
 
 def _coverage(size: tuple[int, int], outlines: Sequence[FloatArray]) -> float:
     """Return the share of the frame that quadrilaterals (4, 2) cover."""
-    import cv2
-
     scale = 256.0 / max(size)
-    mask: Any = np.zeros((int(np.ceil(size[1] * scale)), int(np.ceil(size[0] * scale))), np.uint8)
-    for outline in outlines:
-        cv2.fillConvexPoly(mask, np.round(outline * scale).astype(np.int32), 1)
-    return float(mask.mean())
+    rows, columns = (int(np.ceil(n * scale)) for n in reversed(size))
+    return float(coverage([outline * scale for outline in outlines], (rows, columns)).mean())
 
 
 def _lens_notes(lens: Lens) -> tuple[str, ...]:

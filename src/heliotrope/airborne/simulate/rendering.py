@@ -1,9 +1,8 @@
 """Photographs of a simulated flight: ground, shadows, mirrors that show the sky, and the lamp.
 
-Light is measured in full scale of the sensor. The share of a pixel that a facet covers is taken
-from an 8-fold finer grid; the lamp's reflections are at the exact positions of
-`heliotrope.airborne.mirror`. The blur of lens and motion is applied to all of it, then noise,
-clipping, the curve of sRGB and JPEG.
+Light is measured in full scale of the sensor. The share of a pixel that a facet covers is exact,
+and the lamp's reflections are at the exact positions of `heliotrope.airborne.mirror`. The blur of
+lens and motion is applied to all of it, then noise, clipping, the curve of sRGB and JPEG.
 """
 
 import math
@@ -26,14 +25,13 @@ from heliotrope.errors import InputError
 from heliotrope.field.camera import undistort
 from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray, as_float, direction, enu_to_geodetic, normalize
+from heliotrope.optics.coverage import coverage
 
 Light = npt.NDArray[np.float32]
 Picture = npt.NDArray[np.uint8]
 
 #: Blue, green, red of sky, ground and lamp, relative.
 SKY_TINT, GROUND_TINT, LED_TINT = (1.25, 1.0, 0.80), (0.72, 0.95, 1.15), (1.0, 1.0, 1.0)
-#: Fine cells of a pixel, each way, in which edges of facets are drawn.
-FINER = 8
 _TEXTURE, _TEXEL = 1024, 0.04
 
 
@@ -245,35 +243,15 @@ def _mirror(image: Light, camera: LedCamera, photo: Photo, scene: FlightScene, r
 
 def _cover(image: Light, outline: FloatArray, colour: FloatArray, strength: float) -> None:
     """Blend a colour over the pixels in a polygon (K, 2), each by its covered share."""
-    import cv2
-
     height, width = image.shape[:2]
     low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0)
     high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, [width, height])
     if (high <= low).any():
         return
-    size = high - low
-    fine = np.zeros((size[1] * FINER, size[0] * FINER), np.uint8)
-    # Pixel centres are whole numbers: the centre of the first fine cell is at -1/2 + 1/(2 FINER).
-    places = (_shrunk(outline, 0.5 / FINER) - low + 0.5) * FINER - 0.5
-    cv2.fillPoly(fine, [np.round(places * 16.0).astype(np.int32)], 255, shift=4)
-    share = cv2.resize(fine, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
+    share = coverage([outline - low], (high[1] - low[1], high[0] - low[0])).astype(np.float32)
     part = image[low[1] : high[1], low[0] : high[0]]
-    alpha = (np.float32(strength / 255.0) * share)[..., None]
+    alpha = (np.float32(strength) * share)[..., None]
     part += alpha * (colour.astype(np.float32) - part)
-
-
-def _shrunk(outline: FloatArray, by: float) -> FloatArray:
-    """Move the edges of a convex polygon (K, 2) inwards: fillPoly also fills what it touches."""
-    ahead = np.roll(outline, -1, axis=0) - outline
-    normal = np.stack([-ahead[:, 1], ahead[:, 0]], axis=-1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    before = np.roll(normal, 1, axis=0)
-    turn = 1.0 + np.sum(normal * before, axis=-1, keepdims=True)
-    area = np.sum(
-        outline[:, 0] * np.roll(outline[:, 1], -1) - outline[:, 1] * np.roll(outline[:, 0], -1)
-    )
-    return as_float(outline + math.copysign(by, area) * (normal + before) / np.maximum(turn, 0.1))
 
 
 def _spot(

@@ -1,13 +1,12 @@
 """A view: the map from a plane with targets to one frame, with its covariance."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from heliotrope.field.camera import Camera, undistort
+from heliotrope.field.camera import Camera, distort, undistort
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 
@@ -143,23 +142,6 @@ class FaceView:
         J = _slopes(lambda p: _predict(self.face, self.lens, p, place[None])[..., 0, :], numbers)
         moved = np.linalg.solve(self.scale(place), J)
         return np.asarray(moved @ self.covariance @ moved.T)
-
-
-def distort(lens: Camera, plane: npt.ArrayLike) -> FloatArray:
-    """Return pixels (..., 2) of undistorted places x/z, y/z (..., 2); Brown and Conrady."""
-    return _distort(lens.matrix, lens.distortion, np.asarray(plane, dtype=np.float64))
-
-
-def _distort(
-    m: FloatArray, distortion: Sequence[Any] | FloatArray, plane: FloatArray
-) -> FloatArray:
-    x, y = plane[..., 0], plane[..., 1]
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x * x + y * y
-    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    u = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    v = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return np.stack([m[0, 0] * u + m[0, 1] * v + m[0, 2], m[1, 1] * v + m[1, 2]], axis=-1)
 
 
 def unknown_lens(size: tuple[int, int]) -> Camera:
@@ -302,4 +284,4 @@ def _predict(face: Face, lens: Camera, numbers: FloatArray, plane: FloatArray) -
     homogeneous = np.column_stack([plane, np.ones(len(plane))])
     seen = homogeneous @ np.swapaxes(H, -1, -2)
     norm = seen[..., :2] / seen[..., 2:]
-    return _distort(lens.matrix, (k1[..., None], *lens.distortion[1:]), norm)
+    return distort(lens, norm, (k1[..., None], *lens.distortion[1:]))
