@@ -20,7 +20,7 @@ from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import SLOTS, linear_paint
 from heliotrope.mechanism.parameters import MODELS
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from support.planning_case import AIM, DAY, FIELD, NAMES, PLANT, START, TARGETS
 
 
@@ -67,7 +67,7 @@ def _check(found: CalibrationCampaign, fleets: list[Fleet], timing: Timing, targ
         some, vector = fleet.mechanism[rows], suns.vector[mine]
         centers = np.array([t.center for t in targets])[found.target[mine]]
         solved = track(some, vector, centers, current=found.counts[mine])
-        assert (solved.chosen(solved.status) == Status.OK).all()
+        assert (solved.chosen(solved.status) == TrackingStatus.OK).all()
         np.testing.assert_allclose(solved.chosen(solved.counts), found.counts[mine], atol=1e-3)
         home = track(some, vector, fleet.aim[rows])
         way = np.abs(found.counts[mine] - home.chosen(home.counts))

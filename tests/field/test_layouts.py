@@ -21,7 +21,7 @@ from heliotrope.field.layouts import (
     PACK,
     PATTERNS,
     Ground,
-    Mirror,
+    HeliostatSize,
     lay_out,
     malan_plant,
     nearest_gap,
@@ -95,7 +95,7 @@ def test_no_two_mirrors_can_touch(
     kind: str, count: int, width: float, shape: float, clearance: float, tower: float, north: bool
 ) -> None:
     height = width * shape
-    mirror = Mirror(width, height, 0.5 * height + 1.0, clearance=clearance)
+    mirror = HeliostatSize(width, height, 0.5 * height + 1.0, clearance=clearance)
     site = NORTH if north else Site(-28.5, 21.2, 830.0)
     plant = lay_out(kind, count, mirror=mirror, tower_height=tower, site=site)
     assert len(plant) == count
@@ -112,7 +112,7 @@ def test_no_two_mirrors_can_touch(
 
 
 def test_all_around_the_tower_the_ring_closes() -> None:
-    mirror = Mirror()
+    mirror = HeliostatSize()
     ground = Ground(half_angle=np.pi)
     for make in (layouts.radial_staggered, six_packs):
         places = make(1500, mirror, ground)
@@ -122,7 +122,7 @@ def test_all_around_the_tower_the_ring_closes() -> None:
 
 
 def test_rings_stagger() -> None:
-    mirror, ground = Mirror(), Ground()
+    mirror, ground = HeliostatSize(), Ground()
     places = layouts.radial_staggered(400, mirror, ground)
     rings = np.array([name.split("-")[0] for name in places.names])
     azimuth = np.degrees(np.arctan2(places.position[:, 0], -places.position[:, 1]))
@@ -133,7 +133,7 @@ def test_rings_stagger() -> None:
 
 
 def test_a_pack_is_a_triangle_of_six() -> None:
-    mirror = Mirror()
+    mirror = HeliostatSize()
     places = six_packs(600, mirror, Ground())
     packs = places.position.reshape(-1, PACK, 3)
     apart = np.linalg.norm(packs[:, :, None] - packs[:, None, :], axis=-1)
@@ -230,7 +230,7 @@ def test_an_unknown_pattern_names_the_known() -> None:
 )
 def test_mirrors_that_cannot_be(values: dict[str, float], text: str) -> None:
     with pytest.raises(InputError, match=text):
-        Mirror(**values)
+        HeliostatSize(**values)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 from heliotrope.geometry import angle_between, direction
 from heliotrope.lcu import pointing
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from support.lcu_machines import f32, single
 from support.machines import every_kind, imperfect
 
@@ -47,8 +47,8 @@ def test_double_precision_agrees_with_the_mechanism() -> None:
         machine.solve(tuple(sun), tuple(aim), FREE, HOME)
         for b, pose in enumerate(machine.found):
             assert pose.status == known.status[i, b], i
-            reached += pose.status == Status.OK
-            if pose.status == Status.OK:
+            reached += pose.status == TrackingStatus.OK
+            if pose.status == TrackingStatus.OK:
                 np.testing.assert_allclose(pose.angles, known.angles[i, b], rtol=0, atol=1e-9)
                 assert pose.residual < 1e-9
             else:
@@ -140,11 +140,11 @@ def test_stops_choose_the_branch_and_give_the_nearest_pose() -> None:
         seen.add(int(known.status[best]))
         assert pose.status == known.status[best]
         assert pose.residual == pytest.approx(known.residual[best], abs=1e-9)
-        if known.status[best] == Status.OK:
+        if known.status[best] == TrackingStatus.OK:
             np.testing.assert_allclose(pose.angles, known.angles[best], rtol=0, atol=2e-9)
         for angle, (lower, upper) in zip(pose.angles, stops, strict=True):
             assert lower <= angle <= upper
-    assert seen == {Status.OK, Status.STOPPED}
+    assert seen == {TrackingStatus.OK, TrackingStatus.STOPPED}
 
 
 def test_the_near_field_is_left_to_newton() -> None:
@@ -158,7 +158,7 @@ def test_the_near_field_is_left_to_newton() -> None:
         known = track(machine.armature, sun, aim)
         own.solve(tuple(sun), tuple(aim), FREE, HOME)
         for b, pose in enumerate(own.found):
-            if known.status[b] == Status.OK and pose.status == pointing.OK:
+            if known.status[b] == TrackingStatus.OK and pose.status == pointing.OK:
                 normal, vertex = machine.armature.pose(pose.angles)
                 ray = 2.0 * (normal @ sun) * normal - sun
                 assert np.linalg.norm(np.cross(aim - vertex, ray)) < 1e-8

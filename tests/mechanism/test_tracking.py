@@ -18,7 +18,7 @@ from heliotrope.geometry import (
 from heliotrope.mechanism import guo, kinds
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import direct
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from support.machines import every_kind, imperfect
 
 UNIT = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
@@ -45,20 +45,20 @@ def test_the_beam_reaches_its_aim(a, b, n, s, p, arm, distance) -> None:  # type
     found = track(machine, s, aim)
     for branch in (0, 1):
         status = found.status[branch]
-        if status == Status.OK:
+        if status == TrackingStatus.OK:
             miss = _miss(s, aim, found.normal[branch], found.vertex[branch])
             assert miss < 1.1e-9 + 1e-15 * distance
             normal, vertex = machine.pose(found.angles[branch])
             np.testing.assert_allclose(found.normal[branch], normal, rtol=0, atol=1e-9)
             np.testing.assert_allclose(found.vertex[branch], vertex, rtol=0, atol=1e-9)
-        elif status == Status.UNREACHABLE:
+        elif status == TrackingStatus.UNREACHABLE:
             # Honest: the residual is the angle from the bisector at the pose given.
             way = normalize(aim - found.vertex[branch])
             rest = angle_between(found.normal[branch], bisector(s, way))
             assert rest == pytest.approx(found.residual[branch], abs=1e-9)
             assert 2.0 * rest * distance > 1e-9  # a beam that strikes is not called unreachable
         else:
-            assert status == Status.DEGENERATE or distance < 10
+            assert status == TrackingStatus.DEGENERATE or distance < 10
 
 
 @pytest.mark.parametrize("kind", [k for k in every_kind() if k != "single_axis"])
@@ -106,7 +106,7 @@ def test_dead_cone_gives_the_nearest_pose(seed: int) -> None:
     sun = normalize(wanted + rng.normal(0, 0.2, 3) * [1, 1, 0])
     aim = 80.0 * reflect(sun, wanted)
     found = track(machine, sun, aim)
-    assert (found.status == Status.UNREACHABLE).all()
+    assert (found.status == TrackingStatus.UNREACHABLE).all()
 
     def miss(angles: np.ndarray) -> float:
         normal, vertex = machine.armature.pose(angles)
@@ -139,7 +139,7 @@ def test_stops_give_the_nearest_pose_within(stops: dict[str, float]) -> None:
     machine = _stopped(**stops)
     sun, aim = direction(1.5, 0.9), np.array([10.0, 40.0, 20.0])
     found = track(machine, sun, aim)
-    assert (found.status == Status.STOPPED).all()
+    assert (found.status == TrackingStatus.STOPPED).all()
     low = [stops["a_min_angle"], stops["e_min_angle"]]
     high = [stops["a_max_angle"], stops["e_max_angle"]]
     assert (found.angles >= np.array(low) - 1e-9).all()
@@ -171,7 +171,7 @@ def test_count_stops_and_turns() -> None:
     )
     found = track(machine, sun, aim)
     best = int(found.best)
-    assert found.status[best] == Status.OK
+    assert found.status[best] == TrackingStatus.OK
     assert -7.0 <= found.counts[best, 0] <= 0.5
     assert found.counts[best, 0] == pytest.approx(-found.angles[best, 0])
 
@@ -194,14 +194,14 @@ def test_no_solution() -> None:
     machine = kinds.azimuth_elevation((0, 0, 0), pivot_height=1.0)
     sun = direction(0.3, 0.5)
     opposite = track(machine, sun, np.array([0, 0, 1.0]) - 50.0 * sun)
-    assert (opposite.status == Status.DEGENERATE).all()
+    assert (opposite.status == TrackingStatus.DEGENERATE).all()
     assert np.isnan(opposite.angles).all()
     inside = track(machine, sun, (0.0, 0.0, 1.0))
-    assert (inside.status == Status.DEGENERATE).all()
+    assert (inside.status == TrackingStatus.DEGENERATE).all()
     trough = kinds.single_axis((0, 0, 0), (0, 1, 0))
     along = track(trough, (0.0, 1.0, 0.0), (3.0, 0.0, 5.0))
-    assert along.status[0] == Status.DEGENERATE
-    assert all(status.text for status in Status)
+    assert along.status[0] == TrackingStatus.DEGENERATE
+    assert all(status.text for status in TrackingStatus)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from heliotrope.errors import InputError
 from heliotrope.geometry import normalize
-from heliotrope.optics import SUN_RADIUS, Mirrors, beams, concentration, mean_concentration
+from heliotrope.optics import SUN_RADIUS, MirrorOptics, beams, concentration, mean_concentration
 from heliotrope.optics import glare as eye
 from heliotrope.optics.glare import Eye, Hazard
 
@@ -135,7 +135,7 @@ def test_no_source_no_glare() -> None:
 @pytest.mark.parametrize("focus", [math.inf, 500.0, 60.0])
 def test_on_the_axis_the_mirror_shows_the_sun(focus: float) -> None:
     """Irradiance over solid angle is the sun's radiance, times the reflectivity."""
-    given_ = beams((0, 0, 0), (0, 1, 0), Mirrors.of(5.0, 5.0, focus=focus, reflectivity=0.9))
+    given_ = beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(5.0, 5.0, focus=focus, reflectivity=0.9))
     for distance in (10.0, 100.0, 400.0, 1500.0):
         seen = eye.glare_at(given_, (0.0, distance, 0.0), dni=950.0)
         c = float(concentration(distance, 25.0, focus))
@@ -191,7 +191,7 @@ def _standby(count: int) -> tuple[eye.Beams, np.ndarray]:
     center = np.array([10.0, 0.0, 60.0])
     angle = np.linspace(-0.8, 0.8, count)
     origin = np.stack([150 * np.sin(angle), -150 * np.cos(angle), np.full(count, 3.0)], axis=-1)
-    return beams(origin, center, Mirrors.of(3.0, 3.0, focus=160.0)), center
+    return beams(origin, center, MirrorOptics.of(3.0, 3.0, focus=160.0)), center
 
 
 def test_beyond_the_safe_distance_no_look_burns() -> None:

@@ -13,7 +13,7 @@ from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, direction, normalize, rotation
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.tracking import track
-from heliotrope.optics import Mirrors
+from heliotrope.optics import MirrorOptics
 
 L_SHAPE = ((0.0, 0.0), (20.0, 0.0), (20.0, 8.0), (8.0, 8.0), (8.0, 20.0), (0.0, 20.0))
 ZOO: tuple[Volume, ...] = (
@@ -85,7 +85,7 @@ def test_clearance_is_a_distance(k: int) -> None:
 
 
 def _beam(origin: tuple[float, ...], aim: tuple[float, ...], **shape: float) -> optics.Beams:
-    return optics.beams(origin, aim, Mirrors.of(2.0, 2.0, **shape))
+    return optics.beams(origin, aim, MirrorOptics.of(2.0, 2.0, **shape))
 
 
 def test_entry_into_a_ball_by_hand() -> None:
@@ -103,13 +103,13 @@ def test_entry_into_a_ball_by_hand() -> None:
     assert abs(gap(float(entry.last[0, 0]))) < 2e-3
     assert entry.last[0, 0] > 500.0
     # Without the spread it passes.
-    narrow = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 2.0, error=0.0))
+    narrow = optics.beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(2.0, 2.0, error=0.0))
     assert not optics.find_entries(narrow, [Sphere("ball", (10.0, 500.0, 0.0), 4.0)]).entered[0, 0]
 
 
 def test_beams_end_at_their_reach_and_begin_at_the_mirror() -> None:
     ball = [Sphere("ball", (0.0, 200.0, 0.0), 5.0)]
-    mirror = Mirrors.of(2.0, 2.0)
+    mirror = MirrorOptics.of(2.0, 2.0)
     ahead = optics.beams((0, 0, 0), (0, 100, 0), mirror, reach=190.0)
     assert not optics.find_entries(ahead, ball).entered.any()
     assert optics.find_entries(
@@ -128,7 +128,9 @@ def test_entries_agree_with_points_of_the_beam(focus: float) -> None:
     rng = np.random.default_rng(3)
     origin = rng.uniform((-120, -120, 2), (120, -60, 4), (40, 3))
     aim = rng.uniform((-60, -40, 0), (60, 60, 90), (40, 3))
-    given_ = optics.beams(origin, aim, Mirrors.of(3.0, 2.0, focus=focus, error=1e-9), reach=300.0)
+    given_ = optics.beams(
+        origin, aim, MirrorOptics.of(3.0, 2.0, focus=focus, error=1e-9), reach=300.0
+    )
     entered = optics.find_entries(given_, ZOO).entered
     # Rays: any point of the mirror, bent to the focus, plus any direction within the sun.
     rays = 150
@@ -154,7 +156,7 @@ def test_entries_agree_with_points_of_the_beam(focus: float) -> None:
 
 
 def test_strength_is_that_of_the_focus_if_it_lies_in_the_volume() -> None:
-    mirror = Mirrors.of(10.0, 10.0, focus=300.0, reflectivity=0.9, error=0.0)
+    mirror = MirrorOptics.of(10.0, 10.0, focus=300.0, reflectivity=0.9, error=0.0)
     given_ = optics.beams((0, 0, 0), (0, 300, 0), mirror)
     volumes = [Box("at focus", (0, 300, 0), (50, 60, 50)), Box("far", (0, 900, 0), (50, 60, 50))]
     strength = optics.find_entries(given_, volumes, dni=900.0).irradiance[0]
@@ -201,7 +203,7 @@ def _field(count: int, seed: int) -> tuple[kinds.Mechanism, FloatArray, FloatArr
 
 def test_motion_misses_nothing_that_fine_samples_find() -> None:
     field, start, goal = _field(80, seed=5)
-    mirrors = Mirrors.of(3.0, 2.0, focus=150.0)
+    mirrors = MirrorOptics.of(3.0, 2.0, focus=150.0)
     path = np.stack([start, goal], axis=1)
     motion = optics.sweep(field.armature, path, SUN, mirrors, ZOO, reach=400.0)
     found = np.zeros((80, len(ZOO)), dtype=bool)
@@ -230,7 +232,7 @@ def test_a_flash_between_two_samples_is_found() -> None:
     pole = Cylinder("pole", (0.0, 300.0, 0.0), (0.0, 300.0, 20.0), 0.05)
     mechanism = kinds.azimuth_elevation((0.0, 0.0, 0.0), pivot_height=10.0)
     sun = direction(0.0, 0.4)
-    mirror = Mirrors.of(0.2, 0.2, error=0.0)
+    mirror = MirrorOptics.of(0.2, 0.2, error=0.0)
     angles = np.radians([[-40.0, 11.46], [40.0, 11.46]])
     motion = optics.sweep(mechanism.armature, angles, sun, mirror, [pole])
     assert motion.entered[0, 0]
@@ -250,7 +252,7 @@ def test_a_flash_between_two_samples_is_found() -> None:
 def test_a_finer_resolution_only_removes_entries() -> None:
     field, start, goal = _field(60, seed=8)
     path = np.stack([start, goal], axis=1)
-    mirrors = Mirrors.of(3.0, 2.0)
+    mirrors = MirrorOptics.of(3.0, 2.0)
     coarse, fine = (
         optics.sweep(field.armature, path, SUN, mirrors, ZOO, resolution=r).entered
         for r in (0.05, 1e-3)
@@ -263,7 +265,7 @@ def test_a_mirror_that_shows_its_back_sends_no_beam() -> None:
     mechanism = kinds.azimuth_elevation((0.0, 0.0, 0.0))
     down = np.radians([[0.0, -89.0], [180.0, -60.0]])
     everything = [Sphere("all", (0.0, 0.0, 0.0), 500.0)]
-    mirrors = Mirrors.of(3.0, 3.0)
+    mirrors = MirrorOptics.of(3.0, 3.0)
     noon = direction(0.0, math.radians(80.0))
     assert not optics.sweep(mechanism.armature, down, noon, mirrors, everything).entered.any()
     assert optics.sweep(mechanism.armature, -down, noon, mirrors, everything).entered.all()
@@ -276,7 +278,7 @@ def test_a_grazing_beam_at_the_end_of_a_turn_is_found() -> None:
     behind = [Sphere("behind", tuple(np.array([0.0, 0.0, 100.0]) - 60.0 * noon), 6.0)]
     # The normal passes the plane across the sun's direction at an elevation of −30°.
     turn = np.radians([[0.0, -33.4], [0.0, -27.7]])
-    mirrors = Mirrors.of(2.0, 2.0)
+    mirrors = MirrorOptics.of(2.0, 2.0)
     assert optics.sweep(mechanism.armature, turn, noon, mirrors, behind).entered.all()
     back = np.radians([[0.0, -36.0], [0.0, -30.5]])
     assert not optics.sweep(mechanism.armature, back, noon, mirrors, behind).entered.any()
@@ -284,7 +286,7 @@ def test_a_grazing_beam_at_the_end_of_a_turn_is_found() -> None:
 
 def test_a_path_of_one_pose_is_that_pose() -> None:
     field, start, _ = _field(40, seed=9)
-    mirrors = Mirrors.of(3.0, 2.0)
+    mirrors = MirrorOptics.of(3.0, 2.0)
     motion = optics.sweep(field.armature, start[:, None], SUN, mirrors, ZOO)
     normal, vertex = field.armature.pose(start)
     cosine = normal @ SUN
@@ -312,7 +314,13 @@ def _way(volumes: tuple[Volume, ...], east: float = 30.0) -> optics.Way:
     mechanism = kinds.azimuth_elevation((east, -80.0, 0.0), pivot_height=2.0, pivot_offset=0.2)
     noon = direction(math.radians(190.0), math.radians(55.0))
     return optics.safe_way(
-        mechanism.armature, (0.0, math.pi / 2), noon, FOOT, STANDBY, Mirrors.of(2.0, 2.0), volumes
+        mechanism.armature,
+        (0.0, math.pi / 2),
+        noon,
+        FOOT,
+        STANDBY,
+        MirrorOptics.of(2.0, 2.0),
+        volumes,
     )
 
 
@@ -346,7 +354,7 @@ def test_the_way_leaves_the_tower_aside_where_straight_ahead_is_not_clear() -> N
     place = (80.0, 0.0, 0.0)
     mechanism = kinds.azimuth_elevation(place, pivot_height=2.0)
     sun = direction(math.radians(95.0), math.radians(55.0))
-    mirror, stow = Mirrors.of(2.0, 2.0), (0.0, math.pi / 2)
+    mirror, stow = MirrorOptics.of(2.0, 2.0), (0.0, math.pi / 2)
     straight = track(mechanism, sun, (70.0, 0.0, 0.0))
     goal = straight.chosen(straight.angles)
     path = np.array([[goal[0], math.pi / 2], goal])
@@ -383,7 +391,7 @@ def test_aims_out_of_reach_are_told() -> None:
         direction(1.5, 0.6),
         FOOT,
         STANDBY,
-        Mirrors.of(2, 2),
+        MirrorOptics.of(2, 2),
         [],
         drives=drives,
     )
@@ -415,7 +423,7 @@ def _shining(
 @pytest.mark.parametrize("off", [0.0, 0.4, 0.9, 1.6])
 def test_crossing_agrees_with_sampled_mirrors(focus: float, off: float) -> None:
     rng = np.random.default_rng(11)
-    mirror = Mirrors.of(2.0, 2.0, focus=focus)
+    mirror = MirrorOptics.of(2.0, 2.0, focus=focus)
     given_ = optics.beams((0, 0, 0), (0, 1, 0), mirror)
     point = np.array([off, 100.0, 0.0])
     found = optics.crossing(given_, point)
@@ -426,7 +434,7 @@ def test_crossing_agrees_with_sampled_mirrors(focus: float, off: float) -> None:
 @pytest.mark.parametrize("focus", [math.inf, 150.0, 60.0])
 def test_no_light_is_lost_or_made(focus: float) -> None:
     """Over a section of the beam the concentration adds up to the mirror's area."""
-    given_ = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(2.0, 1.5, focus=focus))
+    given_ = optics.beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(2.0, 1.5, focus=focus))
     line = np.linspace(-4.0, 4.0, 161)
     x, z = np.meshgrid(line, line)
     points = np.stack([x, np.full_like(x, 120.0), z], axis=-1).reshape(-1, 3)
@@ -437,7 +445,7 @@ def test_no_light_is_lost_or_made(focus: float) -> None:
 def test_crossing_sums_the_beams_that_are_there() -> None:
     origin = np.array([[0.0, -100.0, 0.0], [20.0, -100.0, 0.0], [-20.0, -100.0, 0.0]])
     aims = np.array([[0.0, 0.0, 40.0], [0.0, 0.0, 40.0], [300.0, 0.0, 40.0]])
-    mirrors = Mirrors.of(2.0, 2.0, reflectivity=[1.0, 0.5, 1.0])
+    mirrors = MirrorOptics.of(2.0, 2.0, reflectivity=[1.0, 0.5, 1.0])
     here = optics.crossing(
         optics.beams(origin, aims, mirrors), [[0.0, 0.0, 40.0], [0.0, 0.0, 90.0]], dni=800.0
     )
@@ -452,7 +460,7 @@ def test_crossing_sums_the_beams_that_are_there() -> None:
 def test_beside_the_axis_it_is_never_stronger(
     size: float, focus: float, distance: float, off: float
 ) -> None:
-    given_ = optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(size, size, focus=focus))
+    given_ = optics.beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(size, size, focus=focus))
     found = optics.crossing(given_, (off, distance, 0.0)).concentration[0, 0]
     axis = float(optics.concentration(distance, size * size, focus))
     assert 0.0 <= found <= axis * (1.0 + 1e-6) + 1e-9 or abs(1 - distance / focus) < 2e-4
@@ -470,20 +478,29 @@ def test_what_cannot_be_is_refused() -> None:
         (lambda: Prism("d", ((0, 0), (1, 0), (1, math.nan)), 0, 1), "d: a corner or height is not"),
         (lambda: Prism("d", ((0, 0), (1, 0), (1, 1)), 3, 1), "top 1 m must be above bottom 3 m"),
         (lambda: Prism("d", ((0, 0), (0, 0), (1, 1)), 0, 1), "two neighbouring corners coincide"),
-        (lambda: Mirrors.of(0.0, 1.0), "mirrors: width 0.0 m must be above 0 and finite"),
-        (lambda: Mirrors.of(1.0, 1.0, reflectivity=1.5), "reflectivity 1.5 .* at most 1"),
-        (lambda: Mirrors.of(1.0, 1.0, focus=-3.0), "a focus must be above 0 m"),
-        (lambda: Mirrors.of(1.0, 1.0, error=0.6), "an error must be from 0 to 0.5 rad"),
-        (lambda: Mirrors.of(np.ones((2, 2)), 1.0), "give numbers or"),
-        (lambda: Mirrors.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: 2 for 3 beams"),
-        (lambda: optics.beams((0, 0, 0), (0, 0, 0), Mirrors.of(1, 1)), "length 0 has no direction"),
-        (lambda: optics.beams(np.zeros((2, 2, 3)), (0, 1, 0), Mirrors.of(1, 1)), "give .N, 3."),
-        (lambda: optics.beams((0, 0, 0), (0, 1, 0), Mirrors.of(1, 1), reach=-1.0), "reach -1.0 m"),
+        (lambda: MirrorOptics.of(0.0, 1.0), "mirrors: width 0.0 m must be above 0 and finite"),
+        (lambda: MirrorOptics.of(1.0, 1.0, reflectivity=1.5), "reflectivity 1.5 .* at most 1"),
+        (lambda: MirrorOptics.of(1.0, 1.0, focus=-3.0), "a focus must be above 0 m"),
+        (lambda: MirrorOptics.of(1.0, 1.0, error=0.6), "an error must be from 0 to 0.5 rad"),
+        (lambda: MirrorOptics.of(np.ones((2, 2)), 1.0), "give numbers or"),
+        (lambda: MirrorOptics.of([1.0, 1.0], 1.0).broadcast(3), "mirrors: 2 for 3 beams"),
+        (
+            lambda: optics.beams((0, 0, 0), (0, 0, 0), MirrorOptics.of(1, 1)),
+            "length 0 has no direction",
+        ),
+        (
+            lambda: optics.beams(np.zeros((2, 2, 3)), (0, 1, 0), MirrorOptics.of(1, 1)),
+            "give .N, 3.",
+        ),
+        (
+            lambda: optics.beams((0, 0, 0), (0, 1, 0), MirrorOptics.of(1, 1), reach=-1.0),
+            "reach -1.0 m",
+        ),
     )
     for call, text in refusals:
         with pytest.raises(InputError, match=text):
             call()
-    arm, mirror = kinds.azimuth_elevation((0, 0, 0)).armature, Mirrors.of(1, 1)
+    arm, mirror = kinds.azimuth_elevation((0, 0, 0)).armature, MirrorOptics.of(1, 1)
     with pytest.raises(InputError, match="give finite joint angles"):
         optics.sweep(arm, (0.0, 1.0), SUN, mirror, ZOO)
     with pytest.raises(InputError, match=r"resolution 0\.0 rad must be above 0"):

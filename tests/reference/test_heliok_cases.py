@@ -6,7 +6,7 @@ import pytest
 from heliotrope.geometry import reflect, wrap_signed
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.chain import Mechanism
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from reference.cases import params
 
 _LIMIT = 1e-10  # rad
@@ -38,10 +38,10 @@ def _check_two_axis(case: dict) -> None:
     for branch, wanted in enumerate(case["branches"]):
         assert wanted["branch"] == branch
         if wanted["status"] == "unreachable":
-            assert found.status[branch] == Status.UNREACHABLE
+            assert found.status[branch] == TrackingStatus.UNREACHABLE
             assert found.residual[branch] > 1e-3
             continue
-        assert found.status[branch] == Status.OK
+        assert found.status[branch] == TrackingStatus.OK
         angles = [wanted["alpha_rad"], wanted["beta_rad"]]
         assert _difference(found.angles[branch], angles) < _LIMIT
         vertex = mechanism.position + rotation @ np.array(wanted["mirror_point_local"])
@@ -82,7 +82,7 @@ def _check_single_axis(case: dict) -> None:
         # t1 lifts axis and mirror alike; lower the aim instead.
         aim = aim - np.array(inputs["t1"])
     found = track(mechanism, inputs["sun_vector_ENZ"], aim, local=local, tolerance=1e-13)
-    assert found.status[0] == Status.OK
+    assert found.status[0] == TrackingStatus.OK
     assert _difference(found.angles[0], [case["alpha_rad"]]) < _LIMIT
 
 

@@ -53,8 +53,8 @@ from heliotrope.calibration.uncertainty import (
     year_map,
 )
 from heliotrope.calibration.workflow import (
-    Evaluation,
     FieldSightings,
+    HeldOutEvaluation,
     calibrate,
     evaluate,
     read_field_sightings,
@@ -66,12 +66,12 @@ __all__ = [
     "BlindSpot",
     "CalibrationReport",
     "ErrorSummary",
-    "Evaluation",
     "FieldFit",
     "FieldParameters",
     "FieldSightings",
     "FitOutcome",
     "Fleet",
+    "HeldOutEvaluation",
     "Learned",
     "Prediction",
     "SightingLimits",

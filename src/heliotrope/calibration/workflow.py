@@ -159,7 +159,7 @@ def find_model(
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class HeldOutEvaluation:
     """How well held-out sightings are predicted.
 
     Attributes
@@ -196,7 +196,7 @@ def evaluate(
     priors: Mapping[str, npt.ArrayLike] | None = None,
     runner: Runner | None = None,
     steps: Steps | None = None,
-) -> Evaluation:
+) -> HeldOutEvaluation:
     """Learn from a part of each heliostat's sightings and assess the rest.
 
     Everything, the model and the hyperparameters of the field included, is learnt from the
@@ -237,7 +237,7 @@ def evaluate(
         runner=runner,
         progress=_step(steps, "learning from the training part"),
     )
-    return Evaluation(learned, assess(names, learned), scores)
+    return HeldOutEvaluation(learned, assess(names, learned), scores)
 
 
 def calibrate(

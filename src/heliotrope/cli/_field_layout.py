@@ -8,7 +8,7 @@ import typer
 from heliotrope.cli._common import print_json
 
 if TYPE_CHECKING:
-    from heliotrope.field.layouts import Mirror
+    from heliotrope.field.layouts import HeliostatSize
     from heliotrope.field.plant import Plant
 
 
@@ -42,13 +42,13 @@ def layout(
     """
     from heliotrope.errors import InputError
     from heliotrope.field.formats.plant_file import write_plant
-    from heliotrope.field.layouts import Mirror, lay_out
+    from heliotrope.field.layouts import HeliostatSize, lay_out
     from heliotrope.sun import Site
 
     kinds = ("png", "svg", "pdf")
     if picture is not None and picture.suffix.removeprefix(".").lower() not in kinds:
         raise InputError(f"picture {picture}: give a file that ends in .png, .svg or .pdf")
-    mirror = Mirror(
+    mirror = HeliostatSize(
         width, height, 0.5 * height + 0.7 if pivot is None else pivot, clearance=clearance
     )
     plant = lay_out(
@@ -65,7 +65,7 @@ def layout(
     _report(plant, mirror, out, as_json)
 
 
-def _report(plant: "Plant", mirror: "Mirror", out: Path, as_json: bool) -> None:
+def _report(plant: "Plant", mirror: "HeliostatSize", out: Path, as_json: bool) -> None:
     from heliotrope.field.layouts import nearest_gap
 
     area = mirror.width * mirror.height

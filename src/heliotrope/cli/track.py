@@ -99,9 +99,9 @@ def _branch(result: "Tracking", b: int) -> dict[str, Any]:
     import numpy as np
 
     from heliotrope.geometry import azimuth_elevation
-    from heliotrope.mechanism.tracking import Status
+    from heliotrope.mechanism.tracking import TrackingStatus
 
-    status = Status(int(result.status[b]))
+    status = TrackingStatus(int(result.status[b]))
     azimuth, elevation = azimuth_elevation(result.normal[b])
     return {
         "branch": b,

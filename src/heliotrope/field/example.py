@@ -74,7 +74,7 @@ def board_prototype() -> Plant:
     """
     like = prototype()
     (group,) = like.groups.values()
-    mirror = layouts.Mirror(1.83, 1.22, pivot_height=_PIVOT_HEIGHT)
+    mirror = layouts.HeliostatSize(1.83, 1.22, pivot_height=_PIVOT_HEIGHT)
     mechanism = layouts.stepped(group.position, mirror)
     machines = (layouts.stepped_machine(mechanism, like.receivers[0]),) * len(group)
     target = square_target("target", like.targets[0].center, 3.0, np.pi)

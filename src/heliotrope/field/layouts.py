@@ -47,7 +47,7 @@ _SITE = Site(-28.5, 21.2, 830.0, name="Northern Cape")
 
 
 @dataclass(frozen=True)
-class Mirror:
+class HeliostatSize:
     """One heliostat's size.
 
     Attributes
@@ -164,7 +164,7 @@ class Places:
         return len(self.names)
 
 
-def radial_staggered(count: int, mirror: Mirror, ground: Ground) -> Places:
+def radial_staggered(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return mirrors on rings around the tower, each before a gap of the ring in front.
 
     A zone begins as densely as mirrors can turn: ``reach`` apart along the ring and √3/2 of that
@@ -196,7 +196,7 @@ def radial_staggered(count: int, mirror: Mirror, ground: Ground) -> Places:
     return _places(names, parts)
 
 
-def _ring_step(radius: float, zone: float, mirror: Mirror, ground: Ground) -> float:
+def _ring_step(radius: float, zone: float, mirror: HeliostatSize, ground: Ground) -> float:
     """From a ring to the next, m."""
     dense = 0.5 * np.sqrt(3.0) * mirror.reach
     # Where the next ring begins a zone its azimuths are others: no stagger can be counted on.
@@ -205,7 +205,7 @@ def _ring_step(radius: float, zone: float, mirror: Mirror, ground: Ground) -> fl
     return float(max(step, mirror.reach)) if radius + step >= 2.0 * zone else step
 
 
-def rows(count: int, mirror: Mirror, ground: Ground) -> Places:
+def rows(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return mirrors in straight rows east to west, in two fields north and south of the tower.
 
     Each field is twice as wide as it is deep. Rows are ``reach`` apart near the tower and
@@ -239,7 +239,7 @@ def rows(count: int, mirror: Mirror, ground: Ground) -> Places:
     return _places(names, parts)
 
 
-def _row_length(wanted: int, mirror: Mirror, ground: Ground) -> float:
+def _row_length(wanted: int, mirror: HeliostatSize, ground: Ground) -> float:
     """Places of a row, so that a field of ``wanted`` mirrors is about twice as wide as deep."""
     pitch, north, rows_made = 1.1 * mirror.reach, ground.nearest, 0
     while rows_made * 2.0 * (north - ground.nearest) / pitch < wanted:
@@ -248,7 +248,7 @@ def _row_length(wanted: int, mirror: Mirror, ground: Ground) -> float:
     return 2.0 * (north - ground.nearest) / pitch
 
 
-def six_packs(count: int, mirror: Mirror, ground: Ground) -> Places:
+def six_packs(count: int, mirror: HeliostatSize, ground: Ground) -> Places:
     """Return Malan's triangles of six mirrors on arcs around the tower.
 
     A triangle has a mirror at each corner and at the middle of each side. On an arc triangles
@@ -317,7 +317,7 @@ def _places(names: Sequence[str], parts: Sequence[FloatArray]) -> Places:
     return Places(tuple(names), np.concatenate([flat, np.zeros((len(flat), 1))], axis=1))
 
 
-def nearest_gap(position: FloatArray, mirror: Mirror) -> float:
+def nearest_gap(position: FloatArray, mirror: HeliostatSize) -> float:
     """Return the smallest gap between two mirrors in any pose, m; below 0 they can touch.
 
     Parameters
@@ -335,7 +335,7 @@ def nearest_gap(position: FloatArray, mirror: Mirror) -> float:
     return float(np.asarray(apart)[:, 1].min() - (mirror.reach - mirror.clearance))
 
 
-PATTERNS: dict[str, Callable[[int, Mirror, Ground], Places]] = {
+PATTERNS: dict[str, Callable[[int, HeliostatSize, Ground], Places]] = {
     "radial": radial_staggered,
     "rows": rows,
     "six-packs": six_packs,
@@ -347,7 +347,7 @@ def clusters(count: int, each: int = CLUSTER) -> tuple[str, ...]:
     return tuple(f"C{1 + i // each:03d}" for i in range(count))
 
 
-def stepped(position: FloatArray, mirror: Mirror) -> Mechanism:
+def stepped(position: FloatArray, mirror: HeliostatSize) -> Mechanism:
     """Return azimuth-elevation mechanisms on stepper motors at positions (N, 3).
 
     400,000 steps to a turn of a joint (15.7 µrad each), 8000 steps/s: 7.2 °/s. Stops at ±200° of
@@ -413,7 +413,7 @@ def lay_out(
     kind: str,
     heliostats: int,
     *,
-    mirror: Mirror | None = None,
+    mirror: HeliostatSize | None = None,
     tower_height: float | None = None,
     site: Site = _SITE,
     name: str = "",
@@ -449,7 +449,7 @@ def lay_out(
     if kind not in PATTERNS:
         raise UnknownNameError("layout", kind, PATTERNS)
     _check_count(heliostats)
-    size = mirror or Mirror()
+    size = mirror or HeliostatSize()
     tall = _tower_height(heliostats, size) if tower_height is None else tower_height
     if not 20.0 <= tall <= 500.0:
         raise InputError(f"layout: tower height {tall} m; give 20 to 500 m")
@@ -486,7 +486,7 @@ def lay_out(
     )
 
 
-def _tower_height(heliostats: int, mirror: Mirror) -> float:
+def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
     """In proportion to the field, m."""
     area = heliostats * mirror.width * mirror.height
     return float(np.clip(80.0 * np.sqrt(area / 50_000.0), 30.0, 250.0))

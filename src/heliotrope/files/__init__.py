@@ -20,7 +20,7 @@ from heliotrope.files.cells import (
     rows_of,
 )
 from heliotrope.files.json import (
-    Node,
+    JsonNode,
     read_json,
 )
 from heliotrope.files.text import (
@@ -30,15 +30,15 @@ from heliotrope.files.text import (
     write_file,
     write_text,
 )
-from heliotrope.files.xml import Document, Element, read_xml
+from heliotrope.files.xml import Document, XmlElement, read_xml
 
 __all__ = [
     "SIZE_LIMIT",
     "Cells",
     "Document",
-    "Element",
-    "Node",
+    "JsonNode",
     "Rows",
+    "XmlElement",
     "check_file",
     "find_heliostats",
     "format_time",

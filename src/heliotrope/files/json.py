@@ -9,7 +9,7 @@ from heliotrope.errors import FormatError
 from heliotrope.files.text import read_text
 
 
-class Node:
+class JsonNode:
     """A value in a JSON document that knows where it stands.
 
     Parameters
@@ -33,33 +33,33 @@ class Node:
         """Whether this is an object with such a key."""
         return isinstance(self.value, dict) and key in self.value
 
-    def __getitem__(self, key: str) -> "Node":
+    def __getitem__(self, key: str) -> "JsonNode":
         """Return the value of a key, or fail with the keys that are there."""
         if not isinstance(self.value, dict):
             raise self.fail(f"expected an object with {key!r}, found {self.value!r:.60}")
         if key not in self.value:
             there = ", ".join(list(self.value)[:8]) or "nothing"
             raise self.fail(f"{key!r} is missing; there is {there}")
-        return Node(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
+        return JsonNode(self.path, self.value[key], f"{self.where}.{key}" if self.where else key)
 
-    def any_of(self, *keys: str) -> "Node":
+    def any_of(self, *keys: str) -> "JsonNode":
         """Return the value of the first key that is there (formats have changed names)."""
         for key in keys:
             if self.has(key):
                 return self[key]
         return self[keys[0]]
 
-    def items(self) -> list["tuple[str, Node]"]:
+    def items(self) -> list["tuple[str, JsonNode]"]:
         """Return the members of an object."""
         if not isinstance(self.value, dict):
             raise self.fail(f"expected an object, found {self.value!r:.60}")
         return [(key, self[key]) for key in self.value]
 
-    def elements(self) -> list["Node"]:
+    def elements(self) -> list["JsonNode"]:
         """Return the elements of a list."""
         if not isinstance(self.value, list):
             raise self.fail(f"expected a list, found {self.value!r:.60}")
-        return [Node(self.path, v, f"{self.where}[{i}]") for i, v in enumerate(self.value)]
+        return [JsonNode(self.path, v, f"{self.where}[{i}]") for i, v in enumerate(self.value)]
 
     def number(self, low: float = -math.inf, high: float = math.inf) -> float:
         """Return a finite number between limits."""
@@ -95,7 +95,7 @@ class Node:
         )
 
 
-def read_json(path: str | Path, what: str) -> Node:
+def read_json(path: str | Path, what: str) -> JsonNode:
     """Return the root of a JSON file.
 
     Raises
@@ -105,7 +105,7 @@ def read_json(path: str | Path, what: str) -> Node:
     """
     text = read_text(path, what)
     try:
-        return Node(Path(path), json.loads(text))
+        return JsonNode(Path(path), json.loads(text))
     except (json.JSONDecodeError, RecursionError) as error:
         line = getattr(error, "lineno", 1)
         reason = getattr(error, "msg", "nested too deeply")

@@ -10,7 +10,7 @@ from heliotrope.files.text import check_file
 
 
 @dataclass(frozen=True)
-class Element:
+class XmlElement:
     """An element of an XML document.
 
     Attributes
@@ -27,14 +27,14 @@ class Element:
 
     tag: str
     attributes: tuple[tuple[str, str], ...] = ()
-    children: tuple["Element", ...] = ()
+    children: tuple["XmlElement", ...] = ()
     line: int = field(default=0, compare=False)
 
     def get(self, name: str) -> str | None:
         """Return the value of an attribute, or None if there is none of that name."""
         return dict(self.attributes).get(name)
 
-    def elements(self, *tags: str) -> Iterator["Element"]:
+    def elements(self, *tags: str) -> Iterator["XmlElement"]:
         """Give the child elements, only those with one of ``tags`` if any are given."""
         return (child for child in self.children if not tags or child.tag in tags)
 
@@ -51,7 +51,7 @@ class Document:
         File it was read from; ignored in comparisons.
     """
 
-    root: Element
+    root: XmlElement
     path: str = field(default="", compare=False)
 
 
@@ -91,8 +91,8 @@ def read_xml(path: str | Path, what: str) -> Document:
     return Document(_element(tree.getroot()), str(file))
 
 
-def _element(node: Any) -> Element:
+def _element(node: Any) -> XmlElement:
     attributes = tuple((str(name), str(value)) for name, value in node.attrib.items())
     # Comments and processing instructions have no text as tag.
     children = tuple(_element(child) for child in node if isinstance(child.tag, str))
-    return Element(node.tag, attributes, children, node.sourceline or 0)
+    return XmlElement(node.tag, attributes, children, node.sourceline or 0)

@@ -14,7 +14,7 @@ import math
 
 from .vectors import about, across, add, cross, dot, finite, minus, norm, times, turn_between, unit
 
-#: How a solution ended: as in ``heliotrope.mechanism.tracking.Status``.
+#: How a solution ended: as in ``heliotrope.mechanism.tracking.TrackingStatus``.
 OK, UNREACHABLE, STOPPED, NOT_CONVERGED, DEGENERATE = range(5)
 
 #: Largest miss of the beam at its aim, m, where precision allows it.

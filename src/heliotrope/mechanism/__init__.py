@@ -51,8 +51,8 @@ from heliotrope.mechanism.parameters import (
 )
 from heliotrope.mechanism.tracking import (
     Branch,
-    Status,
     Tracking,
+    TrackingStatus,
     track,
 )
 
@@ -68,8 +68,8 @@ __all__ = [
     "Mechanism",
     "Parameter",
     "Pose",
-    "Status",
     "Tracking",
+    "TrackingStatus",
     "azimuth_elevation",
     "check_axes",
     "direct",

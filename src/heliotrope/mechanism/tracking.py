@@ -31,7 +31,7 @@ from heliotrope.parallel import run_blocks
 Branch = Literal["both", 0, 1]
 
 
-class Status(IntEnum):
+class TrackingStatus(IntEnum):
     """Outcome of a solution."""
 
     OK = OK
@@ -47,12 +47,12 @@ class Status(IntEnum):
 
 
 _TEXTS = {
-    Status.OK: "the beam reaches its aim",
-    Status.UNREACHABLE: "the axes cannot turn the mirror there; this is the nearest pose",
-    Status.STOPPED: "a stop is in the way; this is the nearest pose within the stops",
-    Status.NOT_CONVERGED: "the iteration did not settle; do not use this pose",
-    Status.DEGENERATE: "no mirror can do it: source and aim are opposite, or the aim is in the "
-    "mirror",
+    TrackingStatus.OK: "the beam reaches its aim",
+    TrackingStatus.UNREACHABLE: "the axes cannot turn the mirror there; this is the nearest pose",
+    TrackingStatus.STOPPED: "a stop is in the way; this is the nearest pose within the stops",
+    TrackingStatus.NOT_CONVERGED: "the iteration did not settle; do not use this pose",
+    TrackingStatus.DEGENERATE: "no mirror can do it: source and aim are opposite, or the aim is in "
+    "the mirror",
 }
 
 
@@ -69,7 +69,7 @@ class Tracking:
     normal, vertex
         Pose of the mirror, ENU, (..., B, 3).
     status
-        `Status` as integers, (..., B).
+        `TrackingStatus` as integers, (..., B).
     residual
         Angle between the normal and the demanded one, rad, (..., B).
     iterations
@@ -91,7 +91,7 @@ class Tracking:
     @property
     def reachable(self) -> npt.NDArray[np.bool_]:
         """Whether the beam reaches its aim, (..., B)."""
-        return np.asarray(self.status == Status.OK)
+        return np.asarray(self.status == TrackingStatus.OK)
 
     def chosen(self, values: np.ndarray) -> np.ndarray:
         """Return the best branch's part of one of the arrays above, (..., rest)."""

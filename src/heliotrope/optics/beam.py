@@ -6,7 +6,7 @@ Every other module takes these from here. There are two models of a beam:
   angular variances of the sun's disk, of the mirror's slope and of the tracking add up; a mirror
   doubles the latter two:
   $σ_{beam}^2 = σ_{sun}^2 + (2 σ_{slope})^2 + (2 σ_{tracking})^2$.
-- `Mirrors` and `Beams` describe a solid that surely holds the beam, for what must stay dark:
+- `MirrorOptics` and `Beams` describe a solid that surely holds the beam, for what must stay dark:
   keep-out volumes and eyes.
 """
 
@@ -85,7 +85,7 @@ def checked(name: str, value: npt.ArrayLike, unit: str, *, positive: bool = Fals
 
 
 @dataclass(frozen=True)
-class Mirrors:
+class MirrorOptics:
     """The properties of N mirrors that shape their beams.
 
     Attributes
@@ -116,7 +116,7 @@ class Mirrors:
         focus: npt.ArrayLike = np.inf,
         error: npt.ArrayLike = 5e-3,
         reflectivity: npt.ArrayLike = 1.0,
-    ) -> "Mirrors":
+    ) -> "MirrorOptics":
         """Return mirrors from numbers or arrays that broadcast to (N,).
 
         Raises
@@ -172,11 +172,11 @@ class Mirrors:
         """Half angle of the solid that holds the beam, rad, (N,)."""
         return SUN_RADIUS + self.error
 
-    def broadcast(self, count: int) -> "Mirrors":
+    def broadcast(self, count: int) -> "MirrorOptics":
         """Return ``count`` mirrors, repeating a single one."""
         if len(self) not in (1, count):
             raise InputError(f"mirrors: {len(self)} for {count} beams; give one, or one for each")
-        return Mirrors(
+        return MirrorOptics(
             **{k: np.ascontiguousarray(np.broadcast_to(v, (count,))) for k, v in vars(self).items()}
         )
 
@@ -203,7 +203,7 @@ class Beams:
 
     origin: FloatArray
     direction: FloatArray
-    mirrors: Mirrors
+    mirrors: MirrorOptics
     reach: FloatArray
 
     def __len__(self) -> int:
@@ -217,7 +217,11 @@ class Beams:
 
 
 def beams(
-    vertex: npt.ArrayLike, aim: npt.ArrayLike, mirrors: Mirrors, *, reach: npt.ArrayLike = REACH
+    vertex: npt.ArrayLike,
+    aim: npt.ArrayLike,
+    mirrors: MirrorOptics,
+    *,
+    reach: npt.ArrayLike = REACH,
 ) -> Beams:
     """Return beams from vertices (N, 3) to aims (N, 3) or (3,), ENU metres.
 

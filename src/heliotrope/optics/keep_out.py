@@ -21,14 +21,14 @@ from heliotrope.field.volumes import Box, Cylinder, Prism, Sphere, Volume
 from heliotrope.geometry import FloatArray, as_float, as_vectors, direction, normalize
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 from heliotrope.optics import _keep_out_kernels as kernels
 from heliotrope.optics.beam import (
     NOMINAL_DNI,
     REACH,
     SUN_RADIUS,
     Beams,
-    Mirrors,
+    MirrorOptics,
     concentration,
     reaches,
 )
@@ -111,7 +111,9 @@ def find_entries(given: Beams, volumes: Sequence[Volume], *, dni: float = NOMINA
     return Entries(names, first, last, given.point(first), strongest)
 
 
-def _strongest(mirrors: Mirrors, first: FloatArray, last: FloatArray, dni: float) -> FloatArray:
+def _strongest(
+    mirrors: MirrorOptics, first: FloatArray, last: FloatArray, dni: float
+) -> FloatArray:
     """Return the largest irradiance on the axis between two distances (N, V), W/m²."""
     area, focus = mirrors.area[:, None], mirrors.focus[:, None]
     radius = np.sqrt(area / np.pi)
@@ -161,7 +163,7 @@ def sweep(
     armatures: Armature,
     path: npt.ArrayLike,
     sun: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: MirrorOptics,
     volumes: Sequence[Volume],
     *,
     reach: npt.ArrayLike = REACH,
@@ -238,7 +240,11 @@ def sweep(
 
 
 def _leaving(
-    found: FloatArray, table: FloatArray, corners: FloatArray, mirrors: Mirrors, reach: FloatArray
+    found: FloatArray,
+    table: FloatArray,
+    corners: FloatArray,
+    mirrors: MirrorOptics,
+    reach: FloatArray,
 ) -> FloatArray:
     """Return the last contact in the pose of the entry, m, (N, V); at least the first."""
     last = found[..., 1].copy()
@@ -325,7 +331,7 @@ def safe_way(
     sun: npt.ArrayLike,
     foot: npt.ArrayLike,
     standby: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: MirrorOptics,
     volumes: Sequence[Volume],
     *,
     drives: Drive | None = None,
@@ -389,7 +395,7 @@ def _verified(
     stow: FloatArray,
     aims: FloatArray,
     sun: npt.ArrayLike,
-    mirrors: Mirrors,
+    mirrors: MirrorOptics,
     volumes: Sequence[Volume],
     drives: Drive | None,
     reach: float,
@@ -399,7 +405,7 @@ def _verified(
     path = np.stack([stow, np.array([poses[0, 0], stow[1]]), *poses])
     motion = sweep(armature, path, sun, mirrors, volumes, reach=reach)
     blocked = np.flatnonzero(motion.entered[0])
-    lost = np.flatnonzero(status != Status.OK)
+    lost = np.flatnonzero(status != TrackingStatus.OK)
     text = "every beam on the way is proven to stay out of every volume"
     if blocked.size:
         v = blocked[np.argmin(motion.at[0, blocked])]
@@ -411,7 +417,7 @@ def _verified(
         )
     if lost.size:
         k = int(lost[0])
-        text = f"aim {k + 1} of {len(aims)}: {Status(int(status[k])).text}"
+        text = f"aim {k + 1} of {len(aims)}: {TrackingStatus(int(status[k])).text}"
     return Way(aims, path, not blocked.size and not lost.size, motion, text)
 
 
@@ -431,7 +437,7 @@ def _angles(
         options = found.angles[k]
         if drives is None:
             options = before + (options - before + np.pi) % (2.0 * np.pi) - np.pi
-        ok = found.status[k] == Status.OK
+        ok = found.status[k] == TrackingStatus.OK
         cost = np.abs(options - before).max(axis=1) + np.where(ok, 0.0, 1e3)
         best = int(np.argmin(cost))
         before = angles[k] = options[best]

@@ -18,7 +18,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float, as_vectors, reflect, tangent_axes
 from heliotrope.mechanism.chain import Mechanism, Pose
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 
 
 @dataclass(frozen=True)
@@ -180,5 +180,5 @@ def _stand(
         ) from None
     pose = actual.pose(counts)
     beam = reflect(as_vectors(sun, "sun"), pose.normal)
-    reached = tracked.chosen(tracked.status) == Status.OK
+    reached = tracked.chosen(tracked.status) == TrackingStatus.OK
     return aim - tracked.chosen(tracked.vertex), pose, np.where(reached[..., None], beam, np.nan)

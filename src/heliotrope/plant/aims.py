@@ -11,8 +11,8 @@ from heliotrope.field.volumes import Volume
 from heliotrope.geometry import FloatArray, as_float, as_vectors
 from heliotrope.mechanism.armature import Armature
 from heliotrope.mechanism.drives import Drive
-from heliotrope.mechanism.tracking import Status, Tracking, track
-from heliotrope.optics import Hazard, Mirrors, beams, crossing, find_entries, glare_at, sweep
+from heliotrope.mechanism.tracking import Tracking, TrackingStatus, track
+from heliotrope.optics import Hazard, MirrorOptics, beams, crossing, find_entries, glare_at, sweep
 
 #: Length over which an unobstructed beam is followed, m.
 FAR = 3000.0
@@ -118,7 +118,7 @@ class BeamCheck:
         sizes = [
             np.concatenate([getattr(g, what) for g in groups])[rows] for what in ("width", "height")
         ]
-        self.mirrors = Mirrors.of(*sizes)
+        self.mirrors = MirrorOptics.of(*sizes)
 
     def replace(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
         """Take the new calibration of a heliostat: rows (18,) and (2, 19)."""
@@ -172,9 +172,9 @@ class BeamCheck:
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
         status = solved.chosen(solved.status)
-        for i in np.flatnonzero(status != Status.OK):
+        for i in np.flatnonzero(status != TrackingStatus.OK):
             found[self.names[rows[i]]] = (
-                f"the aim {_point(aims[i])} m: {Status(int(status[i])).text}"
+                f"the aim {_point(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
         if not self.volumes:
             return found
@@ -183,7 +183,7 @@ class BeamCheck:
         reach = np.linalg.norm(aims - vertex, axis=-1) if stopped else np.full(len(rows), FAR)
         rest = find_entries(beams(vertex, aims, part, reach=reach), self.volumes)
         self._tell(found, rows, rest.entered, rest.first, "at the aim")
-        swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == Status.OK))
+        swept = np.flatnonzero(np.isfinite(start).all(axis=-1) & (status == TrackingStatus.OK))
         if swept.size and sun[2] > 0.0:
             self._sweep(found, rows[swept], start[swept], aims[swept], sun)
         return found
@@ -245,11 +245,11 @@ class BeamCheck:
         found: dict[str, str] = {}
         solved = self.poses(rows, aims, sun)
         status = solved.chosen(solved.status)
-        for i in np.flatnonzero(status != Status.OK):
+        for i in np.flatnonzero(status != TrackingStatus.OK):
             found[self.names[rows[i]]] = (
-                f"the aim {_point(aims[i])} m: {Status(int(status[i])).text}"
+                f"the aim {_point(aims[i])} m: {TrackingStatus(int(status[i])).text}"
             )
-        good = status == Status.OK
+        good = status == TrackingStatus.OK
         if good.any():
             begin = Drive(self.drives.table[rows]).angles(counts)
             path = np.stack([begin, solved.chosen(solved.angles)], axis=-2)[good]
@@ -273,12 +273,14 @@ class BeamCheck:
             return found
         solved = self.poses(rows, aims, sun)
         vertices = solved.chosen(solved.vertex)
-        for k in np.flatnonzero(solved.chosen(solved.status) == Status.OK):
+        for k in np.flatnonzero(solved.chosen(solved.status) == TrackingStatus.OK):
             part = _rows_of(self.mirrors, rows[k : k + 1])
             # Neighbouring beams overlap, because no beam is narrower than the mirror.
             apart = 0.5 * float(np.hypot(part.width[0], part.height[0]))
             points = _disc(vertices[k], aims[k], radius, apart)
-            many = Mirrors(**{name: np.repeat(v, len(points), 0) for name, v in vars(part).items()})
+            many = MirrorOptics(
+                **{name: np.repeat(v, len(points), 0) for name, v in vars(part).items()}
+            )
             vertex = np.broadcast_to(vertices[k], points.shape)
             rest = find_entries(
                 beams(vertex, points, many, reach=np.full(len(points), FAR)), self.volumes
@@ -319,7 +321,7 @@ class BeamCheck:
         before = self.poses(rows, start, sun)
         counts = before.chosen(before.counts)
         after = self.poses(rows, aims, sun, counts)
-        good = before.chosen(before.status) == Status.OK
+        good = before.chosen(before.status) == TrackingStatus.OK
         path = np.stack([before.chosen(before.angles), after.chosen(after.angles)], axis=-2)
         if good.any():
             self._check_motion(found, rows[good], path[good], sun)
@@ -348,8 +350,8 @@ class BeamCheck:
             )
 
 
-def _rows_of(mirrors: Mirrors, rows: npt.NDArray[np.intp]) -> Mirrors:
-    return Mirrors(**{name: values[rows] for name, values in vars(mirrors).items()})
+def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp]) -> MirrorOptics:
+    return MirrorOptics(**{name: values[rows] for name, values in vars(mirrors).items()})
 
 
 def _disc(eye: FloatArray, aim: FloatArray, radius: float, apart: float) -> FloatArray:

@@ -9,7 +9,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.mechanism.drives import Drive
-from heliotrope.mechanism.tracking import Status
+from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
@@ -157,7 +157,7 @@ class BeamWatch:
         counts = self._field.counts(rows)
         found = self._check.poses(rows, self.points.standbys[rows], light, counts)
         path = np.stack([self._angles(rows, counts), found.chosen(found.angles)], axis=-2)
-        good = found.chosen(found.status) == Status.OK
+        good = found.chosen(found.status) == TrackingStatus.OK
         return rows[good], path[good]
 
     def _by_counts(self, name: str, values: Sequence[float], rows: Rows) -> FloatArray:

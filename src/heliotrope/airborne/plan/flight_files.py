@@ -15,7 +15,7 @@ from heliotrope.airborne.plan.flight import Sortie
 from heliotrope.airborne.plan.flight_plan import FlightPlan
 from heliotrope.airborne.plan.waypoints import Circle, Fence, Mission
 from heliotrope.errors import InputError
-from heliotrope.files.json import Node, read_json
+from heliotrope.files.json import JsonNode, read_json
 from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float, azimuth_elevation, enu_to_geodetic
 from heliotrope.sun import Site
@@ -353,7 +353,7 @@ def read_airspace(path: str | Path, base: Airspace) -> tuple[Airspace, FloatArra
     ), as_float(root["home"].vector()) if root.has("home") else None
 
 
-def _keep_out(node: Node) -> KeepOut:
+def _keep_out(node: JsonNode) -> KeepOut:
     bottom = node["bottom_m"].number() if node.has("bottom_m") else -np.inf
     top = node["top_m"].number() if node.has("top_m") else np.inf
     name = node["name"].text()
@@ -363,11 +363,11 @@ def _keep_out(node: Node) -> KeepOut:
     return KeepOut(name, as_float([centre]), node["radius_m"].number(1e-3), bottom, top)
 
 
-def _polygon(node: Node) -> FloatArray:
+def _polygon(node: JsonNode) -> FloatArray:
     return as_float([_polygon_corner(corner) for corner in node.elements()]).reshape(-1, 2)
 
 
-def _polygon_corner(node: Node) -> tuple[float, float]:
+def _polygon_corner(node: JsonNode) -> tuple[float, float]:
     parts = node.elements()
     if len(parts) != 2:
         raise node.fail(f"expected [east, north], found {len(parts)} numbers")

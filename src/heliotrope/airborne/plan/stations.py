@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import UnknownNameError
-from heliotrope.files.json import Node, read_json
+from heliotrope.files.json import JsonNode, read_json
 from heliotrope.geometry import FloatArray, as_float
 
 
@@ -77,7 +77,7 @@ def read_stations(path: str | Path, names: Sequence[str]) -> tuple[PlannedStatio
     )
 
 
-def _patterns(root: Node) -> dict[int, FloatArray]:
+def _patterns(root: JsonNode) -> dict[int, FloatArray]:
     """Return the photographs' positions of each station; several sorties may share it."""
     parts: dict[int, list[tuple[float, FloatArray]]] = {}
     for sortie in root["sorties"].elements():
@@ -92,7 +92,9 @@ def _patterns(root: Node) -> dict[int, FloatArray]:
 
 
 def _station(
-    node: Node, clusters: dict[str, tuple[npt.NDArray[np.intp], FloatArray]], pattern: FloatArray
+    node: JsonNode,
+    clusters: dict[str, tuple[npt.NDArray[np.intp], FloatArray]],
+    pattern: FloatArray,
 ) -> PlannedStation:
     cluster = node["cluster"].text()
     if cluster not in clusters:

@@ -23,7 +23,7 @@ from heliotrope.errors import InputError
 from heliotrope.field.camera import look_at
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.geometry import FloatArray, as_float, as_vectors, normalize, rotation
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 
 #: Standard deviations of roughly aligned mechanisms, rad.
 ADJUSTED: Mapping[str, float] = {
@@ -123,8 +123,8 @@ def look_counts(heliostats: Heliostats, point: npt.ArrayLike) -> FloatArray:
         result = track(mechanism, normalize(to - vertex), to)
         vertex = result.chosen(result.vertex)
     status = result.chosen(result.status)
-    if (status != Status.OK).any():
-        i = int(np.flatnonzero(status != Status.OK)[0])
+    if (status != TrackingStatus.OK).any():
+        i = int(np.flatnonzero(status != TrackingStatus.OK)[0])
         raise InputError(
             f"heliostat {heliostats.names[i]}: cannot face {to.tolist()} m; choose another point"
         )

@@ -226,14 +226,14 @@ def read_json(path: str | Path) -> FieldParameters:
     )
 
 
-def _numbers(node: _json.Node, size: int) -> list[float]:
+def _numbers(node: _json.JsonNode, size: int) -> list[float]:
     found = [part.number() for part in node.elements()]
     if len(found) != size:
         raise node.fail(f"{len(found)} numbers for {size} parameters")
     return found
 
 
-def _seconds(node: _json.Node) -> float:
+def _seconds(node: _json.JsonNode) -> float:
     if node.value is None:
         return float("nan")
     try:

@@ -192,9 +192,9 @@ def run(
         if configure or check:
             raise InputError("run: --configure and --check need a real plant; give --clusters")
         design = _design(field, heliostats, prototype=prototype)
-        from heliotrope.cli.run.simulated import Choice, run_plant
+        from heliotrope.cli.run.simulated import SimulationOptions, run_plant
 
-        choice = Choice(
+        choice = SimulationOptions(
             speed=speed,
             start=_start(start, design),
             seed=seed,

@@ -14,7 +14,7 @@ from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
 
 
 @dataclass(frozen=True)
-class Choice:
+class SimulationOptions:
     """Options of a simulated plant on the command line; see `cli.run.command`."""
 
     speed: float
@@ -25,13 +25,13 @@ class Choice:
     boards: bool
 
 
-def run_plant(design: Plant, choice: Choice, shown: Shown) -> None:
+def run_plant(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     """Run until Ctrl-C, or until the time is over; the field is stowed at the end."""
     with one_error(), asyncio.Runner(loop_factory=lambda: PacedLoop(choice.speed)) as runner:
         runner.run(_run(design, choice, shown))
 
 
-async def _run(design: Plant, choice: Choice, shown: Shown) -> None:
+async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, PacedLoop)
     clock = VirtualClock(loop.time, choice.start)

@@ -6,7 +6,7 @@ import re
 import numpy as np
 
 from heliotrope.errors import FormatError
-from heliotrope.files import Document, Element
+from heliotrope.files import Document, XmlElement
 from heliotrope.geometry import FloatArray
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
@@ -38,24 +38,24 @@ class Values:
         self.length = self._unit(root, "unitLength", LENGTHS)
         self.angle = self._unit(root, "unitAngle", ANGLES)
 
-    def _unit(self, root: Element, attribute: str, known: dict[str, float]) -> float:
+    def _unit(self, root: XmlElement, attribute: str, known: dict[str, float]) -> float:
         name = self.text(root, attribute)
         if name not in known:
             raise self.error(root, f"{attribute} {name!r} is not one of {', '.join(known)}")
         return known[name]
 
-    def error(self, element: Element, problem: str) -> FormatError:
+    def error(self, element: XmlElement, problem: str) -> FormatError:
         """Return the error that names the file and the line of the element."""
         return FormatError(self.path, problem, f"line {element.line}" if element.line else "")
 
-    def text(self, element: Element, attribute: str) -> str:
+    def text(self, element: XmlElement, attribute: str) -> str:
         """Return an attribute that must be there and not be blank."""
         value = element.get(attribute)
         if value is None or not value.strip():
             raise self.error(element, f"<{element.tag}> has no {attribute}; give one")
         return value
 
-    def child(self, element: Element, tag: str) -> Element:
+    def child(self, element: XmlElement, tag: str) -> XmlElement:
         """Return the only child element of that name."""
         found = list(element.elements(tag))
         if len(found) != 1:
@@ -66,20 +66,20 @@ class Values:
             )
         return found[0]
 
-    def lengths(self, element: Element, attribute: str, count: int) -> FloatArray:
+    def lengths(self, element: XmlElement, attribute: str, count: int) -> FloatArray:
         """Return ``count`` lengths in m."""
         return self._numbers(element, attribute, count, LENGTHS, self.length)
 
-    def angles(self, element: Element, attribute: str, count: int) -> FloatArray:
+    def angles(self, element: XmlElement, attribute: str, count: int) -> FloatArray:
         """Return ``count`` angles in rad."""
         return self._numbers(element, attribute, count, ANGLES, self.angle)
 
-    def ratios(self, element: Element, attribute: str, count: int) -> FloatArray:
+    def ratios(self, element: XmlElement, attribute: str, count: int) -> FloatArray:
         """Return ``count`` numbers without unit."""
         return self._numbers(element, attribute, count, {}, 1.0)
 
     def _numbers(
-        self, element: Element, attribute: str, count: int, units: dict[str, float], unit: float
+        self, element: XmlElement, attribute: str, count: int, units: dict[str, float], unit: float
     ) -> FloatArray:
         parts = self.text(element, attribute).split(",")
         if len(parts) != count:

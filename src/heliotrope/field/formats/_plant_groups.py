@@ -16,7 +16,7 @@ from heliotrope.field.formats._plant_models import (
     GroupTable,
     MachineTable,
 )
-from heliotrope.field.formats._plant_table import HeliostatTable
+from heliotrope.field.formats._plant_table import HeliostatColumns
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism import drives as drive_kinds
@@ -42,7 +42,7 @@ def build_group(
     path: Path,
     name: str,
     group: GroupTable,
-    table: HeliostatTable,
+    table: HeliostatColumns,
     rows: npt.NDArray[np.intp],
     site: Site,
 ) -> Heliostats:
@@ -86,7 +86,7 @@ class _Reader:
         path: Path,
         name: str,
         group: GroupTable,
-        table: HeliostatTable,
+        table: HeliostatColumns,
         rows: npt.NDArray[np.intp],
     ) -> None:
         self.path, self.name, self.group, self.table, self.rows = path, name, group, table, rows

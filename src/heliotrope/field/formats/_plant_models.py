@@ -36,19 +36,19 @@ DRIVE_ANGLES = (
 ANGLE_UNITS = {"deg": 0.017453292519943295, "mrad": 1e-3, "rad": 1.0}
 
 
-class Strict(BaseModel):
+class StrictTable(BaseModel):
     """A table that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", strict=False)
 
 
-class PlantTable(Strict):
+class PlantNameTable(StrictTable):
     """``[plant]``."""
 
     name: str = Field(min_length=1)
 
 
-class SiteTable(Strict):
+class PlantSiteTable(StrictTable):
     """``[site]``: the origin of ENU, and its air."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)]
@@ -60,7 +60,7 @@ class SiteTable(Strict):
     delta_t_s: Number | None = Field(None, description="TT - UT1; default from the date.")
 
 
-class MarkTable(Strict):
+class MarkTable(StrictTable):
     """A mark on a target: L, T, square, disc, tag or taught picture."""
 
     name: str = Field(min_length=1)
@@ -72,7 +72,7 @@ class MarkTable(Strict):
     code: str = Field("", description="Tag: 4X4_50:7 or APRILTAG_36h11:7; picture: its file.")
 
 
-class TargetTable(Strict):
+class TargetTable(StrictTable):
     """``[[targets]]``: four corners from the upper left, seen from the front, or a size."""
 
     name: str = Field(min_length=1)
@@ -85,7 +85,7 @@ class TargetTable(Strict):
     marks: list[MarkTable] = Field(default_factory=list)
 
 
-class ReceiverTable(Strict):
+class ReceiverTable(StrictTable):
     """``[[receivers]]``."""
 
     name: str = Field(min_length=1)
@@ -99,7 +99,7 @@ class ReceiverTable(Strict):
     opening_angle_rad: Annotated[float, Field(ge=0)] = 0.0
 
 
-class CameraTable(Strict):
+class CameraTable(StrictTable):
     """``[[cameras]]``: a pinhole with distortion, in the convention of OpenCV."""
 
     name: str = Field(min_length=1)
@@ -119,7 +119,7 @@ class CameraTable(Strict):
     deviation_px: Annotated[float, Field(ge=0)] = 0.0
 
 
-class BoxTable(Strict):
+class BoxTable(StrictTable):
     """``[[keep_out]]`` of kind box: an upright box, such as a building."""
 
     name: str = Field(min_length=1)
@@ -132,7 +132,7 @@ class BoxTable(Strict):
     azimuth_rad: Number | None = Field(None, description="Instead, as the program writes it.")
 
 
-class SphereTable(Strict):
+class SphereTable(StrictTable):
     """``[[keep_out]]`` of kind sphere."""
 
     name: str = Field(min_length=1)
@@ -141,7 +141,7 @@ class SphereTable(Strict):
     radius_m: Positive
 
 
-class CylinderTable(Strict):
+class CylinderTable(StrictTable):
     """``[[keep_out]]`` of kind cylinder, such as a mast or an approach corridor."""
 
     name: str = Field(min_length=1)
@@ -151,7 +151,7 @@ class CylinderTable(Strict):
     radius_m: Positive
 
 
-class PrismTable(Strict):
+class PrismTable(StrictTable):
     """``[[keep_out]]`` of kind prism: a polygon extruded upwards, such as a walkway."""
 
     name: str = Field(min_length=1)
@@ -168,7 +168,7 @@ AnyVolume = Annotated[
 ]
 
 
-class ChainTable(Strict):
+class ChainTable(StrictTable):
     """``chain``: a mechanism number by number, as the program writes it."""
 
     joints: list[str]
@@ -181,7 +181,7 @@ class ChainTable(Strict):
     normal: Vector
 
 
-class RawDrive(Strict):
+class RawDrive(StrictTable):
     """A drive number by number, as the program writes it."""
 
     kind: Literal["raw"]
@@ -200,7 +200,7 @@ def _drive(name: str, kind: str, **own: Any) -> type[BaseModel]:
         "speed_counts_per_s": (Positive | None, None),
     }
     fields: dict[str, Any] = {"kind": (Literal[kind], ...), **own, **angles, **common}
-    return create_model(name, __base__=Strict, **fields)
+    return create_model(name, __base__=StrictTable, **fields)
 
 
 RotaryDrive = _drive(
@@ -232,7 +232,7 @@ Steps = Annotated[int, Field(ge=-(1 << 29), le=1 << 29)]
 Pair = Annotated[list[Number], Field(min_length=2, max_length=2)]
 
 
-class AxisTable(Strict):
+class AxisTable(StrictTable):
     """``[groups.NAME.machine.axes.JOINT]``: the motor of one driven joint."""
 
     rate_steps_per_s: Annotated[int, Field(gt=0, le=1 << 29)] | None = Field(
@@ -248,7 +248,7 @@ class AxisTable(Strict):
     max_deg: Number | None = None
 
 
-class MachineTable(Strict):
+class MachineTable(StrictTable):
     """``[groups.NAME.machine]``: what local controllers store besides the calibration."""
 
     axes: dict[str, AxisTable] = Field(description="By driven joint.")
@@ -274,7 +274,7 @@ class MachineTable(Strict):
     )
 
 
-class GroupTable(Strict):
+class GroupTable(StrictTable):
     """``[groups.NAME]``: heliostats of one kind."""
 
     kind: str
@@ -307,13 +307,13 @@ class GroupTable(Strict):
     )
 
 
-class PlantDocument(Strict):
+class PlantDocument(StrictTable):
     """The whole file."""
 
     format: Literal["heliotrope-plant"]
     version: Literal[1]
-    plant: PlantTable
-    site: SiteTable
+    plant: PlantNameTable
+    site: PlantSiteTable
     heliostats: str = Field(description="Table of the heliostats (CSV or Parquet), beside it.")
     groups: dict[str, GroupTable] = Field(min_length=1)
     targets: list[TargetTable] = Field(default_factory=list)

@@ -30,7 +30,7 @@ MOST_PROBLEMS = 50
 
 
 @dataclass(frozen=True)
-class HeliostatTable:
+class HeliostatColumns:
     """Columns of the table of heliostats.
 
     Attributes
@@ -57,7 +57,7 @@ class HeliostatTable:
         return self.numbers[name][rows] if name in self.numbers else None
 
 
-def read_table(path: Path) -> HeliostatTable:
+def read_table(path: Path) -> HeliostatColumns:
     """Return the table of heliostats.
 
     Raises
@@ -96,7 +96,7 @@ def read_table(path: Path) -> HeliostatTable:
         for column in frame.columns
         if column not in TEXTS
     }
-    return HeliostatTable(
+    return HeliostatColumns(
         path, texts_read["name"], texts_read["group"], texts_read["cluster"], numbers, problems
     )
 

@@ -31,7 +31,7 @@ from heliotrope.field.formats.frames import euler_matrix, mirror_frame
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.files import Document, Element, read_xml
+from heliotrope.files import Document, XmlElement, read_xml
 from heliotrope.geometry import FloatArray, angle_between, as_float, direction, normalize
 from heliotrope.mechanism.armature import check_axes
 from heliotrope.mechanism.drives import Drive, direct
@@ -41,11 +41,11 @@ from heliotrope.sun import Site
 __all__ = [
     "Document",
     "DrivenAxis",
-    "Element",
     "Model",
     "PlacedModel",
     "PlacedSurface",
     "Surface",
+    "XmlElement",
     "heliostats",
     "models",
     "read",
@@ -202,7 +202,7 @@ def models(document: Document) -> dict[str, Model]:
     return found
 
 
-def _model(values: Values, element: Element, name: str) -> Model:
+def _model(values: Values, element: XmlElement, name: str) -> Model:
     tracking = values.child(element, "Tracking")
     angles = values.child(element, "Angles")
     aiming = list(element.elements("Aiming"))
@@ -236,7 +236,7 @@ def _model(values: Values, element: Element, name: str) -> Model:
     )
 
 
-def _axis(values: Values, element: Element) -> DrivenAxis:
+def _axis(values: Values, element: XmlElement) -> DrivenAxis:
     along = values.ratios(element, "rotationAxis", 3)
     if not along.any():
         raise values.error(
@@ -252,7 +252,7 @@ def _axis(values: Values, element: Element) -> DrivenAxis:
     return DrivenAxis(values.lengths(element, "translation", 3), normalize(along), stops)
 
 
-def _facet(values: Values, element: Element, normal: FloatArray) -> Surface:
+def _facet(values: Values, element: XmlElement, normal: FloatArray) -> Surface:
     center, axes = _place(values, element)
     away = np.degrees(angle_between(axes[:, 2], normal))
     if away > FACET_LIMIT_DEG:
@@ -264,7 +264,7 @@ def _facet(values: Values, element: Element, normal: FloatArray) -> Surface:
     return _surface(values, values.child(element, "ShapeKit"), center, axes)
 
 
-def _surface(values: Values, kit: Element, origin: FloatArray, axes: FloatArray) -> Surface:
+def _surface(values: Values, kit: XmlElement, origin: FloatArray, axes: FloatArray) -> Surface:
     aperture = values.child(kit, "ApertureRectangular")
     if aperture.get("xWidth") is not None:
         width = float(values.lengths(aperture, "xWidth", 1)[0])
@@ -281,7 +281,7 @@ def _surface(values: Values, kit: Element, origin: FloatArray, axes: FloatArray)
     return Surface(origin + axes @ middle, axes, width, height)
 
 
-def _place(values: Values, element: Element) -> tuple[FloatArray, FloatArray]:
+def _place(values: Values, element: XmlElement) -> tuple[FloatArray, FloatArray]:
     """Return the translation and the rotation of a node or facet; both may be missing."""
     moved, turned = np.zeros(3), np.eye(3)
     if element.get("translation") is not None:
@@ -295,13 +295,13 @@ def _place(values: Values, element: Element) -> tuple[FloatArray, FloatArray]:
 class _Kit:
     """A HeliostatKit or ShapeKit of the scene with what its nodes add up to."""
 
-    element: Element
+    element: XmlElement
     path: tuple[str, ...]
     position: FloatArray = field(default_factory=lambda: np.zeros(3))
     axes: FloatArray = field(default_factory=lambda: np.eye(3))
 
 
-def _kits(values: Values, node: Element, place: _Kit) -> Iterator[_Kit]:
+def _kits(values: Values, node: XmlElement, place: _Kit) -> Iterator[_Kit]:
     for child in node.elements():
         if child.tag == "Node":
             moved, turned = _place(values, child)

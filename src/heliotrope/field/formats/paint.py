@@ -16,7 +16,7 @@ from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.marks import Mark
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
-from heliotrope.files import Node, read_json, write_text
+from heliotrope.files import JsonNode, read_json, write_text
 from heliotrope.geometry import FloatArray, enu_to_geodetic, geodetic_to_enu
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import Drive, linear_paint
@@ -127,11 +127,11 @@ def read_heliostat(path: str | Path, name: str | None = None) -> Properties:
     )
 
 
-def _number_or(node: Node, key: str, default: float) -> float:
+def _number_or(node: JsonNode, key: str, default: float) -> float:
     return node[key].number() if node.has(key) and node[key].value is not None else default
 
 
-def _drive(node: Node, zero: float) -> Drive:
+def _drive(node: JsonNode, zero: float) -> Drive:
     kind = node.any_of("type_axis", "type").text()
     # "ideal" says how ARTIST is to simulate it; the constants beside it are the jack's.
     if kind not in ("linear", "ideal"):
@@ -156,7 +156,7 @@ def _drive(node: Node, zero: float) -> Drive:
         raise node.fail(str(error)) from None
 
 
-def _facets(root: Node) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _facets(root: JsonNode) -> tuple[FloatArray, FloatArray, FloatArray]:
     empty = np.empty((0, 3))
     if not root.has("facet_properties"):
         return empty, empty, empty
@@ -223,7 +223,7 @@ def read_tower(path: str | Path) -> Tower:
     return Tower(origin, with_marks(targets), tuple(receivers))
 
 
-def _corners(node: Node, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
+def _corners(node: JsonNode, points: dict[str, FloatArray], prefix: str = "") -> FloatArray:
     """Corners from the upper left, as seen from the front."""
     order = ("upper_left", "upper_right", "lower_right", "lower_left")
     for corner in order:
@@ -232,7 +232,7 @@ def _corners(node: Node, points: dict[str, FloatArray], prefix: str = "") -> Flo
     return np.stack([points[prefix + corner] for corner in order])
 
 
-def _target(name: str, node: Node, points: dict[str, FloatArray]) -> Target:
+def _target(name: str, node: JsonNode, points: dict[str, FloatArray]) -> Target:
     if "center" not in points:
         raise node["coordinates"].fail("'center' is missing")
     corners = _corners(node, points)
@@ -263,7 +263,7 @@ def with_marks(targets: Sequence[Target]) -> tuple[Target, ...]:
     return tuple(marked)
 
 
-def _receiver(name: str, kind: str, node: Node, points: dict[str, FloatArray]) -> Receiver:
+def _receiver(name: str, kind: str, node: JsonNode, points: dict[str, FloatArray]) -> Receiver:
     corners = _corners(node, points, "receiver_outer_")
     return Receiver(
         name=name,

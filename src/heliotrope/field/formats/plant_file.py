@@ -21,7 +21,7 @@ from heliotrope.field.formats._plant_cameras import (
 )
 from heliotrope.field.formats._plant_groups import build_group, group_document
 from heliotrope.field.formats._plant_models import PlantDocument, ReceiverTable, TargetTable
-from heliotrope.field.formats._plant_table import HeliostatTable, read_table, write_table
+from heliotrope.field.formats._plant_table import HeliostatColumns, read_table, write_table
 from heliotrope.field.formats._plant_volumes import build_volume, volume_document
 from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver, Target
@@ -70,8 +70,8 @@ def _models() -> list[Any]:
 
     return [
         models.PlantDocument,
-        models.PlantTable,
-        models.SiteTable,
+        models.PlantNameTable,
+        models.PlantSiteTable,
         models.TargetTable,
         models.MarkTable,
         models.ReceiverTable,
@@ -93,7 +93,7 @@ _MODELS = _models()
 
 
 def _assemble(
-    path: Path, document: PlantDocument, table: HeliostatTable, problems: list[FormatError]
+    path: Path, document: PlantDocument, table: HeliostatColumns, problems: list[FormatError]
 ) -> Plant | None:
     """Build the plant; errors are added to ``problems``."""
     site = Site(

@@ -14,7 +14,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.drives import Drive
 from heliotrope.mechanism.kernels import slots as slot
 from heliotrope.mechanism.machine import Machine
-from heliotrope.mechanism.tracking import Status, track
+from heliotrope.mechanism.tracking import TrackingStatus, track
 
 Rows = npt.NDArray[np.intp]
 Bools = npt.NDArray[np.bool_]
@@ -93,7 +93,7 @@ class Journals:
             current=counts,
             tolerance=2e-10,
         )
-        good = np.asarray(found.chosen(found.status) == Status.OK)
+        good = np.asarray(found.chosen(found.status) == TrackingStatus.OK)
         return np.asarray(found.chosen(found.angles)), good
 
     def items(self, row: int) -> dict[str, bytes]:
