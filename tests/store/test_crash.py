@@ -35,6 +35,8 @@ class Loads:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            # It uses the helpers of all tests, as pytest's own `pythonpath` lets this file do.
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         )
         assert self._read() == "ready"
 

@@ -53,5 +53,5 @@ def test_the_store_begins_in_the_database_of_the_sql(server: str) -> None:
 
 
 def test_another_database_is_refused() -> None:
-    with pytest.raises(InputError, match="no postgresql://user@host/name"):
+    with pytest.raises(InputError, match="--database must be postgresql://user@host/name"):
         Shown(database="mysql://a/b")

@@ -426,7 +426,7 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StoreError(
-            f"store {folder}: {error.strerror}; give a folder that may be written to"
+            f"store {folder}: {error.strerror}; give a folder that can be written"
         ) from None
 
 
