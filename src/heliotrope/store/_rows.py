@@ -1,43 +1,32 @@
-"""Rows of the tables from records, and records from rows."""
+"""Rows of the tables from records, and records from rows.
 
-import math
-from collections.abc import Mapping, Sequence
+Names say which field belongs to which column, and the types of the columns convert the values (see
+`tables`). Two kinds of record have functions of their own, because one record is many rows:
+sightings, and the sightings behind a calibration.
+"""
+
+from collections.abc import Sequence
+from dataclasses import fields
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Connection, Executable, RowMapping, Table
+from sqlalchemy import Connection, Executable, RowMapping, Select, Table
 from sqlalchemy import Row as SqlRow
 from sqlalchemy.dialects import postgresql, sqlite
 
-from heliotrope.calibration.fit.estimator import FitOutcome
-from heliotrope.calibration.record import (
-    CalibrationOutcome,
-    HeliostatCalibration,
-    Identities,
-    Provenance,
-)
+from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.geometry import FloatArray
 from heliotrope.store import tables
-from heliotrope.store.records import (
-    SEVERITIES,
-    AlarmEntry,
-    CampaignEntry,
-    Event,
-    KeptSightings,
-    PlannedVisit,
-    VisitEntry,
-)
+from heliotrope.store.records import KeptSightings
 
 Row = dict[str, Any]
 _ENDS = ("source", "destination")
 _AXES = ("east", "north", "up")
 _MISSES = ("before_right", "before_above", "after_right", "after_above")
-_VISIT_REALS = (
-    "gain", "sigma_before", "sigma_expected", "sigma_after", "error_before", "error_after",
-)  # fmt: skip
+Record = TypeVar("Record")
 
 
 def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
@@ -65,19 +54,21 @@ def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
     connection.execute(statement.on_conflict_do_update(index_elements=keys, set_=rest), list(rows))
 
 
-def real(value: float | None) -> float | None:
-    """Return a number as it is written: what is none is NULL."""
-    return float(value) if value is not None and math.isfinite(value) else None
+def row_of(table: Table, record: object, **others: Any) -> Row:
+    """Return the row of a record: each column from the attribute of its name or ``others``."""
+    own = (key for key in table.columns.keys() if key not in others)  # noqa: SIM118
+    return {**{key: getattr(record, key) for key in own}, **others}
 
 
-def number(value: float | None) -> float:
-    """Return a number as it is read: NULL is NaN."""
-    return math.nan if value is None else value
+def record_of(kind: type[Record], row: RowMapping, **others: Any) -> Record:
+    """Return the record of a row: each field from the column of its name or ``others``."""
+    names = {field.name for field in fields(cast("Any", kind))} - others.keys()
+    return kind(**{name: row[name] for name in names if name in row}, **others)
 
 
-def reals(values: Mapping[str, float]) -> dict[str, float | None]:
-    """Return numbers by name as they are written."""
-    return {str(name): real(value) for name, value in values.items()}
+def records(connection: Connection, kind: type[Record], query: Select[Any]) -> list[Record]:
+    """Return the records that a query finds."""
+    return [record_of(kind, row) for row in connection.execute(query).mappings()]
 
 
 # -- sightings ---------------------------------------------------------------------------
@@ -92,7 +83,7 @@ def sighting_rows(
     for i, row in enumerate(s.heliostat.tolist()):
         found: Row = {
             "number": int(numbers[i]), "heliostat": names[row], "kind": kind, "target": target,
-            "campaign": campaign, "time": real(s.time[i]), "counts": s.counts[i].tolist(),
+            "campaign": campaign, "time": s.time[i], "counts": s.counts[i].tolist(),
             "sigma": float(s.sigma[i]),
         }  # fmt: skip
         for end in _ENDS:
@@ -143,38 +134,14 @@ def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
     return KeptSightings(array("number", np.int64), names, seen, *texts)
 
 
-# -- parameters --------------------------------------------------------------------------
-
-
-def calibration_row(record: HeliostatCalibration) -> Row:
-    """Return the row of the table ``parameter_version``."""
-    return {
-        "heliostat": record.heliostat,
-        "version": record.version,
-        "at": record.at,
-        "model": record.model,
-        "names": list(record.names),
-        "value": record.values.tolist(),
-        "covariance": record.covariance.tolist(),
-        "prior": record.prior.tolist(),
-        "error_before": real(record.before),
-        "error_after": real(record.after),
-        "scale": real(record.scale),
-        "outcome": record.outcome.name.lower(),
-        "provenance": record.provenance.value,
-        "person": record.person,
-        "campaign": record.campaign,
-        "note": record.note,
-        "pushed": list(record.pushed),
-        "code": record.code,
-    }
+# -- calibrations ------------------------------------------------------------------------
 
 
 def used_rows(record: HeliostatCalibration) -> list[Row]:
     """Return the rows of the table ``parameter_sighting``: sightings used, then those left out."""
     nothing = np.full((len(record.left_out), 4), np.nan)
     misses = np.concatenate([record.residual_before, record.residual_after], axis=1)
-    whole = np.concatenate([misses, nothing])
+    whole = np.concatenate([misses, nothing]).tolist()
     numbers = (*record.sightings.tolist(), *record.left_out.tolist())
     return [
         {
@@ -183,130 +150,21 @@ def used_rows(record: HeliostatCalibration) -> list[Row]:
             "place": place,
             "sighting": number,
             "used": place < len(record.sightings),
-            **{name: real(x) for name, x in zip(_MISSES, whole[place], strict=True)},
+            **dict(zip(_MISSES, whole[place], strict=True)),
         }
         for place, number in enumerate(numbers)
     ]
 
 
 def calibration(row: RowMapping, behind: Sequence[RowMapping] = ()) -> HeliostatCalibration:
-    """Return a calibration from its row, and the rows of the sightings behind it."""
+    """Return a calibration from its row and the rows of the sightings behind it."""
     used = [u for u in behind if u["used"]]
-    misses = np.array([[number(u[name]) for name in _MISSES] for u in used]).reshape(-1, 4)
-    names = tuple(row["names"])
-    return HeliostatCalibration(
-        row["heliostat"],
-        row["at"],
-        names,
-        np.array(row["value"], np.float64),
-        np.array(row["covariance"], np.float64).reshape(len(names), len(names)),
-        np.array(row["prior"], np.float64),
-        number(row["error_before"]),
-        number(row["error_after"]),
-        number(row["scale"]),
-        FitOutcome[row["outcome"].upper()],
-        np.array([u["sighting"] for u in used], np.int64),
-        np.array([u["sighting"] for u in behind if not u["used"]], np.int64),
-        misses[:, :2],
-        misses[:, 2:],
-        row["model"],
-        Provenance(row["provenance"]),
-        row["person"],
-        row["campaign"],
-        row["note"],
-        tuple(row["pushed"]),
-        row["code"],
-        row["version"],
+    misses = np.array([[u[name] for name in _MISSES] for u in used]).reshape(-1, 4)
+    return record_of(
+        HeliostatCalibration,
+        row,
+        sightings=np.array([u["sighting"] for u in used], np.int64),
+        left_out=np.array([u["sighting"] for u in behind if not u["used"]], np.int64),
+        residual_before=misses[:, :2],
+        residual_after=misses[:, 2:],
     )
-
-
-# -- the others --------------------------------------------------------------------------
-
-
-def visit_row(entry: VisitEntry, number: int) -> Row:
-    """Return the row of the table ``visit``."""
-    row = {column.name: getattr(entry, column.name) for column in tables.visit.columns}
-    reals = {name: real(row[name]) for name in _VISIT_REALS}
-    return {**row, **reals, "number": number, "outcome": entry.outcome.value}
-
-
-def visit(row: RowMapping) -> VisitEntry:
-    """Return a visit from its row."""
-    values = {name: value for name, value in row.items() if name != "good"}
-    reals = {name: number(row[name]) for name in _VISIT_REALS}
-    return VisitEntry(**{**values, **reals, "outcome": CalibrationOutcome(row["outcome"])})
-
-
-def plan_rows(plan: Sequence[PlannedVisit]) -> list[Row]:
-    """Return the rows of the table ``plan``, in the order of their time."""
-    return [
-        {
-            "place": i,
-            "heliostat": p.heliostat,
-            "target": p.target,
-            "due": p.due,
-            "gain": real(p.gain),
-            "note": p.note,
-        }
-        for i, p in enumerate(sorted(plan, key=lambda p: p.due))
-    ]
-
-
-def planned(row: RowMapping) -> PlannedVisit:
-    """Return a planned visit from its row."""
-    return PlannedVisit(
-        row["heliostat"], row["target"], row["due"], number(row["gain"]), row["note"]
-    )
-
-
-def campaign_row(entry: CampaignEntry) -> Row:
-    """Return the row of the table ``campaign``."""
-    return {
-        "name": entry.name,
-        "begun": entry.begun,
-        "finished": entry.finished,
-        "model": entry.model,
-        "note": entry.note,
-        "expected": reals(entry.expected),
-        "found": reals(entry.found),
-    }
-
-
-def campaign(row: RowMapping) -> CampaignEntry:
-    """Return a campaign from its row."""
-    figures = {
-        key: {name: number(x) for name, x in row[key].items()} for key in ("expected", "found")
-    }
-    return CampaignEntry(**{**row, **figures})
-
-
-def event_row(entry: Event, number: int) -> Row:
-    """Return the row of the table ``event``."""
-    return {
-        "number": number,
-        "at": entry.at,
-        "source": entry.source,
-        "severity": SEVERITIES.index(entry.severity),
-        "heliostat": entry.heliostat,
-        "text": entry.text,
-        "values": reals(entry.values),
-    }
-
-
-def event(row: RowMapping) -> Event:
-    """Return an event from its row."""
-    values = {name: number(x) for name, x in row["values"].items()}
-    return Event(
-        row["at"],
-        row["source"],
-        row["text"],
-        SEVERITIES[row["severity"]],
-        row["heliostat"],
-        values,
-        row["number"],
-    )
-
-
-def alarm(row: RowMapping) -> AlarmEntry:
-    """Return an alarm from its row."""
-    return AlarmEntry(**row)

@@ -1,8 +1,6 @@
 """The audit's table: one record for each accepted command, begun and then ended."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
-from typing import Any
 
 from sqlalchemy import Connection, delete, func, select, update
 
@@ -32,9 +30,8 @@ def begin(connection: Connection, entry: AuditEntry) -> None:
             )
         return
     number = (connection.scalar(select(func.max(_AUDIT.c.number))) or 0) + 1
-    values = [float(v) for v in entry.values]
-    row = {**asdict(entry), "values": values, "heliostats": list(entry.heliostats)}
-    rows.insert(connection, _AUDIT, [{**row, "number": number, "result": "", "finished": ""}])
+    row = rows.row_of(_AUDIT, entry, number=number, result="", finished="")
+    rows.insert(connection, _AUDIT, [row])
 
 
 def finish(connection: Connection, identity: str, result: str, at: str) -> None:
@@ -65,19 +62,13 @@ def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[A
     query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
     if before:
         query = query.where(_AUDIT.c.number < before)
-    return [_entry(row) for row in connection.execute(query).mappings()]
+    return rows.records(connection, AuditEntry, query)
 
 
 def _find(connection: Connection, identity: str) -> AuditEntry | None:
     query = select(_AUDIT).where(_AUDIT.c.identity == identity)
-    row = connection.execute(query).mappings().first()
-    return None if row is None else _entry(row)
-
-
-def _entry(row: Any) -> AuditEntry:
-    fields = {name: value for name, value in row.items() if name != "number"}
-    sets = {"values": tuple(row["values"]), "heliostats": tuple(row["heliostats"])}
-    return AuditEntry(**{**fields, **sets})
+    found = rows.records(connection, AuditEntry, query)
+    return found[0] if found else None
 
 
 def probe(connection: Connection) -> None:

@@ -7,6 +7,7 @@ is there whole or not at all. A restore needs an empty place: nothing is ever ov
 
 import hashlib
 import json
+import math
 import os
 import shutil
 import sqlite3
@@ -204,7 +205,9 @@ def summary(database: Database) -> dict[str, Any]:
         first, last = connection.execute(select(func.min(time), func.max(time))).one()
         open_ = select(func.count()).where(tables.audit.c.result == "")
         found["audit_without_result"] = int(connection.scalar(open_) or 0)
-    found["first_sighting"], found["last_sighting"] = first, last
+    # No time is NULL, which the column's type reads as NaN.
+    times = {"first_sighting": first, "last_sighting": last}
+    found.update({name: None if math.isnan(at) else at for name, at in times.items()})
     if database.file is not None:
         found["bytes"] = database.file.stat().st_size
     return found
@@ -301,7 +304,7 @@ def _copy_tables(source: Database, target: Database) -> None:
 def _parts(connection: Connection, table: Any) -> Iterator[list[dict[str, Any]]]:
     found = connection.execute(select(table).execution_options(yield_per=_ROWS)).mappings()
     for part in found.partitions():
-        yield [dict(row) for row in part]
+        yield [{c.key: row[c] for c in table.columns} for row in part]
 
 
 def _copy_telemetry(source: Path, target: Path) -> None:

@@ -8,10 +8,10 @@ import asyncio
 import threading
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from sqlalchemy import Connection, Table, and_, delete, func, select, update
+from sqlalchemy import Connection, Select, Table, and_, delete, func, select, update
 
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
@@ -33,6 +33,7 @@ from heliotrope.store.records import (
 )
 from heliotrope.store.writer import Work, Writer
 
+T = TypeVar("T")
 _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
 #: More names than this are not put into a query; what is read is sifted instead.
 _MANY = 500
@@ -128,9 +129,9 @@ class Keeper:
             self._numbers[table.name] += count
         return first
 
-    def _select(self, statement: Any) -> Any:
+    def _records(self, kind: type[T], query: Select[Any]) -> list[T]:
         with self.database.reading() as connection:
-            return connection.execute(statement).mappings().all()
+            return rows.records(connection, kind, query)
 
     # -- sightings and parameters --------------------------------------------------------
 
@@ -179,7 +180,8 @@ class Keeper:
                     f"calibration of {record.heliostat}: version {record.version} is not above "
                     f"{last}, the last one kept; number it anew"
                 )
-            row, used = rows.calibration_row(record), rows.used_rows(record)
+            row = rows.row_of(tables.parameter_version, record)
+            used = rows.used_rows(record)
 
             def work(connection: Connection) -> None:
                 rows.insert(connection, tables.parameter_version, [row])
@@ -230,9 +232,9 @@ class Keeper:
             query = query.where(table.c.heliostat.in_(list(heliostats)))
         wanted = None if heliostats is None else set(heliostats)
         return {
-            row["heliostat"]: rows.calibration(row)
-            for row in self._select(query)
-            if wanted is None or row["heliostat"] in wanted
+            record.heliostat: record
+            for record in self._records(HeliostatCalibration, query)
+            if wanted is None or record.heliostat in wanted
         }
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
@@ -244,12 +246,14 @@ class Keeper:
 
     def record_visit(self, visit: VisitEntry) -> None:
         """Keep what became of a measurement."""
-        row = rows.visit_row(visit, self._take_numbers(tables.visit))
+        number = self._take_numbers(tables.visit)
+        row = rows.row_of(tables.visit, visit, number=number)
         self.writer.put(lambda c: rows.insert(c, tables.visit, [row]))
 
     def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
         """Keep what the schedule plans, in place of the plan before."""
-        made = rows.plan_rows(plan)
+        in_order = enumerate(sorted(plan, key=lambda visit: visit.due))
+        made = [rows.row_of(tables.plan, visit, place=place) for place, visit in in_order]
 
         def work(connection: Connection) -> None:
             connection.execute(delete(tables.plan))
@@ -259,7 +263,7 @@ class Keeper:
 
     def record_campaign(self, campaign: CampaignEntry) -> None:
         """Keep a campaign, in place of what was kept of the same name."""
-        row = rows.campaign_row(campaign)
+        row = rows.row_of(tables.campaign, campaign)
         self.writer.put(lambda c: rows.replace(c, tables.campaign, [row]))
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
@@ -267,17 +271,16 @@ class Keeper:
         query = select(tables.visit).order_by(tables.visit.c.number.desc()).limit(limit)
         if heliostat:
             query = query.where(tables.visit.c.heliostat == heliostat)
-        return [rows.visit(row) for row in self._select(query)]
+        return self._records(VisitEntry, query)
 
     def plan(self) -> list[PlannedVisit]:
         """Return the plan that was kept last, the first due first."""
-        found = self._select(select(tables.plan).order_by(tables.plan.c.place))
-        return [rows.planned(row) for row in found]
+        return self._records(PlannedVisit, select(tables.plan).order_by(tables.plan.c.place))
 
     def campaigns(self) -> list[CampaignEntry]:
         """Return the campaigns, the last first."""
-        found = self._select(select(tables.campaign).order_by(tables.campaign.c.begun.desc()))
-        return [rows.campaign(row) for row in found]
+        query = select(tables.campaign).order_by(tables.campaign.c.begun.desc())
+        return self._records(CampaignEntry, query)
 
     # -- events and alarms ---------------------------------------------------------------
 
@@ -290,7 +293,8 @@ class Keeper:
             If there is no such severity.
         """
         _check_severity(event.severity)
-        row = rows.event_row(event, self._take_numbers(tables.event))
+        number = self._take_numbers(tables.event)
+        row = rows.row_of(tables.event, event, number=number)
         self.writer.put(lambda c: rows.insert(c, tables.event, [row]))
 
     def record_alarm(
@@ -298,11 +302,9 @@ class Keeper:
     ) -> None:
         """Keep that an alarm stands, or (not active) that it is over."""
         _check_severity(severity)
-        row = {
-            "number": self._take_numbers(tables.alarm), "condition": condition,
-            "subject": subject, "severity": severity, "text": text, "raised": at,
-            "acknowledged_by": "",
-        }  # fmt: skip
+        number = self._take_numbers(tables.alarm)
+        entry = AlarmEntry(condition, subject, severity, text, at, number=number)
+        row = rows.row_of(tables.alarm, entry)
         a = tables.alarm.c
         stands = and_(a.condition == condition, a.subject == subject, a.cleared.is_(None))
         change = {"severity": severity, "text": text} if active else {"cleared": at}
@@ -327,12 +329,12 @@ class Keeper:
         """Return events of a severity and above, the last first; those before a number if given."""
         _check_severity(severity)
         e = tables.event.c
-        query = select(tables.event).where(e.severity >= SEVERITIES.index(severity))
+        query = select(tables.event).where(e.severity >= severity)
         if heliostat:
             query = query.where(e.heliostat == heliostat)
         if before:
             query = query.where(e.number < before)
-        return [rows.event(r) for r in self._select(query.order_by(e.number.desc()).limit(limit))]
+        return self._records(Event, query.order_by(e.number.desc()).limit(limit))
 
     def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
         """Return alarms, the last first; only those neither over nor acknowledged if standing."""
@@ -340,7 +342,7 @@ class Keeper:
         query = select(tables.alarm).order_by(a.number.desc()).limit(limit)
         if standing:
             query = query.where(a.cleared.is_(None) | a.acknowledged.is_(None))
-        return [rows.alarm(row) for row in self._select(query)]
+        return self._records(AlarmEntry, query)
 
     def forget_events(self, before: float) -> None:
         """Let go of events before a time, and of alarms that were over and acknowledged by then."""
@@ -366,18 +368,10 @@ class Keeper:
         """Keep the schedule off some heliostats; one that is held already is held anew."""
         names = list(dict.fromkeys(heliostats))
         first = self._take_numbers(tables.hold, len(names))
+        new = {name: Hold(name, reason, person, at, until) for name in names}
         made = [
-            {
-                "number": first + i,
-                "heliostat": name,
-                "reason": reason,
-                "person": person,
-                "since": at,
-                "until": until,
-                "ended": None,
-                "ended_by": "",
-            }
-            for i, name in enumerate(names)
+            rows.row_of(tables.hold, hold, number=first + i, ended=None, ended_by="")
+            for i, hold in enumerate(new.values())
         ]
 
         def work(connection: Connection) -> None:
@@ -387,7 +381,6 @@ class Keeper:
         with self._mine:
             self.writer.put(work)
             # A new dictionary: whoever reads the old one sees one state of all.
-            new = {name: Hold(name, reason, person, at, until) for name in names}
             self._holds = {**self._holds, **new}
 
     def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
@@ -442,12 +435,7 @@ def _last_versions(connection: Connection) -> dict[str, int]:
 
 def _standing_holds(connection: Connection) -> dict[str, Hold]:
     query = select(tables.hold).where(tables.hold.c.ended.is_(None))
-    return {
-        row["heliostat"]: Hold(
-            *(row[n] for n in ("heliostat", "reason", "person", "since", "until"))
-        )
-        for row in connection.execute(query).mappings()
-    }
+    return {held.heliostat: held for held in rows.records(connection, Hold, query)}
 
 
 def _end_holds(connection: Connection, names: Sequence[str], person: str, at: float) -> None:

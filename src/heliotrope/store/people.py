@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, field
 from sqlalchemy import ColumnElement, Connection, Table, select
 
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database
 from heliotrope.store.records import StoreError
@@ -134,15 +135,14 @@ class People:
     def accounts(self) -> tuple[Account, ...]:
         """Return all accounts by name."""
         with self._database.reading() as connection:
-            found = connection.execute(select(_ACCOUNT).order_by(_ACCOUNT.c.name)).mappings()
-            return tuple(Account(**row) for row in found)
+            return tuple(
+                rows.records(connection, Account, select(_ACCOUNT).order_by(_ACCOUNT.c.name))
+            )
 
     def account(self, name: str) -> Account | None:
         """Return an account, None if the name is unknown."""
         with self._database.reading() as connection:
-            row = connection.execute(select(_ACCOUNT).where(_ACCOUNT.c.name == name))
-            found = row.mappings().first()
-        return None if found is None else Account(**found)
+            return _find(connection, name)
 
     def add(self, name: str, password_hash: str, role: str, now: float) -> Account:
         """Make an account.
@@ -265,16 +265,14 @@ class People:
             row = connection.execute(query).mappings().first()
         if row is None or row["disabled"]:
             return None
-        return Session(
-            row["key"], row["name"], row["role"], row["since"], row["expires"], row["note"]
-        )
+        return rows.record_of(Session, row)
 
     def sessions(self, now: float) -> tuple[Session, ...]:
         """Return all unexpired sessions, the oldest first."""
         joined = select(_SESSION, _ACCOUNT.c.role).join(_ACCOUNT)
         query = joined.where(_SESSION.c.expires > now).order_by(_SESSION.c.since, _SESSION.c.key)
         with self._database.reading() as connection:
-            return tuple(Session(**row) for row in connection.execute(query).mappings())
+            return tuple(rows.records(connection, Session, query))
 
     def keep_session(self, secret: str, now: float, lifetime: float) -> None:
         """Extend an unexpired session to ``lifetime`` s from now; written in the background."""
@@ -336,15 +334,7 @@ class People:
             return None
         self._note_use(row["key"], now)
         least = min(row["role"], row["owner_role"], key=ROLES.index)
-        return ApiToken(
-            row["key"],
-            row["name"],
-            row["label"],
-            least,
-            row["created"],
-            row["expires"],
-            row["last_used"],
-        )
+        return rows.record_of(ApiToken, row, role=least)
 
     def _note_use(self, key: str, now: float) -> None:
         last = self._noted.get(key)
@@ -363,7 +353,7 @@ class People:
         if name:
             query = query.where(_TOKEN.c.name == name)
         with self._database.reading() as connection:
-            return tuple(ApiToken(**row) for row in connection.execute(query).mappings())
+            return tuple(rows.records(connection, ApiToken, query))
 
     def revoke_token(self, key: str) -> None:
         """Remove a token by its key, if it exists."""
@@ -392,8 +382,8 @@ def _check_role(role: str) -> None:
 
 
 def _find(connection: Connection, name: str) -> Account | None:
-    row = connection.execute(select(_ACCOUNT).where(_ACCOUNT.c.name == name)).mappings().first()
-    return None if row is None else Account(**row)
+    found = rows.records(connection, Account, select(_ACCOUNT).where(_ACCOUNT.c.name == name))
+    return found[0] if found else None
 
 
 def _need(connection: Connection, name: str) -> Account:

@@ -1,10 +1,18 @@
-"""The tables of the database, for SQLite and PostgreSQL alike.
+"""The tables of the database, for SQLite and PostgreSQL alike, and the types of their columns.
 
-Times are POSIX seconds (UTC), angles rad, lengths m. What is not a number stands as NULL. Numbers
-of rows are given by the one process that writes (see `keeper`), so that writing a row twice is
-writing it once.
+Times are POSIX seconds (UTC), angles rad, lengths m. The one process that writes numbers the rows
+(see `keeper`), so a row that is written twice is there once.
+
+A column has the name of the field that it keeps, or that name as its ``key``. Its type converts the
+value: a record's field goes in and comes out as it is (see `_rows`).
 """
 
+import math
+from collections.abc import Callable, Iterable, Mapping
+from enum import Enum
+from typing import Any
+
+import numpy as np
 from sqlalchemy import (
     JSON,
     BigInteger,
@@ -19,7 +27,14 @@ from sqlalchemy import (
     MetaData,
     Table,
     Text,
+    TypeDecorator,
 )
+from sqlalchemy.engine import Dialect
+
+from heliotrope.calibration.fit.estimator import FitOutcome
+from heliotrope.calibration.record import CalibrationOutcome, Provenance
+from heliotrope.geometry import FloatArray
+from heliotrope.safety import Severity
 
 metadata = MetaData(
     naming_convention={
@@ -34,6 +49,126 @@ metadata = MetaData(
 Number = BigInteger().with_variant(Integer, "sqlite")
 
 
+def _finite(value: float | None) -> float | None:
+    """Return a float as it is kept: None if it is not finite."""
+    return float(value) if value is not None and math.isfinite(value) else None
+
+
+def _figure(value: float | None) -> float:
+    """Return a float as it is read: NaN for None."""
+    return math.nan if value is None else value
+
+
+class _Converted(TypeDecorator[Any]):
+    """A type that converts each value as it is written and as it is read."""
+
+    impl: Any = Text
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002 - SQLAlchemy gives it
+        """Return a value as the database keeps it."""
+        return self._written(value)
+
+    def process_result_value(self, value: Any, dialect: Dialect) -> Any:  # noqa: ARG002 - SQLAlchemy gives it
+        """Return a value as a record has it."""
+        return self._read(value)
+
+    def _written(self, value: Any) -> Any:
+        raise NotImplementedError
+
+    def _read(self, value: Any) -> Any:
+        raise NotImplementedError
+
+
+class Figure(_Converted):
+    """A float; one that is not finite is NULL, and NULL is NaN."""
+
+    impl = Double
+    cache_ok = True
+
+    def _written(self, value: float | None) -> float | None:
+        return _finite(value)
+
+    def _read(self, value: float | None) -> float:
+        return _figure(value)
+
+
+class FiguresByName(_Converted):
+    """Floats by name, as a JSON object; one that is not finite is null, and null is NaN."""
+
+    impl = JSON
+    cache_ok = True
+
+    def _written(self, value: Mapping[str, float]) -> dict[str, float | None]:
+        return {str(name): _finite(x) for name, x in value.items()}
+
+    def _read(self, value: Mapping[str, float | None]) -> dict[str, float]:
+        return {name: _figure(x) for name, x in value.items()}
+
+
+class Figures(_Converted):
+    """An array of floats with a given number of axes, as nested JSON lists."""
+
+    impl = JSON
+    cache_ok = True
+
+    def __init__(self, axes: int = 1) -> None:
+        super().__init__()
+        self.axes = axes
+
+    def _written(self, value: FloatArray) -> Any:
+        return value.tolist()
+
+    def _read(self, value: list[Any]) -> FloatArray:
+        # The list of an empty array has lost all axes but one.
+        return np.array(value, np.float64) if value else np.zeros((0,) * self.axes)
+
+
+class Items(_Converted):
+    """A tuple of values of one kind, as a JSON list."""
+
+    impl = JSON
+    cache_ok = True
+
+    def __init__(self, kind: Callable[[Any], Any]) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def _written(self, value: Iterable[Any]) -> list[Any]:
+        return [self.kind(item) for item in value]
+
+    def _read(self, value: list[Any]) -> tuple[Any, ...]:
+        return tuple(value)
+
+
+class Name(_Converted):
+    """A member of an enum, as its name in lower case."""
+
+    cache_ok = True
+
+    def __init__(self, kind: type[Enum]) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def _written(self, value: Any) -> str:
+        return self.kind(value).name.lower()
+
+    def _read(self, value: str) -> Enum:
+        return self.kind[value.upper()]
+
+
+class SeverityRank(_Converted):
+    """A severity, as its rank, by which the database compares severities."""
+
+    impl = Integer
+    cache_ok = True
+
+    def _written(self, value: str) -> int:
+        return Severity(value).rank
+
+    def _read(self, value: int) -> Severity:
+        return tuple(Severity)[value]
+
+
 def _number() -> "Column[int]":
     return Column("number", Number, primary_key=True, autoincrement=False)
 
@@ -46,6 +181,10 @@ def _real(name: str, *, needed: bool = False) -> "Column[float]":
     return Column(name, Double, nullable=not needed)
 
 
+def _figure_of(name: str, key: str | None = None) -> "Column[float]":
+    return Column(name, Figure, key=key)
+
+
 about = Table("about", metadata, _text("name", key=True), _text("value"))
 
 sighting = Table(
@@ -56,7 +195,7 @@ sighting = Table(
     _text("kind"),
     _text("target"),
     _text("campaign"),
-    _real("time"),
+    _figure_of("time"),
     Column("counts", JSON, nullable=False),
     *(
         _real(f"{end}_{axis}", needed=True)
@@ -77,17 +216,20 @@ parameter_version = Table(
     Column("version", Integer, primary_key=True, autoincrement=False),
     _real("at", needed=True),
     _text("model"),
-    *(Column(name, JSON, nullable=False) for name in ("names", "value", "covariance", "prior")),
-    _real("error_before"),
-    _real("error_after"),
-    _real("scale"),
-    _text("outcome"),
+    Column("names", Items(str), nullable=False),
+    Column("value", Figures, key="values", nullable=False),
+    Column("covariance", Figures(axes=2), nullable=False),
+    Column("prior", Figures, nullable=False),
+    _figure_of("error_before", key="before"),
+    _figure_of("error_after", key="after"),
+    _figure_of("scale"),
+    Column("outcome", Name(FitOutcome), nullable=False),
     _text("person"),
     _text("campaign"),
     _text("note"),
-    Column("pushed", JSON, nullable=False),
+    Column("pushed", Items(str), nullable=False),
     _text("code"),
-    _text("provenance"),
+    Column("provenance", Name(Provenance), nullable=False),
 )
 
 #: The sightings behind a version: those used in the fit with their residuals, and those left out.
@@ -98,7 +240,7 @@ parameter_sighting = Table(
     Column("version", Integer, primary_key=True, autoincrement=False),
     Column("place", Integer, primary_key=True, autoincrement=False),
     Column("sighting", Number, ForeignKey(sighting.c.number), nullable=False),
-    *(_real(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
+    *(_figure_of(f"{when}_{way}") for when in ("before", "after") for way in ("right", "above")),
     Column("used", Boolean, nullable=False),
     ForeignKeyConstraint(
         ["heliostat", "version"], [parameter_version.c.heliostat, parameter_version.c.version]
@@ -113,8 +255,8 @@ campaign = Table(
     _real("finished"),
     _text("model"),
     _text("note"),
-    Column("expected", JSON, nullable=False),
-    Column("found", JSON, nullable=False),
+    Column("expected", FiguresByName, nullable=False),
+    Column("found", FiguresByName, nullable=False),
 )
 
 visit = Table(
@@ -128,7 +270,7 @@ visit = Table(
     Column("good", Boolean, nullable=False),
     _text("text"),
     *(
-        _real(name)
+        _figure_of(name)
         for name in (
             "gain",
             "sigma_before",
@@ -141,7 +283,7 @@ visit = Table(
     Column("sightings", Integer, nullable=False),
     Column("version", Integer, nullable=False),
     _text("campaign"),
-    _text("outcome"),
+    Column("outcome", Name(CalibrationOutcome), nullable=False),
     Index(None, "heliostat"),
 )
 
@@ -152,7 +294,7 @@ plan = Table(
     _text("heliostat"),
     _text("target"),
     _real("due", needed=True),
-    _real("gain"),
+    _figure_of("gain"),
     _text("note"),
 )
 
@@ -182,10 +324,10 @@ event = Table(
     _number(),
     _real("at", needed=True),
     _text("source"),
-    Column("severity", Integer, nullable=False),
+    Column("severity", SeverityRank, nullable=False),
     _text("heliostat"),
     _text("text"),
-    Column("values", JSON, nullable=False),
+    Column("values", FiguresByName, nullable=False),
     Index(None, "at"),
     Index(None, "heliostat"),
 )
@@ -214,8 +356,8 @@ audit = Table(
     _text("role"),
     _text("what"),
     _text("at"),
-    Column("values", JSON, nullable=False),
-    Column("heliostats", JSON, nullable=False),
+    Column("values", Items(float), nullable=False),
+    Column("heliostats", Items(str), nullable=False),
     _text("note"),
     _text("result"),
     _text("finished"),
