@@ -224,7 +224,7 @@ def test_plant_file_must_come_back(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     field, shared = _module(monkeypatch, "field"), _module(monkeypatch, "_run")
     plant, other = field._plant(3), field._plant(4)
     monkeypatch.setattr(field, "read_plant", lambda _: other)
-    with pytest.raises(shared.BenchmarkError, match="csv: what is read is not what was written"):
+    with pytest.raises(shared.BenchmarkError, match="csv: the plant read differs"):
         field._contenders(plant, "csv", tmp_path)
 
 

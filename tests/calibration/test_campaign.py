@@ -208,7 +208,7 @@ def test_campaign_refusals() -> None:
         plan_campaign([fleet], *run, START, np.inf)
     with pytest.raises(InputError, match="0 slots of 12 s"):
         plan_campaign([fleet], *run, START, START + 5.0)
-    with pytest.raises(InputError, match="never 10° high"):
+    with pytest.raises(InputError, match="never reaches 10°"):
         plan_campaign([fleet], *run, START + 0.9 * DAY, START + 0.95 * DAY)
     with pytest.raises(InputError, match="settle -1"):
         Timing(settle=-1.0)

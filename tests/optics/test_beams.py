@@ -261,7 +261,7 @@ def _reflected(**changes: object) -> Beam:
     [
         (lambda: Beam(np.zeros(3), 0.1, np.zeros(2)), r"flux of shape \(3,\)"),
         (lambda: Beam(-np.ones((2, 2)), 0.1, np.zeros(2)), "nowhere below 0"),
-        (lambda: Beam(np.zeros((2, 2)), 0.1, np.zeros(2)), "without light"),
+        (lambda: Beam(np.zeros((2, 2)), 0.1, np.zeros(2)), "give a beam with light"),
         (lambda: Beam(np.ones((2, 2)), 0.0, np.zeros(2)), "step 0.0 m must be above 0"),
         (lambda: Beam(np.ones((2, 2)), 0.1, np.zeros(3)), "origin"),
         (lambda: Beam.from_image(np.ones(3), 0.1), "picture of shape"),

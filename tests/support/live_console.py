@@ -48,9 +48,11 @@ class LiveConsole:
         page: bool = True,
         speed: float = 1.0,
         rendered: bool = False,
+        boards: bool = False,
     ) -> None:
         self.folder, self.address = folder, ""
-        self._made = (heliostats, page, speed, rendered)
+        self._made = (heliostats, page, speed)
+        self._options = LiveOptions(rendered=rendered, boards=boards)
         self._ready, self._over = threading.Event(), threading.Event()
         self._problem: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="console")
@@ -69,7 +71,7 @@ class LiveConsole:
         self._ready.set()
 
     async def _main(self) -> None:
-        heliostats, page, speed, rendered = self._made
+        heliostats, page, speed = self._made
         self._loop = asyncio.get_running_loop()
         clock = VirtualClock(self._loop.time)
         self.keeper = Keeper(self.folder / "store.sqlite")
@@ -80,7 +82,7 @@ class LiveConsole:
         self.live = LivePlant(
             design,
             clock,
-            LiveOptions(rendered=rendered),
+            self._options,
             audit=JsonLines(self.folder / "audit.jsonl", clock.utc()),
             records=self.keeper,
             extra=lambda: {"speed": speed},
