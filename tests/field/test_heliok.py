@@ -29,7 +29,7 @@ def test_comments_and_unknown_elements_change_nothing(tmp_path: Path) -> None:
     path = edited(tmp_path, "<Scene>", "<!-- note --><Scene><?tool x?><Note a='1'>text</Note>")
     again = heliok.to_plant(heliok.read(path), SITE)
     np.testing.assert_array_equal(again.position, plant().position)
-    assert heliok.Element("a", line=1) == heliok.Element("a", line=2)
+    assert heliok.XmlElement("a", line=1) == heliok.XmlElement("a", line=2)
 
 
 def test_published_angles_are_met() -> None:
