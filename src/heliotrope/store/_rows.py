@@ -30,21 +30,21 @@ Record = TypeVar("Record")
 
 
 def insert(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Insert rows; one whose key is there already is there already."""
+    """Insert rows; a row whose key exists already is left as it is."""
     if rows:
         connection.execute(_insert(connection.dialect.name, table), list(rows))
 
 
 @cache
 def _insert(dialect: str, table: Table) -> Executable:
-    """Return the statement, which is made once: events come in thousands."""
+    """Return the statement; cached, because events come in thousands."""
     kind = postgresql if dialect == "postgresql" else sqlite
     statement: Executable = kind.insert(table).on_conflict_do_nothing()
     return statement
 
 
 def replace(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
-    """Insert rows, or put them in place of those with their keys."""
+    """Insert rows; each replaces the row with its key."""
     if not rows:
         return
     kind = postgresql if connection.dialect.name == "postgresql" else sqlite
@@ -97,8 +97,8 @@ def sighting_rows(
 
 
 def kept_sightings(rows: Sequence[SqlRow[Any]]) -> KeptSightings:
-    """Return sightings from M rows of the whole table, all with as many drives."""
-    # By columns: of 100,000 rows a look-up of each cell takes longer than reading them.
+    """Return sightings from M rows of the whole table, all with the same number of drives."""
+    # By columns: looking up each cell of 100,000 rows takes longer than reading them.
     cells = zip(*rows, strict=True) if rows else ((),) * len(tables.sighting.columns)
     columns = dict(zip(tables.sighting.columns.keys(), cells, strict=True))
     names = tuple(dict.fromkeys(columns["heliostat"]))

@@ -58,7 +58,7 @@ def finish_open(connection: Connection, result: str, at: str) -> int:
 
 
 def entries(connection: Connection, limit: int = 100, before: int = 0) -> list[AuditEntry]:
-    """Return records, the last begun first; only those before a place in that order, if given."""
+    """Return records, the latest first; only those before a number if given."""
     query = select(_AUDIT).order_by(_AUDIT.c.number.desc()).limit(limit)
     if before:
         query = query.where(_AUDIT.c.number < before)
@@ -72,7 +72,7 @@ def _find(connection: Connection, identity: str) -> AuditEntry | None:
 
 
 def probe(connection: Connection) -> None:
-    """Write something meaningless: only a write shows that the disk accepts one."""
+    """Write a row without meaning: only a write shows that the disk accepts one."""
     about = tables.about
     known = connection.scalar(select(about.c.value).where(about.c.name == "probe"))
     row = {"name": "probe", "value": str(int(known or 0) + 1)}

@@ -1,7 +1,7 @@
-"""Every step of the calibrations as CSV: what was seen, what it missed by, what was learnt.
+"""Every step of the calibrations as CSV: sightings, their beam errors, and the parameters learnt.
 
-One folder for each heliostat, after Malan's habit for finding faults: ``sightings.csv`` (which
-`calibration.sighting_table` reads again), ``residuals.csv`` (of every version, before and after),
+One folder for each heliostat, as Malan kept them to find faults: ``sightings.csv`` (which
+`calibration.sighting_table` reads), ``residuals.csv`` (of every version, before and after),
 ``versions.csv``, ``parameters.csv`` and ``covariance.csv``; and ``heliostats.csv`` beside them.
 """
 
@@ -33,16 +33,16 @@ def export(
     heliostats: Sequence[str] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[str]:
-    """Write the steps of all calibrations; return the heliostats that were written.
+    """Write the steps of all calibrations; return the names of the heliostats written.
 
     Parameters
     ----------
     database
-        May be written meanwhile: what is exported is one state of it.
+        It may be written meanwhile: the export shows one consistent state.
     folder
-        Is made; files that are there already are replaced.
+        Made if missing; existing files are replaced.
     heliostats
-        Names; None: all of which something is kept.
+        Names; None: every heliostat in the store.
     progress
         Called with (done, all) after each heliostat.
 
@@ -51,9 +51,9 @@ def export(
     StoreError
         If the store cannot be read.
     UnknownNameError
-        If nothing is kept of a heliostat.
+        If a heliostat is not in the store.
     InputError
-        If the folder cannot be written to.
+        If the folder cannot be written.
     """
     place = Path(folder)
     database.require()
@@ -76,7 +76,7 @@ def export(
 
 
 def folder_name(heliostat: str) -> str:
-    """Return the name of a heliostat's folder: what a file system does not take is %-coded."""
+    """Return the name of a heliostat's folder; characters that file systems refuse are %-coded."""
     name = quote(heliostat, safe=" +-_.,()=@")
     return name.replace(".", "%2E") if set(name) <= {"."} else name
 
@@ -118,7 +118,7 @@ def _write(path: Path, header: Sequence[str], lines: Iterable[Sequence[Any]]) ->
 
 
 def _cell(value: Any) -> str:
-    """Return a cell; what is not a number is empty, and a float reads back as the same."""
+    """Return a cell: empty for NaN; a float reads back as the same float."""
     if isinstance(value, float):
         return "" if np.isnan(value) else repr(float(value))
     return str(value)
@@ -138,7 +138,7 @@ def _index_row(
     return (name, folder_name(name), len(seen), len(history), *tail)
 
 
-#: ``row`` is that of sightings.csv, 1 for the first below the header.
+#: ``row`` counts the rows of sightings.csv from 1, without the header.
 _RESIDUALS = (
     "version", "row", "sighting", "time", "before_right_rad", "before_above_rad", "before_beam_rad",
     "after_right_rad", "after_above_rad", "after_beam_rad",

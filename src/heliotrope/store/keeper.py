@@ -1,7 +1,8 @@
-"""The keeper: `Records` on a database, with the one writer behind it.
+"""The keeper: `Records` in a database, with the one writer behind it.
 
-The keeper numbers what it takes, so the caller knows the numbers of sightings before they are
-written, and a row that is written twice is there once. Only one process has a store at a time.
+The keeper numbers each record when it accepts it, so the caller knows the numbers of sightings
+before they are written, and a row that is written twice is there once. Only one process has a store
+open for writing.
 """
 
 import asyncio
@@ -35,21 +36,21 @@ from heliotrope.store.writer import Work, Writer
 
 T = TypeVar("T")
 _NUMBERED = (tables.sighting, tables.visit, tables.hold, tables.event, tables.alarm)
-#: More names than this are not put into a query; what is read is sifted instead.
+#: With more names than this a query reads all rows, which are then filtered.
 _MANY = 500
 
 
 class Keeper:
-    """Keeps what the plant must remember; see `Records` for what each method promises.
+    """Keeps the records of a plant; see `Records` for the guarantees of each method.
 
     Parameters
     ----------
     place
-        A folder (made if need be), a file ``.sqlite``, or a URL ``postgresql://...``.
+        A folder (made if missing), a file ``.sqlite``, or a URL ``postgresql://...``.
     inline
         Write at once in the caller's thread: for virtual time, in which no thread can be awaited.
     limit
-        Records that may wait.
+        Number of records that may wait.
 
     Attributes
     ----------
@@ -59,7 +60,7 @@ class Keeper:
     Raises
     ------
     StoreError
-        If the store cannot be opened, is another program's, or another process has it.
+        If the store cannot be opened, belongs to another program, or is open in another process.
     """
 
     def __init__(self, place: str | Path, *, inline: bool = False, limit: int = 50_000) -> None:
@@ -87,16 +88,16 @@ class Keeper:
 
     @property
     def refused(self) -> str:
-        """Which record the database refused for what it is, the last; "" if none was."""
+        """The last record that the database refused for its content, "" if none."""
         return self.writer.refused
 
     @property
     def backlog(self) -> int:
-        """How many records wait to be written."""
+        """Number of records that wait to be written."""
         return self.writer.backlog
 
     def close(self) -> None:
-        """Write what waits, and end.
+        """Write the records that wait, and close.
 
         Raises
         ------
@@ -109,12 +110,12 @@ class Keeper:
             self.database.close()
 
     async def confirm(self) -> None:
-        """Wait until all that was recorded before is safe.
+        """Wait until all earlier records are safe.
 
         Raises
         ------
         StoreError
-            If an attempt to write it failed; it is kept waiting and tried again by itself.
+            If an attempt to write failed; the records wait and are tried again.
         """
         done = self.writer.confirmed()
         if self.writer.inline:
@@ -144,14 +145,14 @@ class Keeper:
         target: str = "",
         campaign: str = "",
     ) -> Identities:
-        """Keep sightings, whose rows point to ``names``; return their numbers, (M,).
+        """Record sightings, whose rows point to ``names``; return their numbers, (M,).
 
         Raises
         ------
         InputError
             If a row points beyond the names.
         StoreError
-            If too much waits already.
+            If too many records wait already.
         """
         if len(sightings) and int(sightings.heliostat.max()) >= len(names):
             raise InputError(
@@ -164,21 +165,21 @@ class Keeper:
         return numbers
 
     def record_calibration(self, record: HeliostatCalibration) -> None:
-        """Keep a calibration, whose version is above those kept of the heliostat.
+        """Record a calibration; its version must be above the recorded ones of the heliostat.
 
         Raises
         ------
         InputError
             If its version is not above them.
         StoreError
-            If too much waits already.
+            If too many records wait already.
         """
         with self._mine:
             last = self._versions.get(record.heliostat, 0)
             if record.version <= last:
                 raise InputError(
                     f"calibration of {record.heliostat}: version {record.version} is not above "
-                    f"{last}, the last one kept; number it anew"
+                    f"{last}, the last one recorded; give it a higher version"
                 )
             row = rows.row_of(tables.parameter_version, record)
             used = rows.used_rows(record)
@@ -198,7 +199,7 @@ class Keeper:
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings of some heliostats (None: of all), those of one campaign if named."""
+        """Return sightings by time: of some heliostats (None: all), of one campaign if given."""
         s = tables.sighting.c
         query = select(tables.sighting).order_by(s.time, s.number)
         if heliostats is not None and len(heliostats) <= _MANY:
@@ -219,7 +220,7 @@ class Keeper:
     def latest_calibrations(
         self, heliostats: Sequence[str] | None = None
     ) -> dict[str, HeliostatCalibration]:
-        """Return the last version of each, by heliostat, without sightings and residuals."""
+        """Return the latest version by heliostat, without sightings and residuals."""
         table = tables.parameter_version
         last = (
             select(table.c.heliostat, func.max(table.c.version).label("version"))
@@ -245,13 +246,13 @@ class Keeper:
     # -- measurements and their plan -----------------------------------------------------
 
     def record_visit(self, visit: VisitEntry) -> None:
-        """Keep what became of a measurement."""
+        """Record a measurement and its outcome."""
         number = self._take_numbers(tables.visit)
         row = rows.row_of(tables.visit, visit, number=number)
         self.writer.put(lambda c: rows.insert(c, tables.visit, [row]))
 
     def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
-        """Keep what the schedule plans, in place of the plan before."""
+        """Record the plan of the schedule; it replaces the plan before."""
         in_order = enumerate(sorted(plan, key=lambda visit: visit.due))
         made = [rows.row_of(tables.plan, visit, place=place) for place, visit in in_order]
 
@@ -262,30 +263,30 @@ class Keeper:
         self.writer.put(work)
 
     def record_campaign(self, campaign: CampaignEntry) -> None:
-        """Keep a campaign, in place of what was kept of the same name."""
+        """Record a campaign; it replaces the one of the same name."""
         row = rows.row_of(tables.campaign, campaign)
         self.writer.put(lambda c: rows.replace(c, tables.campaign, [row]))
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
-        """Return measurements, the last first."""
+        """Return the measurements, the latest first."""
         query = select(tables.visit).order_by(tables.visit.c.number.desc()).limit(limit)
         if heliostat:
             query = query.where(tables.visit.c.heliostat == heliostat)
         return self._records(VisitEntry, query)
 
     def plan(self) -> list[PlannedVisit]:
-        """Return the plan that was kept last, the first due first."""
+        """Return the recorded plan, the first due first."""
         return self._records(PlannedVisit, select(tables.plan).order_by(tables.plan.c.place))
 
     def campaigns(self) -> list[CampaignEntry]:
-        """Return the campaigns, the last first."""
+        """Return the campaigns, the latest first."""
         query = select(tables.campaign).order_by(tables.campaign.c.begun.desc())
         return self._records(CampaignEntry, query)
 
     # -- events and alarms ---------------------------------------------------------------
 
     def record_event(self, event: Event) -> None:
-        """Keep an event.
+        """Record an event.
 
         Raises
         ------
@@ -300,7 +301,7 @@ class Keeper:
     def record_alarm(
         self, condition: str, subject: str, severity: str, text: str, at: float, *, active: bool
     ) -> None:
-        """Keep that an alarm stands, or (not active) that it is over."""
+        """Record that an alarm stands, or (not active) that it is over."""
         _check_severity(severity)
         number = self._take_numbers(tables.alarm)
         entry = AlarmEntry(condition, subject, severity, text, at, number=number)
@@ -317,7 +318,7 @@ class Keeper:
         self.writer.put(work)
 
     def record_acknowledgement(self, condition: str, subject: str, person: str, at: float) -> None:
-        """Keep that a person acknowledged an alarm."""
+        """Record that a person acknowledged an alarm."""
         a = tables.alarm.c
         which = and_(a.condition == condition, a.subject == subject, a.acknowledged.is_(None))
         change = {"acknowledged": at, "acknowledged_by": person}
@@ -326,7 +327,7 @@ class Keeper:
     def events(
         self, limit: int = 100, *, heliostat: str = "", severity: str = "info", before: int = 0
     ) -> list[Event]:
-        """Return events of a severity and above, the last first; those before a number if given."""
+        """Return events of at least a severity, the latest first; before a number if given."""
         _check_severity(severity)
         e = tables.event.c
         query = select(tables.event).where(e.severity >= severity)
@@ -337,7 +338,7 @@ class Keeper:
         return self._records(Event, query.order_by(e.number.desc()).limit(limit))
 
     def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
-        """Return alarms, the last first; only those neither over nor acknowledged if standing."""
+        """Return alarms, the latest first; with standing, without those over and acknowledged."""
         a = tables.alarm.c
         query = select(tables.alarm).order_by(a.number.desc()).limit(limit)
         if standing:
@@ -345,7 +346,7 @@ class Keeper:
         return self._records(AlarmEntry, query)
 
     def forget_events(self, before: float) -> None:
-        """Let go of events before a time, and of alarms that were over and acknowledged by then."""
+        """Remove events before a time, and alarms that were over and acknowledged by then."""
         a = tables.alarm.c
         over = and_(a.cleared < before, a.acknowledged < before)
 
@@ -365,7 +366,7 @@ class Keeper:
         at: float,
         until: float | None = None,
     ) -> None:
-        """Keep the schedule off some heliostats; one that is held already is held anew."""
+        """Hold heliostats back from the schedule; a new hold replaces the one before."""
         names = list(dict.fromkeys(heliostats))
         first = self._take_numbers(tables.hold, len(names))
         new = {name: Hold(name, reason, person, at, until) for name in names}
@@ -380,11 +381,11 @@ class Keeper:
 
         with self._mine:
             self.writer.put(work)
-            # A new dictionary: whoever reads the old one sees one state of all.
+            # A new dictionary: a reader of the old one sees one consistent state.
             self._holds = {**self._holds, **new}
 
     def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
-        """Give heliostats back to the schedule."""
+        """Return heliostats to the schedule."""
         names = list(dict.fromkeys(heliostats))
         with self._mine:
             self.writer.put(lambda c: _end_holds(c, names, person, at))
@@ -392,11 +393,11 @@ class Keeper:
             self._holds = {n: held for n, held in self._holds.items() if n not in gone}
 
     def holds(self, at: float) -> dict[str, Hold]:
-        """Return what is held at a time, by heliostat."""
+        """Return the holds at a time, by heliostat."""
         return {n: h for n, h in self._holds.items() if h.until is None or at < h.until}
 
     def do(self, work: Work[Any], timeout: float = 5.0) -> Any:
-        """Let work be written, and return what it gives; see `Writer.do`."""
+        """Do work in the writer and return its result; see `Writer.do`."""
         return self.writer.do(work, timeout)
 
 

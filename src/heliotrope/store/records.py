@@ -1,8 +1,8 @@
-"""What the plant keeps: its records, and the protocol by which it keeps them.
+"""The records of a plant, and the protocol of a place that keeps them.
 
-Times are POSIX seconds (UTC) unless they say otherwise. A record is taken at once and written
-behind; `Records.confirm` waits until all that was taken before is safe, and only what was
-confirmed is promised to be there after a crash.
+Times are POSIX seconds (UTC) unless stated otherwise. A record is accepted at once and written in
+the background; `Records.confirm` waits until all earlier records are safe. Only confirmed records
+are sure to survive a crash.
 
 ::
 
@@ -32,18 +32,18 @@ class StoreError(HeliotropeError):
 
 @dataclass(frozen=True)
 class KeptSightings:
-    """M sightings as they are kept.
+    """M sightings from the store.
 
     Attributes
     ----------
     identities
         Numbers of the sightings, unique for all time, (M,).
     names
-        Of the heliostats that the rows of ``sightings`` point to.
+        Names of the heliostats that the rows of ``sightings`` point to.
     sightings
-        In the order of time.
+        The sightings by time.
     kinds, targets, campaigns
-        Of each sighting, "" where there is none, (M,).
+        One word for each sighting, "" for none, (M,).
     """
 
     identities: Identities
@@ -57,31 +57,31 @@ class KeptSightings:
         return len(self.identities)
 
     def of(self, heliostat: str) -> Sightings:
-        """Return the sightings of one heliostat, renumbered to 0; none if it is not known."""
+        """Return the sightings of one heliostat, renumbered to 0; none if its name is unknown."""
         row = self.names.index(heliostat) if heliostat in self.names else len(self.names)
         return self.sightings.of(row)
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened.
+    """An event.
 
     Attributes
     ----------
     at
-        When.
+        POSIX s.
     source
-        What part of the plant says so ("calibration", "cluster C12", "store").
+        Part of the plant that reports it ("calibration", "cluster C12", "store").
     text
         One line.
     severity
         One of `SEVERITIES`.
     heliostat
-        Whom it is about; "" if about none.
+        Heliostat that it concerns; "" for none.
     values
-        Numbers to it, by name.
+        Figures by name.
     number
-        Counts up for all time; 0 before it is kept.
+        Rises for all time; 0 before it is recorded.
     """
 
     at: float
@@ -95,20 +95,20 @@ class Event:
 
 @dataclass(frozen=True)
 class AlarmEntry:
-    """An alarm, from when it was raised to when it was over and acknowledged.
+    """An alarm, from its beginning to its end and acknowledgement.
 
     Attributes
     ----------
     condition, subject
-        What, and of what; together they name an alarm that stands.
+        Condition, and the object it concerns; together they identify a standing alarm.
     severity, text
-        How bad, and one line.
+        Severity, and one line.
     raised, cleared, acknowledged
-        When; None if not yet.
+        POSIX s; None if not yet.
     acknowledged_by
-        By whom; "" if by nobody.
+        Person; "" for nobody.
     number
-        Counts up for all time.
+        Rises for all time.
     """
 
     condition: str
@@ -128,10 +128,12 @@ class Hold:
 
     Attributes
     ----------
-    heliostat, reason, person, since
-        Which, why, by whom and from when.
+    heliostat, reason, person
+        Name, reason, and person who holds it.
+    since
+        POSIX s.
     until
-        When it ends by itself; None: only by `Records.unhold`.
+        End, POSIX s; None: until `Records.unhold`.
     """
 
     heliostat: str
@@ -148,11 +150,11 @@ class PlannedVisit:
     Attributes
     ----------
     heliostat, target, due
-        Which, where, when.
+        Names, and POSIX s.
     gain
-        What the schedule expects of it, in its own unit.
+        Gain that the schedule expects, in its own unit.
     note
-        Why now.
+        Reason for measuring now.
     """
 
     heliostat: str
@@ -164,30 +166,30 @@ class PlannedVisit:
 
 @dataclass(frozen=True)
 class VisitEntry:
-    """A measurement that was made, or was tried: what was expected of it and what it brought.
+    """A measurement made or attempted: what was expected, and what came out.
 
     Attributes
     ----------
     heliostat, target, begun, finished
-        Which, where, when.
+        Names, and POSIX s.
     outcome
-        What became of it.
+        Outcome of the attempt.
     text
-        The same for people, one line.
+        The outcome for people, one line.
     gain
-        What the schedule had expected of it.
+        Gain that the schedule expected.
     sigma_before, sigma_expected, sigma_after
         Predicted standard deviation of the normal, rad: before, as planned, and after.
     error_before, error_after
         Beam error over the sightings, rad RMS.
     sightings
-        How many it brought.
+        Number of sightings.
     version
-        Parameter version that it led to; 0 for none.
+        Version of the resulting calibration; 0 for none.
     campaign
-        It belongs to.
+        Name of its campaign; "" for none.
     number
-        Counts up for all time; 0 before it is kept.
+        Rises for all time; 0 before it is recorded.
     """
 
     heliostat: str
@@ -222,11 +224,11 @@ class CampaignEntry:
     name
         Unique.
     begun, finished
-        When; None while it runs.
+        POSIX s; ``finished`` is None while it runs.
     model, note
-        Parameters that it learns, further details.
+        Model of the parameters, and remarks.
     expected, found
-        Figures by name: what was predicted of it and what it brought.
+        Figures by name: the prediction and the result.
     """
 
     name: str
@@ -240,7 +242,7 @@ class CampaignEntry:
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One accepted command; as `control.audit.Record`, whose times are ISO 8601."""
+    """One accepted command, as `plant.audit.Record`; times are ISO 8601."""
 
     identity: str
     who: str
@@ -255,21 +257,22 @@ class AuditEntry:
 
 
 class Records(Protocol):
-    """Where the plant keeps what it must remember.
+    """Where a plant keeps its records.
 
-    Whatever begins with ``record_`` returns at once: the event loop never waits for a disk. It
-    raises `StoreError` if too much waits already. What is read is what has been written:
-    `confirm` first to find what was just recorded; holds are the exception, they hold at once.
+    Methods that begin with ``record_`` return at once, because the event loop never waits for a
+    disk; they raise `StoreError` if too many records wait already. Reading shows what has been
+    written: `confirm` first to see the latest records. Holds are the exception: they take effect at
+    once.
     """
 
     @property
     def problem(self) -> str:
-        """Why records cannot be written now, "" if they can: for an alarm."""
+        """Why records cannot be written now, "" if they can; the text of an alarm."""
         ...
 
     @property
     def backlog(self) -> int:
-        """How many records wait to be written."""
+        """Number of records that wait to be written."""
         ...
 
     def record_sightings(
@@ -281,37 +284,37 @@ class Records(Protocol):
         target: str = "",
         campaign: str = "",
     ) -> Identities:
-        """Keep sightings, whose rows point to ``names``; return their numbers, (M,)."""
+        """Record sightings, whose rows point to ``names``; return their numbers, (M,)."""
         ...
 
     def record_calibration(self, record: HeliostatCalibration) -> None:
-        """Keep a calibration, whose version is above those kept of the heliostat."""
+        """Record a calibration; its version must be above the recorded ones of the heliostat."""
         ...
 
     def record_visit(self, visit: VisitEntry) -> None:
-        """Keep what became of a measurement."""
+        """Record a measurement and its outcome."""
         ...
 
     def record_plan(self, plan: Sequence[PlannedVisit]) -> None:
-        """Keep what the schedule plans, in place of the plan before."""
+        """Record the plan of the schedule; it replaces the plan before."""
         ...
 
     def record_campaign(self, campaign: CampaignEntry) -> None:
-        """Keep a campaign, in place of what was kept of the same name."""
+        """Record a campaign; it replaces the one of the same name."""
         ...
 
     def record_event(self, event: Event) -> None:
-        """Keep an event."""
+        """Record an event."""
         ...
 
     def record_alarm(
         self, condition: str, subject: str, severity: str, text: str, at: float, *, active: bool
     ) -> None:
-        """Keep that an alarm stands, or (not active) that it is over."""
+        """Record that an alarm stands, or (not active) that it is over."""
         ...
 
     def record_acknowledgement(self, condition: str, subject: str, person: str, at: float) -> None:
-        """Keep that a person acknowledged an alarm."""
+        """Record that a person acknowledged an alarm."""
         ...
 
     def hold(
@@ -322,24 +325,24 @@ class Records(Protocol):
         at: float,
         until: float | None = None,
     ) -> None:
-        """Keep the schedule off some heliostats; one that is held already is held anew."""
+        """Hold heliostats back from the schedule; a new hold replaces the one before."""
         ...
 
     def unhold(self, heliostats: Sequence[str], person: str, at: float) -> None:
-        """Give heliostats back to the schedule."""
+        """Return heliostats to the schedule."""
         ...
 
     def holds(self, at: float) -> dict[str, Hold]:
-        """Return what is held at a time, by heliostat."""
+        """Return the holds at a time, by heliostat."""
         ...
 
     async def confirm(self) -> None:
-        """Wait until all that was recorded before is safe.
+        """Wait until all earlier records are safe.
 
         Raises
         ------
         StoreError
-            If an attempt to write it failed; it is kept waiting and tried again by itself.
+            If an attempt to write failed; the records wait and are tried again.
         """
         ...
 
@@ -351,13 +354,13 @@ class Records(Protocol):
         until: float = float("inf"),
         campaign: str = "",
     ) -> KeptSightings:
-        """Return sightings of some heliostats (None: of all), those of one campaign if named."""
+        """Return sightings by time: of some heliostats (None: all), of one campaign if given."""
         ...
 
     def latest_calibrations(
         self, heliostats: Sequence[str] | None = None
     ) -> dict[str, HeliostatCalibration]:
-        """Return the last version of each, by heliostat, without sightings and residuals."""
+        """Return the latest version by heliostat, without sightings and residuals."""
         ...
 
     def calibration_history(self, heliostat: str) -> list[HeliostatCalibration]:
@@ -365,27 +368,27 @@ class Records(Protocol):
         ...
 
     def visits(self, limit: int = 100, heliostat: str = "") -> list[VisitEntry]:
-        """Return measurements, the last first."""
+        """Return the measurements, the latest first."""
         ...
 
     def plan(self) -> list[PlannedVisit]:
-        """Return the plan that was kept last, the first due first."""
+        """Return the recorded plan, the first due first."""
         ...
 
     def campaigns(self) -> list[CampaignEntry]:
-        """Return the campaigns, the last first."""
+        """Return the campaigns, the latest first."""
         ...
 
     def events(
         self, limit: int = 100, *, heliostat: str = "", severity: str = "info", before: int = 0
     ) -> list[Event]:
-        """Return events of a severity and above, the last first; those before a number if given."""
+        """Return events of at least a severity, the latest first; before a number if given."""
         ...
 
     def alarms(self, limit: int = 100, *, standing: bool = False) -> list[AlarmEntry]:
-        """Return alarms, the last first; only those neither over nor acknowledged if standing."""
+        """Return alarms, the latest first; with standing, without those over and acknowledged."""
         ...
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the records that wait, and close."""
         ...
