@@ -1,4 +1,4 @@
-"""Starts the controller of one heliostat; `board` is that of the chip."""
+"""Start the controller of one heliostat; `board` is the module of the chip."""
 
 import settings
 from board import Board

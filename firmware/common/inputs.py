@@ -1,13 +1,13 @@
-"""What all boards read alike: switches, limits, supply, watchdog."""
+"""Inputs that are the same on all boards: switches, limits, supply, watchdog."""
 
 import hashlib
 
-#: Volts at the supply's divider (100 kΩ over 10 kΩ) for a volt at the pin.
+#: Volts at the supply's divider (100 kΩ over 10 kΩ) per volt at the pin.
 DIVIDER = 11
 
 
 class Inputs:
-    """What is read the same way on all boards.
+    """Inputs read the same way on all boards.
 
     ``good``, ``limits`` and ``address`` are pins of the board, ``dog`` its watchdog.
     """

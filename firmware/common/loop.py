@@ -1,4 +1,4 @@
-"""The main loop of a board: what `lcu.node` needs, in time."""
+"""The main loop of a board: calls `lcu.node` in time."""
 
 import time
 
@@ -6,9 +6,9 @@ from lcu.node import Node
 
 from lcu import controller
 
-#: Between two ticks of the node, and two measurements, ms.
+#: Intervals of the node's ticks and of measurements, ms.
 TICK, MEASURE = 10, 1000
-#: Limits of the supply (mV) and of the board (°C); a fault beyond.
+#: Limits of the supply (mV) and of the board (°C); beyond them there is a fault.
 LEAST_MV, MOST_MV, HOTTEST, COLDEST = 20000, 30000, 80, -35
 
 
@@ -37,14 +37,14 @@ class Loop:
         )
         config = self.node.controller.config
         if config.address == 0:
-            # Not set over the wire yet: the switches serve until it is.
+            # No address set over the wire yet: use the switches.
             config.address = board.switches()
         self.ticked = self.measured = now
         self.failing = self.limited = False
         self.hot = self.weak = False
 
     def turn(self):
-        """Once round; to be called without a pause."""
+        """Run one pass of the loop; to be called without a pause."""
         board, node = self.board, self.node
         now = time.ticks_ms() & 0x3FFFFFFF
         self.guard(now)
@@ -61,7 +61,7 @@ class Loop:
             self.measure(now)
 
     def guard(self, now):
-        """What cannot wait: the supply's fall, and the limit switches."""
+        """Handle urgent inputs: the supply's fall, and the limit switches."""
         good = self.board.supply_good()
         if not good and not self.failing:
             self.failing = True
@@ -77,7 +77,7 @@ class Loop:
         self.limited = hit
 
     def measure(self, now):
-        """Supply and temperature: told in STATUS, and a fault beyond their limits."""
+        """Measure supply and temperature, for STATUS; beyond their limits latch a fault."""
         supply, warmth = self.board.supply_mv(), self.board.temperature_degc()
         self.node.measured(supply, warmth)
         self.weak = self._judge(

@@ -1,7 +1,7 @@
-"""The journal's flash: a serial NOR chip of its own (W25Q and its kin), or a partition.
+"""The journal's flash: a separate serial NOR chip (W25Q and similar), or a partition.
 
-A chip of its own, because the boards' own flash is taken by their file system to the last block,
-and because the rp2 can run no code while its own flash is erased.
+A separate chip, because the file system takes all of the board's own flash, and because the rp2
+can run no code while its own flash is erased.
 """
 
 import time
@@ -13,7 +13,7 @@ PATIENCE = 1000
 
 
 class SpiNor:
-    """A chip on an SPI bus, with the interface that ``lcu.journal`` asks for.
+    """A chip on an SPI bus, with the storage interface of ``lcu.journal``.
 
     Raises OSError where no chip answers, or one stays busy.
     """
@@ -56,7 +56,7 @@ class SpiNor:
     def write(self, offset, data):
         start = 0
         while start < len(data):
-            # A page that is written beyond its end goes on at its beginning.
+            # A write beyond the end of a page continues at its beginning.
             size = min(len(data) - start, PAGE - (offset + start) % PAGE)
             here = self._address(PROGRAM, offset + start)
             self._change(here + data[start : start + size])
@@ -67,7 +67,7 @@ class SpiNor:
 
 
 class Blocks:
-    """A partition with MicroPython's block interface (esp32), as the same."""
+    """A partition with MicroPython's block interface (esp32), as the same storage interface."""
 
     block_size = BLOCK
 
@@ -81,7 +81,7 @@ class Blocks:
         return bytes(data)
 
     def write(self, offset, data):
-        # With an offset nothing is erased before.
+        # A write with an offset erases nothing first.
         self.device.writeblocks(offset // BLOCK, data, offset % BLOCK)
 
     def erase(self, block):

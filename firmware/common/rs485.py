@@ -2,7 +2,7 @@
 
 
 class Port:
-    """Bytes out with the driver on, bytes in as they came.
+    """Sends bytes with the driver on, and reads the bytes received.
 
     ``uart`` is a ``machine.UART`` with a receive buffer of two frames; ``drive`` the pin of the
     transceiver's DE and /RE.
@@ -16,7 +16,7 @@ class Port:
         self.drive(1)
         try:
             self.uart.write(data)
-            # The last bit must have left before the driver goes: 250 bytes take 22 ms at
+            # The last bit must have left before the driver is switched off: 250 bytes take 22 ms at
             # 115,200 baud, and steps are queued for 100 ms.
             self.uart.flush()
         finally:

@@ -12,7 +12,7 @@ from steps import Timer
 
 
 def storage(pins):
-    """The partition "journal", where the board was given one; else a chip on the SPI bus."""
+    """Return the partition "journal" if the board has one; else a chip on the SPI bus."""
     found = esp32.Partition.find(esp32.Partition.TYPE_DATA, label="journal")
     if found:
         return Blocks(found[0])

@@ -1,10 +1,10 @@
 """Steps by the remote-control peripheral (RMT) of the ESP32: one channel for each axis.
 
-What is queued goes to the peripheral as one sequence; the next follows when the loop finds the
-channel idle, some milliseconds later: MicroPython gives the peripheral no queue. Hence a motor
-is to be run no faster than it starts from rest; and within a sequence the steps come closer
-together by an eighth, which makes up for the pauses: the rate of SET_LIMITS is to be 7/8 of what
-the motor can do. A stop lets the sequence in hand end, at most ``LONGEST_US`` later, so that no
+Queued steps go to the peripheral as one sequence; the next follows when the loop finds the
+channel idle, some milliseconds later: MicroPython gives the peripheral no queue. A motor must
+therefore run no faster than it can start from rest. Within a sequence the steps come closer
+together by an eighth, which makes up for the pauses: set the rate of SET_LIMITS to 7/8 of the
+motor's rate. A stop lets the current sequence end, at most ``LONGEST_US`` later, so that no
 step is lost or counted twice.
 """
 
@@ -59,7 +59,7 @@ class Axis:
 
 
 def sequence(interval):
-    """Durations of one step: high, then low, in parts where it is too long for one."""
+    """Return durations of one step: high, then low, in parts where it is too long for one."""
     times, rest = [HIGH], interval - HIGH
     while rest > PART:
         times.append(PART)
@@ -69,7 +69,7 @@ def sequence(interval):
 
 
 class Timer:
-    """The step timer that ``lcu.node`` asks for."""
+    """The step timer for ``lcu.node``."""
 
     def __init__(self, pins):
         """``pins``: step and direction of the primary axis, then of the secondary one."""

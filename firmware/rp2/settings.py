@@ -1,8 +1,8 @@
-"""What differs from board to board; docs/how-to/firmware.md tells what each pin is for."""
+"""Settings that differ from board to board; docs/how-to/firmware.md explains each pin."""
 
 FIRMWARE = 1
 BAUD = 115200
-#: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
+#: 32 bytes known to the plant and this board only; if empty, nothing can be stored over the wire.
 KEY = b""
 PINS = {
     "bus": (0, 1), "flash": (18, 19, 16, 17),

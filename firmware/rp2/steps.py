@@ -1,8 +1,8 @@
 """Steps by the state machines of the rp2: one for each axis, exact to 0.2 µs.
 
 A word in a state machine's queue is a segment: direction (1 bit), steps less one (10), wait in
-cycles (21). The step pin rises in the same instruction that counts the step, so what is left
-after a stop is known to the step.
+cycles (21). The step pin rises in the same instruction that counts the step, so the remainder
+after a stop is exact to the step.
 """
 
 import rp2
@@ -10,7 +10,7 @@ from machine import Pin
 
 #: Cycles a second; cycles for which a step pin is high: 3.2 µs.
 CLOCK, HIGH = 5_000_000, 16
-#: Cycles of a step beside its wait, and of a segment beside its steps.
+#: Cycles of a step in addition to its wait, and of a segment in addition to its steps.
 STEP, SEGMENT = 2 + HIGH, 4
 MOST = 1024
 QUEUE = 4
@@ -37,7 +37,7 @@ def steps():
 
 
 def word(direction, count, interval_us):
-    """A segment for the state machine. It never lasts longer than it should."""
+    """Return a segment for the state machine. It never lasts longer than it should."""
     cycles = (interval_us * (CLOCK // 1_000_000) * count - SEGMENT) // count - STEP
     return (count - 1) | (direction > 0) << 10 | min(cycles, (1 << 21) - 1) << 11
 
@@ -89,7 +89,7 @@ class Axis:
         if left != IDLE:
             undone += left + 1 if self.given[-1 - queued] > 0 else -left - 1
         elif taken:
-            # A word that was taken and not yet unpacked; else all its bits are shifted out.
+            # A word taken but not yet unpacked; otherwise all its bits are shifted out.
             undone += self.given[-1 - queued]
         for _ in range(queued):
             machine.exec("pull(noblock)")
@@ -100,7 +100,7 @@ class Axis:
 
 
 class Timer:
-    """The step timer that ``lcu.node`` asks for."""
+    """The step timer for ``lcu.node``."""
 
     def __init__(self, pins):
         """``pins``: step and direction of the primary axis, then of the secondary one."""

@@ -1,11 +1,11 @@
-"""What differs from board to board; docs/how-to/firmware.md tells what each pin is for."""
+"""Settings that differ from board to board; docs/how-to/firmware.md explains each pin."""
 
 FIRMWARE = 1
 BAUD = 115200
-#: 32 bytes known to the plant and this board only; none: nothing can be stored over the wire.
+#: 32 bytes known to the plant and this board only; if empty, nothing can be stored over the wire.
 KEY = b""
 PINS = {
-    # The chip gives these to UART 2 and SPI 2; only the flash's select can be another.
+    # The chip fixes these pins of UART 2 and SPI 2; only the flash's select can change.
     "bus": ("A2", "A3"), "flash": ("B13", "B15", "B14", "B12"),
     "drive": "A1", "steps": ("A8", "B0", "C6", "B1"),
     "supply_good": "C0", "limits": ("C1", "C2"),

@@ -1,11 +1,11 @@
 """Steps by the advanced timers of the STM32 (TIM1, TIM8): one for each axis.
 
 A timer's repetition counter makes a burst of up to 256 pulses and then takes period and count of
-the next burst, which lie ready in its preload registers: no pause, and one interrupt for each
-burst. In the last burst its one-pulse mode is set, which stops the timer at the end. The pulse
-comes at the end of the interval, so the direction, set at the begin, is there in time.
+the next burst from its preload registers: no pause, and one interrupt for each burst. In the last
+burst its one-pulse mode is set, which stops the timer at the end. The pulse comes at the end of the
+interval, so the direction, set at the beginning, is there in time.
 
-Bursts last 10 ms at most, but for a single slow step. A stop lets the burst in hand end, so that
+Bursts last 10 ms at most, except a single slow step. A stop lets the current burst end, so that
 no step is lost or counted twice.
 """
 
@@ -22,7 +22,7 @@ HIGH, LONGEST_US, MOST, SLOWEST = 4, 10_000, 256, 65_536
 
 
 class Axis:
-    """One timer and its bursts: (steps with sign, interval)."""
+    """One timer and its bursts: (signed steps, interval)."""
 
     def __init__(self, number, step, direction):
         self.bursts = []
@@ -53,7 +53,7 @@ class Axis:
         self.pump()
 
     def pump(self):
-        """Go on, if the timer stands or its last burst is not the last any more."""
+        """Continue, if the timer stands or its last burst is no longer the last."""
         state = machine.disable_irq()
         if self._get(CR1) & ENABLE == 0:
             self.running = self.ready = None
@@ -63,15 +63,15 @@ class Axis:
             self._prepare()
             if self._get(SR) & 1 and self.ready is not None:
                 # The timer ended between two of these lines, perhaps with half of the new
-                # values. No pulse of them has come yet, for it comes at the interval's end.
+                # values. None of their pulses has come yet: a pulse comes at the interval's end.
                 self._begin(self.ready)
         machine.enable_irq(state)
 
     def _begin(self, burst):
-        """Start the burst whose values lie in the preload registers."""
+        """Start the burst in the preload registers."""
         self._set(CR1, self._get(CR1) & ~ENABLE)
         self.running, self.ready = burst, None
-        # Take the values over now: with URS set that counts as no end of a burst.
+        # Load the values now: with URS set this does not count as the end of a burst.
         self._set(EGR, 1)
         self._set(SR, 0)
         self.way(burst[0] > 0)
@@ -88,7 +88,7 @@ class Axis:
         return burst
 
     def _prepare(self):
-        """Make the next burst ready, or let the timer stop after this one.
+        """Prepare the next burst, or let the timer stop after this one.
 
         A burst of the other direction waits until the timer stands: see ``pump``.
         """
@@ -101,7 +101,7 @@ class Axis:
             self._set(CR1, control | ONE_PULSE)
 
     def ended(self, timer):
-        """The interrupt: a burst has ended, and the next one has begun if one was ready."""
+        """Handle the interrupt: a burst has ended; the next one, if ready, has begun."""
         self.running = self.ready
         if self.running is None:
             self.pump()
@@ -111,7 +111,7 @@ class Axis:
     def stop(self):
         state = machine.disable_irq()
         if self._get(SR) & 1 and self.ready is not None:
-            # It has ended just now, and the ready one has begun: that is the one in hand.
+            # It has ended just now, and the ready one has begun: that is now the current one.
             self.running, self.ready = self.ready, None
         undone = sum([steps for steps, _ in self.bursts])
         self.bursts = []
@@ -124,7 +124,7 @@ class Axis:
 
 
 class Timer:
-    """The step timer that ``lcu.node`` asks for."""
+    """The step timer for ``lcu.node``."""
 
     def __init__(self, pins):
         """``pins``: step and direction of the primary axis, then of the secondary one."""

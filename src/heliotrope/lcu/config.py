@@ -1,4 +1,4 @@
-"""What a local controller is told once and keeps: checked before it is taken."""
+"""Settings of a local controller: stored once, checked before they are accepted."""
 
 import struct
 from binascii import crc32
@@ -12,16 +12,16 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
     from typing import Any
 
-#: No coordinate (m) or step count is larger.
+#: Largest coordinate (m) or step count.
 FAR, MOST_STEPS = 1e5, 1 << 29
 #: A defocus of less than this (rad) on both axes would leave the beam on the receiver.
 LEAST_DEFOCUS, MOST_DEFOCUS = 0.02, 1.6
-#: Points that the item "way" has room for.
+#: Points that fit in the item "way".
 MOST_POINTS = 4
 
 
 def is_place(point: "tuple[float, ...]") -> bool:
-    """Whether these are coordinates (m) that a plant can hold."""
+    """Whether these are coordinates (m) that a plant can have."""
     for value in point:  # noqa: SIM110 - a generator would allocate
         if not -FAR <= value <= FAR:
             return False
@@ -36,7 +36,7 @@ class Config:
     pointing, drives, axes, stow
         From SET_ARMATURE, SET_DRIVES with SET_BIAS, SET_LIMITS, SET_STOW; None while missing.
     armature_crc
-        CRC-32 of the armature's bytes as they came.
+        CRC-32 of the armature's bytes as received.
     defocus, location, standby
         Angles (rad), and ENU points (m), the latter None while missing.
     path
@@ -72,11 +72,11 @@ class Config:
         self._numbers: list[tuple[Any, ...] | None] = [None, None]
 
     def complete(self) -> bool:
-        """Whether everything that tracking needs is there and fits together."""
+        """Whether all settings that tracking needs are present and consistent."""
         return self.pointing is not None and None not in self.drives and self.fits()
 
     def fits(self) -> bool:
-        """Whether the limits are there and the stow position lies within them."""
+        """Whether the limits are present and the stow position lies within them."""
         if self.stow is None:
             return False
         for axis, steps in zip(self.axes, self.stow):  # noqa: B905 - not in MicroPython
@@ -85,14 +85,14 @@ class Config:
         return True
 
     def load(self, items: "dict[str, bytes]") -> bool:
-        """Take the journal's items; False if one is not as it must be."""
+        """Take the journal's items; return False if one is invalid."""
         good = True
         for name in items:
             good = self.take(name, items[name]) and good
         return good
 
     def take(self, name: str, data: bytes) -> bool:
-        """Take one item of ``journal.ITEMS``; False, and nothing changed, if it cannot be."""
+        """Take an item of ``journal.ITEMS``; return False, and change nothing, if it is invalid."""
         was_complete = self.complete()
         before = self.pointing, self.drives[:], self.axes[:], self.biases, self.stow
         numbers = self._numbers[:]

@@ -1,15 +1,15 @@
 """The controller of one heliostat: messages and time in, actions out; no input or output.
 
 Safety rests on three things here: the state table, the sun's lease, and that DEFOCUS and STOW
-pass every check. Who may command, and what is new, is decided by ``wire.Gate``.
+pass every check. ``wire.Gate`` decides who may command and which frames are new.
 
-Every call returns the same list of actions, good until the next call:
+Every call returns the same list of actions, valid until the next call:
 
 SEGMENT       axis, direction, count, interval_us: for the step timer
 ANSWER        number, values: send it to the cluster controller
 STORE         items by name: for ``Journal.store``
 RECALL        item number: answer STORED from the journal
-BEFORE_STEPS  counts now (2) and after (2): ``Journal.before_steps``, ere the segments are played
+BEFORE_STEPS  counts now (2) and after (2): ``Journal.before_steps``, before the segments are played
 AT_REST       counts (2): ``Journal.at_rest``
 NOTE          state, aim as bytes or None: ``Journal.note``
 ZEROED        counts (2): ``Journal.zero``
@@ -34,7 +34,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 
 (SEGMENT, ANSWER, STORE, RECALL, BEFORE_STEPS, AT_REST, NOTE, ZEROED, HALT, FEED) = range(10)
 
-#: Faults; their texts, and the names of the flags' bits, stand in ``names``.
+#: Faults; their texts, and the names of the flags' bits, are in ``names``.
 (
     NO_FAULT,
     STUCK_PRIMARY,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     LATCHED,
 ) = range(11)
 
-#: Where settings may change: those of the calibration, and those of the machine.
+#: States in which settings may change: those of the calibration, and those of the machine.
 CALIBRATION = (
     states.UNCONFIGURED,
     states.STOWED,
@@ -65,7 +65,7 @@ STATES_OF = {
     "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": CALIBRATION,
 }  # fmt: skip
 
-#: A clock set differently by more than this (ms) has jumped.
+#: A clock that changes by more than this (ms) has jumped.
 CLOCK_JUMP_MS = 2000
 MOST_STEPS = 1 << 29
 
@@ -116,7 +116,7 @@ class Controller:
         self._clock_jumped = self._ticks_jumped = False
         self._moving = False
 
-    # Beginning.
+    # Start.
 
     def boot(
         self,
@@ -128,8 +128,8 @@ class Controller:
         boots: int,
         looping: bool,
     ) -> "list[tuple[Any, ...]]":
-        """Start with what the journal holds: ``primary, secondary, doubt, state, aim, boots,
-        looping`` of ``Journal``, its items being in the configuration already.
+        """Start from the journal: ``primary, secondary, doubt, state, aim, boots, looping`` of
+        ``Journal``, whose items are in the configuration already.
         """  # noqa: D205 - the names are the summary
         self.out.clear()
         motion = self.motion
@@ -157,11 +157,11 @@ class Controller:
     # Time.
 
     def _time(self, now_ms: int) -> None:
-        """Charge the time since the last call to everything that ends."""
+        """Charge the time since the last call to everything that has a time limit."""
         elapsed = ticks.diff(now_ms, self._seen)
         self._seen = now_ms
         if elapsed < 0:
-            # No clock goes on after that, and no lease outlives it.
+            # No clock is trusted after that, and no lease outlives it.
             self._ticks_jumped = True
             self.clock.lose()
             self.sun.end()
@@ -180,7 +180,7 @@ class Controller:
         self._lapses(fresh, silent, dark)
 
     def _lapses(self, fresh: bool, silent: bool, dark: bool) -> None:
-        """What the state table says of time that has run out."""
+        """Pass expired time limits to the state table."""
         state, kind = self.state, self.motion.kind
         if state in states.NEED_SUN and not fresh:
             self._event("LAPSED")
@@ -199,7 +199,7 @@ class Controller:
             self._event("SILENT")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
-        """Go on; to be called more often than every ``ahead_ms`` while something moves."""
+        """Advance in time; to be called more often than every ``ahead_ms`` during a motion."""
         self.out.clear()
         self._time(now_ms)
         elapsed, self._owed_ms = self._owed_ms, 0
@@ -219,8 +219,8 @@ class Controller:
                 self.out.insert(place, steps)
                 self._moving = True
             elif self._moving and motion.still() and not motion.following():
-                # A mirror that follows the sun stands still several times a second: telling
-                # flash of each would wear it out in a year.
+                # A mirror that follows the sun stops several times a second: recording each stop in
+                # flash would wear it out in a year.
                 self._moving = False
                 self.out.append((AT_REST, one, two))
         if self.state != states.TRACKING or self.sun.fresh():
@@ -249,7 +249,7 @@ class Controller:
         self.out.append((NOTE, self.state, data))
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> "list[tuple[Any, ...]]":
-        """Latch a fault that the caller found; ``halt`` stops the motors at once."""
+        """Latch a fault that the caller has found; ``halt`` stops the motors at once."""
         self.out.clear()
         self._time(now_ms)
         self._latch(number)
@@ -265,11 +265,11 @@ class Controller:
         self._event("FAULTED")
 
     def fault_gone(self, number: int) -> None:
-        """The cause of a fault is gone; the fault itself stays until CLEAR_FAULT."""
+        """Note that the cause of a fault is gone; the fault itself stays until CLEAR_FAULT."""
         self._present &= ~(1 << number)
 
     def halted(self, primary: int, secondary: int) -> "list[tuple[Any, ...]]":
-        """After HALT: signed steps that were emitted and not made."""
+        """After HALT: take back signed steps that were emitted and not made."""
         self.out.clear()
         self.motion.halted(primary, secondary)
         self._moving = False
@@ -287,7 +287,7 @@ class Controller:
     # Messages.
 
     def on_frame(self, frame: "Frame", now_ms: int) -> "list[tuple[Any, ...]]":
-        """Take a frame that came whole."""
+        """Take a whole frame."""
         self.out.clear()
         if not frame.for_address(self.config.address):
             return self.out
@@ -316,7 +316,7 @@ class Controller:
         number, sequence
             Of the message.
         values, payload
-            Its numbers, and the bytes they came in; both with the head.
+            Its numbers, and the bytes that they were read from; both with the head.
         verdict
             Of the gate: ``messages.DONE`` if it may act.
         now_ms
@@ -367,7 +367,7 @@ class Controller:
             self.out.append((ANSWER, 0x0D, (sequence, number, result)))
 
     def _hear(self, name: str, values: "tuple[Any, ...]", now_ms: int) -> None:
-        """Time and sun."""
+        """Take TIME or SUN."""
         if name == "TIME":
             if abs(self.clock.set(values[0], values[1])) > CLOCK_JUMP_MS:
                 self._clock_jumped = True
@@ -395,7 +395,7 @@ class Controller:
             self.out.append((ANSWER, answer[0], answer[1]))
 
     def status(self) -> "tuple[Any, ...]":
-        """The numbers of STATUS."""
+        """Return the numbers of STATUS."""
         return (
             self.state,
             self.flags(),
@@ -409,7 +409,7 @@ class Controller:
         )
 
     def flags(self) -> int:
-        """Bits of ``names.FLAGS``."""
+        """Return the bits of ``names.FLAGS``."""
         motion = self.motion
         bits = 0
         for i, value in enumerate(
@@ -438,7 +438,7 @@ class Controller:
     # Commands.
 
     def _command(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Obey a fresh command of the authority; returns the result for ACK."""
+        """Obey a fresh command of the authority; return the result for ACK."""
         if name in ("AIM", "LOCK_AIM", "ROUGH", "STANDBY"):
             return self._adjust(name, values, payload)
         motion = self.motion
@@ -480,7 +480,7 @@ class Controller:
         return messages.DONE
 
     def _may_track(self) -> int:
-        """Whether the mirror may go from where it is straight to its aim."""
+        """Whether the mirror may go straight from its position to its aim."""
         motion = self.motion
         if not (motion.ready and motion.known and self.sun.fresh() and self.fault == NO_FAULT):
             return messages.REFUSED_STATE
@@ -511,7 +511,7 @@ class Controller:
         return messages.DONE
 
     def _adjust(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Aim, standby point and stepping: no change of state."""
+        """Set aim, standby point or stepping: no change of state."""
         motion, config = self.motion, self.config
         if name in ("LOCK_AIM", "ROUGH"):
             if values[0] > 1:
@@ -537,10 +537,10 @@ class Controller:
         motion.renew()
         return messages.DONE
 
-    # What is stored.
+    # Stored settings.
 
     def _set(self, name: str, values: "tuple[Any, ...]", payload: bytes) -> int:
-        """Take a setting, in a safe state and at rest; returns the result for ACK."""
+        """Take a setting, in a safe state and at rest; return the result for ACK."""
         allowed = STATES_OF.get(name)
         if allowed is None or self.state not in allowed:
             return messages.REFUSED_STATE

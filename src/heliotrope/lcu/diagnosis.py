@@ -8,7 +8,7 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such module
     from typing import Any
 
-#: Angle that an axis is moved, and least change of tilt that the sensor tells, rad.
+#: Angle by which an axis is moved, and least change of tilt that the sensor detects, rad.
 NUDGE, NOTICED = 0.02, 0.002
 
 #: Results, bits.
@@ -18,15 +18,15 @@ MOVED_PRIMARY, MOVED_SECONDARY, STUCK_PRIMARY, STUCK_SECONDARY, NO_SENSOR = 1, 2
 class Diagnosis:
     """One diagnosis: before, with the primary axis moved, with the secondary axis moved, back.
 
-    An accelerometer sees an axis turn but for its part about the plumb line: where less than
-    ``NOTICED`` is to be expected, neither MOVED nor STUCK is said.
+    An accelerometer sees an axis turn except for the part about the plumb line: where less than
+    ``NOTICED`` is to be expected, neither MOVED nor STUCK is reported.
 
     Parameters
     ----------
     config
         A complete configuration.
     home
-        Counts where the mirror stands.
+        Step counts of the mirror's position.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Diagnosis:
         self._tilts: list[tuple[float, float] | None] = []
 
     def advance(self, tilt: "tuple[float, float] | None") -> "list[int]":
-        """Take the tilt at rest; returns the counts to go to next."""
+        """Take the tilt at rest; return the step counts to go to next."""
         self._tilts.append(tilt)
         stage = len(self._tilts)
         steps = [self.home[0], self.home[1]]
@@ -55,7 +55,7 @@ class Diagnosis:
         return steps
 
     def _nudged(self, i: int) -> int:
-        """Counts of an axis after a nudge, within its limits."""
+        """Return the step counts of an axis after a nudge, within its limits."""
         drive, axis = self.config.drives[i], self.config.axes[i]
         assert drive is not None
         assert axis is not None
@@ -80,7 +80,7 @@ class Diagnosis:
             moved[i] = self._nudged(i) - self.home[i]
             angle = drive.angle(self.home[i])
             turn = abs(drive.angle(self.home[i] + moved[i]) - angle)
-            # Gravity, seen from the mirror, turns with it, but for the part along the axis.
+            # Gravity, seen from the mirror, turns with it, except for the part along the axis.
             expected = turn * math.sqrt(axis[0] * axis[0] + axis[1] * axis[1])
             seen = after[0] - before[0], after[1] - before[1]
             if expected > NOTICED:

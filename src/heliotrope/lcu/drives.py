@@ -2,8 +2,9 @@
 
 The law is that of ``heliotrope.mechanism.drives``:
 θ = bias + (1 + scale) φ + worm_cos cos u + worm_sin sin u + sag cos φ, where φ is linear in
-the steps (rotary) or follows the law of cosines (jack, with the constants of PAINT). A phase
-of the sag is taken into the other numbers by `reduced`, so ten numbers and the bias do.
+the steps (rotary) or follows the law of cosines (jack, with the constants of PAINT).
+:func:`reduced` folds a phase of the sag into the other numbers, so ten numbers and the bias
+are enough.
 """
 
 import math
@@ -13,7 +14,7 @@ from .vectors import finite
 
 ROTARY, JACK_RISING, JACK_FALLING = 0, 1, 2
 
-#: Places in the ten numbers.
+#: Indices of the ten numbers.
 ZERO, RATE, STROKE, OFFSET, RADIUS, SCALE, WORM_COS, WORM_SIN, WORM_RATIO, SAG = range(10)
 
 
@@ -35,7 +36,7 @@ class Drive:
     Raises
     ------
     ValueError
-        If a number is not finite or the drive could not move, or not to and fro.
+        If a number is not finite, or the drive could not move in both directions.
     """
 
     def __init__(self, kind: int, numbers: tuple[float, ...], bias: float) -> None:
@@ -76,7 +77,7 @@ class Drive:
         return n[ZERO] + self.sense * turned
 
     def angle(self, steps: float) -> float:
-        """Joint angle (rad) at a number of steps."""
+        """Return the joint angle (rad) at a number of steps."""
         n = self.numbers
         phi = self._ideal(steps)
         theta = self.bias + (1.0 + n[SCALE]) * phi
@@ -99,9 +100,9 @@ class Drive:
         return (length - n[STROKE]) / n[RATE]
 
     def steps(self, theta: float) -> float:
-        """Steps (a real number) at a joint angle (rad); beyond a jack's reach, its end.
+        """Return the steps (a real number) at a joint angle (rad); beyond a jack's reach, its end.
 
-        With periodic terms a bracketed secant (regula falsi with bisection), to a
+        With periodic terms, a bracketed secant (regula falsi with bisection) finds them to a
         thousandth of a step.
         """
         phi = (theta - self.bias) / (1.0 + self.numbers[SCALE])
@@ -126,14 +127,14 @@ class Drive:
         return found
 
     def nearest(self, theta: float) -> int:
-        """Whole steps nearest to a joint angle (rad)."""
+        """Return the whole number of steps nearest to a joint angle (rad)."""
         return math.floor(self.steps(theta) + 0.5)
 
 
 def reduced(
     kind: int, numbers: tuple[float, ...], bias: float, phase: float
 ) -> tuple[tuple[float, ...], float]:
-    """(numbers, bias) of a drive whose sag is sag · cos(φ + phase), without a phase.
+    """Return (numbers, bias), without a phase, of a drive whose sag is sag · cos(φ + phase).
 
     With φ' = φ + phase the bias takes −(1 + scale) · phase, and a rotary drive's worm, whose
     argument is a multiple of φ, is turned by that multiple of the phase.

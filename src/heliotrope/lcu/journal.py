@@ -1,20 +1,19 @@
-"""What a local controller keeps through a loss of power.
+"""The journal: the memory of a local controller through a loss of power.
 
-Two kinds of records lie in NOR flash, each with a counter and a CRC-32, each written once into
-erased flash and never touched again until its block is erased:
+NOR flash holds two kinds of records, each with a counter and a CRC-32, each written once into
+erased flash and not touched again until its block is erased:
 
-*What is stored*, in two slots of a block each. A new record goes to the slot that does not hold
-the present one, so that one is whole at every instant. Armature, drives and the like are kept as
-the bytes in which they came: single precision cannot change them, and their checksum is the
-sender's.
+*Stored items* lie in two slots of a block each. A new record goes to the slot that does not hold
+the present one, so that one is whole at every instant. Armature, drives and the like are stored as
+the bytes received: single precision cannot change them, and their checksum is the sender's.
 
-*What changes often*, in a ring of the other blocks: step counts, aim, state, boots. A record is
-appended where flash is blank; a full block is left for the next one, which was erased before, so
-wear is even and there is always room for a last record when the supply fails. The block with
-the newest record is never erased.
+*Counts* (step counts, aim, state, boots) change often and lie in a ring of the other blocks. A
+record is appended where flash is blank; a full block gives way to the next one, which was erased
+before, so wear is even and there is always room for a last record when the supply fails. The block
+with the newest record is never erased.
 
-A cut at any byte of a write or an erasure leaves the old or the new record: what was cut fails its
-checksum and is passed over (2^-32 aside).
+A cut at any byte of a write or an erasure leaves the old or the new record: a damaged record fails
+its checksum and is passed over (except with probability 2^-32).
 
 **Step counts.** Before the first step away from rest, and whenever the next steps would lead
 farther than ``STRIDE`` from the counts in flash, a record "moving" is written; at rest, a record
@@ -38,7 +37,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     from typing import Any, Protocol
 
     class Storage(Protocol):
-        """NOR flash; see the head of this module."""
+        """NOR flash; see the docstring of this module."""
 
         block_size: int
         blocks: int
@@ -53,7 +52,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
             """Set all bits of a block."""
 
 
-#: What is stored: name and ``struct`` codes, little-endian. The place in this table, from 1, is
+#: Stored items: name and ``struct`` codes, little-endian. The position in this table, from 1, is
 #: the item's number in QUERY_STORED; the order is part of the layout in flash.
 ITEMS = (
     ("address", "H"),
@@ -74,7 +73,7 @@ ITEMS = (
 SIZE_OF = {row[0]: struct.calcsize("<" + row[1]) for row in ITEMS}
 CODES_OF = {row[0]: "<" + row[1] for row in ITEMS}
 
-#: Which item a message of class KEY sets; of two names, the one of its axis.
+#: The item that a message of class KEY sets; of two names, the one of its axis.
 TARGETS = {
     "SET_ARMATURE": ("armature",),
     "SET_DRIVES": ("drive_primary", "drive_secondary"),
@@ -102,22 +101,22 @@ REST, AIM = 0x80, 0x40  # flags; the lower bits: three of doubts, three of boots
 
 #: Greatest distance of the true step counts from those in flash, steps.
 STRIDE = 1000
-#: From so many unhealthy boots in a row on, the controller stays in FAULT.
+#: From this many unhealthy boots in a row, the controller stays in FAULT.
 BOOT_LIMIT = 5
-#: A boot is healthy after this time, ms; the caller then says so.
+#: A boot is healthy after this time, ms; the caller then reports it.
 HEALTHY_MS = 60000
 MOST = 7
 
 
 def items_of(name: str, payload: bytes) -> "dict[str, bytes]":
-    """Return what a message of class KEY sets, its edition included.
+    """Return the items that a message of class KEY sets, with its edition.
 
     Parameters
     ----------
     name
         Name of the message.
     payload
-        Its payload with head; of a length that fits, as ``wire`` makes sure.
+        Its payload with head; ``wire`` ensures that its length fits.
 
     Raises
     ------
@@ -151,16 +150,16 @@ class Journal:
     Parameters
     ----------
     storage
-        NOR flash; see the head of this module.
+        NOR flash; see the docstring of this module.
     stride
         Greatest distance of the true step counts from those in flash, steps.
 
     Attributes
     ----------
     items
-        What is stored, as bytes, by name; a name that was never stored is not there.
+        Stored items, as bytes, by name; without names that were never stored.
     damaged
-        Whether flash held something but no whole record of what is stored.
+        Whether flash held something but no whole record of stored items.
     primary, secondary
         Step counts of the newest record.
     rest
@@ -173,9 +172,9 @@ class Journal:
     aim
         Aim of the newest record as bytes (three ``f``), or None.
     boots
-        Boots in all, modulo 65536.
+        Total of boots, modulo 65536.
     unhealthy
-        Boots in a row of which none reached a healthy minute; 7 stands for 7 or more.
+        Consecutive boots that did not reach a healthy minute; 7 stands for 7 or more.
     """
 
     def __init__(self, storage: "Storage", stride: int = STRIDE) -> None:
@@ -207,7 +206,7 @@ class Journal:
         self._place = self._places  # of the next record; beyond the last: none left
         self._next_ready = False
 
-    # What is stored.
+    # Stored items.
 
     def load(self) -> "dict[str, bytes]":
         """Read the newest whole records, and return ``items``. Nothing is written."""
@@ -237,7 +236,7 @@ class Journal:
         return items
 
     def store(self, changes: "dict[str, bytes]") -> None:
-        """Store items, all of them or, at a cut, none; those not named stay as they are.
+        """Store items, all of them or, at a cut, none; other items stay as they are.
 
         Raises
         ------
@@ -283,11 +282,11 @@ class Journal:
         data = self.items.get(name)
         return 0 if data is None else crc32(data)
 
-    # What changes often.
+    # Counts.
 
     @property
     def doubt(self) -> int:
-        """By how many steps the counts may be wrong; -1 if nothing is known of them."""
+        """Number of steps by which the counts may be wrong; -1 if nothing is known of them."""
         return self.doubts * self.stride if self.doubts < MOST else -1
 
     @property
@@ -296,13 +295,13 @@ class Journal:
         return self.unhealthy >= BOOT_LIMIT
 
     def boot(self) -> None:
-        """Count a boot. From here on there is room for a last record at all times."""
+        """Count a boot. From here on there is always room for a last record."""
         self.boots = (self.boots + 1) & 0xFFFF
         self.unhealthy = min(self.unhealthy + 1, MOST)
         self._append(self.primary, self.secondary, True)
 
     def healthy(self) -> None:
-        """Say that the controller ran well for ``HEALTHY_MS``."""
+        """Record that the controller ran well for ``HEALTHY_MS``."""
         if self.unhealthy:
             self.unhealthy = 0
             self._append(self.primary, self.secondary, self.rest)
@@ -310,7 +309,7 @@ class Journal:
     def before_steps(
         self, primary: int, secondary: int, next_primary: int, next_secondary: int
     ) -> None:
-        """Make sure, before steps are emitted, that flash will be right to within ``stride``.
+        """Ensure, before steps are emitted, that flash will be right to within ``stride``.
 
         Parameters
         ----------
@@ -337,7 +336,7 @@ class Journal:
         return abs(one - other) > self.stride
 
     def at_rest(self, primary: int, secondary: int) -> None:
-        """Say that nothing moves, at these counts. Erases the next block in time."""
+        """Record rest at these counts, and erase the next block in time."""
         if not (self.rest and (primary, secondary) == (self.primary, self.secondary)):
             self._append(primary, secondary, True)
         if not self._next_ready and self._place > self._places // 2:
@@ -346,7 +345,7 @@ class Journal:
     def brown_out(self, primary: int, secondary: int) -> bool:
         """Write the last record while the supply falls: no erasure, one write of 32 bytes.
 
-        Returns whether it was written; after ``boot`` there always is room.
+        Returns whether it was written; after ``boot`` there is always room.
         """
         if self._place >= self._places and not self._next_ready:
             return False
@@ -359,7 +358,7 @@ class Journal:
         self._append(primary, secondary, True)
 
     def note(self, state: int, aim: "bytes | None") -> None:
-        """Keep state and aim: a new state at once, a new aim with the next record."""
+        """Record state and aim: a new state at once, a new aim with the next record."""
         if aim is not None and len(aim) != 12:
             raise ValueError(f"journal: {len(aim)} bytes for an aim, 12 needed")
         changed = state != self.state

@@ -1,8 +1,8 @@
-"""The sun as last heard, and how long it may be trusted."""
+"""The last sun vector, and how long it may be trusted."""
 
 from . import ticks
 
-#: The sun's components come in 2^-30, its rate in 2^-28 a second.
+#: Units: the sun's components 2^-30, its rate 2^-28 a second.
 UNIT, RATE_FACTOR = 1 << 30, 4
 #: A vector may be this far (ms) ahead of the clock: the cluster sends it for a full second.
 AHEAD_MS = 2000
@@ -12,7 +12,7 @@ MODULO = 1 << 32
 
 
 class Clock:
-    """GPS time between two TIME messages, carried by ticks.
+    """GPS time between two TIME messages, advanced by ticks.
 
     ``second`` is None until TIME has come, and again after the ticks ran backwards.
     """
@@ -22,14 +22,14 @@ class Clock:
         self.ms = 0
 
     def set(self, week: int, time_of_week_ms: int) -> int:
-        """Take TIME; returns the jump in ms, 0 at the first."""
+        """Take TIME; return the jump in ms, 0 at the first."""
         second, ms = week * 604_800 + time_of_week_ms // 1000, time_of_week_ms % 1000
         jump = 0 if self.second is None else 1000 * (second - self.second) + ms - self.ms
         self.second, self.ms = second % MODULO, ms
         return jump
 
     def elapse(self, ms: int) -> None:
-        """Go on by the ticks that have passed."""
+        """Advance by the ticks that have passed."""
         if self.second is not None:
             self.ms += ms
             self.second = (self.second + self.ms // 1000) % MODULO
@@ -49,8 +49,8 @@ class Clock:
 class SunLease:
     """The sun's direction and the lease that it gives.
 
-    Only a vector for a later second than any before renews the lease; one that was under way
-    for some time gives so much less. The lease ends early, never late, if ticks jump.
+    Only a vector for a later second than any before renews the lease; the time that it was under
+    way is deducted. The lease ends early, never late, if ticks jump.
     """
 
     def __init__(self, span_ms: int) -> None:
@@ -63,7 +63,7 @@ class SunLease:
         self.bad = 0
 
     def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
-        """Take SUN; False, and the lease is not renewed, if it is stale, repeated or no sun."""
+        """Take SUN; return False, and renew nothing, if it is stale, repeated or not a sun."""
         second = values[0]
         delay = 0 if clock.second is None else clock.since(second)
         lapsed = self._left.over(now)
@@ -94,7 +94,7 @@ class SunLease:
         return self._left.left > 0
 
     def age_ms(self) -> int:
-        """Age of the vector; the greatest number if there is none fresh."""
+        """Age of the vector; the greatest number if there is no fresh one."""
         return self.span_ms - self._left.left if self._left.left > 0 else 0xFFFFFFFF
 
     def end(self) -> None:
@@ -102,7 +102,7 @@ class SunLease:
         self._left.end()
 
     def vector(self, ahead_ms: int) -> tuple[float, float, float]:
-        """Direction to the sun, of length near 1, some time from now."""
+        """Return the direction to the sun, of length near 1, some time from now."""
         ms = self._since_ms + ahead_ms
         east, north, up = [self._sun[i] + self._rate[i] * ms // 1000 for i in (0, 1, 2)]
         return east / UNIT, north / UNIT, up / UNIT

@@ -1,17 +1,17 @@
 """All messages of the wire, version 2: one table.
 
 A row: number, name, who may send it, codes of the payload, names of its fields. Codes are
-those of ``struct``, little-endian; ``s`` alone is a rest of bytes. A field of several numbers
-has a code with a count ("18d"). Names of fields end in their unit; the meaning of a message
-stands in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
-microcontroller it costs no memory there).
+those of ``struct``, little-endian; ``s`` alone stands for the remaining bytes. A field of several
+numbers has a code with a count ("18d"). Names of fields end in their unit. The meaning of a message
+is in the comment above its row, from where ``docs/reference/wire.md`` takes it (on a
+microcontroller a comment costs no memory).
 
 Who may send a message:
 
-ANYONE     taken from everybody at any time: what makes the field safe
+ANYONE     accepted from anyone at any time: the messages that make the field safe
 AUTHORITY  moves the mirror: token of the one authority, and expires
-KEY        changes what is stored: a truncated HMAC and an edition besides
-CLUSTER    from the cluster controller, every second or so: time, sun, session
+KEY        changes stored settings: a truncated HMAC and an edition besides
+CLUSTER    from the cluster controller, about every second: time, sun, session
 ASK        a question of the cluster controller; it changes nothing
 NODE       an answer of a local controller
 
@@ -31,16 +31,16 @@ HEADS = {AUTHORITY: ("II", "token expires_s"), KEY: ("III", "token expires_s edi
 MESSAGES = (
     # Ask for step counts.
     (0x01, "QUERY_STEPS", ASK, "", ""),
-    # Step counts, and where they are going.
+    # Step counts and their goals.
     (0x02, "STEPS", NODE, "iiii", "primary secondary primary_goal secondary_goal"),
     # Ask for state and flags.
     (0x03, "QUERY_STATUS", ASK, "", ""),
     # State, flags and health.
     (0x04, "STATUS", NODE, "BIBIIHbIH",
      "state flags fault uptime_s sun_age_ms supply_mv temperature_degc armature_crc boots"),
-    # Ask where the heliostat stands.
+    # Ask for the heliostat's location.
     (0x05, "QUERY_POSITION", ASK, "", ""),
-    # Where the heliostat stands, ENU.
+    # The heliostat's location, ENU.
     (0x06, "POSITION", NODE, "fff", "east_m north_m up_m"),
     # Ask for the last diagnosis of movement.
     (0x07, "QUERY_DIAGNOSIS", ASK, "", ""),
@@ -51,11 +51,11 @@ MESSAGES = (
     (0x09, "QUERY_STORED", ASK, "B", "item"),
     # A stored item.
     (0x0A, "STORED", NODE, "Bs", "item data"),
-    # Ask all whose serial number lies between to answer, in slots drawn by chance.
+    # Ask all controllers with a serial number in a range to answer, in slots drawn at random.
     (0x0B, "DISCOVER", ASK, "II", "low high"),
     # Serial number, firmware and address.
     (0x0C, "HERE", NODE, "IHH", "serial firmware address"),
-    # What became of a command.
+    # Result of a command.
     (0x0D, "ACK", NODE, "HBB", "sequence_of type_of result"),
     # GPS time.
     (0x10, "TIME", CLUSTER, "HIB", "week time_of_week_ms quality"),
@@ -65,7 +65,7 @@ MESSAGES = (
     # The sender's session: its epoch, which rises with every start; the upper bits of its
     # sequence; and the token of the authority that commands through it (0: nobody).
     (0x12, "SESSION", CLUSTER, "IHI", "epoch rollover token"),
-    # Beams off the receiver, now.
+    # Take the beam off the receiver, now.
     (0x20, "DEFOCUS", ANYONE, "", ""),
     # Go to the stow position: one heliostat, or all by broadcast.
     (0x21, "STOW", ANYONE, "", ""),
@@ -79,11 +79,11 @@ MESSAGES = (
     (0x33, "REFOCUS", AUTHORITY, "", ""),
     # Release a lock.
     (0x34, "UNLOCK", AUTHORITY, "", ""),
-    # Leave FAULT, the cause being gone.
+    # Leave FAULT once its cause is gone.
     (0x35, "CLEAR_FAULT", AUTHORITY, "", ""),
     # Stop and hold position.
     (0x36, "LOCK", AUTHORITY, "", ""),
-    # Point to send the beam to, ENU.
+    # Aim point of the beam, ENU.
     (0x40, "AIM", AUTHORITY, "fff", "east_m north_m up_m"),
     # Hold the aim against changes.
     (0x41, "LOCK_AIM", AUTHORITY, "B", "locked"),
@@ -93,19 +93,19 @@ MESSAGES = (
     (0x43, "GOTO", AUTHORITY, "ii", "primary secondary"),
     # Rough or fine stepping.
     (0x44, "ROUGH", AUTHORITY, "B", "rough"),
-    # Move the beam in a spiral about its aim, to be found by the target's camera.
+    # Move the beam in a spiral about its aim until the target's camera finds it.
     (0x45, "SEARCH", AUTHORITY, "ff", "pitch_rad radius_rad"),
-    # Move a little and back, and see whether it moved.
+    # Move a little and back, and check whether the mirror moved.
     (0x46, "DIAGNOSE", AUTHORITY, "", ""),
     # Standby point beside the receiver, ENU.
     (0x47, "STANDBY", AUTHORITY, "fff", "east_m north_m up_m"),
     # Axes, origins, vertex and normal of the calibrated heliostat, in place of a matrix.
     (0x50, "SET_ARMATURE", KEY, "18d", "numbers"),
-    # How steps become angles.
+    # Conversion of steps to angles.
     (0x51, "SET_DRIVES", KEY, "BB10d", "axis kind numbers"),
     # Biases of the angles.
     (0x52, "SET_BIAS", KEY, "ff", "primary_rad secondary_rad"),
-    # Where the heliostat stands, ENU.
+    # The heliostat's location, ENU.
     (0x53, "SET_POSITION", KEY, "ddd", "east_m north_m up_m"),
     # Address on the bus.
     (0x54, "SET_ADDRESS", KEY, "IH", "serial address"),
@@ -116,10 +116,10 @@ MESSAGES = (
     # Range, rate and backlash of an axis.
     (0x57, "SET_LIMITS", KEY, "BiiIIH",
      "axis low high rate_steps_per_s acceleration_steps_per_s2 backlash"),
-    # How far the angles go when defocused.
+    # Angles by which the axes turn when defocused.
     (0x58, "SET_DEFOCUS", KEY, "ff", "primary_rad secondary_rad"),
     # The safe way from stow: the axis (0 or 1) that moves first when leaving and last when
-    # returning, how many points follow (0: the way is found without them), and the points
+    # returning, the number of points (0: the way is found without them), and the points
     # that the beam passes on its way from the ground to the standby point, ENU.
     (0x59, "SET_WAY", KEY, "BB12f", "azimuth_axis points path_m"),
 )  # fmt: skip
@@ -127,8 +127,8 @@ MESSAGES = (
 NUMBER_OF = {row[1]: row[0] for row in MESSAGES}
 ROW_OF = {row[0]: row for row in MESSAGES}
 
-#: What a board needs of the table, as text: number (two hexadecimal digits), who, name, codes
-#: with those of the head. ``scripts/shrink.py`` leaves the rest out there.
+#: The part of the table that a board needs, as text: number (two hexadecimal digits), who, name,
+#: codes with those of the head. ``scripts/shrink.py`` leaves the rest out there.
 TABLE = "\n" + "".join(
     [
         f"{row[0]:02x}{row[2]}{row[1]} {HEADS[row[2]][0] if row[2] in HEADS else ''}{row[3]}\n"

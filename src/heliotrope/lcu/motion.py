@@ -1,4 +1,4 @@
-"""Motion: what the actions of the state table do to the two axes.
+"""Motion: how the actions of the state table move the two axes.
 
 One motion runs at a time; starting another replaces it. Beams leave stow with azimuth first
 and elevation last, go along the ground to the foot of the tower and up to standby, and come
@@ -24,16 +24,17 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
 #: Motions.
 HOLD, MOVE, DEFOCUS, APPROACH, RETURN, STOW, STANDBY, TRACK, SEARCH, DIAGNOSE = range(10)
 
-#: Goals are renewed so often, ms; poses are computed so far apart and between them interpolated,
-#: while the angles change by no more than this (rad; the chord is then 1e-6 rad off at most).
+#: Interval at which goals are renewed, ms; interval at which poses are computed, with
+#: interpolation between them while the angles change by at most this (rad; the chord is then off
+#: by at most 1e-6 rad).
 RENEW_MS, KNOT_MS, KNOT_LIMIT = 200, 4000, 1e-3
-#: A path is followed by poses whose beams are no more than this apart, rad.
+#: A path is followed by poses whose beams are at most this far apart, rad.
 PIECE = 0.1
-#: The spiral rests so long on a point, ms.
+#: Time that the spiral rests on a point, ms.
 DWELL_MS = 2000
-#: Rough stepping waits for so many steps.
+#: Rough stepping waits for this many steps.
 ROUGH_STEPS = 16
-#: A diagnosis rests so long before the sensor is read, ms.
+#: Rest before a diagnosis reads the sensor, ms.
 SETTLE_MS = 500
 
 
@@ -43,11 +44,11 @@ class Motion:
     Parameters
     ----------
     config
-        Settings; `rebuild` after they change.
+        Settings; call :meth:`rebuild` after they change.
     sun
         The lease.
     sensor
-        Gives the mirror's tilt by an accelerometer as (x, y), rad, or None.
+        Returns the mirror's tilt measured by an accelerometer as (x, y), rad, or None.
 
     Attributes
     ----------
@@ -96,7 +97,7 @@ class Motion:
     # The axes.
 
     def rebuild(self) -> None:
-        """Take the settings over; other limits only at rest."""
+        """Apply the settings; new limits only at rest."""
         config = self.config
         first, second = config.axes
         if first is None or second is None:
@@ -122,11 +123,11 @@ class Motion:
                 axis.count = axis.goal = axis.leg = count
 
     def place(self, i: int) -> int:
-        """Step count of an axis."""
+        """Return the step count of an axis."""
         return self.counts[i] if self.stepper is None else self.stepper.axes[i].count
 
     def goal(self, i: int) -> int:
-        """Where an axis is going."""
+        """Return the goal of an axis."""
         return self.counts[i] if self.stepper is None else self.stepper.axes[i].goal
 
     def still(self) -> bool:
@@ -134,12 +135,12 @@ class Motion:
         return self.stepper is None or self.stepper.still()
 
     def following(self) -> bool:
-        """Whether the mirror goes with the sun, so that its beam stays where it is."""
+        """Whether the mirror follows the sun, so that its beam stays in place."""
         kind = self._base if self.kind == DEFOCUS else self.kind
         return kind in (STANDBY, TRACK, SEARCH) and self.sun.fresh()
 
     def at_stow(self) -> bool:
-        """Whether it stands at stow."""
+        """Whether the mirror is at stow."""
         stow = self.config.stow
         return (
             self.known
@@ -150,7 +151,7 @@ class Motion:
         )
 
     def halted(self, primary: int, secondary: int) -> None:
-        """The hardware was stopped at once, with these signed steps emitted but not made."""
+        """After an emergency stop: take back these signed steps, emitted but not made."""
         self.kind = HOLD
         if self.stepper is not None:
             self.stepper.undone(primary, secondary)
@@ -158,7 +159,7 @@ class Motion:
     # Poses.
 
     def pose(self, aim: tuple[float, float, float], ahead_ms: int) -> "Pose | None":
-        """Pose for an aim, some time from now; None if no pose within the stops reaches it."""
+        """Return the pose for an aim, some time from now; None if none within the stops fits."""
         pointing = self.config.pointing
         if pointing is None or self.stepper is None:
             return None
@@ -196,7 +197,7 @@ class Motion:
         self.cut = not inside
 
     def _follow(self, aim: tuple[float, float, float]) -> bool:
-        """Keep the beam on an aim while time goes on; False if no pose reaches it."""
+        """Keep the beam on an aim while time goes on; return False if no pose reaches it."""
         if self._knot_ms <= 0:
             # Goals hold until the next renewal: they are right at its middle.
             here = self.pose(aim, RENEW_MS // 2)
@@ -220,7 +221,7 @@ class Motion:
         return True
 
     def _away(self, i: int, angle: float) -> float:
-        """An angle turned away by the defocus; the other way where a stop is near."""
+        """Return an angle turned away by the defocus; the other way where a stop is near."""
         offset = self.config.defocus[i]
         low, high = self._stops[i]
         if low <= angle + offset <= high:
@@ -238,7 +239,7 @@ class Motion:
             self.stepper.stop()
 
     def defocus(self) -> None:
-        """Turn away from wherever the mirror is."""
+        """Turn away from the present position."""
         if self.kind in (DEFOCUS, STOW) or self.at_stow():
             return
         if not self.known or self.stepper is None or None in self.config.drives:
@@ -255,7 +256,7 @@ class Motion:
         self._go_angles(angles, BOTH)
 
     def stow(self) -> None:
-        """Back by the way of the approach, as far as the sun allows, and to stow."""
+        """Return by the way of the approach, as far as the sun allows, and go to stow."""
         if not (self.sun.fresh() and self.config.complete()):
             self.stow_directly()
             return
@@ -279,7 +280,7 @@ class Motion:
             self.stepper.stop()
 
     def stow_directly(self) -> None:
-        """To stow at once, azimuth last."""
+        """Go to stow at once, azimuth last."""
         self.ready = False
         stow = self.config.stow
         if self.stepper is None or stow is None or not (self.known and self.config.fits()):
@@ -295,7 +296,7 @@ class Motion:
         self._path, self._place = self.way(), -1
 
     def standby(self) -> None:
-        """Keep the beam on the standby point; hold where it was not reached."""
+        """Keep the beam on the standby point; hold if it was not reached."""
         if self.kind == APPROACH:
             self.ready = True
         if self.ready and self.config.standby is not None and self.sun.fresh():
@@ -315,7 +316,7 @@ class Motion:
             self._wait_ms = 0
 
     def prepare_search(self, pitch: float, radius: float) -> bool:
-        """Make the spiral ready; False if it cannot be."""
+        """Prepare the spiral; return False if that is impossible."""
         try:
             self._spiral = Spiral(pitch, radius)
         except ValueError:
@@ -323,7 +324,7 @@ class Motion:
         return True
 
     def prepare_move(self, primary: int, secondary: int) -> bool:
-        """Make a motion to step counts ready; False if it leaves the limits."""
+        """Prepare a motion to step counts; return False if it leaves the limits."""
         self._home[0], self._home[1] = primary, secondary
         if self.stepper is None:
             return False
@@ -337,14 +338,14 @@ class Motion:
             self.stepper.go(self._home[0], self._home[1], BOTH)
 
     def diagnose(self) -> None:
-        """Move each axis a little and back, and ask the sensor whether it moved."""
+        """Move each axis a little and back, and read from the sensor whether it moved."""
         self.hold()
         if self.stepper is not None and self.config.complete():
             self.kind, self._wait_ms = DIAGNOSE, SETTLE_MS
             self._diagnosis = None
 
     def renew(self) -> None:
-        """The aim, the armature or the standby point has changed."""
+        """Note that the aim, the armature or the standby point has changed."""
         self._knot_ms = self._renew_ms = 0
         if self.kind == TRACK:
             self._target = self.aim
@@ -352,7 +353,7 @@ class Motion:
             self._target = self.config.standby
 
     def set_rough(self, steps: int) -> None:
-        """Wait for so many steps before following; 0 is fine stepping."""
+        """Wait for this many steps before following; 0 is fine stepping."""
         self.rough = steps
         if self.stepper is not None:
             self.stepper.rough = steps
@@ -364,14 +365,14 @@ class Motion:
     # The safe way.
 
     def way(self) -> "list[tuple[float, float, float]]":
-        """Points from the ground to standby, close enough to each other."""
+        """Return points from the ground to standby, close enough to each other."""
         config = self.config
         standby = config.standby
         if standby is None or config.pointing is None:
             return []
         points = list(config.path)
         if not points:
-            # Aside of the tower on the ground, half-way to its foot, then the foot.
+            # Beside the tower on the ground, half-way to its foot, then the foot.
             here = config.location if config.location is not None else config.pointing.origin
             east, north = 0.5 * (standby[0] - here[0]), 0.5 * (standby[1] - here[1])
             sine, cosine = 0.5, 0.866
@@ -386,7 +387,7 @@ class Motion:
     def _pieces(
         self, points: "list[tuple[float, float, float]]"
     ) -> "list[tuple[float, float, float]]":
-        """The points, with others between where the beam would turn by more than ``PIECE``."""
+        """Return the points, with more between them where the beam would turn by over ``PIECE``."""
         pointing = self.config.pointing
         assert pointing is not None
         found = [points[0]]
@@ -409,7 +410,7 @@ class Motion:
         return found
 
     def _on_path(self) -> str:
-        """Go on along the path; the event when it is at its end or leads nowhere."""
+        """Advance along the path; return an event at its end or where no pose reaches it."""
         if not self.still():
             return ""
         self._place += 1
@@ -430,7 +431,7 @@ class Motion:
     # Time.
 
     def tick(self, elapsed_ms: int) -> str:
-        """Go on with the motion; returns an event of the state table, or ""."""
+        """Advance the motion; return an event of the state table, or ""."""
         self._knot_ms = max(0, self._knot_ms - elapsed_ms)
         self._renew_ms = max(0, self._renew_ms - elapsed_ms)
         self._since_ms = min(self._since_ms + elapsed_ms, KNOT_MS)
@@ -454,7 +455,7 @@ class Motion:
                 return "" if self._follow(self._target) else "UNREACHABLE"
             follows = kind == DEFOCUS and self._target is not None and self.following()
             if follows and self._target is not None and not self._follow(self._target):
-                # It stands now, and a beam that stands does not stay where it is.
+                # It stands now, and the beam of a standing mirror moves with the sun.
                 self._base = HOLD
         return ""
 

@@ -1,4 +1,4 @@
-"""Meanings of the state table and of STATUS: for those who read them, not needed on a board."""
+"""Meanings of the state table and of STATUS, for people; a board does not need them."""
 
 from . import states
 

@@ -1,7 +1,7 @@
-"""A whole local controller but for its pins: what boards and the simulator run.
+"""A whole local controller except its pins: the program of boards and of the simulator.
 
 ``Node`` joins the reader of frames, the gate, the controller, the journal and the step timer.
-It has no loop, no clock and no port of its own: bytes and time come in by calls, bytes go out
+It has no loop, clock or port of its own: bytes and time come in by calls, bytes go out
 by ``write``, steps go to the timer, records go to flash. It boots when it is made; to reset
 it, make another one on the same flash.
 
@@ -12,18 +12,18 @@ it, make another one on the same flash.
         node.on_bytes(uart.read(), now_ms())     # when bytes have come
         node.on_tick(now_ms())                   # always, every 50 ms or more often
 
-``now_ms`` is a counter of milliseconds modulo 2^30, as of ``time.ticks_ms``; see ``ticks``.
+``now_ms`` is a counter of milliseconds modulo 2^30, like ``time.ticks_ms``; see ``ticks``.
 
 **Answers** carry the sequence of the frame that asked, and go out within the call that brought
-it, but for HERE: that waits for a slot drawn by chance, ``HERE_SLOTS`` of ``HERE_SLOT_MS`` each.
-Nothing else answers a question to everybody.
+it, except HERE, which waits for a slot drawn at random, ``HERE_SLOTS`` of ``HERE_SLOT_MS`` each.
+No other message answers a question to all.
 
-**Order.** Flash is written before the steps are played that it tells of, and before an ACK says
+**Order.** Flash is written before the steps that it records are played, and before an ACK reports
 that something was stored. An emergency stop comes before everything.
 
 **A journal that fails** latches the fault JOURNAL, which holds until the next reset; from then
 on nothing is written and nothing stored. The mirror still goes off the receiver and to stow,
-because that protects more than the step counts; a boot on such flash takes the counts as unknown.
+because that protects more than the step counts; a boot on such flash treats the counts as unknown.
 """
 
 import struct
@@ -41,7 +41,7 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     from .journal import Storage
 
     class StepTimer(Protocol):
-        """Makes the steps of two axes by hardware."""
+        """Hardware that makes the steps of two axes."""
 
         def play(self, axis: int, direction: int, count: int, interval_us: int) -> None:
             """Queue ``count`` steps of ``axis`` (0, 1), ``direction`` being 1 or -1.
@@ -51,18 +51,18 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
             """
 
         def stop(self) -> "tuple[int, int]":
-            """Stop both axes at once; returns the signed steps queued and not made, by axis."""
+            """Stop both axes at once; return the signed steps queued and not made, by axis."""
 
 
 #: Slots in which HERE answers DISCOVER: their number, and the length of each (ms).
 HERE_SLOTS, HERE_SLOT_MS = 32, 20
 ACK, HERE, STORED = 0x0D, 0x0C, 0x0A
-#: An action of the node itself, beside those of the controller.
+#: An action of the node itself, in addition to those of the controller.
 HEALTHY = -1
 
 
 def no_sensor() -> "tuple[float, float] | None":
-    """The tilt, where no accelerometer is fitted."""
+    """Return no tilt: no accelerometer is fitted."""
     return None
 
 
@@ -91,7 +91,7 @@ class Node:
     key
         Of this controller; b"": nothing can be stored.
     sensor
-        Gives the mirror's tilt (x, y), rad, or None; see ``Motion``.
+        Returns the mirror's tilt (x, y), rad, or None; see ``Motion``.
     feed
         Feeds the hardware's watchdog.
 
@@ -100,7 +100,7 @@ class Node:
     controller, journal, reader, timer
         The parts.
     trouble
-        What flash said when it failed, "" if it did not.
+        The error of flash that has failed, "" if it has not.
     """
 
     def __init__(
@@ -152,19 +152,19 @@ class Node:
                 self.controller.fault_gone(controller.JOURNAL)
 
     def on_bytes(self, data: bytes, now_ms: int) -> None:
-        """Take bytes as they came, in pieces of any size."""
+        """Take received bytes, in pieces of any size."""
         for frame in self.reader.feed(data):
             self.on_frame(frame, now_ms)
 
     def on_frame(self, frame: "wire.Frame", now_ms: int) -> None:
-        """Take a frame that came whole; a simulated bus may read it once for many nodes."""
+        """Take a whole frame; a simulated bus may read it once for many nodes."""
         own = self.controller
         # A new address takes effect after the answer.
         self._address, self._sequence = own.config.address, frame.sequence
         self._obey(own.on_frame(frame, now_ms), now_ms)
 
     def on_tick(self, now_ms: int) -> None:
-        """Go on; to be called every 50 ms or more often."""
+        """Advance in time; to be called every 50 ms or more often."""
         self._obey(self.controller.on_tick(now_ms), now_ms)
         if self._here and self._slot.over(now_ms):
             values, self._here = self._here, ()
@@ -174,7 +174,7 @@ class Node:
             self._obey([(HEALTHY,)], now_ms)
 
     def on_fault(self, number: int, now_ms: int, halt: bool) -> None:
-        """Latch a fault (of ``controller``) that the board found; ``halt`` stops the motors.
+        """Latch a fault (of ``controller``) that the board has found; ``halt`` stops the motors.
 
         The cause counts as present until ``fault_gone``.
         """
@@ -184,11 +184,11 @@ class Node:
             self._obey(self.controller.halted(undone[0], undone[1]), now_ms)
 
     def fault_gone(self, number: int) -> None:
-        """The cause of a fault is gone; the fault stays until CLEAR_FAULT."""
+        """Note that the cause of a fault is gone; the fault stays until CLEAR_FAULT."""
         self.controller.fault_gone(number)
 
     def on_supply_failing(self, now_ms: int) -> bool:
-        """Stop and keep the step counts: the supply falls and milliseconds are left.
+        """Stop and store the step counts: the supply falls and milliseconds are left.
 
         Returns whether flash holds the counts. The fault SUPPLY is latched; when the supply has
         come back without a reset, call ``fault_gone``.
@@ -208,11 +208,11 @@ class Node:
         return kept
 
     def measured(self, supply_mv: int, temperature_degc: int) -> None:
-        """Say what STATUS shall tell of supply and temperature."""
+        """Set the supply voltage and temperature reported in STATUS."""
         self.controller.supply_mv = min(max(supply_mv, 0), 0xFFFF)
         self.controller.temperature_degc = min(max(temperature_degc, -128), 127)
 
-    # What the controller orders.
+    # The controller's actions.
 
     def _obey(self, actions: "list[tuple[Any, ...]]", now_ms: int) -> None:
         before = self.trouble
@@ -234,7 +234,7 @@ class Node:
             self.on_fault(controller.JOURNAL, now_ms, False)
 
     def _keep(self, kind: int, action: "tuple[Any, ...]") -> bool:
-        """Do what concerns the journal; False if flash failed, now or before."""
+        """Carry out actions on the journal; return False if flash failed, now or before."""
         journal = self.journal
         if self.trouble:
             return False
@@ -268,7 +268,7 @@ class Node:
         self._slot.start(now_ms, self._draw(now_ms) * HERE_SLOT_MS)
 
     def _draw(self, now_ms: int) -> int:
-        """A slot, other for each controller and each time: xorshift of Marsaglia."""
+        """Return a slot, different for each controller and each time: xorshift of Marsaglia."""
         chance = self._chance ^ now_ms or 1
         chance ^= (chance << 13) & 0xFFFFFFFF
         chance ^= chance >> 17

@@ -1,23 +1,23 @@
-"""The 12-byte packet of Malan's thesis, to speak with controllers that know no other.
+"""The 12-byte packet of Malan's thesis, for controllers that understand no other.
 
-From the thesis we hold: twelve bytes; a 16-bit address; a byte for the type (Table D.1), of
+From the thesis we have: twelve bytes; a 16-bit address; a byte for the type (Table D.1), of
 which 0xD8 is the search of a target and the detection of motion; data; a checksum. **The rest is
 ours, because the thesis's table was not at hand**: the order of the bytes, the other types, the
-data in them, and that the checksum is the sum of the eleven bytes before it modulo 256. A board
-that was built to the thesis needs this table compared with its firmware first::
+data in them, and that the checksum is the sum of the eleven bytes before it modulo 256. Before use
+with a board that was built to the thesis, compare this table with its firmware::
 
     address (high, low)  type  data (8)  sum
 
-Whoever looks for such a packet at every byte of a stream takes false ones: one place in 256 has a
-matching sum by chance. Packets are therefore told apart by silence on the line, as in Modbus RTU:
-between two silences there are exactly twelve bytes with a matching sum, or nothing. A packet
+A reader that looks for such a packet at every byte of a stream accepts false ones: one place in 256
+has a matching sum by chance. Packets are therefore separated by silence on the line, as in Modbus
+RTU: between two silences there are exactly twelve bytes with a matching sum, or nothing. A packet
 damaged in one byte is always refused; damaged in several, still one in 256 passes. Hence version 2.
 
 A packet has no sender, number, authority, expiry or MAC. ``to_packets`` leaves the head of a
-command out, ``Joiner`` cannot give it back; who bridges to version 2 puts in his own. Messages of
-class KEY have no packets: without a MAC nothing is stored. A message longer than eight bytes goes
-in parts of at most seven; the eighth byte of all its parts holds the same tag, which changes from
-message to message, so that parts of two messages never make one.
+command out and ``Joiner`` cannot restore it; a bridge to version 2 adds a head of its own. Messages
+of class KEY have no packets: without a MAC nothing is stored. A message longer than eight bytes is
+sent in parts of at most seven; the eighth byte of all its parts holds the same tag, which changes
+from message to message, so that parts of two messages are never joined.
 """
 
 import struct
@@ -81,7 +81,7 @@ def checksum(data: bytes) -> int:
 
 
 def build(address: int, kind: int, data: bytes) -> bytes:
-    """Return a packet; ``data`` of at most eight bytes is filled up with zeros.
+    """Return a packet; ``data`` of at most eight bytes is padded with zeros.
 
     Raises
     ------
@@ -111,18 +111,18 @@ def to_packets(address: int, name: str, values: "tuple[Any, ...]", tag: int = 0)
     Parameters
     ----------
     address
-        Of the local controller: whom it goes to, or who answers.
+        Of the local controller: the receiver of a command, the sender of an answer.
     name
         Name of the message.
     values
         Its numbers without the head.
     tag
-        0 to 255, another one than for the last message of the same name to that address.
+        0 to 255, different from that of the last message of the same name to that address.
 
     Raises
     ------
     ValueError
-        A message that no packet holds, or numbers that do not fit it.
+        A message that has no packet, or numbers that do not fit it.
     """
     if name in KINDS:
         data = struct.pack(">B", KINDS.index(name))
@@ -152,7 +152,7 @@ class Joiner:
     """Packets in, messages out: joins the parts of a message.
 
     The parts must come in order and without another packet of the same address between. It keeps
-    the parts of one message only, as on a bus that is polled nobody interrupts another.
+    the parts of one message only: on a polled bus no node interrupts another.
     """
 
     def __init__(self) -> None:
@@ -212,7 +212,7 @@ def _search_or_diagnose(address: int, data: bytes) -> "tuple[int, str, tuple[Any
 
 
 class Splitter:
-    """Bytes with their times in, packets out, told apart by silence.
+    """Bytes with their times in, packets out, separated by silence.
 
     Parameters
     ----------
@@ -224,9 +224,9 @@ class Splitter:
     Attributes
     ----------
     good
-        Packets that came.
+        Packets received.
     bad
-        Runs of bytes between two silences that were none.
+        Runs of bytes between two silences that were not packets.
     """
 
     def __init__(self, character_us: int, gap_us: int = 0) -> None:
@@ -245,13 +245,13 @@ class Splitter:
         ----------
         tick
             When the first of the bytes began, µs modulo 2^30. They must not be older than the
-            silence is long: read the line at least that often.
+            length of the silence: read the line at least that often.
         data
-            The bytes; none, to say only how late it is.
+            The bytes; empty to report the time only.
         """
         silence = ticks.diff(tick, self._end)
         packets = []
-        # Far before the last end is no overlap but a counter that went round in a long silence.
+        # Far before the last end is not an overlap but a counter that wrapped in a long silence.
         if self._length and (silence >= self._gap_us or silence < -SIZE * self._character_us):
             if self._length == SIZE and parse(self._kept) is not None:
                 packets.append(self._kept)

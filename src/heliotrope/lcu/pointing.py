@@ -19,19 +19,19 @@ OK, UNREACHABLE, STOPPED, NOT_CONVERGED, DEGENERATE = range(5)
 
 #: Largest miss of the beam at its aim, m, where precision allows it.
 TOLERANCE = 2e-10
-#: The fixed point is left for Newton when a step gains less than this factor.
+#: Newton replaces the fixed point when a step gains less than this factor.
 SLOW = 0.3
 STEPS, NEWTON_STEPS, TRIALS = 20, 60, 20
 #: Source and aim closer to opposite than this (rad), or aim nearer to the vertex (m).
 DEGENERATE_LIMIT = 1e-6
 #: A pose on the branch of the last one that moves less than this (rad) is taken at once.
 CLOSE = 0.05
-#: Angles this far (rad) beyond a stop count as on it.
+#: A pose on the last branch that moves less than this (rad) is accepted at once.
 STOP_SLACK = 1e-6
 
 
 def epsilon(one: float) -> float:
-    """Rounding of the numbers that ``one`` (1.0, of their type) belongs to."""
+    """Return the rounding of numbers of the type of ``one`` (1.0)."""
     step = one
     while one + 0.5 * step != one:
         step = 0.5 * step
@@ -57,8 +57,8 @@ def into_stops(theta: float, low: float, high: float, near: float) -> tuple[floa
 class Pose:
     """A solution of one branch.
 
-    ``status``; ``angles`` of the joints, rad; ``residual``, angle of the normal from where
-    it should be, rad; ``branch`` −1 or 1.
+    ``status``; ``angles`` of the joints, rad; ``residual``, angle of the normal from its
+    target direction, rad; ``branch`` −1 or 1.
     """
 
     def __init__(self, branch: int) -> None:
@@ -133,7 +133,7 @@ class Pointing:
     ) -> Pose:
         """Return the pose that sends light from the sun to the aim.
 
-        Of the two branches the one within the stops that moves least; if none reaches the
+        Of the two branches, the one within the stops that moves least; if neither reaches the
         aim, the nearest pose, whose status and residual say so. The pose is overwritten by
         the next call.
 
@@ -423,7 +423,7 @@ def turn_of(one: float, two: float) -> tuple[float, float, float, float]:
 def _advanced(
     turn: tuple[float, float, float, float], one: float, two: float
 ) -> tuple[float, float, float, float]:
-    """The turn moved on by two small angles, without going through the large ones."""
+    """Return the turn advanced by two small angles, without computing the large ones."""
     s1, c1, s2, c2 = turn_of(one, two)
     return (
         turn[0] * c1 + turn[1] * s1,

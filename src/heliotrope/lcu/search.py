@@ -16,7 +16,7 @@ class Spiral:
     Raises
     ------
     ValueError
-        If pitch and radius are not finite, not above 0, or ask for more than ``MOST`` points.
+        If pitch and radius are not finite, not above 0, or need more than ``MOST`` points.
     """
 
     MOST = 4000
@@ -32,7 +32,7 @@ class Spiral:
         self.over = False
 
     def advance(self) -> bool:
-        """Go on to the next point, in ``offset`` (right, up); False when at the end."""
+        """Go on to the next point, in ``offset`` (right, up); return False at the end."""
         if self.over:
             return False
         per_radian = self.pitch / (2.0 * math.pi)
@@ -57,7 +57,7 @@ def displaced(
     right: float,
     up: float,
 ) -> tuple[float, float, float]:
-    """The aim moved across the line of sight by angles (rad) right and up, seen from the vertex."""
+    """Return the aim moved right and up by angles (rad) as seen from the vertex."""
     east, north, high = aim[0] - vertex[0], aim[1] - vertex[1], aim[2] - vertex[2]
     flat = math.sqrt(east * east + north * north)
     slant = math.sqrt(flat * flat + high * high)

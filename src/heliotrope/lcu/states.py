@@ -1,8 +1,8 @@
 """States of a local controller, and all its transitions as one table.
 
-A line: state, event, new state, motion that starts (if one does). What is not in the table is
-refused and changes nothing. A motion that starts replaces any other. What the events and motions
-mean stands in ``names``. The table is text: on a microcontroller a tuple for each line would take
+A line: state, event, new state, motion that starts (if any). An event that is not in the table is
+refused and changes nothing. A motion that starts replaces any other. ``names`` gives the meanings
+of the events and motions. The table is text: on a microcontroller a tuple for each line would take
 7 kB more.
 """
 
@@ -31,7 +31,7 @@ STATES = (
     FAULT,
 ) = range(10)
 
-#: The sun must be fresh to enter these, and stays needed: LAPSED leaves them.
+#: States that need a fresh sun to enter and to stay in: LAPSED leaves them.
 NEED_SUN = (APPROACHING, TRACKING, SEARCHING)
 
 TABLE = """
@@ -121,7 +121,7 @@ FAULT FAULTED FAULT
 
 
 def transition(state: int, event: str) -> "tuple[int, str] | None":
-    """(new state, motion or ""), or None where the event is refused."""
+    """Return (new state, motion or ""), or None where the event is refused."""
     key = "\n" + STATES[state] + " " + event + " "
     start = TABLE.find(key)
     if start < 0:

@@ -1,14 +1,14 @@
 """Steps: goals of two axes become segments for a hardware timer.
 
 Time runs in slots of some tens of milliseconds. In each, an axis makes the steps of its
-present speed, which changes by no more than the acceleration allows and never exceeds what
-can still be stopped before the goal. Everything is in integers; speeds and phases are in
+present speed, which changes by no more than the acceleration allows and never exceeds the speed
+from which it can still stop before the goal. Everything is in integers; speeds and phases are in
 steps per slot times ``SCALE``. A segment is (axis, direction, count, interval in µs): the
 hardware makes ``count`` pulses, waiting the interval after each. It plays the segments of an
 axis one after the other; no Python runs per step.
 
-Counts are of segments emitted. What is emitted is played, but for an emergency stop: then the
-hardware says how many steps it did not make, and `Stepper.undone` takes them back.
+Counts are of segments emitted. An emitted segment is played, except at an emergency stop: then the
+hardware reports how many steps it did not make, and :meth:`Stepper.undone` takes them back.
 """
 
 SCALE = 1024
@@ -18,7 +18,7 @@ BOTH, PRIMARY_FIRST, SECONDARY_FIRST = range(3)
 
 
 def root(square: int) -> int:
-    """Integer square root, rounded down."""
+    """Return the integer square root, rounded down."""
     if square < 2:
         return square
     guess = 1
@@ -34,13 +34,13 @@ def root(square: int) -> int:
 
 
 def stopping(speed: int, change: int) -> int:
-    """Distance of a slot at ``speed`` and of the slots of slowing down after it."""
+    """Return the distance of a slot at ``speed`` and of the slots of slowing down after it."""
     m = speed // change
     return (m + 1) * speed - change * m * (m + 1) // 2
 
 
 def fastest(distance: int, change: int) -> int:
-    """The greatest speed whose `stopping` distance is no more than ``distance``."""
+    """Return the greatest speed whose :func:`stopping` distance is at most ``distance``."""
     m = (root(8 * distance // change + 1) - 1) >> 1
     while change * m * (m + 1) // 2 > distance:
         m -= 1
@@ -50,16 +50,16 @@ def fastest(distance: int, change: int) -> int:
 
 
 class Axis:
-    """One axis: where it is, how fast, and where to.
+    """One axis: position, speed and goal.
 
     Parameters
     ----------
     low, high
-        Range of the counts, steps. No goal beyond is taken.
+        Range of the counts, steps. No goal beyond it is accepted.
     rate, acceleration
         steps/s, steps/s².
     backlash
-        Steps by which a goal is passed when it is come to from above, so that it is always
+        Steps by which a goal approached from above is passed, so that it is always
         reached from below.
     slot_ms
         Length of a slot.
@@ -81,8 +81,8 @@ class Axis:
         self.rate, self.acceleration = rate, acceleration
         self.slot_us = 1000 * slot_ms
         self.shortest_us = -(-1_000_000 // rate)
-        # Intervals are whole microseconds: a slot holds no more steps than have room in it, or
-        # the hardware would fall behind.
+        # Intervals are whole microseconds: a slot holds no more steps than fit in it, or the
+        # hardware would fall behind.
         room = self.slot_us * SCALE // self.shortest_us
         self.top = max(1, min(rate * slot_ms * SCALE // 1000, room))
         self.change = max(1, acceleration * slot_ms * slot_ms * SCALE // 1_000_000)
@@ -94,11 +94,11 @@ class Axis:
         self.braking = False
 
     def still(self) -> bool:
-        """Whether it stands where it shall."""
+        """Whether the axis stands at its goal."""
         return self.speed == 0 and (self.braking or self.count == self.leg == self.goal)
 
     def aim(self, goal: int) -> bool:
-        """Set a goal to be reached from below; False if it was cut to the range."""
+        """Set a goal to be reached from below; return False if it was cut to the range."""
         cut = min(max(goal, self.low), self.high)
         self.goal = self.leg = cut
         self.braking = self.led = False
@@ -107,7 +107,7 @@ class Axis:
         return cut == goal
 
     def stop_distance(self) -> int:
-        """Steps that slowing down from the present speed takes at most."""
+        """Return the most steps that slowing down from the present speed takes."""
         if self.speed <= self.change:
             return 0
         return stopping(self.speed - self.change, self.change) // SCALE + 1
@@ -117,7 +117,7 @@ class Axis:
         self.braking = True
 
     def slot(self, held: bool) -> int:
-        """Go on by one slot, or slow down if held; returns its steps, of sign ``direction``."""
+        """Advance by one slot, or slow down if held; return its steps, of sign ``direction``."""
         if self.speed == 0:
             self.phase = 0
             if self.braking:
@@ -142,7 +142,7 @@ class Axis:
         return steps
 
     def interval_us(self, steps: int) -> int:
-        """Time between the steps of the slot that has just been made, rounded up."""
+        """Return the time between the steps of the last slot, rounded up."""
         return max(self.shortest_us, self.slot_us // steps)
 
 
@@ -166,7 +166,7 @@ class Stepper:
         self.queued_ms = 0
 
     def go(self, primary: int, secondary: int, order: int) -> bool:
-        """Go to step counts, one axis after the other or both; False if one was cut."""
+        """Go to step counts, one axis after the other or both; return False if one was cut."""
         self.order = order
         first = self.axes[0].aim(primary)
         return self.axes[1].aim(secondary) and first
@@ -205,11 +205,11 @@ class Stepper:
         self.queued_ms = 0
 
     def still(self) -> bool:
-        """Whether both axes stand where they shall and the hardware has played everything."""
+        """Whether both axes stand at their goals and the hardware has played everything."""
         return self.queued_ms <= 0 and self.axes[0].still() and self.axes[1].still()
 
     def advance(self, elapsed_ms: int, out: list[tuple[int, ...]], kind: int) -> None:
-        """Emit what ``elapsed_ms`` has made room for: (kind, axis, direction, count, µs)."""
+        """Emit segments for ``elapsed_ms``: (kind, axis, direction, count, µs)."""
         self.queued_ms -= elapsed_ms
         if self.queued_ms < 0:
             for axis in self.axes:

@@ -1,6 +1,6 @@
 """Time as a counter that wraps: the arithmetic of MicroPython's ``ticks_ms``, written out.
 
-Ticks are integers modulo 2^30. A difference is taken as the shorter way round, so it lies in
+Ticks are integers modulo 2^30. A difference is taken the shorter way round, so it lies in
 [-2^29, 2^29): half the period is 6.2 days in milliseconds, 8.9 minutes in microseconds.
 MicroPython's own ``ticks_diff`` gives the same numbers; CPython has none.
 """
@@ -22,14 +22,14 @@ def diff(later: int, earlier: int) -> int:
 class Deadline:
     """A span of time that ends on time or too early, never too late (invariant 9).
 
-    It holds what is left, not the instant of its end, so it stays right when the counter wraps.
+    It stores the time left, not the instant of the end, so it stays right when the counter wraps.
     Every step of the counter between two looks is charged with its size, whatever its sign: a
     jump, forwards or backwards, can only shorten the span. Once over, it stays over until
     ``start`` is called. It is over when made.
 
     It must be looked at at least once in 2^29 ticks: a counter that wrapped unseen cannot be
-    told from one that stood still. A loop that hangs for longer, or a counter that stands
-    still, is the hardware watchdog's to end.
+    distinguished from one that stood still. Ending a loop that hangs for longer, or a counter that
+    stands still, is up to the hardware watchdog.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Deadline:
         self.left = span
 
     def look(self, now: int) -> int:
-        """Charge the time since the last look, and return what is left (0: over)."""
+        """Charge the time since the last look, and return the time left (0: over)."""
         step = diff(now, self._seen)
         self._seen = now
         self.left = max(0, self.left - abs(step))

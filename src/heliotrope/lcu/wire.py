@@ -6,26 +6,26 @@ A frame, before byte stuffing (numbers little-endian)::
        1      2    2       2       1   0..236     8       4      bytes
 
 COBS removes every zero from it, and a zero ends it. ``from`` 0 is the cluster controller, ``to``
-0xFFFF is everybody. The MAC stands in messages of class KEY only. The CRC covers all before it.
-A receiver that starts amid a frame, or hears noise, is in step again at the next zero; a sender
-may begin with a zero to end whatever noise came before.
+0xFFFF is all. Only messages of class KEY have a MAC. The CRC covers all bytes before it.
+A receiver that starts in the middle of a frame, or hears noise, is in step again at the next zero;
+a sender may begin with a zero to end any noise before.
 
-**What makes a frame old.** Sequence numbers alone cannot tell a restart of their sender, or a
+**Old frames.** Sequence numbers alone cannot distinguish a restart of their sender, or a
 link that came back after an hour, from a replay. So the sender keeps a 32-bit count of its
 frames; the lower 16 bits are the sequence, and once a second it broadcasts SESSION with the
 upper ones, its epoch and the token of the one authority. The epoch rises with every start of
 the sender (the GPS second of the start serves, and needs no memory) and whenever the count is
-used up. A receiver takes a SESSION whose (epoch, count) is greater than the one it holds, and
-between SESSIONs each frame whose sequence is 1 to 32767 after the last one taken. After a
-restart of the receiver, or 10 s of silence (far less than 32768 frames last on the bus), nothing
-but SESSION is taken first. Frames of before a sender's restart that are still under way fail by
-their token, which changes with the epoch. A sender whose commands are answered "duplicate" for
-any other reason starts a new epoch.
+used up. A receiver accepts a SESSION whose (epoch, count) is greater than the one it holds, and
+between SESSIONs each frame whose sequence is 1 to 32767 after the last one accepted. After a
+restart of the receiver, or 10 s of silence (in which the bus carries far fewer than 32768 frames),
+it accepts a SESSION first and nothing else. Frames from before a sender's restart that are still
+under way fail by their token, which changes with the epoch. A sender whose commands are answered
+"duplicate" for any other reason starts a new epoch.
 
-What acts has a second and a third lock: it expires by the clock, within a time in which the
-sequence cannot come round, and what is stored carries a MAC and an edition that only rises.
-DEFOCUS and STOW pass no lock at all; questions change nothing. This stops accidents. Against a
-person at the bus only the MAC protects, thus what is stored.
+Messages that act have two further locks: they expire by the clock, within a time in which the
+sequence cannot come round, and those that change stored settings carry a MAC and an edition that
+only rises. DEFOCUS and STOW have no lock at all; questions change nothing. This prevents accidents.
+Against a person at the bus only the MAC protects, and so only the stored settings.
 
 The hash is injected: ``sha256(data) -> 32 bytes``.
 """
@@ -55,7 +55,7 @@ CRC_SIZE = 4
 PAYLOAD_LIMIT = FRAME_LIMIT - 2 - HEADER_SIZE - CRC_SIZE
 
 #: Longest life of a command, s. It is short enough that fewer than half the sequence numbers
-#: are used in it on the fastest bus: a command of before then is old by its number or expired.
+#: are used in it on the fastest bus: an earlier command is old by its number or has expired.
 HORIZON_S = 30
 #: After this silence of a sender its next frame must be a SESSION, ms.
 SILENCE_MS = 10000
@@ -112,7 +112,7 @@ def unstuff(data: bytes) -> "bytes | None":
 
 
 def _single(codes: str) -> str:
-    """Write counts out: "B3d" -> "Bddd"."""
+    """Expand counts: "B3d" -> "Bddd"."""
     out = ""
     count = ""
     for code in codes:
@@ -140,7 +140,7 @@ def _refusal(code: str, value: "Any") -> str:
 
 
 def pack(name: str, *values: "Any") -> bytes:
-    """Make a message's payload, head included.
+    """Return a message's payload, head included.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def pack(name: str, *values: "Any") -> bytes:
     ------
     ValueError
         An unknown name, a wrong number of values, or a value that its code cannot hold.
-        (``struct`` of MicroPython would cut it off in silence.)
+        (``struct`` of MicroPython would truncate it silently.)
     """
     number = messages.NUMBER_OF.get(name)
     if number is None:
@@ -183,7 +183,7 @@ def _fits(codes: str, size: int) -> bool:
 
 
 def finite(values: "tuple[Any, ...]") -> bool:
-    """Return whether no number is infinite or none at all."""
+    """Return whether all numbers are finite."""
     return not any(isinstance(value, float) and not math.isfinite(value) for value in values)
 
 
@@ -194,7 +194,7 @@ def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
     -------
     tuple or None
         The numbers as ``pack`` takes them; None if the message is unknown, the length is wrong,
-        or a number is not finite (which no sender means, and which would pass every comparison).
+        or a number is not finite (no sender means that, and it would pass every comparison).
     """
     if messages.who_of(number) < 0:
         return None
@@ -210,15 +210,15 @@ def unpack(number: int, payload: bytes) -> "tuple[Any, ...] | None":
 
 
 class Frame:
-    """A frame that came whole.
+    """A whole frame.
 
     Attributes
     ----------
     to, sender, sequence, number
         As in the header; ``number`` is the type of the message.
     payload
-        Bytes with the head, without the MAC. A known message has a length that fits; of an
-        unknown one it is all that stood before the CRC.
+        Bytes with the head, without the MAC. A known message has a length that fits; in an
+        unknown one it is everything before the CRC.
     mac
         8 bytes in messages of class KEY, else b"".
     """
@@ -246,7 +246,7 @@ class Frame:
         return self._values
 
     def body(self) -> bytes:
-        """Return what the MAC covers: header and payload."""
+        """Return the bytes that the MAC covers: header and payload."""
         return (
             struct.pack(HEADER, VERSION, self.to, self.sender, self.sequence, self.number)
             + self.payload
@@ -282,7 +282,7 @@ def authenticate(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -
 def verify(sha256: "Callable[[bytes], bytes]", key: bytes, frame: Frame) -> bool:
     """Return whether a frame carries the MAC of ``key``; never with an empty key.
 
-    All bytes are compared whatever the first ones say, so the time taken tells nothing.
+    All bytes are compared whatever the first ones say, so timing reveals nothing.
     """
     if not key or len(frame.mac) != MAC_SIZE:
         return False
@@ -322,7 +322,7 @@ def encode(frame: Frame) -> bytes:
 
 
 def sealed(frame: Frame) -> bytes:
-    """Return a frame's bytes on the wire, of a frame that is known to be right."""
+    """Return the bytes on the wire of a frame that is known to be right."""
     data = frame.body() + frame.mac
     return stuff(data + struct.pack("<I", crc32(data))) + b"\0"
 
@@ -333,7 +333,7 @@ class Reader:
     Attributes
     ----------
     good, crc, cobs, length, version
-        Counts of what came: whole frames; wrong checksums; impossible stuffing; frames too
+        Counts: whole frames; wrong checksums; impossible stuffing; frames too
         long, too short or of a length that does not fit their message; frames of another
         version. A frame that is counted under anything but ``good`` changes nothing else.
     """
@@ -348,7 +348,7 @@ class Reader:
         self._too_long = False
 
     def feed(self, data: bytes) -> "list[Frame]":
-        """Take bytes as they came, and return the frames that ended in them."""
+        """Take received bytes, and return the frames that ended in them."""
         data = bytes(data)
         frames: list[Frame] = []
         start = 0
@@ -413,25 +413,25 @@ def expired(expires_s: int, now_s: "int | None") -> bool:
     Parameters
     ----------
     expires_s
-        Last GPS second at which it is good, modulo 2^32.
+        Last GPS second at which it is valid, modulo 2^32.
     now_s
         The present GPS second, modulo 2^32; None if it is not known: then every command is void.
 
     Notes
     -----
-    A command good for more than ``HORIZON_S`` is void too: with 32 bits that wrap, long ago and
+    A command valid for more than ``HORIZON_S`` is void too: with 32 bits that wrap, long ago and
     far ahead are the same.
     """
     return now_s is None or ((expires_s - now_s) & 0xFFFFFFFF) > HORIZON_S
 
 
 class Replay:
-    """Which frames of one sender are new; see the head of this module.
+    """Decides which frames of one sender are new; see the docstring of this module.
 
     Attributes
     ----------
     epoch, count
-        Of the last frame taken; ``epoch`` is -1 before the first SESSION.
+        Of the last frame accepted; ``epoch`` is -1 before the first SESSION.
     """
 
     def __init__(self) -> None:
@@ -462,11 +462,11 @@ class Replay:
         return True
 
     def look(self, tick: int) -> bool:
-        """Return whether the sender was heard of late; see ``ticks.Deadline`` for how often."""
+        """Return whether the sender was heard recently; see ``ticks.Deadline`` for how often."""
         return not self._heard.over(tick)
 
     def fresh(self, sequence: int, tick: int) -> bool:
-        """Return whether any other frame is new, and if it is, take it."""
+        """Return whether any other frame is new, and if it is, record it."""
         if not self.look(tick):
             return False
         ahead = (sequence - self.count) & 0xFFFF
@@ -478,25 +478,25 @@ class Replay:
 
 
 class Gate:
-    """Decides of each frame that came whether it may act: invariants 4 and 5 in one place.
+    """Decides whether a frame may act: invariants 4 and 5 in one place.
 
     Parameters
     ----------
     sha256
         The hash, or None where nothing may be stored.
     key
-        Key of this local controller, b"" for none: then nothing can be stored.
+        Key of this local controller; b"": nothing can be stored.
     edition
         Edition of the last stored message, from the journal.
     sender
-        Address from where commands come.
+        Address that commands come from.
 
     Attributes
     ----------
     token
         Of the one authority, 0 if nobody has it.
     edition
-        Of the last stored message; the caller stores it together with what the message sets.
+        Of the last stored message; the caller stores it together with the message's items.
     """
 
     def __init__(
@@ -558,7 +558,7 @@ class Gate:
 
 
 class Sender:
-    """Numbers and frames what one sender sends: the other side of ``Gate``.
+    """Numbers and frames the messages of one sender: the counterpart of ``Gate``.
 
     Parameters
     ----------
@@ -597,7 +597,7 @@ class Sender:
         return self._make(to, name, pack(name, *values), key)
 
     def session(self, token: int) -> bytes:
-        """Return a SESSION for everybody, to be sent once a second; ``token`` 0: no authority.
+        """Return a SESSION for all, to be sent once a second; ``token`` 0: no authority.
 
         Within the last 65536 numbers of an epoch the next one is begun.
         """
