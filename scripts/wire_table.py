@@ -16,20 +16,20 @@ WHO = {
 }
 GROUPS = {
     0x00: "Questions and answers", 0x10: "Time, sun and session", 0x20: "Safety",
-    0x30: "States", 0x40: "Aim and motion", 0x50: "What is stored",
+    0x30: "States", 0x40: "Aim and motion", 0x50: "Stored settings",
 }  # fmt: skip
 FRAME = f"""# The wire, version 2
 
-This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages`, `packet12` and `journal`.
+This page is made from the tables in the program (`scripts/wire_table.py`); the code is `heliotrope.lcu.wire`, `messages`, `packet12` (offered as `heliotrope.links.packet12`) and `journal`.
 
 ## A frame
 
-Numbers are little-endian. COBS takes every zero out of the frame, and a zero ends it; with both it is at most {wire.FRAME_LIMIT} bytes long.
+Numbers are little-endian. COBS removes every zero from the frame, and a zero ends it; with both it is at most {wire.FRAME_LIMIT} bytes long.
 
 | bytes | content |
 |---|---|
 | 1 | version, {wire.VERSION} |
-| 2 | to: address, 0xFFFF everybody, 0 the cluster controller |
+| 2 | to: address, 0xFFFF all, 0 the cluster controller |
 | 2 | from |
 | 2 | sequence |
 | 1 | type |
@@ -37,17 +37,17 @@ Numbers are little-endian. COBS takes every zero out of the frame, and a zero en
 | {wire.MAC_SIZE} | MAC, in messages that store: HMAC-SHA256 over all before it, truncated |
 | 4 | CRC-32 over all before it (that of zlib) |
 
-A frame whose stuffing, checksum, version or length is wrong changes nothing but a counter. A type that is not in the table is handed on with its bytes. A frame whose payload holds a number that is not finite does not act.
+A frame whose stuffing, checksum, version or length is wrong changes nothing but a counter. A type that is not in the table is passed on with its bytes. A frame whose payload holds a number that is not finite does not act.
 
 ## What acts
 
 - DEFOCUS and STOW, from anyone, always.
 - Questions, always: they change nothing.
-- Everything else must be new. The sender counts its frames in 32 bits; the lower 16 are the sequence, and once a second it broadcasts SESSION with the upper ones, its epoch and the token of the authority. A SESSION is taken if its (epoch, count) is greater than the one held; any other frame, if its sequence is 1 to 32767 after the last one taken. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, a SESSION must come first. The epoch rises with every start of the sender: the GPS second of the start serves.
+- Everything else must be new. The sender counts its frames in 32 bits; the lower 16 are the sequence, and once a second it broadcasts SESSION with the upper ones, its epoch and the token of the authority. A SESSION is accepted if its (epoch, count) is greater than the one held; any other frame, if its sequence is 1 to 32767 after the last one accepted. After a restart of the receiver or {wire.SILENCE_MS // 1000} s of silence, a SESSION must come first. The epoch rises with every start of the sender: the GPS second of the start serves.
 - A command of the authority must carry the token of the last SESSION (0 is nobody's) and must not have expired: its last second is at most {wire.HORIZON_S} s ahead by the receiver's clock. Without a clock every command is void.
-- A message that stores must carry the MAC of the receiver's key besides, and an edition greater than the last one stored. The edition is kept in the journal with what was set, so a recorded message is void for ever.
+- A message that stores must also carry the MAC of the receiver's key, and an edition greater than the last one stored. The edition is kept in the journal with what was set, so a recorded message is void for ever.
 
-All but the MAC stops accidents, not a person at the bus.
+All except the MAC prevents accidents; it does not stop a person at the bus.
 """  # noqa: E501
 
 
@@ -110,13 +110,13 @@ PACKET = (
     "Address (high, low), type, eight bytes of data, sum of the eleven bytes modulo 256. Of this, "
     "the length, the 16-bit address, a type byte, 0xD8 for target search and motion detection, "
     "data and a checksum are Malan's; the rest is ours, because the thesis's Table D.1 was not at "
-    "hand: compare it with the firmware of a board that was built to the thesis. Packets are told "
-    f"apart by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, so "
-    "nothing can be stored by them."
+    "hand: compare it with the firmware of a board that was built to the thesis. Packets are "
+    f"separated by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, so "
+    "they can store nothing."
 )
 
 #: Measured by ``python -m benchmarks frames``.
-DAMAGE = """Ten million frames of all types were damaged at random in five ways and read (`python -m benchmarks frames`), and ten million 12-byte packets told apart by silence, which is the best they can be. A false accept is a frame that comes out and was never sent.
+DAMAGE = """Ten million frames of all types were damaged at random in five ways and read (`python -m benchmarks frames`), and ten million 12-byte packets separated by silence, the best case for them. A false accept is a frame that comes out and was never sent.
 
 | damage | frames | false accepts | packets | false accepts |
 |---|---|---|---|---|
@@ -126,7 +126,7 @@ DAMAGE = """Ten million frames of all types were damaged at random in five ways 
 | 1 to 12 bytes added | 2,000,954 | 0 | 2,000,746 | 0 |
 | the head of one and the tail of another | 2,000,478 | 0 | 1,998,360 | 479 (1 in 4,171) |
 
-A receiver of packets that looks at every byte, without silence, finds 38,897 of them in ten million bytes of noise. Of version 2 a share of 2^-32 of heavily damaged frames passes by chance, one in four thousand million; a MAC stands before what is stored."""  # noqa: E501
+A receiver of packets that looks at every byte, without silence, finds 38,897 of them in ten million bytes of noise. In version 2 a share of 2^-32 of heavily damaged frames passes by chance, one in four thousand million; a MAC protects stored settings."""  # noqa: E501
 
 
 if __name__ == "__main__":
