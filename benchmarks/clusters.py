@@ -20,8 +20,8 @@ from heliotrope.cluster.controller import Cluster
 from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import Clock, SystemClock, VirtualClock, run_virtual
-from heliotrope.links.link import LinkClosedError, Outcome, Statistics, running
-from heliotrope.links.messages import Lease, Status, decode, encode
+from heliotrope.links.link import LinkClosedError, SendOutcome, Statistics, running
+from heliotrope.links.messages import ClusterStatus, Lease, decode, encode
 from heliotrope.sun import Site
 
 HELIOSTATS = 32
@@ -52,11 +52,11 @@ class ReadyBus:
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Count a frame."""
         del frame, expires, urgent
         self.frames += 1
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def transact(
         self,
@@ -111,13 +111,13 @@ class LeasingLink:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Keep a message."""
         del expires, hold
         self.last = data
         if self.told is not None:
             self.told()
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def receive(self) -> bytes:
         """Give a lease after a second."""
@@ -198,7 +198,7 @@ def _lateness(count: int, seconds: int, *, spread: bool) -> tuple[float, float]:
 def _heard(link: LeasingLink) -> int:
     """How many heliostats the last status tells of as heard within a second."""
     status = decode(link.last)
-    assert isinstance(status, Status)
+    assert isinstance(status, ClusterStatus)
     return int(np.sum(status.nodes()["heard_ms"] < 1000))
 
 

@@ -21,7 +21,7 @@ from heliotrope.cluster.config import ClusterConfig, Member, spread_phase
 from heliotrope.cluster.controller import Cluster
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, gps_seconds, run_virtual
-from heliotrope.links.link import LinkClosedError, Outcome, Statistics, running
+from heliotrope.links.link import LinkClosedError, SendOutcome, Statistics, running
 from heliotrope.links.messages import Acknowledge, Command, Emergency, Lease, Message, encode
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
@@ -58,10 +58,10 @@ class Line:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Take what the plant is told."""
         del data, expires, hold
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     def put(self, data: bytes) -> None:
         """Bring a message of the plant."""

@@ -21,13 +21,13 @@ from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Box, Cylinder, Volume
 from heliotrope.lcu import states
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.link import LinkClosedError, Outcome, Statistics
+from heliotrope.links.link import LinkClosedError, SendOutcome, Statistics
 from heliotrope.links.messages import (
     NODE,
+    ClusterStatus,
     Emergency,
     Progress,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -62,10 +62,10 @@ class _Direct:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         del expires, hold
         self.sent.append(data)
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def receive(self) -> bytes:
         if self.closed:
@@ -141,7 +141,7 @@ class _Run:
     def _report(self, *, greet: bool = False) -> None:
         for k, link in enumerate(self.links):
             names = self._members(k) if greet else ()
-            status = Status(
+            status = ClusterStatus(
                 link.name,
                 MEMBERS,
                 0.0,

@@ -111,8 +111,8 @@ PACKET = (
     "the length, the 16-bit address, a type byte, 0xD8 for target search and motion detection, "
     "data and a checksum are Malan's; the rest is ours, because the thesis's Table D.1 was not at "
     "hand: compare it with the firmware of a board that was built to the thesis. Packets are "
-    f"separated by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, so "
-    "they can store nothing."
+    f"separated by {packet12.GAP_CHARACTERS} characters of silence. They carry no head and no MAC, "
+    "so they can store nothing."
 )
 
 #: Measured by ``python -m benchmarks frames``.

@@ -15,9 +15,9 @@ from heliotrope.links.messages import (
     Acknowledge,
     Answer,
     Ask,
+    ClusterStatus,
     Lease,
     Stage,
-    Status,
     encode,
 )
 from heliotrope.safety import Alarm, Severity
@@ -57,8 +57,8 @@ def test_at_a_start_nothing_moves_by_itself() -> None:
         await asyncio.sleep(60.0)
         assert [board.timer.made for board in field.boards] == before
         assert field.states() == ["STOWED", "STOWED"]
-        # Status comes once a second, the names with every tenth: the first may be lost.
-        statuses = field.plant.all(Status)
+        # The status comes once a second, the names with every tenth: the first may be lost.
+        statuses = field.plant.all(ClusterStatus)
         assert 58 <= len(statuses) <= 63
         named = [number for number, status in enumerate(statuses) if status.names]
         assert named == list(range(0, len(statuses), 10))
@@ -474,7 +474,7 @@ def test_what_no_plant_says_is_an_alarm() -> None:
         await field.plant.link.send(b"nonsense")
         await field.until(lambda: bool(field.plant.alarms("plant_unintelligible")))
         await asyncio.sleep(0.5)
-        await field.plant.link.send(encode(Status("C9", 0, 0.0, "gps", 0.0, 0.0, 0.0)))
+        await field.plant.link.send(encode(ClusterStatus("C9", 0, 0.0, "gps", 0.0, 0.0, 0.0)))
         await asyncio.sleep(2.0)
         first, second = field.plant.alarms("plant_unintelligible")
         assert "message of 8 bytes does not begin with JSON" in first.text

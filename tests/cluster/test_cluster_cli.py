@@ -13,9 +13,9 @@ from heliotrope.lcu import states
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from heliotrope.links.messages import (
+    ClusterStatus,
     Command,
     Stage,
-    Status,
 )
 from heliotrope.links.tcp import TcpServer
 from support.cluster_process import (
@@ -53,7 +53,7 @@ def test_a_cluster_in_its_own_process_over_a_port(line: Line, tmp_path: Path) ->
             async with asyncio.TaskGroup() as group:
                 group.create_task(plant.listen())
                 leasing = group.create_task(plant.lease())
-                await until(lambda: any(isinstance(each, Status) for each in plant.heard))
+                await until(lambda: any(isinstance(each, ClusterStatus) for each in plant.heard))
                 boards = line.boards
                 await until(lambda: all(b.node.controller.sun.fresh() for b in boards))
                 # IDLE away from the receiver: it holds. A machine that stands still for seconds
@@ -67,7 +67,7 @@ def test_a_cluster_in_its_own_process_over_a_port(line: Line, tmp_path: Path) ->
                         break
                 assert [board.state for board in boards] == ["IDLE", "IDLE"]
                 assert plant.stages(f"idle{attempt}") == {Stage.DONE}
-                status = [each for each in plant.heard if isinstance(each, Status)][-1]
+                status = [each for each in plant.heard if isinstance(each, ClusterStatus)][-1]
                 rows = status.nodes()
                 process.send_signal(signal.SIGTERM)
                 text = await asyncio.to_thread(ended, process)

@@ -16,7 +16,7 @@ import pytest
 
 from heliotrope.links.clock import SystemClock, gps_seconds
 from heliotrope.links.link import running
-from heliotrope.links.messages import Alarm, Status
+from heliotrope.links.messages import Alarm, ClusterStatus
 from heliotrope.links.mqtt import Broker, mqtt_link
 from support.broker import Mosquitto, mosquitto_for
 from support.cluster_process import KEY, Line, Plant, ended, start, until, written
@@ -94,8 +94,10 @@ def test_a_cluster_with_a_receiver_and_a_broker(
 async def follow(plant: Plant, line: Line, receiver: GpsdProcess) -> None:
     """From the first fix to the loss of the sky."""
 
-    def last() -> Status | None:
-        return next((each for each in reversed(plant.heard) if isinstance(each, Status)), None)
+    def last() -> ClusterStatus | None:
+        return next(
+            (each for each in reversed(plant.heard) if isinstance(each, ClusterStatus)), None
+        )
 
     def alarms() -> list[Alarm]:
         return [each for each in plant.heard if isinstance(each, Alarm)]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from heliotrope.cluster.gpsd import Gpsd, Reader
+from heliotrope.cluster.gpsd import Gpsd, GpsdReader
 from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.links.link import running
@@ -61,7 +61,7 @@ def gpsd() -> Iterator[GpsdProcess]:
 
 @pytest.mark.parametrize("size", [1, 7, 4096])
 def test_reports_are_read_however_they_are_cut(size: int) -> None:
-    reader = Reader()
+    reader = GpsdReader()
     data = VERSION + SKY + tpv(START)
     found = [reader.feed(data[k : k + size]) for k in range(0, len(data), size)]
     assert sum(found) == 1
@@ -75,7 +75,7 @@ def test_reports_are_read_however_they_are_cut(size: int) -> None:
 
 
 def test_a_fix_counts_once_and_its_loss_is_told() -> None:
-    reader = Reader()
+    reader = GpsdReader()
     assert reader.feed(tpv(START))
     assert not reader.feed(tpv(START))
     assert not reader.feed(NO_FIX)
@@ -100,7 +100,7 @@ def test_a_fix_counts_once_and_its_loss_is_told() -> None:
     ],
 )
 def test_a_line_that_is_not_gpsds_is_counted_and_changes_nothing(line: bytes) -> None:
-    reader = Reader()
+    reader = GpsdReader()
     reader.feed(tpv(START))
     before = reader.receiver
     assert not reader.feed(line)

@@ -15,7 +15,7 @@ from heliotrope.cluster.serial_bus import BusSettings, SerialBus, ends_in_zero
 from heliotrope.errors import InputError
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import SystemClock
-from heliotrope.links.link import LinkClosedError, LinkError, Outcome, running
+from heliotrope.links.link import LinkClosedError, LinkError, SendOutcome, running
 
 QUICK = BusSettings(baud_rate=115200, first_pause=0.02, longest_pause=0.1)
 PATIENCE = 10.0
@@ -231,11 +231,12 @@ def test_what_has_expired_when_its_turn_comes_is_not_sent(line: Line) -> None:
                 expires = clock.monotonic() + 0.5 * NO_ANSWER
                 moving = group.create_task(bus.transmit(b"move\0", expires=expires))
                 asking = group.create_task(bus.transact(b"ask\0", ANSWER, expires=expires))
-            assert moving.result() is Outcome.EXPIRED
+            assert moving.result() is SendOutcome.EXPIRED
             assert asking.result() == b""
             assert bus.statistics.expired == 2
             assert (
-                await bus.transmit(b"all\0", expires=clock.monotonic() + PATIENCE) is Outcome.SENT
+                await bus.transmit(b"all\0", expires=clock.monotonic() + PATIENCE)
+                is SendOutcome.SENT
             )
             await until(lambda: bytes(line.heard) == b"poll\0all\0")
 
@@ -269,7 +270,7 @@ def test_ones_own_echo_is_taken_out(line: Line) -> None:
             assert await bus.transact(b"question\0", ANSWER) == b"answer\0"
             line.answer = lambda data: [data]
             assert await bus.transact(b"nobody\0", NO_ANSWER) == b""
-            assert await bus.transmit(b"to all\0") is Outcome.SENT
+            assert await bus.transmit(b"to all\0") is SendOutcome.SENT
             assert (bus.statistics.spoilt, bus.statistics.silent) == (0, 1)
 
     real(main)
@@ -285,7 +286,7 @@ def test_an_echo_that_differs_spoils_the_transaction(line: Line) -> None:
             assert await bus.transact(b"question\0", ANSWER) == b""
             assert bus.statistics.spoilt == 1
             line.answer = lambda _: []
-            assert await bus.transmit(b"to all\0") is Outcome.SENT
+            assert await bus.transmit(b"to all\0") is SendOutcome.SENT
             assert bus.statistics.spoilt == 2
 
     real(main)
@@ -303,7 +304,7 @@ def test_an_adapter_that_is_unplugged_is_found_again(line: Line) -> None:
             await until(lambda: not bus.connected)
             assert str(line.path) in bus.problem
             assert await bus.transact(b"2\0", ANSWER) == b""
-            assert await bus.transmit(b"2\0") is Outcome.DISCONNECTED
+            assert await bus.transmit(b"2\0") is SendOutcome.DISCONNECTED
             assert bus.statistics.dropped == 2
             await asyncio.to_thread(line.plug_in)
             await bus.opened()

@@ -24,7 +24,7 @@ from heliotrope.links.link import (
     LinkClosedError,
     LinkError,
     LinkSettings,
-    Outcome,
+    SendOutcome,
     Statistics,
     received,
     running,
@@ -267,8 +267,8 @@ def test_messages_pass_both_ways_in_order() -> None:
             await plant.established()
             await cluster.established()
             for number in range(5):
-                assert await plant.send(bytes([number])) is Outcome.SENT
-                assert await cluster.send(bytes([10 + number])) is Outcome.SENT
+                assert await plant.send(bytes([number])) is SendOutcome.SENT
+                assert await cluster.send(bytes([10 + number])) is SendOutcome.SENT
             assert [await cluster.receive() for _ in range(5)] == [bytes([n]) for n in range(5)]
             assert [await plant.receive() for _ in range(5)] == [bytes([n + 10]) for n in range(5)]
             assert (plant.name, cluster.name) == ("cluster", "plant")
@@ -294,11 +294,11 @@ def test_a_partition_is_noticed_by_both_within_the_deadline_and_nothing_is_kept(
             line.cut()
             begin = clock.monotonic()
             in_doubt = await plant.send(b"while cut", expires=begin + 1.0)
-            assert in_doubt is Outcome.SENT  # nobody can know yet
+            assert in_doubt is SendOutcome.SENT  # nobody can know yet
             while plant.connected or cluster.connected:
                 await asyncio.sleep(0.01)
             assert 1.0 <= clock.monotonic() - begin <= 1.52
-            assert await plant.send(b"dropped", expires=begin + 60.0) is Outcome.DISCONNECTED
+            assert await plant.send(b"dropped", expires=begin + 60.0) is SendOutcome.DISCONNECTED
             assert plant.statistics.dropped == 1
             await asyncio.sleep(5.0)
             assert plant.problem == "no heartbeat from the other end for 1.5 s"
@@ -306,7 +306,7 @@ def test_a_partition_is_noticed_by_both_within_the_deadline_and_nothing_is_kept(
             line.heal()
             await plant.established()
             await cluster.established()
-            assert await plant.send(b"after") is Outcome.SENT
+            assert await plant.send(b"after") is SendOutcome.SENT
             assert await cluster.receive() == b"after"
             assert plant.statistics.reconnects >= 1
 
@@ -337,7 +337,7 @@ def test_what_is_held_waits_for_the_connection_until_it_expires() -> None:
         line.reachable = False
         async with running(plant, cluster):
             now = clock.monotonic()
-            assert await plant.send(b"1", expires=now + 2.0, hold=True) is Outcome.EXPIRED
+            assert await plant.send(b"1", expires=now + 2.0, hold=True) is SendOutcome.EXPIRED
             assert clock.monotonic() == pytest.approx(now + 2.0)
             assert plant.statistics.expired == 1
             assert plant.problem == "the line is not reachable"
@@ -348,7 +348,7 @@ def test_what_is_held_waits_for_the_connection_until_it_expires() -> None:
                 )
                 await asyncio.sleep(5.0)
                 line.reachable = True
-            assert sending.result() is Outcome.SENT
+            assert sending.result() is SendOutcome.SENT
             assert await cluster.receive() == b"2"
 
     run_virtual(main)
@@ -360,7 +360,7 @@ def test_a_message_is_not_delivered_from_a_slow_line_or_a_full_queue_after_its_e
         async with running(plant, cluster):
             await plant.established()
             line.faults = Faults(delay=(0.4, 0.4))
-            assert await plant.send(b"slow", expires=clock.monotonic() + 0.3) is Outcome.SENT
+            assert await plant.send(b"slow", expires=clock.monotonic() + 0.3) is SendOutcome.SENT
             await asyncio.sleep(0.5)
             assert cluster.statistics.late == 1
             line.faults = Faults()
@@ -370,7 +370,7 @@ def test_a_message_is_not_delivered_from_a_slow_line_or_a_full_queue_after_its_e
             await asyncio.sleep(1.0)
             assert await cluster.receive() == b"stays good"
             assert cluster.statistics.late == 2
-            assert await plant.send(b"", expires=clock.monotonic()) is Outcome.EXPIRED
+            assert await plant.send(b"", expires=clock.monotonic()) is SendOutcome.EXPIRED
 
     run_virtual(main)
 
@@ -420,7 +420,7 @@ def test_bad_messages_are_refused_with_a_reason() -> None:
             await plant.send(b"", expires=now + 4000.0)
         with pytest.raises(InputError, match="above the horizon"):
             await plant.send(b"", expires=float("nan"))
-        assert await plant.send(b"nobody") is Outcome.DISCONNECTED
+        assert await plant.send(b"nobody") is SendOutcome.DISCONNECTED
 
     run_virtual(main)
 
@@ -566,12 +566,12 @@ def test_clusters_find_their_links_at_the_server() -> None:
                 expires = SystemClock().monotonic() + PATIENCE
                 for name in ("north", "south"):
                     sent = await plant.links[name].send(name.encode(), expires=expires)
-                    assert sent is Outcome.SENT
+                    assert sent is SendOutcome.SENT
                 assert await south.receive() == b"south"
                 assert await north.receive() == b"north"
                 large = random.Random(1).randbytes(QUICK.largest)
                 for _ in range(20):
-                    assert await north.send(large) is Outcome.SENT
+                    assert await north.send(large) is SendOutcome.SENT
                     assert await plant.links["north"].receive() == large
         assert plant.refused == 0
 
@@ -726,10 +726,10 @@ def test_a_half_open_line_is_noticed_by_the_heartbeat_and_healed_anew() -> None:
                     await until(lambda: not north.connected and not far.connected)
                     assert far.silent_for >= QUICK.deadline
                     await until(lambda: "0.6 s" in far.problem)
-                    assert await far.send(b"now") is Outcome.DISCONNECTED
+                    assert await far.send(b"now") is SendOutcome.DISCONNECTED
                     gate.passing.set()
                     await connected(north, far)
-                    assert await far.send(b"then") is Outcome.SENT
+                    assert await far.send(b"then") is SendOutcome.SENT
                     assert await north.receive() == b"then"
 
     real(main)
@@ -749,7 +749,7 @@ def test_what_a_stalled_line_held_back_is_not_delivered_after_its_expiry() -> No
                     gate.passing.clear()
                     await asyncio.sleep(0.1)  # what select has reported already is still passed on
                     expires = clock.monotonic() + 0.2
-                    assert await far.send(b"old", expires=expires) is Outcome.SENT
+                    assert await far.send(b"old", expires=expires) is SendOutcome.SENT
                     await sleep_until(clock, expires)
                     gate.passing.set()
                     await far.send(b"new")
@@ -773,10 +773,10 @@ def test_a_reader_that_stands_still_fills_no_memory() -> None:
                     await connected(north, far)
                     gate.passing.clear()
                     outcomes = []
-                    while Outcome.EXPIRED not in outcomes and len(outcomes) < 500:
+                    while SendOutcome.EXPIRED not in outcomes and len(outcomes) < 500:
                         sent = await far.send(bytes(60000), expires=clock.monotonic() + 0.2)
                         outcomes.append(sent)
-                    assert outcomes[-1] is Outcome.EXPIRED
+                    assert outcomes[-1] is SendOutcome.EXPIRED
                     pipe = plant._slots["north"]._last
                     assert pipe is not None
                     assert pipe._transport is not None
@@ -802,7 +802,7 @@ def test_a_new_connection_of_a_cluster_takes_the_place_of_the_old_at_once() -> N
                     async with running(new):
                         await connected(new)
                         assert far.statistics.reconnects == 1
-                        assert await far.send(b"here") is Outcome.SENT
+                        assert await far.send(b"here") is SendOutcome.SENT
                         assert await new.receive() == b"here"
 
     real(main)
@@ -818,11 +818,11 @@ def test_a_restarted_plant_is_found_again() -> None:
                 await connected(north, first.links["north"])
                 await first.close()
                 await until(lambda: not north.connected)
-                assert await north.send(b"nobody there") is Outcome.DISCONNECTED
+                assert await north.send(b"nobody there") is SendOutcome.DISCONNECTED
                 second = TcpServer("127.0.0.1", first.port, {"north": KEY}, SystemClock(), QUICK)
                 async with running(second):
                     await connected(north, second.links["north"])
-                    assert await north.send(b"again") is Outcome.SENT
+                    assert await north.send(b"again") is SendOutcome.SENT
                     assert await second.links["north"].receive() == b"again"
 
     real(main)
@@ -913,7 +913,7 @@ def test_tls_by_files(certificate: tuple[Path, Path]) -> None:
             async with running(north, clear):
                 far = plant.links["north"]
                 await connected(north, far)
-                assert await north.send(b"hidden") is Outcome.SENT
+                assert await north.send(b"hidden") is SendOutcome.SENT
                 assert await far.receive() == b"hidden"
                 assert not clear.connected
 

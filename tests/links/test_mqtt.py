@@ -15,7 +15,7 @@ import pytest
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import SystemClock, sleep_until
-from heliotrope.links.link import Link, LinkSettings, Outcome, running
+from heliotrope.links.link import Link, LinkSettings, SendOutcome, running
 from heliotrope.links.mqtt import Broker, mqtt_link
 from heliotrope.links.tcp import client_tls
 from support.broker import MOSQUITTO, Mosquitto, mosquitto_for
@@ -70,9 +70,9 @@ def test_messages_pass_both_ways_and_clusters_do_not_hear_each_other(mosquitto: 
             for number in range(50):
                 data = bytes([number]) * 1000
                 expires = CLOCK.monotonic() + PATIENCE
-                assert await north[0].send(data, expires=expires) is Outcome.SENT
+                assert await north[0].send(data, expires=expires) is SendOutcome.SENT
                 assert await north[1].receive() == data
-                assert await north[1].send(data) is Outcome.SENT
+                assert await north[1].send(data) is SendOutcome.SENT
                 assert await north[0].receive() == data
             assert south[1].statistics.received == south[0].statistics.received == 0
             assert north[1].statistics.refused == south[1].statistics.refused == 0
@@ -142,7 +142,7 @@ def test_nothing_is_kept_for_a_cluster_that_is_away(mosquitto: Mosquitto) -> Non
                 await connected(plant, before)
             # The plant does not know yet that nobody is there; the broker takes the message.
             sent = await plant.send(b"order", expires=CLOCK.monotonic() + PATIENCE)
-            assert sent is Outcome.SENT
+            assert sent is SendOutcome.SENT
             after = pair(mosquitto.port, CALM)[1]
             async with running(after):
                 await connected(plant, after)
@@ -225,17 +225,17 @@ def test_a_frozen_broker_is_noticed_by_the_heartbeat_and_what_it_held_comes_no_m
             frozen = CLOCK.monotonic()
             # Nobody knows yet: the message goes into the frozen broker's socket.
             sent = await plant.send(b"old order", expires=frozen + 0.5)
-            assert sent in (Outcome.EXPIRED, Outcome.DISCONNECTED)
+            assert sent in (SendOutcome.EXPIRED, SendOutcome.DISCONNECTED)
             await until(lambda: not plant.connected and not cluster.connected)
             # Long before the broker's keepalive of 60 s, for which this test would not wait.
             assert plant.silent_for >= QUICK.deadline
             await until(lambda: "heartbeat" in cluster.problem or "refuses" in cluster.problem)
             late = await plant.send(b"later", expires=CLOCK.monotonic() + 60.0)
-            assert late is Outcome.DISCONNECTED
+            assert late is SendOutcome.DISCONNECTED
             await until(lambda: plant.statistics.failures >= 1)  # it does not get in meanwhile
             mosquitto.thaw()
             await connected(plant, cluster)
-            assert await plant.send(b"new order") is Outcome.SENT
+            assert await plant.send(b"new order") is SendOutcome.SENT
             assert await cluster.receive() == b"new order"
             assert cluster.statistics.received == 1
 
@@ -250,7 +250,7 @@ def test_what_a_broker_held_for_a_moment_is_late_by_our_own_reckoning(mosquitto:
             mosquitto.freeze()
             # MQTT's expiry has whole seconds, and does not run in a frozen broker.
             expires = CLOCK.monotonic() + 0.3
-            assert await plant.send(b"old", expires=expires) is Outcome.EXPIRED
+            assert await plant.send(b"old", expires=expires) is SendOutcome.EXPIRED
             await sleep_until(CLOCK, expires)
             mosquitto.thaw()
             await plant.send(b"new")
@@ -269,11 +269,11 @@ def test_a_killed_broker_is_found_again(mosquitto: Mosquitto) -> None:
             mosquitto.kill()
             await until(lambda: plant.statistics.failures >= 1 and cluster.statistics.failures >= 1)
             assert "refuses the connection" in plant.problem
-            assert await plant.send(b"nobody") is Outcome.DISCONNECTED
+            assert await plant.send(b"nobody") is SendOutcome.DISCONNECTED
             await asyncio.to_thread(mosquitto.start)
             await connected(plant, cluster)
             assert min(plant.statistics.reconnects, cluster.statistics.reconnects) >= 1
-            assert await plant.send(b"again") is Outcome.SENT
+            assert await plant.send(b"again") is SendOutcome.SENT
             assert await cluster.receive() == b"again"
 
     real(main)
@@ -456,7 +456,7 @@ def test_the_settings_of_the_page_let_plant_and_clusters_talk(
         async with running(*ends, *other):
             await connected(*ends, *other)
             order = bytes(CALM.largest)
-            assert await ends[0].send(order) is Outcome.SENT
+            assert await ends[0].send(order) is SendOutcome.SENT
             assert await ends[1].receive() == order
             await other[1].send(b"report")
             assert await other[0].receive() == b"report"

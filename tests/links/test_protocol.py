@@ -13,6 +13,7 @@ from heliotrope.links.messages import (
     NODE,
     Answer,
     Ask,
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
@@ -20,7 +21,6 @@ from heliotrope.links.messages import (
     Progress,
     ProtocolError,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -34,7 +34,9 @@ MESSAGES = [
     Emergency("e1", "DEFOCUS"),
     Parameters.of("p1", "A1", {"biases": b"\x00\n12", "stow": b"", "armature": b"\xff"}, 17),
     Ask("q1", "stored", "A1"),
-    Status("K1", 4, 1.4e9, "gps", 1e-3, 2.5, 0.2, ("DEFOCUS",), ("A1", "A2"), ROWS.tobytes()),
+    ClusterStatus(
+        "K1", 4, 1.4e9, "gps", 1e-3, 2.5, 0.2, ("DEFOCUS",), ("A1", "A2"), ROWS.tobytes()
+    ),
     Progress("c1", Stage.ACKNOWLEDGED, ("A1",), "because"),
     Alarm("wind_gust", "", Severity.ALARM, "the wind is 25 m/s"),
     Answer("q1", {"A1": [1, {"x": None}]}, b"\n\n"),
@@ -66,7 +68,7 @@ def test_an_alarm_of_an_older_cluster_is_not_lost(word: str, severity: Severity)
 
 def test_rows_and_items_come_back() -> None:
     status = decode(encode(MESSAGES[5]))
-    assert isinstance(status, Status)
+    assert isinstance(status, ClusterStatus)
     assert status.nodes()["primary"].tolist() == [-5, 7, 2**31 - 1]
     items = decode(encode(MESSAGES[3]))
     assert isinstance(items, Parameters)

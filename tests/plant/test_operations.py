@@ -17,8 +17,8 @@ from heliotrope.field.target import Receiver, Target
 from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import normalize
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.link import Outcome, Statistics
-from heliotrope.links.messages import Ask, Lease, Status, encode
+from heliotrope.links.link import SendOutcome, Statistics
+from heliotrope.links.messages import Ask, ClusterStatus, Lease, encode
 from heliotrope.optics import air_loss, intercept_rectangle, predict_flux
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
@@ -157,12 +157,12 @@ class _Silent:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         del data, expires, hold
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def receive(self) -> bytes:
-        return encode(Status("C1", 0, 0.0, "gps", 0.0, 2.5, 0.3))
+        return encode(ClusterStatus("C1", 0, 0.0, "gps", 0.0, 2.5, 0.3))
 
     async def close(self) -> None:
         """Nothing to do."""

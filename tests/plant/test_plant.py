@@ -19,12 +19,12 @@ from heliotrope.links.messages import (
     NODE,
     Answer,
     Ask,
+    ClusterStatus,
     Command,
     Lease,
     Parameters,
     Progress,
     Stage,
-    Status,
     encode,
 )
 from heliotrope.mechanism.board_items import Wanted, items_of
@@ -475,9 +475,11 @@ def test_what_cannot_be_recorded_is_not_accepted_but_defocus_is(
 def test_nothing_that_a_cluster_says_ends_the_plant(tmp_path: Path) -> None:
     rows = np.zeros(3, NODE).tobytes()
     said = [
-        Status("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[:-1]),
-        Status("pod-1", 2, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[: NODE.itemsize]),
-        Status("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, names=("P1A", "P1A", "P6C"), block=rows),
+        ClusterStatus("pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[:-1]),
+        ClusterStatus("pod-1", 2, 0.0, "gps", 0.0, 3.0, 0.1, block=rows[: NODE.itemsize]),
+        ClusterStatus(
+            "pod-1", 3, 0.0, "gps", 0.0, 3.0, 0.1, names=("P1A", "P1A", "P6C"), block=rows
+        ),
         Progress("nothing-known", Stage.DONE, ("P1A",)), Lease(7), Command("c", "TRACK"),
         Answer("statistics-1", {"error": "no"}), Answer("stored-9", {"names": 1}),
         Answer("stored-1", {"names": ["a"], "sizes": [3]}), Alarm("x", "", Severity.ALARM, "text"),

@@ -15,7 +15,7 @@ from heliotrope.field.example import prototype
 from heliotrope.lcu import drives, states
 from heliotrope.lcu.config import Config
 from heliotrope.links.clock import VirtualClock
-from heliotrope.links.messages import NODE, ProtocolError, Stage, Status
+from heliotrope.links.messages import NODE, ClusterStatus, ProtocolError, Stage
 from heliotrope.mechanism.board_items import (
     Wanted,
     checksums,
@@ -314,8 +314,8 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     rows = np.zeros(3, NODE)
     rows["state"] = (states.IDLE, states.TRACKING, states.FAULT)
 
-    def status(count: int, names: tuple[str, ...] = ()) -> Status:
-        return Status(
+    def status(count: int, names: tuple[str, ...] = ()) -> ClusterStatus:
+        return ClusterStatus(
             "K", count, 0.0, "gps", 0.0, 3.0, 0.1, names=names, block=rows[:count].tobytes()
         )
 
@@ -327,7 +327,7 @@ def test_rows_are_put_by_their_names_and_strangers_left_out() -> None:
     assert not field.of("C", 10.0).live
     assert field.take("K", status(2), 11.0) == ["cluster K: 2 rows for 3 names"]
     with pytest.raises(ProtocolError, match="are not rows of"):
-        field.take("K", Status("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)
+        field.take("K", ClusterStatus("K", 1, 0.0, "gps", 0.0, 3.0, 0.1, block=b"x"), 11.0)
     # Who falls into FAULT or silent counts as failed for ten minutes.
     assert field.failed_share(11.0) == 0.0
     rows["state"][0] = states.FAULT

@@ -30,7 +30,7 @@ from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.links.clock import SystemClock
 from heliotrope.plant.cameras import RealCameras, source_of
 from heliotrope.safety import Alarm
-from heliotrope.twin.cameras import Mirror, Optics, RenderedCamera, Sight
+from heliotrope.twin.cameras import FieldSnapshot, Optics, RenderedCamera, TrueMirror
 
 SUN = normalize(np.array([0.2, -0.7, 0.7]), "sun")
 OFF = 0.4
@@ -53,8 +53,8 @@ def frame(plant: Plant) -> Frame:
     vertex = np.asarray(target.center) + 60.0 * np.asarray(target.normal) * [1.0, 1.0, 0.0]
     point = np.asarray(target.center) + OFF * target.axes[0]
     normal = normalize(SUN + normalize(point - vertex, "beam"), "normal")
-    mirror = Mirror("H", vertex, normal, 1.8, 1.2)
-    sight = Sight(SystemClock(), lambda: [mirror], lambda: SUN, latency=0.0)
+    mirror = TrueMirror("H", vertex, normal, 1.8, 1.2)
+    sight = FieldSnapshot(SystemClock(), lambda: [mirror], lambda: SUN, latency=0.0)
     camera = RenderedCamera(
         sight, [Scene(plant.cameras[0], (target,))], optics=Optics(facets=(1, 1))
     )

@@ -15,11 +15,11 @@ from pathlib import Path
 from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import Link, received
 from heliotrope.links.messages import (
+    ClusterStatus,
     Lease,
     Message,
     Progress,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -102,7 +102,7 @@ class Plant:
 
     def calm(self) -> bool:
         """Whether the last status says that nothing is wrong."""
-        statuses = [each for each in self.heard if isinstance(each, Status)]
+        statuses = [each for each in self.heard if isinstance(each, ClusterStatus)]
         return bool(statuses) and not statuses[-1].acts
 
     def ended(self, identity: str) -> bool:

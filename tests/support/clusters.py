@@ -21,13 +21,13 @@ from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import memory_pair
 from heliotrope.links.link import Bus, received, running
 from heliotrope.links.messages import (
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
     Message,
     Progress,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -154,8 +154,8 @@ class Plant:
     def all(self, kind: type[M]) -> list[M]:
         return [each for each in self.heard if isinstance(each, kind)]
 
-    def status(self) -> Status:
-        return self.all(Status)[-1]
+    def status(self) -> ClusterStatus:
+        return self.all(ClusterStatus)[-1]
 
     def stages(self, identity: str, heliostat: str) -> list[Stage]:
         """The stages of a command at a heliostat, in order."""
@@ -234,7 +234,7 @@ class Field:
                 running(self.bus, self.link, self.plant.link, self.time),
                 running(self.cluster),
             ):
-                await self.until(lambda: bool(self.plant.all(Status)))
+                await self.until(lambda: bool(self.plant.all(ClusterStatus)))
                 yield self
             for other in others:
                 other.cancel()

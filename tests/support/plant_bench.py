@@ -20,6 +20,7 @@ from heliotrope.links.messages import (
     NODE,
     Answer,
     Ask,
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
@@ -27,7 +28,6 @@ from heliotrope.links.messages import (
     Parameters,
     Progress,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -115,7 +115,7 @@ class ScriptedCluster:
                 rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
                 rows["steps_ms"] = rows["heard_ms"]
                 greet = self.first and self.greets
-                status = Status(
+                status = ClusterStatus(
                     self.name,
                     len(rows),
                     self.clock.utc().timestamp(),

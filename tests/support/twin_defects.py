@@ -187,7 +187,7 @@ def _acceptance_lost(patch: pytest.MonkeyPatch) -> None:
 
 
 def _always_new(patch: pytest.MonkeyPatch) -> None:
-    pack_into = _nodes.Node.pack_into
+    pack_into = _nodes.ClusterNode.pack_into
 
     def fresh(self: Any, block: bytearray, now: float) -> None:
         told = self.status_at
@@ -196,19 +196,19 @@ def _always_new(patch: pytest.MonkeyPatch) -> None:
         pack_into(self, block, now)
         self.status_at = told
 
-    patch.setattr(_nodes.Node, "pack_into", fresh)
+    patch.setattr(_nodes.ClusterNode, "pack_into", fresh)
 
 
 def _young_by_any_answer(patch: pytest.MonkeyPatch) -> None:
     """A row is as old as the last answer of any kind, be it an ACK."""
-    pack_into = _nodes.Node.pack_into
+    pack_into = _nodes.ClusterNode.pack_into
 
     def of_any(self: Any, block: bytearray, now: float) -> None:
         told, self.status_at = self.status_at, self.heard_at
         pack_into(self, block, now)
         self.status_at = told
 
-    patch.setattr(_nodes.Node, "pack_into", of_any)
+    patch.setattr(_nodes.ClusterNode, "pack_into", of_any)
 
 
 def _questions_alike(patch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,13 @@ from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.optics.mirror_image import gaussian_beam
 from heliotrope.plant.visits import CalibrationCycle, CycleSettings, Shot
 from heliotrope.twin.boards.outfit import RECEIVER
-from heliotrope.twin.cameras import ExactCamera, Mirror, RenderedCamera, Sight, mirrors_of
+from heliotrope.twin.cameras import (
+    ExactCamera,
+    FieldSnapshot,
+    RenderedCamera,
+    TrueMirror,
+    mirrors_of,
+)
 from support.whole_plant import ENGINEER, WholePlant
 
 MRAD = 1e-3
@@ -24,21 +30,21 @@ SCENE = Scene(example_camera(TARGET, 120.0, (1000, 750)), (TARGET,))
 SUN = normalize(np.array([0.2, 0.4, 0.9]))
 
 
-def mirror(name: str, right: float = 0.0, up: float = 0.0, east: float = 5.0) -> Mirror:
+def mirror(name: str, right: float = 0.0, up: float = 0.0, east: float = 5.0) -> TrueMirror:
     """One whose ray meets the target so far right of and above its middle."""
     vertex = np.array([east, 90.0, 2.0])
     point = TARGET.point(np.array([right, up]))
-    return Mirror(name, vertex, bisector(SUN, normalize(point - vertex)))
+    return TrueMirror(name, vertex, bisector(SUN, normalize(point - vertex)))
 
 
-def sight(clock: VirtualClock, *mirrors: Mirror) -> Sight:
-    def seen() -> Sequence[Mirror]:
+def sight(clock: VirtualClock, *mirrors: TrueMirror) -> FieldSnapshot:
+    def seen() -> Sequence[TrueMirror]:
         return mirrors
 
     def sun() -> FloatArray:
         return SUN
 
-    return Sight(clock, seen, sun)
+    return FieldSnapshot(clock, seen, sun)
 
 
 def plane(shot: Shot) -> FloatArray:
@@ -88,8 +94,10 @@ def test_an_exact_camera_tells_what_is_wrong() -> None:
 
 def test_a_rendered_camera_finds_the_beam_within_what_it_tells() -> None:
     async def main(clock: VirtualClock) -> None:
-        there: list[Mirror] = []
-        camera = RenderedCamera(Sight(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=2)
+        there: list[TrueMirror] = []
+        camera = RenderedCamera(
+            FieldSnapshot(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=2
+        )
         await camera.look(TARGET.name)
         for place in [(0.6, -0.5), (-0.9, 0.4)]:
             there[:] = [mirror("A", *place)]
@@ -108,8 +116,10 @@ def test_a_rendered_camera_finds_the_beam_within_what_it_tells() -> None:
 
 def test_photographs_that_may_not_be_believed() -> None:
     async def main(clock: VirtualClock) -> None:
-        there: list[Mirror] = []
-        camera = RenderedCamera(Sight(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=1)
+        there: list[TrueMirror] = []
+        camera = RenderedCamera(
+            FieldSnapshot(clock, lambda: tuple(there), lambda: SUN), [SCENE], seed=1
+        )
         await camera.look(TARGET.name)
         assert camera.taken == 1
         nothing = await camera.photograph(TARGET, "A")
@@ -153,7 +163,7 @@ def test_a_calibration_cycle_with_rendered_photographs(tmp_path: Path) -> None:
         assert await plant.aim(ENGINEER, token, plant.default_aims()).end(20.0)
         assert await plant.command(ENGINEER, token, "APPROACH").end(400.0)
         camera = RenderedCamera(
-            Sight(whole.clock, mirrors_of(whole.boards), plant.sun_vector), [SCENE], seed=1
+            FieldSnapshot(whole.clock, mirrors_of(whole.boards), plant.sun_vector), [SCENE], seed=1
         )
         await camera.look(TARGET.name)
         assert await plant.command(ENGINEER, token, "TRACK").end(30.0)

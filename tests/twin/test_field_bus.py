@@ -11,7 +11,7 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import states, wire
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.in_process import memory_pair
-from heliotrope.links.link import LinkClosedError, Outcome, running
+from heliotrope.links.link import LinkClosedError, SendOutcome, running
 from heliotrope.links.messages import Command, Emergency, Lease, Stage, decode, encode
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.drives import rotary
@@ -97,7 +97,7 @@ def test_answers_are_frames_of_the_wire() -> None:
         answers = [await bus.transact(frame, 0.1) for frame in asked]
         bus.plugged = False
         assert await bus.transact(asked[0], 0.1) == b""
-        assert await bus.transmit(asked[0]) is Outcome.DISCONNECTED
+        assert await bus.transmit(asked[0]) is SendOutcome.DISCONNECTED
         await bus.close()
         with pytest.raises(LinkClosedError, match="field bus: closed"):
             await bus.transmit(asked[0])

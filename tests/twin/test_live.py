@@ -20,13 +20,19 @@ from heliotrope.geometry import bisector, normalize, reflect
 from heliotrope.imaging.synthetic.scenes import Scene
 from heliotrope.lcu import journal, messages, states, wire
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.photographs import Shot
 from heliotrope.store.keeper import Keeper
-from heliotrope.twin.cameras import ExactCamera, Mirror, RenderedCamera, Sight, mirrors_near
+from heliotrope.twin.cameras import (
+    ExactCamera,
+    FieldSnapshot,
+    RenderedCamera,
+    TrueMirror,
+    mirrors_near,
+)
 from heliotrope.twin.field import Field, FieldBus
 from heliotrope.twin.live import PacedLoop, WorldOptions, near_pair
 from heliotrope.twin.live.live import machine_of
@@ -95,14 +101,14 @@ def test_a_near_link_carries_what_is_fresh() -> None:
         assert plant.name == "C1"
         assert cluster.name == "plant"
         now = clock.monotonic()
-        assert await plant.send(b"late", expires=now) is Outcome.EXPIRED
-        assert await plant.send(b"stale", expires=now + 1.0) is Outcome.SENT
+        assert await plant.send(b"late", expires=now) is SendOutcome.EXPIRED
+        assert await plant.send(b"stale", expires=now + 1.0) is SendOutcome.SENT
         await asyncio.sleep(2.0)
-        assert await plant.send(b"fresh", expires=clock.monotonic() + 1.0) is Outcome.SENT
+        assert await plant.send(b"fresh", expires=clock.monotonic() + 1.0) is SendOutcome.SENT
         assert await cluster.receive() == b"fresh"
         assert cluster.statistics.late == 1
         cluster.plugged = False
-        assert await plant.send(b"lost") is Outcome.DISCONNECTED
+        assert await plant.send(b"lost") is SendOutcome.DISCONNECTED
         assert plant.problem == "the line is cut"
         cluster.plugged = True
         assert plant.connected
@@ -341,11 +347,11 @@ def test_a_live_camera_shows_what_it_saw() -> None:
     light = normalize(np.array([0.2, 0.6, 0.7]))
     vertex = design.position[0] + [0.0, 0.0, 2.0]
     point = target.point(np.array([0.5, -0.3]))
-    mirror = Mirror("A", vertex, bisector(light, normalize(point - vertex)), 2.5, 2.0)
-    there: list[Mirror] = []
+    mirror = TrueMirror("A", vertex, bisector(light, normalize(point - vertex)), 2.5, 2.0)
+    there: list[TrueMirror] = []
 
     async def main(clock: VirtualClock) -> None:
-        sight = Sight(clock, lambda: tuple(there), lambda: light)
+        sight = FieldSnapshot(clock, lambda: tuple(there), lambda: light)
         eye = RenderedCamera(sight, [Scene(camera, (target,))], threads=0)
         assert eye.view(target.name).version == 0
         await eye.look(target.name)

@@ -8,11 +8,11 @@ import pytest
 from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
 from heliotrope.links.clock import VirtualClock, run_virtual
-from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
-from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import outfits
 from heliotrope.twin.world.simulation import RunPlan
 from heliotrope.twin.world.soak import run_many
@@ -33,7 +33,7 @@ def test_flash_takes_what_came_before_the_cut() -> None:
 
 
 def test_motors_play_in_time_with_backlash_and_lose_what_is_queued() -> None:
-    axis = Axis(100, play=10.0)
+    axis = MotorAxis(100, play=10.0)
     axis.take(1, 50, 1000, now=0.0)
     axis.play_to(0.0245)
     assert axis.turned == 125
@@ -44,7 +44,7 @@ def test_motors_play_in_time_with_backlash_and_lose_what_is_queued() -> None:
     assert (axis.turned, axis.joint) == (140, 150.0)
     assert axis.stop() == -20
     assert axis.emitted == axis.turned == 140
-    missing = Axis(0, miss=1.0, chance=random.Random(1))
+    missing = MotorAxis(0, miss=1.0, chance=random.Random(1))
     missing.take(1, 5, 1000, now=0.0)
     missing.play_to(1.0)
     assert (missing.turned, missing.missed, missing.emitted) == (4, 1, 5)
@@ -116,9 +116,9 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
         assert await bus.transact(b"stuck\0", 0.1) == b""
         bus.faults = BusFaults()
         bus.plugged = False
-        assert await bus.transmit(b"x\0") is Outcome.DISCONNECTED
+        assert await bus.transmit(b"x\0") is SendOutcome.DISCONNECTED
         bus.plugged = True
-        assert await bus.transmit(b"x\0", expires=clock.monotonic()) is Outcome.EXPIRED
+        assert await bus.transmit(b"x\0", expires=clock.monotonic()) is SendOutcome.EXPIRED
         with pytest.raises(InputError, match=r"bus: a timeout of 0.0 s; it must be above 0"):
             await bus.transact(b"x\0", 0.0)
         await bus.close()

@@ -13,7 +13,7 @@ Begin with ``config_file.read_cluster`` and ``controller``. The cluster knows no
 
 from heliotrope.cluster.config import MOST_MEMBERS, ClusterConfig, Member, spread_phase
 from heliotrope.cluster.controller import Cluster
-from heliotrope.cluster.gpsd import Gpsd, Receiver
+from heliotrope.cluster.gpsd import Gpsd, SatelliteReceiver
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import Quality, SystemTime, Time, TimeKeeper, kernel_bound
 from heliotrope.cluster.turns import Turns
@@ -26,7 +26,7 @@ __all__ = [
     "Kept",
     "Member",
     "Quality",
-    "Receiver",
+    "SatelliteReceiver",
     "SystemTime",
     "Time",
     "TimeKeeper",

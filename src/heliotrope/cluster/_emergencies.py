@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._goals import Goals
-from heliotrope.cluster._nodes import Node, Nodes
+from heliotrope.cluster._nodes import ClusterNode, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.links.messages import Stage
 from heliotrope.safety import ORDER_BUDGET, alarms
@@ -27,7 +27,9 @@ _PATIENCE = 30.0
 
 
 class _Order:
-    def __init__(self, identity: str, name: str, nodes: list[Node], everybody: bool, now: float):
+    def __init__(
+        self, identity: str, name: str, nodes: list[ClusterNode], everybody: bool, now: float
+    ):
         self.identity, self.name, self.everybody = identity, name, everybody
         self.began = now
         self.calls = _CALLS if everybody else 0
@@ -68,7 +70,7 @@ class Emergencies:
         self._asked: set[tuple[str, int]] = set()
         self.pressing = False
 
-    def begin(self, identity: str, name: str, nodes: list[Node]) -> None:
+    def begin(self, identity: str, name: str, nodes: list[ClusterNode]) -> None:
         """Take an emergency for some heliostats or all; a repeated one counts once."""
         if identity and any(order.identity == identity for order in self._orders):
             return
@@ -109,7 +111,7 @@ class Emergencies:
             self._name(order, now)
         self.pressing = bool(self._orders)
 
-    def waits(self, node: Node) -> bool:
+    def waits(self, node: ClusterNode) -> bool:
         """Whether a node has yet to acknowledge an order."""
         return any(node in order.waiting for order in self._orders)
 
@@ -120,7 +122,7 @@ class Emergencies:
             order.calls -= 1
             self._sent(order, order.waiting)
 
-    def _sent(self, order: _Order, nodes: Iterable[Node]) -> None:
+    def _sent(self, order: _Order, nodes: Iterable[ClusterNode]) -> None:
         for node in nodes:
             if node.index not in order.sent:
                 order.sent.add(node.index)
@@ -144,7 +146,7 @@ class Emergencies:
                     await self._ask(order, node)
         order.new = False
 
-    def _later(self, order: _Order, node: Node, number: int) -> bool:
+    def _later(self, order: _Order, node: ClusterNode, number: int) -> bool:
         """Whether a node is left out of a round of the order."""
         if order.given_up and node.missed > 0:
             return True  # polling finds it when it comes back
@@ -157,7 +159,7 @@ class Emergencies:
             enough = (order.name, node.index) in self._asked
         return enough or self._clock() - self._serving > ORDER_BUDGET
 
-    async def _ask(self, order: _Order, node: Node) -> None:
+    async def _ask(self, order: _Order, node: ClusterNode) -> None:
         begin = self._clock()
         answer = await self._exchange.ask(node, order.name, expires=begin + 1.0, urgent=True)
         self._asked.add((order.name, node.index))
@@ -183,7 +185,7 @@ class Emergencies:
             other.waiting.remove(node)
             self._acknowledged(other, node)
 
-    def _acknowledged(self, order: _Order, node: Node) -> None:
+    def _acknowledged(self, order: _Order, node: ClusterNode) -> None:
         if not order.given_up:
             self._reports.add(order.identity, Stage.ACKNOWLEDGED, node.name)
             self._goals.begin(order.identity, order.name, node, self._clock())

@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from heliotrope.cluster._nodes import Node, Question, answer_in
+from heliotrope.cluster._nodes import ClusterNode, Question, answer_in
 from heliotrope.lcu import messages, wire
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Bus, Outcome
+from heliotrope.links.link import Bus, SendOutcome
 
 #: The share of bad frames is computed over this many seconds.
 _WINDOW = 10
@@ -22,7 +22,7 @@ def sha256(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()
 
 
-class Answer(NamedTuple):
+class NodeAnswer(NamedTuple):
     """An answer: name, values, and the number of earlier attempts without an answer."""
 
     name: str
@@ -95,10 +95,10 @@ class Exchange:
         """Send a frame that is not answered, within ``life`` s; return whether it went out."""
         expires = self._clock.monotonic() + life
         outcome = await self._bus.transmit(frame, expires=expires, urgent=urgent)
-        return outcome is Outcome.SENT
+        return outcome is SendOutcome.SENT
 
     async def poll(
-        self, node: Node, question: Question, sequence: int, begin: float
+        self, node: ClusterNode, question: Question, sequence: int, begin: float
     ) -> tuple[Any, ...] | None:
         """Ask a node at ``begin``, and return the values of its answer or None; sets ``now``."""
         node.asked()
@@ -118,7 +118,7 @@ class Exchange:
 
     async def ask(
         self,
-        node: Node,
+        node: ClusterNode,
         name: str,
         *values: Any,
         key: bytes = b"",
@@ -127,7 +127,7 @@ class Exchange:
         stored: bool = False,
         tries: int = 1,
         urgent: bool = False,
-    ) -> Answer | None:
+    ) -> NodeAnswer | None:
         """Send a message to a node, repeat the same frame if nothing comes, and return the answer.
 
         ``stored``: flash is written before the answer.
@@ -157,7 +157,7 @@ class Exchange:
                 now = self._clock.monotonic()
                 self._answered += 1
                 node.answered(now, now - begin)
-                return Answer(answer.name, found, attempt)
+                return NodeAnswer(answer.name, found, attempt)
             self._spoilt(node, data, begin)
         return None
 
@@ -206,7 +206,7 @@ class Exchange:
         """End the effect of `interrupt`."""
         self._hurry = False
 
-    def _spoilt(self, node: Node, data: bytes, now: float) -> None:
+    def _spoilt(self, node: ClusterNode, data: bytes, now: float) -> None:
         node.spoilt(data)
         # A node that is switched off says nothing about the bus; damage always does.
         if data or now - node.heard_at <= _WINDOW:

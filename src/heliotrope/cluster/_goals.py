@@ -8,7 +8,7 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from heliotrope.cluster._nodes import Node, Nodes
+from heliotrope.cluster._nodes import ClusterNode, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.lcu import names, states
 from heliotrope.lcu.states import (
@@ -149,7 +149,7 @@ class Goals:
         self,
         identity: str,
         name: str,
-        node: Node,
+        node: ClusterNode,
         now: float,
         *,
         sure: bool = True,
@@ -167,16 +167,16 @@ class Goals:
             self.end(node, f"{name} came after it")
         self._watches[node.index] = [*same, _Watch(identity, name, now, sure, shift)]
 
-    def waits(self, node: Node) -> bool:
+    def waits(self, node: ClusterNode) -> bool:
         """Whether a node has a goal."""
         return node.index in self._watches
 
-    def end(self, node: Node, why: str) -> None:
+    def end(self, node: ClusterNode, why: str) -> None:
         """Give up the goals of a node."""
         for watch in self._watches.pop(node.index, []):
             self._reports.add(watch.identity, Stage.FAILED, node.name, f"{watch.name}: {why}")
 
-    def heard(self, node: Node, asked_at: float) -> None:
+    def heard(self, node: ClusterNode, asked_at: float) -> None:
         """Judge a node's STATUS and STEPS; STATUS was requested at ``asked_at``."""
         watches = self._watches.get(node.index)
         if watches is None:
@@ -188,7 +188,7 @@ class Goals:
         for index in list(self._watches):
             self._judge(nodes[index], functools.partial(_late, nodes[index], now))
 
-    def _judge(self, node: Node, verdict: "Callable[[_Watch], str | None]") -> None:
+    def _judge(self, node: ClusterNode, verdict: "Callable[[_Watch], str | None]") -> None:
         left = []
         for watch in self._watches.get(node.index, []):
             text = verdict(watch)
@@ -203,7 +203,7 @@ class Goals:
         else:
             self._watches.pop(node.index, None)
 
-    def _verdict(self, node: Node, watch: _Watch, asked_at: float) -> str | None:
+    def _verdict(self, node: ClusterNode, watch: _Watch, asked_at: float) -> str | None:
         """Return "" if it is done, a text if it has failed, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
@@ -228,7 +228,7 @@ class Goals:
         return "" if reached else f"went to {state}{fault}"
 
 
-def _late(node: Node, now: float, watch: _Watch) -> str | None:
+def _late(node: ClusterNode, now: float, watch: _Watch) -> str | None:
     if now - watch.since <= GOALS[watch.name].limit:
         return None
     return f"still {states.STATES[node.state]} after {now - watch.since:.0f} s"

@@ -30,7 +30,7 @@ _NO_STEPS = (0, 0, 0, 0)
 _UNSTUFFED_MOST = 254
 
 
-class Refusal(Exception):  # noqa: N818 (an answer, not a failure)
+class OrderRefusedError(Exception):
     """A command that is refused; the text says why."""
 
 
@@ -115,7 +115,7 @@ class Counts:
     longest: float = 0.0
 
 
-class Node:
+class ClusterNode:
     """One local controller.
 
     Attributes
@@ -245,31 +245,31 @@ class Nodes:
 
     def __init__(self, config: ClusterConfig) -> None:
         self._cluster = config.name
-        self._nodes = [Node(member, index) for index, member in enumerate(config.heliostats)]
+        self._nodes = [ClusterNode(member, index) for index, member in enumerate(config.heliostats)]
         self._by_name = {node.name: node for node in self._nodes}
 
-    def __iter__(self) -> Iterator[Node]:
+    def __iter__(self) -> Iterator[ClusterNode]:
         return iter(self._nodes)
 
     def __len__(self) -> int:
         return len(self._nodes)
 
-    def __getitem__(self, index: int) -> Node:
+    def __getitem__(self, index: int) -> ClusterNode:
         return self._nodes[index]
 
-    def chosen(self, wanted: Iterable[str]) -> list[Node]:
+    def chosen(self, wanted: Iterable[str]) -> list[ClusterNode]:
         """Return heliostats by name, all if none is named.
 
         Raises
         ------
-        Refusal
+        OrderRefusedError
             A name that does not belong to this cluster.
         """
         found = []
         for name in dict.fromkeys(wanted):
             node = self._by_name.get(name)
             if node is None:
-                raise Refusal(f"cluster {self._cluster} has no heliostat {name!r}")
+                raise OrderRefusedError(f"cluster {self._cluster} has no heliostat {name!r}")
             found.append(node)
         return found or list(self._nodes)
 

@@ -19,7 +19,7 @@ from heliotrope.cluster._discovery import SPAN, heard
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._goals import GOALS, Goals, Shift
-from heliotrope.cluster._nodes import Node, Nodes, Refusal
+from heliotrope.cluster._nodes import ClusterNode, Nodes, OrderRefusedError
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
 from heliotrope.cluster.memory import Kept
@@ -81,10 +81,10 @@ class Order:
     token: int
 
 
-class Job:
+class NodeOrder:
     """An order at one heliostat."""
 
-    def __init__(self, order: Order, node: Node) -> None:
+    def __init__(self, order: Order, node: ClusterNode) -> None:
         self.order, self.node = order, node
         self.place = 0
         self.told_sent = False
@@ -133,14 +133,14 @@ class Orders:
         kept: Kept,
         clock: Callable[[], float],
         gps: Callable[[], float | None],
-        look: Callable[[Node], Awaitable[None]],
+        look: Callable[[ClusterNode], Awaitable[None]],
     ) -> None:
         self._nodes, self._exchange, self._goals, self._reports = nodes, exchange, goals, reports
         self._watch, self._epoch, self._kept = watch, epoch, kept
         self._clock, self._gps, self._look = clock, gps, look
-        self._ready: deque[Job] = deque()
-        self._later: list[Job] = []
-        self._at_work: Job | None = None
+        self._ready: deque[NodeOrder] = deque()
+        self._later: list[NodeOrder] = []
+        self._at_work: NodeOrder | None = None
 
     @property
     def ready(self) -> bool:
@@ -155,7 +155,7 @@ class Orders:
             nodes = self._nodes.chosen(command.heliostats)
             steps = self._steps_of(command, nodes)
             self._may(command.token, command.lifetime, len(nodes))
-        except Refusal as refusal:
+        except OrderRefusedError as refusal:
             for name in command.heliostats or ("",):
                 self._reports.add(command.identity, Stage.REFUSED, name, str(refusal))
             return
@@ -167,44 +167,48 @@ class Orders:
             order = Order(command.identity, command.name, (own,), deadline, command.token)
             self._begin(order, node)
 
-    def _steps_of(self, command: Command, nodes: list[Node]) -> list[Step]:
+    def _steps_of(self, command: Command, nodes: list[ClusterNode]) -> list[Step]:
         number = messages.NUMBER_OF.get(command.name)
         who = -1 if number is None else messages.who_of(number)
         if number is None or who not in (messages.AUTHORITY, messages.KEY):
-            raise Refusal(f"{command.name!r} is not a command for local controllers")
+            raise OrderRefusedError(f"{command.name!r} is not a command for local controllers")
         if command.name in MOTIONS and self._watch.verdict.forbidden:
-            raise Refusal(self._watch.verdict.forbidden)
+            raise OrderRefusedError(self._watch.verdict.forbidden)
         steps = []
         for node in nodes:
             values = command.values
             if command.name == "SET_ADDRESS" and not values:
                 if node.member.serial is None:
-                    raise Refusal(
+                    raise OrderRefusedError(
                         f"{node.name}: no serial number is configured; add it to the cluster file"
                     )
                 values = node.member.serial, node.address
             if who == messages.KEY and not node.member.key:
-                raise Refusal(f"{node.name}: no key is configured; add it to the key file")
+                raise OrderRefusedError(
+                    f"{node.name}: no key is configured; add it to the key file"
+                )
             steps.append(Step(command.name, _typed(number, values)))
         return steps
 
     def _may(self, token: int, lifetime: float, jobs: int) -> None:
         authority = self._authority()
         if authority == 0:
-            raise Refusal("nobody has command authority: the plant's lease is over")
+            raise OrderRefusedError("nobody has command authority: the plant's lease is over")
         if token != authority:
-            raise Refusal(
+            raise OrderRefusedError(
                 "no command authority: the token is out of date; take command authority first"
             )
         if not 0.0 < lifetime <= 3600.0:
-            raise Refusal(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
+            raise OrderRefusedError(f"a lifetime of {lifetime:g} s; give above 0 to 3600 s")
         waiting = len(self._ready) + len(self._later)
         if waiting + jobs > _MOST_JOBS:
-            raise Refusal(
+            raise OrderRefusedError(
                 f"{waiting} orders are waiting; the limit is {_MOST_JOBS}: try again later"
             )
         if self._gps() is None:
-            raise Refusal("the local controllers have no time yet, so no command could expire")
+            raise OrderRefusedError(
+                "the local controllers have no time yet, so no command could expire"
+            )
 
     def _authority(self) -> int:
         return self._watch.authority(self._clock())
@@ -215,15 +219,15 @@ class Orders:
             (node,) = self._nodes.chosen((message.heliostat,))
             steps = _steps_of_items(node, message)
             self._may(message.token, message.lifetime, 1)
-        except Refusal as refusal:
+        except OrderRefusedError as refusal:
             self._reports.add(message.identity, Stage.REFUSED, message.heliostat, str(refusal))
             return
         deadline = self._clock() + message.lifetime
         self._begin(Order(message.identity, "parameters", steps, deadline, message.token), node)
 
-    def _begin(self, order: Order, node: Node) -> None:
+    def _begin(self, order: Order, node: ClusterNode) -> None:
         self._reports.add(order.identity, Stage.ACCEPTED, node.name)
-        self._ready.append(Job(order, node))
+        self._ready.append(NodeOrder(order, node))
 
     # -- time ------------------------------------------------------------------------------
 
@@ -232,7 +236,7 @@ class Orders:
         self._ready.extend(self._later)
         self._later.clear()
 
-    def cancel(self, nodes: Iterable[Node], why: str) -> None:
+    def cancel(self, nodes: Iterable[ClusterNode], why: str) -> None:
         """Give up unacknowledged jobs and unreached goals, for some heliostats."""
         chosen = {node.index for node in nodes}
         for job in [*self._ready, *self._later]:
@@ -253,7 +257,7 @@ class Orders:
         await self._work(self._at_work)
         self._at_work = None
 
-    async def _work(self, job: Job) -> None:
+    async def _work(self, job: NodeOrder) -> None:
         if job.order.token != self._authority():
             return self._fail(job, "command authority has changed, or the plant's lease is over")
         if self._clock() >= job.order.deadline:
@@ -270,7 +274,7 @@ class Orders:
             return await self._check(job)
         return await self._set(job)
 
-    async def _note_origin(self, job: Job) -> None:
+    async def _note_origin(self, job: NodeOrder) -> None:
         """Ask for the goals of the step counts: if the answer is lost, they show what was done."""
         node, asked_at = job.node, self._clock()
         node.follow(asked_at + FOLLOWED)
@@ -278,7 +282,7 @@ class Orders:
         if node.steps_at >= asked_at:
             job.origin = node.steps[2], node.steps[3]
 
-    async def _set(self, job: Job) -> None:
+    async def _set(self, job: NodeOrder) -> None:
         step, node, order = job.step, job.node, job.order
         gps = self._gps()
         if gps is None:
@@ -312,7 +316,7 @@ class Orders:
             return self._fail(job, f"no answer to {step.name}; it may have been taken")
         return self._again(job, f"no answer to {step.name} before it expired")
 
-    async def _give_address(self, job: Job, head: tuple[int, ...], key: bytes) -> None:
+    async def _give_address(self, job: NodeOrder, head: tuple[int, ...], key: bytes) -> None:
         """Broadcast to an unknown address; then ask the node by its serial number."""
         serial, address = job.step.values
         frame = self._exchange.sender.frame(
@@ -342,7 +346,7 @@ class Orders:
         life = min(order.deadline - self._clock(), _WIRE_LIFE)
         return int(gps + life) & 0xFFFFFFFF
 
-    async def _knows_edition(self, job: Job) -> bool:
+    async def _knows_edition(self, job: NodeOrder) -> bool:
         """Ask for the edition of the node's journal: another cluster may have written it."""
         if job.edition < 0:
             data = await self._stored(job, "edition")
@@ -351,10 +355,10 @@ class Orders:
             job.edition = struct.unpack("<I", data)[0] if len(data) == SIZE_OF["edition"] else 0
         return True
 
-    async def _stored(self, job: Job, item: str) -> bytes | None:
+    async def _stored(self, job: NodeOrder, item: str) -> bytes | None:
         return await stored(self._exchange, job.node, item, job.order.deadline)
 
-    async def _check(self, job: Job) -> None:
+    async def _check(self, job: NodeOrder) -> None:
         """Compare the stored item, and the checksum in STATUS."""
         step, node = job.step, job.node
         data = await self._stored(job, step.item)
@@ -373,7 +377,7 @@ class Orders:
             )
         return self._advance(job)
 
-    def _judge(self, job: Job, result: int, *, lost: bool) -> None:
+    def _judge(self, job: NodeOrder, result: int, *, lost: bool) -> None:
         """Continue after an ACK; ``lost``: an earlier answer may have been lost."""
         name = job.step.name
         if result == messages.DONE:
@@ -392,14 +396,14 @@ class Orders:
         self._reports.add(job.order.identity, Stage.REFUSED, job.node.name, text)
         return None
 
-    def _why(self, node: Node, result: int) -> str:
+    def _why(self, node: ClusterNode, result: int) -> str:
         text = messages.RESULTS[result] if result < len(messages.RESULTS) else f"result {result}"
         if result == messages.REFUSED_STATE and node.known:
             fault = f", {names.FAULTS[node.fault]}" if node.fault else ""
             text += f" ({states.STATES[node.state]}{fault})"
         return text
 
-    def _advance(self, job: Job, *, sure: bool = True) -> None:
+    def _advance(self, job: NodeOrder, *, sure: bool = True) -> None:
         """Continue after a step; not ``sure``: the goal shows whether it was taken."""
         if job.void:
             return self._fail(job, job.void)
@@ -419,18 +423,18 @@ class Orders:
             self._goals.begin(order.identity, done.name, node, now, sure=sure, shift=shift)
         return None
 
-    def _again(self, job: Job, why: str) -> None:
+    def _again(self, job: NodeOrder, why: str) -> None:
         if job.void:
             return self._fail(job, job.void)
         job.last = why
         self._later.append(job)
         return None
 
-    def _fail(self, job: Job, why: str) -> None:
+    def _fail(self, job: NodeOrder, why: str) -> None:
         self._reports.add(job.order.identity, Stage.FAILED, job.node.name, why)
 
 
-async def stored(exchange: Exchange, node: Node, item: str, expires: float) -> bytes | None:
+async def stored(exchange: Exchange, node: ClusterNode, item: str, expires: float) -> bytes | None:
     """Return a node's stored item, b"" if it has none; None if it does not answer."""
     answer = await exchange.ask(
         node,
@@ -451,7 +455,7 @@ def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
 
     Raises
     ------
-    Refusal
+    OrderRefusedError
         Too many, too few, or a number that its code cannot hold.
     """
     name = messages.name_of(number)
@@ -468,37 +472,37 @@ def _typed(number: int, values: Sequence[float]) -> tuple[Any, ...]:
     try:
         wire.pack(name, *([0] * head), *typed)
     except ValueError as error:
-        raise Refusal(str(error)) from None
+        raise OrderRefusedError(str(error)) from None
     return tuple(typed)
 
 
-def _steps_of_items(node: Node, message: Parameters) -> tuple[Step, ...]:
+def _steps_of_items(node: ClusterNode, message: Parameters) -> tuple[Step, ...]:
     """Return the messages that store items, then their checks.
 
     Raises
     ------
-    Refusal
+    OrderRefusedError
         Items that cannot be stored.
     """
     try:
         items = message.items()
     except ProtocolError as error:
-        raise Refusal(str(error)) from None
+        raise OrderRefusedError(str(error)) from None
     if not node.member.key:
-        raise Refusal(f"{node.name}: no key is configured; add it to the key file")
+        raise OrderRefusedError(f"{node.name}: no key is configured; add it to the key file")
     if not items:
-        raise Refusal("no items; name at least one")
+        raise OrderRefusedError("no items; name at least one")
     sets, checks = [], []
     for item, data in items.items():
         if item not in SIZE_OF or item in ("key_id", "edition", "address"):
-            raise Refusal(f"item {item!r} cannot be set by parameters")
+            raise OrderRefusedError(f"item {item!r} cannot be set by parameters")
         if len(data) != SIZE_OF[item]:
-            raise Refusal(f"item {item}: {len(data)} bytes, {SIZE_OF[item]} needed")
+            raise OrderRefusedError(f"item {item}: {len(data)} bytes, {SIZE_OF[item]} needed")
         values = struct.unpack(CODES_OF[item], data)
         name, axis = _MESSAGE_OF.get(item, ("STANDBY", None))
         values = values if axis is None else (axis, *values)
         if not wire.finite(values):
-            raise Refusal(f"item {item}: a number that is not finite")
+            raise OrderRefusedError(f"item {item}: a number that is not finite")
         sets.append(Step(name, values))
         checks.append(Step("QUERY_STORED", item=item, data=data))
     return (*sets, *checks)

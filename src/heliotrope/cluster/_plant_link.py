@@ -9,11 +9,12 @@ from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, LinkClosedError, Outcome, received
+from heliotrope.links.link import Link, LinkClosedError, SendOutcome, received
 from heliotrope.links.messages import (
     Acknowledge,
     Answer,
     Ask,
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
@@ -22,7 +23,6 @@ from heliotrope.links.messages import (
     Progress,
     ProtocolError,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -99,7 +99,7 @@ class PlantLink:
             self._work.take(message)
         elif isinstance(message, Acknowledge):
             self._take_acknowledgement(message)
-        elif isinstance(message, Status | Progress | Alarm | Answer):
+        elif isinstance(message, ClusterStatus | Progress | Alarm | Answer):
             text = f"a {message.kind} came from the plant; only clusters send it"
             self._reports.event(alarms.PLANT_UNINTELLIGIBLE.raised(problem=text))
 
@@ -127,7 +127,7 @@ class PlantLink:
         now = self._clock.monotonic()
         told = (self._number - self._told_names) % _NAMES_EVERY == 0
         self._reports.status(
-            Status(
+            ClusterStatus(
                 cluster=self._cluster,
                 count=len(self._nodes),
                 utc_s=present.utc_s,
@@ -152,8 +152,8 @@ class PlantLink:
                 await self._reports.published()
 
     async def _send(self, message: Message) -> None:
-        status = isinstance(message, Status)
+        status = isinstance(message, ClusterStatus)
         expires = self._clock.monotonic() + (_STATUS_LIFE if status else _NEWS_LIFE)
         outcome = await self._link.send(encode(message), expires=expires)
-        if status and outcome is not Outcome.SENT:
+        if status and outcome is not SendOutcome.SENT:
             self._opened = -1  # the names may not have arrived

@@ -10,7 +10,7 @@ from typing import Any
 from heliotrope.cluster._emergencies import Emergencies
 from heliotrope.cluster._exchange import Exchange
 from heliotrope.cluster._goals import BEAM_OUT, Goals
-from heliotrope.cluster._nodes import STATUS, STEPS, Node, Nodes
+from heliotrope.cluster._nodes import STATUS, STEPS, ClusterNode, Nodes
 from heliotrope.cluster._reports import Reports
 from heliotrope.cluster._watch import Watch
 from heliotrope.cluster._work import Work
@@ -80,11 +80,11 @@ class Polling:
                 await work.serve()
                 now = self._clock.monotonic()
 
-    async def look(self, node: Node) -> None:
+    async def look(self, node: ClusterNode) -> None:
         """Ask a node for its state, between two rounds."""
         await self._poll(node, self._clock.monotonic())
 
-    async def _poll(self, node: Node, now: float) -> float:
+    async def _poll(self, node: ClusterNode, now: float) -> float:
         """Ask a node for state and step counts at ``now``, and return the time afterwards."""
         exchange, sequence = self._exchange, node.next_sequence()
         status = await exchange.poll(node, STATUS, sequence, now)
@@ -100,7 +100,7 @@ class Polling:
             self._goals.heard(node, now)
         return exchange.now
 
-    def _believes(self, node: Node, status: tuple[Any, ...]) -> bool:
+    def _believes(self, node: ClusterNode, status: tuple[Any, ...]) -> bool:
         """Take a STATUS; return False if its firmware has states unknown here."""
         if status[0] >= len(states.STATES):
             self._reports.alarm(alarms.NODE_UNINTELLIGIBLE.raised(node.name, state=status[0]))
@@ -122,7 +122,7 @@ class Polling:
             self._emergencies.begin("", "DEFOCUS", [node])
         return True
 
-    def _report_fault(self, node: Node) -> None:
+    def _report_fault(self, node: ClusterNode) -> None:
         if node.fault:
             known = node.fault < len(names.FAULTS)
             text = names.FAULTS[node.fault] if known else f"fault {node.fault}"
@@ -143,7 +143,7 @@ class Polling:
                 self._silent.remove(node.index)
                 self._reports.clear(alarms.NODE_SILENT.ended(node.name))
 
-    def _report_silence(self, node: Node, limit: float) -> None:
+    def _report_silence(self, node: ClusterNode, limit: float) -> None:
         out = node.known and node.state in BEAM_OUT
         if not node.known:
             last = "never heard" if node.heard_at < self._started else "its state was never heard"

@@ -7,7 +7,7 @@ from typing import Any
 
 from heliotrope.cluster._discovery import Discovery
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._nodes import Node, Nodes, Refusal
+from heliotrope.cluster._nodes import ClusterNode, Nodes, OrderRefusedError
 from heliotrope.cluster._orders import stored
 from heliotrope.cluster._reports import Reports
 from heliotrope.lcu.journal import ITEMS
@@ -23,7 +23,7 @@ _STORED = tuple(name for name, _ in ITEMS if name != _SECRET)
 class _Recall:
     """A question for the stored items of a node, one by one."""
 
-    def __init__(self, ask: Ask, node: Node) -> None:
+    def __init__(self, ask: Ask, node: ClusterNode) -> None:
         self.ask, self.node = ask, node
         self.found: dict[str, bytes] = {}
         self.tries = 0
@@ -105,7 +105,7 @@ class Questions:
     def _take_stored(self, ask: Ask) -> None:
         try:
             (node,) = self._nodes.chosen((ask.heliostat,))
-        except Refusal as refusal:
+        except OrderRefusedError as refusal:
             self._error(ask, str(refusal))
         else:
             self._waiting.append(_Recall(ask, node))

@@ -4,7 +4,7 @@ import asyncio
 from collections import deque
 from dataclasses import replace
 
-from heliotrope.links.messages import Answer, Message, Progress, Stage, Status
+from heliotrope.links.messages import Answer, ClusterStatus, Message, Progress, Stage
 from heliotrope.safety import Alarm
 
 #: Messages that may wait; the oldest are dropped first. Of the status only the newest is kept.
@@ -21,7 +21,7 @@ class Reports:
     def __init__(self) -> None:
         self._groups: dict[tuple[str, Stage, str], list[str]] = {}
         self._out: deque[Message] = deque(maxlen=_CAPACITY)
-        self._status: Status | None = None
+        self._status: ClusterStatus | None = None
         self._alarms: dict[tuple[str, str], Alarm] = {}
         self._published = asyncio.Event()
 
@@ -34,7 +34,7 @@ class Reports:
         """Report an answer."""
         self._out.append(answer)
 
-    def status(self, status: Status) -> None:
+    def status(self, status: ClusterStatus) -> None:
         """Report the status, in place of the previous one."""
         self._status = status
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from heliotrope.cluster._emergencies import NAMES, Emergencies
 from heliotrope.cluster._epoch import Epoch
 from heliotrope.cluster._exchange import Exchange
-from heliotrope.cluster._nodes import Nodes, Refusal
+from heliotrope.cluster._nodes import Nodes, OrderRefusedError
 from heliotrope.cluster._orders import Orders
 from heliotrope.cluster._questions import Questions
 from heliotrope.cluster._reports import Reports
@@ -45,9 +45,9 @@ class Work:
     def _take_emergency(self, identity: str, name: str, heliostats: Sequence[str]) -> None:
         try:
             if name not in NAMES:
-                raise Refusal(f"{name!r} is not an emergency; give DEFOCUS or STOW")
+                raise OrderRefusedError(f"{name!r} is not an emergency; give DEFOCUS or STOW")
             nodes = self._nodes.chosen(heliostats)
-        except Refusal as refusal:
+        except OrderRefusedError as refusal:
             self._reports.add(identity, Stage.REFUSED, text=str(refusal))
             return
         self._orders.cancel(nodes, f"{name} came before it")

@@ -30,7 +30,7 @@ _OLD_TIME = {
 }
 
 
-class SiteTable(Table):
+class ClusterSiteTable(Table):
     """``[site]``: the origin of ENU, and its air."""
 
     latitude_deg: float = Field(ge=-90.0, le=90.0, description="North positive.")
@@ -60,7 +60,7 @@ class BusTable(Table):
     )
 
 
-class PlantTable(Table):
+class PlantLinkTable(Table):
     """``[plant]``: the link to the central controller."""
 
     url: str = Field(
@@ -119,7 +119,7 @@ class SafetyTable(Table):
     )
 
 
-class HeliostatTable(Table):
+class MemberTable(Table):
     """``[[heliostats]]``: one for each, up to 32."""
 
     name: str = Field(min_length=1, description="As the plant knows it.")
@@ -139,19 +139,19 @@ class ClusterDocument(Table):
     state: str = Field(
         "", description="File for epoch and editions, beside this one; default NAME.state.json."
     )
-    site: SiteTable
+    site: ClusterSiteTable
     bus: BusTable
-    plant: PlantTable
+    plant: PlantLinkTable
     time: TimeTable = Field(default_factory=TimeTable)  # type: ignore[arg-type]
     polling: PollingTable = Field(default_factory=PollingTable)  # type: ignore[arg-type]
     safety: SafetyTable = Field(default_factory=SafetyTable)  # type: ignore[arg-type]
-    heliostats: list[HeliostatTable] = Field(min_length=1, max_length=MOST_MEMBERS)
+    heliostats: list[MemberTable] = Field(min_length=1, max_length=MOST_MEMBERS)
 
 
 #: The tables, for the reference and for hints.
 TABLES: tuple[type[Table], ...] = (
-    ClusterDocument, SiteTable, BusTable, PlantTable, TimeTable, PollingTable, SafetyTable,
-    HeliostatTable,
+    ClusterDocument, ClusterSiteTable, BusTable, PlantLinkTable, TimeTable, PollingTable,
+    SafetyTable, MemberTable,
 )  # fmt: skip
 
 
@@ -184,7 +184,7 @@ class Installation:
     config: ClusterConfig
     bus_url: str
     bus: BusSettings
-    plant: PlantTable
+    plant: PlantLinkTable
     scheme: str
     host: str
     port: int

@@ -4,8 +4,8 @@ gpsd reads the receiver and feeds chrony, which disciplines the computer's clock
 (docs/how-to/time.md). The cluster takes its time from that clock. It listens to gpsd only to show
 the receiver's state and to notice when clock and receiver contradict each other.
 
-`Reader` turns bytes of gpsd's JSON protocol into a `Receiver` without any input or output; `Gpsd`
-keeps a connection open and feeds one.
+`GpsdReader` turns bytes of gpsd's JSON protocol into a `SatelliteReceiver` without any input or
+output; `Gpsd` keeps a connection open and feeds one.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ _FIRST_PAUSE, _LONGEST_PAUSE = 0.5, 10.0
 
 
 @dataclass(frozen=True)
-class Receiver:
+class SatelliteReceiver:
     """State of a receiver.
 
     Attributes
@@ -80,7 +80,7 @@ class Receiver:
         return f"{kind}{place}, {self.used} of {self.seen} satellites"
 
 
-class Reader:
+class GpsdReader:
     """A parser of gpsd's JSON lines.
 
     Attributes
@@ -94,7 +94,7 @@ class Reader:
     """
 
     def __init__(self) -> None:
-        self.receiver = Receiver()
+        self.receiver = SatelliteReceiver()
         self.error = ""
         self.refused = 0
         self._rest = b""
@@ -157,7 +157,7 @@ class Gpsd:
 
     def __init__(self, clock: Clock, host: str = "localhost", port: int = PORT) -> None:
         self._clock, self._host, self._port = clock, host, port
-        self._reader = Reader()
+        self._reader = GpsdReader()
         #: UTC of each of the last fixes minus the monotonic time at which it came, s.
         self._offsets: deque[float] = deque(maxlen=_REPORTS)
         self._fixed_at = -math.inf
@@ -166,7 +166,7 @@ class Gpsd:
         self._closing = asyncio.Event()
 
     @property
-    def receiver(self) -> Receiver:
+    def receiver(self) -> SatelliteReceiver:
         """State of the receiver; one without a fresh fix says so."""
         receiver = self._reader.receiver
         return receiver if self._fresh else replace(receiver, mode=min(receiver.mode, 1))

@@ -27,7 +27,7 @@ from heliotrope.links.link import (
     Backoff,
     LinkClosedError,
     LinkError,
-    Outcome,
+    SendOutcome,
     until_closed,
 )
 
@@ -294,7 +294,7 @@ class SerialBus:
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a frame that nobody answers, and wait until it is out.
 
         Parameters
@@ -375,18 +375,18 @@ class SerialBus:
             self.statistics.silent += 1
             return b""
 
-    async def _put(self, frame: bytes, expires: float | None) -> tuple[_Port | None, Outcome]:
+    async def _put(self, frame: bytes, expires: float | None) -> tuple[_Port | None, SendOutcome]:
         if self.closed:
             raise LinkClosedError(f"bus {self._url}: it is closed")
         await sleep_until(self._clock, self._free_at)
         port, transport = self._port, self._transport
         if port is None or transport is None:
             self.statistics.dropped += 1
-            return None, Outcome.DISCONNECTED
+            return None, SendOutcome.DISCONNECTED
         now = self._clock.monotonic()
         if expires is not None and now >= expires:
             self.statistics.expired += 1
-            return None, Outcome.EXPIRED
+            return None, SendOutcome.EXPIRED
         self.statistics.stray += len(port.data)
         port.data.clear()
         port.spoilt = False
@@ -396,10 +396,10 @@ class SerialBus:
         except (OSError, serialx.SerialException) as error:
             port.connection_lost(error)
             self.statistics.dropped += 1
-            return None, Outcome.DISCONNECTED
+            return None, SendOutcome.DISCONNECTED
         self.statistics.sent += 1
         self._free_at = now + self._settings.duration(len(frame)) + self._settings.quiet
-        return port, Outcome.SENT
+        return port, SendOutcome.SENT
 
     def _judge_echo(self, port: _Port) -> bool:
         if not port.spoilt and not port.echo:

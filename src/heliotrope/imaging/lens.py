@@ -33,7 +33,7 @@ INNER = ("log_focal", "center_x", "center_y", "k1")
 
 
 @dataclass(frozen=True)
-class Board:
+class Chessboard:
     """A picture of a chessboard.
 
     Attributes
@@ -82,7 +82,7 @@ class Lens:
     deviation: float
     sigma: FloatArray
     model: str
-    boards: tuple[Board, ...]
+    boards: tuple[Chessboard, ...]
     coverage: float = float("nan")
     notes: tuple[str, ...] = ()
 
@@ -194,7 +194,7 @@ def calibrate_corners(
     points = np.pad(plane, ((0, 0), (0, 1)))
     what = f"the pattern of {columns} × {rows} inner corners"
     boards = [
-        Board(name, seen, f"{what} was not found" if seen is None else "")
+        Chessboard(name, seen, f"{what} was not found" if seen is None else "")
         for name, seen in zip(names, corners, strict=True)
     ]
     if sum(board.used for board in boards) < 3:
@@ -214,7 +214,7 @@ def calibrate_corners(
 
 
 def _solve(
-    size: tuple[int, int], points: FloatArray, boards: Sequence[Board], model: str
+    size: tuple[int, int], points: FloatArray, boards: Sequence[Chessboard], model: str
 ) -> tuple[Lens, float, FloatArray]:
     """Return the lens of a model, its information criterion, and the boards' normals."""
     import cv2
@@ -267,8 +267,8 @@ _FRONTAL = (
 
 
 def _without_outliers(
-    size: tuple[int, int], points: FloatArray, boards: Sequence[Board]
-) -> list[Board]:
+    size: tuple[int, int], points: FloatArray, boards: Sequence[Chessboard]
+) -> list[Chessboard]:
     """Leave out boards whose residuals are far above the others', the worst first."""
     kept = list(boards)
     while sum(board.used for board in kept) > 3:

@@ -5,7 +5,7 @@ one implementation, over a `Carrier`: in the same process (`memory_pair`), TCP (
 `TcpServer`) or an MQTT broker (module ``mqtt``, which needs the extra ``control``). `Conversation`
 seals each message in an envelope that proves its age without a common clock.
 
-`encode` and `decode` turn messages (`Lease`, `Command`, `Status`, …) into bytes and back.
+`encode` and `decode` turn messages (`Lease`, `Command`, `ClusterStatus`, …) into bytes and back.
 `packet12` reads and writes the 12-byte packets of Malan's thesis, for local controllers that
 understand no other.
 
@@ -42,7 +42,7 @@ from heliotrope.links.link import (
     LinkError,
     LinkLostError,
     LinkSettings,
-    Outcome,
+    SendOutcome,
     Statistics,
     received,
     running,
@@ -52,6 +52,7 @@ from heliotrope.links.messages import (
     Acknowledge,
     Answer,
     Ask,
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
@@ -60,7 +61,6 @@ from heliotrope.links.messages import (
     Progress,
     ProtocolError,
     Stage,
-    Status,
     decode,
     encode,
 )
@@ -75,6 +75,7 @@ __all__ = [
     "CarriedLink",
     "Carrier",
     "Clock",
+    "ClusterStatus",
     "Command",
     "Conversation",
     "Emergency",
@@ -90,13 +91,12 @@ __all__ = [
     "LinkSettings",
     "MemoryLine",
     "Message",
-    "Outcome",
     "Parameters",
     "Progress",
     "ProtocolError",
+    "SendOutcome",
     "Stage",
     "Statistics",
-    "Status",
     "SystemClock",
     "TcpServer",
     "VirtualClock",

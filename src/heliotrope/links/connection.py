@@ -19,7 +19,7 @@ from heliotrope.links.link import (
     LinkError,
     LinkLostError,
     LinkSettings,
-    Outcome,
+    SendOutcome,
     Statistics,
     until_closed,
 )
@@ -172,7 +172,7 @@ class CarriedLink:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a message.
 
         Parameters
@@ -206,10 +206,10 @@ class CarriedLink:
                     return await self._send_now(data, expires)
         except TimeoutError:
             self._statistics.expired += 1
-            return Outcome.EXPIRED
+            return SendOutcome.EXPIRED
         except (LinkLostError, OSError):
             self._statistics.dropped += 1
-            return Outcome.DISCONNECTED
+            return SendOutcome.DISCONNECTED
 
     def _check(self, data: bytes, expires: float | None, hold: bool) -> None:
         if self.closed:
@@ -230,7 +230,7 @@ class CarriedLink:
                 f"{self._settings.horizon:.0f} s; expiries are in s of the monotonic clock"
             )
 
-    async def _send_now(self, data: bytes, expires: float | None) -> Outcome:
+    async def _send_now(self, data: bytes, expires: float | None) -> SendOutcome:
         if not self.connected:
             raise LinkLostError(self._problem)
         await self._carrier.ready()
@@ -238,7 +238,7 @@ class CarriedLink:
         lifetime = None if expires is None else expires - self._clock.monotonic()
         await self._carrier.write(envelope, lifetime, confirmed=True)
         self._statistics.sent += 1
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def run(self) -> None:
         """Keep the link connected until it is closed.

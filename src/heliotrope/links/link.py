@@ -47,7 +47,7 @@ class LinkClosedError(LinkError):
     """The link was closed for good."""
 
 
-class Outcome(enum.Enum):
+class SendOutcome(enum.Enum):
     """Fate of a message at its sender; the receiver may still refuse it.
 
     SENT: the transport took it in time (with MQTT: the broker confirmed it).
@@ -194,7 +194,7 @@ class Link(Protocol):
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a message by ``expires`` of the monotonic clock, or not at all."""
         ...
 
@@ -238,7 +238,7 @@ class Bus(Protocol):
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a frame that is not answered."""
         ...
 

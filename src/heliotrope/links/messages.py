@@ -5,7 +5,7 @@ PARAMETERS). The line names the kind and holds the fields. Unknown fields are ig
 a newer plant can talk to an older cluster; an unknown kind is refused with its name.
 
 Plant to cluster: `Lease`, `Command`, `Emergency`, `Parameters`, `Ask`, `Acknowledge`.
-Cluster to plant: `Status`, `Progress`, `Alarm`, `Answer`.
+Cluster to plant: `ClusterStatus`, `Progress`, `Alarm`, `Answer`.
 
 Every message that moves a mirror towards the receiver carries the token of the command authority
 and is sent with an expiry of the link; `Emergency` needs neither, and is accepted from anyone.
@@ -160,7 +160,7 @@ class Parameters:
 class Ask:
     """A question: ``checksums``, ``stored`` (of a heliostat), ``statistics``, ``discover``.
 
-    The answer to ``statistics`` names all heliostats in the order of the rows of `Status`.
+    The answer to ``statistics`` names all heliostats in the order of the rows of `ClusterStatus`.
     """
 
     kind: ClassVar[str] = "ask"
@@ -184,7 +184,7 @@ class Acknowledge:
 
 
 @dataclass(frozen=True)
-class Status:
+class ClusterStatus:
     """State of the cluster and all its heliostats, sent once a second.
 
     ``names``, in the order of the rows, is sent in the first message of a connection and in
@@ -251,7 +251,7 @@ Message = (
     | Parameters
     | Ask
     | Acknowledge
-    | Status
+    | ClusterStatus
     | Progress
     | Alarm
     | Answer
@@ -265,7 +265,7 @@ _KINDS: dict[str, type[Any]] = {
         Parameters,
         Ask,
         Acknowledge,
-        Status,
+        ClusterStatus,
         Progress,
         Alarm,
         Answer,

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from heliotrope.links.clock import Clock, sleep_until
-from heliotrope.links.link import Link, LinkClosedError, Outcome, received
+from heliotrope.links.link import Link, LinkClosedError, SendOutcome, received
 from heliotrope.links.messages import (
     Answer,
     Ask,
@@ -27,7 +27,7 @@ QUESTION_LIFE, ANSWER_PATIENCE = 5.0, 60.0
 class _Post:
     data: bytes
     expires: float | None
-    told: Callable[[Outcome], None] | None
+    told: Callable[[SendOutcome], None] | None
 
 
 class ClusterEnd:
@@ -56,7 +56,7 @@ class ClusterEnd:
         self,
         message: Message,
         lifetime: float | None,
-        told: Callable[[Outcome], None] | None = None,
+        told: Callable[[SendOutcome], None] | None = None,
         *,
         urgent: bool = False,
     ) -> None:
@@ -75,7 +75,7 @@ class ClusterEnd:
                 try:
                     outcome = await self.link.send(post.data, expires=post.expires)
                 except LinkClosedError:
-                    outcome = Outcome.DISCONNECTED
+                    outcome = SendOutcome.DISCONNECTED
                 if post.told is not None:
                     post.told(outcome)
             news.clear()

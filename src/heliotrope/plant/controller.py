@@ -33,11 +33,11 @@ from heliotrope.links.link import Link
 from heliotrope.links.messages import (
     Acknowledge,
     Answer,
+    ClusterStatus,
     Lease,
     Progress,
     ProtocolError,
     Stage,
-    Status,
 )
 from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.plant import refusals
@@ -222,7 +222,7 @@ class PlantController:
 
     def _take(self, end: ClusterEnd, message: object, now: float) -> None:
         match message:
-            case Status():
+            case ClusterStatus():
                 self._take_status(end, message, now)
             case Progress():
                 found = self._orders.take(end.name, message)
@@ -239,7 +239,7 @@ class PlantController:
                     f"{type(message).__name__.lower()}: a cluster must not send this kind"
                 )
 
-    def _take_status(self, end: ClusterEnd, status: Status, now: float) -> None:
+    def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:

@@ -1,8 +1,8 @@
 """The state of the whole field in one table, each row with its age.
 
-Rows come from the clusters' `Status` messages. The age of a row is the age that the cluster gave to
-the local controller's answer plus the time since. A row older than the limit is stale, and its
-values are masked: an unknown value is never shown as if it were known (invariant 11).
+Rows come from the clusters' `ClusterStatus` messages. The age of a row is the age that the cluster
+gave to the local controller's answer plus the time since. A row older than the limit is stale, and
+its values are masked: an unknown value is never shown as if it were known (invariant 11).
 """
 
 import math
@@ -17,7 +17,7 @@ from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.lcu import names as meanings
 from heliotrope.lcu import states
-from heliotrope.links.messages import NEVER, NODE, Status
+from heliotrope.links.messages import NEVER, NODE, ClusterStatus
 
 #: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
@@ -119,7 +119,7 @@ class FieldState:
     def __len__(self) -> int:
         return len(self.names)
 
-    def take(self, cluster: str, status: Status, at: float) -> list[str]:
+    def take(self, cluster: str, status: ClusterStatus, at: float) -> list[str]:
         """Take a status that arrived at ``at`` (monotonic s); return its problems.
 
         Raises

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Outcome
+from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.clusters import ClusterEnd, Clusters
@@ -212,11 +212,11 @@ class PlantOrders:
             ticket.expect(part, now + self._lifetime + GRACE)
         return identity
 
-    def _told(self, identity: str) -> Callable[[Outcome], None]:
-        def told(outcome: Outcome) -> None:
+    def _told(self, identity: str) -> Callable[[SendOutcome], None]:
+        def told(outcome: SendOutcome) -> None:
             under = self._under.get(identity)
             # DEFOCUS and STOW are repeated until they are acknowledged.
-            if under is None or outcome is Outcome.SENT or under.ticket.name in SAFE:
+            if under is None or outcome is SendOutcome.SENT or under.ticket.name in SAFE:
                 return
             text = f"cluster {under.cluster}: {outcome.value}"
             under.ticket.advance(under.heliostats, Stage.FAILED, text)

@@ -38,7 +38,7 @@ PEAK = 0.7
 
 
 @dataclass(frozen=True)
-class Mirror:
+class TrueMirror:
     """One mirror as it stands.
 
     Attributes
@@ -67,7 +67,7 @@ class Mirror:
 
 
 @dataclass(frozen=True)
-class Sight:
+class FieldSnapshot:
     """The true mirrors and sun at the moment of the call.
 
     Attributes
@@ -83,7 +83,7 @@ class Sight:
     """
 
     clock: Clock
-    mirrors: Callable[[], Sequence[Mirror]]
+    mirrors: Callable[[], Sequence[TrueMirror]]
     sun: Callable[[], FloatArray]
     latency: float = 1.0
 
@@ -95,11 +95,11 @@ class Sight:
 
 def mirrors_of(
     boards: Mapping[str, Board], width: float = 3.0, height: float = 2.0
-) -> Callable[[], Sequence[Mirror]]:
+) -> Callable[[], Sequence[TrueMirror]]:
     """Return a function that gives the mirrors of boards, by name, all of one size in m."""
 
-    def mirrors() -> Sequence[Mirror]:
-        return [Mirror(name, *board.mirror(), width, height) for name, board in boards.items()]
+    def mirrors() -> Sequence[TrueMirror]:
+        return [TrueMirror(name, *board.mirror(), width, height) for name, board in boards.items()]
 
     return mirrors
 
@@ -111,7 +111,7 @@ def mirrors_near(
     names: tuple[str, ...],
     sizes: FloatArray,
     reach: float = NEAR,
-) -> list[Mirror]:
+) -> list[TrueMirror]:
     """Return the mirrors whose rays meet the plane of a target near its centre.
 
     Parameters
@@ -139,7 +139,8 @@ def mirrors_near(
     away = np.linalg.norm(vertex + along[:, None] * rays - middle, axis=-1)
     hits = np.flatnonzero((cosine > GRAZING) & (along > 0.0) & (away <= limit)).tolist()
     return [
-        Mirror(names[i], vertex[i], facing[i], float(sizes[i, 0]), float(sizes[i, 1])) for i in hits
+        TrueMirror(names[i], vertex[i], facing[i], float(sizes[i, 0]), float(sizes[i, 1]))
+        for i in hits
     ]
 
 
@@ -161,7 +162,9 @@ class ExactCamera:
         A covariance of another shape, or not a covariance.
     """
 
-    def __init__(self, sight: Sight, covariance: npt.ArrayLike = 1e-4, seed: int = 0) -> None:
+    def __init__(
+        self, sight: FieldSnapshot, covariance: npt.ArrayLike = 1e-4, seed: int = 0
+    ) -> None:
         given = np.asarray(covariance, dtype=np.float64)
         plane = given * np.eye(2) if given.ndim == 0 else given
         if plane.shape != (2, 2) or not np.isfinite(plane).all():
@@ -293,7 +296,7 @@ class RenderedCamera:
 
     def __init__(
         self,
-        sight: Sight,
+        sight: FieldSnapshot,
         scenes: Sequence[Scene],
         *,
         optics: Optics | None = None,
@@ -409,7 +412,7 @@ class RenderedCamera:
 
 
 def _thrown(
-    target: Target, mirrors: Sequence[Mirror], sun: FloatArray, optics: Optics
+    target: Target, mirrors: Sequence[TrueMirror], sun: FloatArray, optics: Optics
 ) -> tuple[Thrown, ...]:
     """Return the beams of mirrors on a target, and near enough beside it."""
     thrown = []

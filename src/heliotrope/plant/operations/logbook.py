@@ -9,8 +9,8 @@ import numpy as np
 
 from heliotrope.errors import HeliotropeError
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, Outcome, Statistics
-from heliotrope.links.messages import ProtocolError, Status, decode
+from heliotrope.links.link import Link, SendOutcome, Statistics
+from heliotrope.links.messages import ClusterStatus, ProtocolError, decode
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
 from heliotrope.safety import Alarm, alarms
@@ -58,7 +58,7 @@ class Logbook:
         self._packets: deque[tuple[float, str, str, bytes]] = deque(maxlen=packets)
         self._steady: dict[tuple[str, str, str], tuple[float, bytes]] = {}
         self._links: dict[str, Link] = {}
-        self._statuses: dict[str, Status] = {}
+        self._statuses: dict[str, ClusterStatus] = {}
         self.refused: dict[str, int] = {}
 
     def _now(self) -> float:
@@ -222,7 +222,7 @@ class Logbook:
             link.problem if link is not None else "",
         )
 
-    def _status(self, cluster: str) -> Status | None:
+    def _status(self, cluster: str) -> ClusterStatus | None:
         _, data = self._steady.get((cluster, "from", "status"), (0.0, b""))
         try:
             found = decode(data) if data else None
@@ -230,7 +230,7 @@ class Logbook:
             self.refused[cluster] = self.refused.get(cluster, 0) + 1
             self._steady.pop((cluster, "from", "status"))
             found = None
-        if isinstance(found, Status):
+        if isinstance(found, ClusterStatus):
             self._statuses[cluster] = found
         return self._statuses.get(cluster)
 
@@ -266,9 +266,9 @@ class _Tapped:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         outcome = await self._link.send(data, expires=expires, hold=hold)
-        if outcome is Outcome.SENT:
+        if outcome is SendOutcome.SENT:
             self._book.packet(self.name, "to", data)
         return outcome
 

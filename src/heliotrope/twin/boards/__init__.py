@@ -9,15 +9,15 @@ from heliotrope.twin.boards.board import Board, Witness
 from heliotrope.twin.boards.bus import BusFaults, Station, Tap, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
-from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import MACHINE, Outfit, mechanisms, outfits, own_items
 
 __all__ = [
     "MACHINE",
-    "Axis",
     "Board",
     "BusFaults",
     "DriftingClock",
+    "MotorAxis",
     "NorFlash",
     "Outfit",
     "PowerCutError",

@@ -19,7 +19,7 @@ from heliotrope.lcu.journal import Journal
 from heliotrope.lcu.node import Node
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
-from heliotrope.twin.boards.motors import Axis
+from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import Outfit, sha256
 from heliotrope.twin.wind import Wind
 
@@ -73,7 +73,7 @@ class Board:
     ticks
         Its counter of milliseconds.
     play, miss
-        Of the motors; see `twin.motors.Axis`.
+        Of the motors; see `MotorAxis`.
     wind
         That turns the mirror; None: there is none.
 
@@ -106,7 +106,7 @@ class Board:
         self.ticks = ticks or TickCounter()
         self.flash = NorFlash(chance.getrandbits(32))
         self.axes = [
-            Axis(count, play, miss, random.Random(chance.random())) for count in outfit.stow
+            MotorAxis(count, play, miss, random.Random(chance.random())) for count in outfit.stow
         ]
         self.node: Node | None = None
         self.witness: Witness | None = None

@@ -14,7 +14,7 @@ from typing import Protocol
 from heliotrope.cluster.turns import Turns
 from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.links.link import LinkClosedError, SendOutcome
 
 #: Start, eight data bits, stop.
 _BITS = 10
@@ -166,7 +166,7 @@ class TwinBus:
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a frame that nobody answers, and wait until it is out.
 
         Raises
@@ -176,7 +176,7 @@ class TwinBus:
         """
         async with self._turns.turn(urgent=urgent):
             outcome = self._may(expires)
-            if outcome is Outcome.SENT:
+            if outcome is SendOutcome.SENT:
                 await self._pause(len(frame))
                 self.carry(frame)
             return outcome
@@ -202,7 +202,7 @@ class TwinBus:
         if not timeout > 0.0:
             raise InputError(f"bus: a timeout of {timeout} s; it must be above 0")
         async with self._turns.turn(urgent=urgent):
-            if self._may(expires) is not Outcome.SENT:
+            if self._may(expires) is not SendOutcome.SENT:
                 return b""
             await self._pause(len(frame))
             answer = self.carry(frame)
@@ -221,14 +221,14 @@ class TwinBus:
         if self._per_byte:
             await asyncio.sleep(self._per_byte * size)
 
-    def _may(self, expires: float | None) -> Outcome:
+    def _may(self, expires: float | None) -> SendOutcome:
         if self.closed:
             raise LinkClosedError("bus: it is closed")
         if not self.plugged:
-            return Outcome.DISCONNECTED
+            return SendOutcome.DISCONNECTED
         if expires is not None and self._clock.monotonic() >= expires:
-            return Outcome.EXPIRED
-        return Outcome.SENT
+            return SendOutcome.EXPIRED
+        return SendOutcome.SENT
 
     # -- the wire --------------------------------------------------------------------------
 

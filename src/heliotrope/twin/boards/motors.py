@@ -10,7 +10,7 @@ import random
 from collections import deque
 
 
-class Axis:
+class MotorAxis:
     """One motor with its timer and its gear.
 
     Parameters

@@ -15,7 +15,7 @@ import numpy as np
 
 from heliotrope.errors import InputError
 from heliotrope.lcu import journal, messages, states, wire
-from heliotrope.links.link import LinkClosedError, Outcome
+from heliotrope.links.link import LinkClosedError, SendOutcome
 from heliotrope.twin.field.field import LEASE_MS, Field
 
 _HEADER = struct.Struct(wire.HEADER)
@@ -119,16 +119,16 @@ class FieldBus:
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a frame without an answer, and let other buses of the process take their turn."""
         del expires, urgent
         await asyncio.sleep(0)
         if self.closed:
             raise LinkClosedError("field bus: closed")
         if not self.plugged:
-            return Outcome.DISCONNECTED
+            return SendOutcome.DISCONNECTED
         self._hear(frame)
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     async def transact(
         self,

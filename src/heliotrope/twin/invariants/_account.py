@@ -53,7 +53,7 @@ def fingerprint(board: Board, *, gate: bool, clock: bool) -> dict[str, object]:
     return found
 
 
-class Account:
+class HeliostatAccount:
     """One heliostat as the observer knows it.
 
     Attributes

@@ -34,7 +34,7 @@ from typing import Any
 from heliotrope.errors import HeliotropeError
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states, wire
-from heliotrope.links.messages import NEVER, Progress, Stage, Status
+from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.outfit import (
     KEEP_OUT,
@@ -44,8 +44,8 @@ from heliotrope.twin.boards.outfit import (
     RECEIVER,
     STOW,
 )
-from heliotrope.twin.invariants._account import Account, fingerprint
-from heliotrope.twin.invariants.ledger import FrameLedger, Order, OrderLedger, Sent
+from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
+from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 
 #: Returns the true direction to the sun, (3,), at a time in s.
 SunAt = Callable[[float], FloatArray]
@@ -198,12 +198,12 @@ class Observer:
         self.leased_at = start
         self.jumped_at = self.disturbed_at = float("-inf")
         self.autonomy = 0.0
-        self.accounts = [Account(board, start) for board in boards]
+        self.accounts = [HeliostatAccount(board, start) for board in boards]
         self.start = start
         self._sun = sun
         self._by_address = {account.address: account for account in self.accounts}
         self._emergencies: list[tuple[str, float]] = []
-        self._unreported: deque[tuple[float, str, list[int], list[Order]]] = deque()
+        self._unreported: deque[tuple[float, str, list[int], list[PlantCommand]]] = deque()
         self.entered: Counter[int] = Counter()
         for account in self.accounts:
             account.board.witness = self
@@ -280,7 +280,7 @@ class Observer:
             account.before = self._fingerprint(account, how)
         account.good = account.board.node.reader.good
 
-    def _expects_quiet(self, account: Account, sent: Sent | None, how: str) -> int:
+    def _expects_quiet(self, account: HeliostatAccount, sent: Sent | None, how: str) -> int:
         """Return the invariant by which a frame must change nothing, 0 if it may act."""
         if how == "damaged":
             return 6
@@ -299,7 +299,7 @@ class Observer:
             return 5 if sent.values[0] < node.controller.gate.replay.epoch else 0
         return 5 if sent.index <= account.taken else 0
 
-    def _fingerprint(self, account: Account, how: str) -> dict[str, object]:
+    def _fingerprint(self, account: HeliostatAccount, how: str) -> dict[str, object]:
         sent = account.in_hand
         told = sent is not None and sent.who == messages.CLUSTER
         return fingerprint(account.board, gate=how in ("damaged", "twice"), clock=not told)
@@ -341,7 +341,7 @@ class Observer:
             account.in_hand = None
             account.how = ""
 
-    def _took(self, account: Account, now: float) -> None:
+    def _took(self, account: HeliostatAccount, now: float) -> None:
         board, sent = account.board, account.in_hand
         node = board.node
         assert node is not None
@@ -374,7 +374,7 @@ class Observer:
                 self.check(4, board.state not in ON_THE_WAY, now, name, saw)
         account.quiet = 0
 
-    def _changed(self, account: Account, now: float, heard: bool) -> None:
+    def _changed(self, account: HeliostatAccount, now: float, heard: bool) -> None:
         """Check a transition: by a command at this instant, or allowed by `FREE`."""
         before, after = account.state, account.board.state
         account.entered(after, now)
@@ -388,7 +388,7 @@ class Observer:
         saw = f"from {states.STATES[before]} to {states.STATES[after]} by {cause}"
         self.check(3, good, now, account.name, saw)
 
-    def _leases(self, account: Account, now: float) -> None:
+    def _leases(self, account: HeliostatAccount, now: float) -> None:
         """Check that a state that needs the sun has a fresh one."""
         if account.board.state in states.NEED_SUN:
             age = now - account.sun_at
@@ -397,7 +397,7 @@ class Observer:
             number = self._lease_number(now, 1)
             self.check(number, age <= LEASE + LOOK, now, account.name, saw)
 
-    def _booted(self, account: Account, now: float) -> None:
+    def _booted(self, account: HeliostatAccount, now: float) -> None:
         board = account.board
         node = board.node
         assert node is not None
@@ -440,7 +440,7 @@ class Observer:
         """Note a lease that the plant has sent on a working line."""
         self.leased_at = now
 
-    def ordered(self, order: Order) -> None:
+    def ordered(self, order: PlantCommand) -> None:
         """Note an order of the plant."""
         self.orders.note(order)
 
@@ -489,7 +489,7 @@ class Observer:
                     saw = f"{order.name} of {account.name} is reported as done and never was"
                     self.check(11, reached, now, subject, saw)
 
-    def status(self, message: Status, names: Iterable[str], now: float) -> None:
+    def status(self, message: ClusterStatus, names: Iterable[str], now: float) -> None:
         """Judge a report to the plant about each heliostat: no younger and no other than it is."""
         by_name = {account.name: account for account in self.accounts}
         for name, row in zip(names, message.nodes(), strict=True):
@@ -542,7 +542,7 @@ class Observer:
             saw = f"{where} went out {now - at:.1f} s ago and was never reported as accepted"
             self.check(11, told, now, "cluster", saw)
 
-    def _counted(self, account: Account, now: float) -> None:
+    def _counted(self, account: HeliostatAccount, now: float) -> None:
         """Check that counted steps are those that were handed to the timers."""
         board = account.board
         assert board.node is not None
@@ -553,7 +553,7 @@ class Observer:
             saw = f"axis {i} counts {counted} steps, and {ordered} were ordered"
             self.check(8, ordered == counted, now, account.name, saw)
 
-    def _due(self, account: Account, sun: FloatArray, now: float, leased: bool) -> None:
+    def _due(self, account: HeliostatAccount, sun: FloatArray, now: float, leased: bool) -> None:
         """Check that heliostats that are cut off or ordered off leave, and stow, in time."""
         board, name = account.board, account.name
         account.served(now, leased)

@@ -39,7 +39,7 @@ class Sent:
 
 
 @dataclass
-class Order:
+class PlantCommand:
     """A command of the plant.
 
     Attributes
@@ -129,9 +129,9 @@ class OrderLedger:
     """The recent orders of the plant."""
 
     def __init__(self) -> None:
-        self.by_identity: dict[str, Order] = {}
+        self.by_identity: dict[str, PlantCommand] = {}
 
-    def note(self, order: Order) -> None:
+    def note(self, order: PlantCommand) -> None:
         """Keep an order; a second one with the same identity is the same order, sent again."""
         self.by_identity.setdefault(order.identity, order)
 
@@ -147,7 +147,7 @@ class OrderLedger:
         for identity in old:
             del self.by_identity[identity]
 
-    def covering(self, name: str, addresses: Iterable[int], now: float) -> list[Order]:
+    def covering(self, name: str, addresses: Iterable[int], now: float) -> list[PlantCommand]:
         """Return the orders of a name for all these addresses that were given before now."""
         wanted = frozenset(addresses)
         return [

@@ -39,10 +39,10 @@ from heliotrope.plant.visits.settings import CycleSettings
 from heliotrope.store.records import Records
 from heliotrope.twin.cameras import (
     ExactCamera,
-    Mirror,
+    FieldSnapshot,
     Optics,
     RenderedCamera,
-    Sight,
+    TrueMirror,
     mirrors_near,
 )
 from heliotrope.twin.field.field import Field
@@ -215,7 +215,7 @@ class World:
         self.links[name], self.buses[name] = near, bus
 
     def _new_cameras(self) -> ExactCamera | RenderedCamera:
-        seed, sight = self.options.seed, Sight(self.clock, self._mirrors, self.sun)
+        seed, sight = self.options.seed, FieldSnapshot(self.clock, self._mirrors, self.sun)
         if not self.options.rendered:
             return ExactCamera(sight, self.options.centroid, seed)
         scenes = []
@@ -266,10 +266,10 @@ class World:
         mixed = first + (second - first) * (part / _SUN_EVERY)
         return np.asarray(mixed / np.linalg.norm(mixed))
 
-    def _mirrors(self) -> list[Mirror]:
+    def _mirrors(self) -> list[TrueMirror]:
         """Return the mirrors whose light may be on a target."""
         light, stand = self.sun(), self.field.stand()
-        found: dict[str, Mirror] = {}
+        found: dict[str, TrueMirror] = {}
         for target in self.design.targets:
             for mirror in mirrors_near(target, light, stand, self.names, self._sizes):
                 found[mirror.heliostat] = mirror

@@ -8,7 +8,7 @@ import asyncio
 from collections import deque
 
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import LinkClosedError, Outcome, Statistics
+from heliotrope.links.link import LinkClosedError, SendOutcome, Statistics
 
 #: Most messages that wait at an end; beyond that the oldest is dropped, as at any link.
 _CAPACITY = 256
@@ -67,20 +67,20 @@ class NearLink:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Put a message at the other end."""
         del hold
         if self.closed:
             raise LinkClosedError(f"link to {self.name}: it is closed")
         if expires is not None and self._clock.monotonic() >= expires:
             self.statistics.expired += 1
-            return Outcome.EXPIRED
+            return SendOutcome.EXPIRED
         if not self.connected or self.other is None:
             self.statistics.dropped += 1
-            return Outcome.DISCONNECTED
+            return SendOutcome.DISCONNECTED
         self.other.take(data, expires)
         self.statistics.sent += 1
-        return Outcome.SENT
+        return SendOutcome.SENT
 
     def take(self, data: bytes, expires: float | None) -> None:
         """Take a message from the other end."""

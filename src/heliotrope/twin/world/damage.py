@@ -22,7 +22,7 @@ from heliotrope.twin.world.records import RecordsDisk
 _HINDERS = ("line", "bus", "plant")
 
 
-class World(Protocol):
+class SimulatedPlant(Protocol):
     """The simulated plant that faults happen to; see `Simulation` for its attributes."""
 
     begin: float
@@ -66,7 +66,7 @@ class Damage:
         Time of the next change, s.
     """
 
-    def __init__(self, world: World, faults: Sequence[Fault]) -> None:
+    def __init__(self, world: SimulatedPlant, faults: Sequence[Fault]) -> None:
         self._of = world
         self._begin = world.begin
         self._left = deque(sorted(faults, key=lambda fault: fault.at))

@@ -14,13 +14,13 @@ from heliotrope.links.clock import VirtualClock
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import MemoryLine
 from heliotrope.links.messages import (
+    ClusterStatus,
     Command,
     Emergency,
     Lease,
     Message,
     Parameters,
     Progress,
-    Status,
     decode,
 )
 from heliotrope.safety import Alarm
@@ -29,7 +29,7 @@ from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
 from heliotrope.twin.invariants.invariants import Observer
-from heliotrope.twin.invariants.ledger import Order
+from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.intruder import Intruder
 from heliotrope.twin.world.tapped import TappedLink
@@ -196,7 +196,7 @@ class PlantEar:
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
 
-    def order(self, message: Command | Parameters, now: float, *, known: bool) -> Order:
+    def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""
         if isinstance(message, Command):
             name, whom = message.name, message.heliostats or tuple(self._addresses)
@@ -204,13 +204,13 @@ class PlantEar:
             name, whom = "PARAMETERS", (message.heliostat,)
         until = self._plant.until(message.token, now + message.lifetime + UNDER_WAY)
         addresses = frozenset(self._addresses[each] for each in whom)
-        return Order(message.identity, name, addresses, now, until, known, message.token)
+        return PlantCommand(message.identity, name, addresses, now, until, known, message.token)
 
     def received(self, data: bytes, now: float) -> None:
         """Judge a message to the plant."""
         message: Message = decode(data)
         observer, counts = self._pod.observer, self._pod.counts
-        if isinstance(message, Status):
+        if isinstance(message, ClusterStatus):
             counts["status"] += 1
             self._names = message.names or self._names
             if len(self._names) == len(message.nodes()):

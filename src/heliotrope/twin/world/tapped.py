@@ -4,7 +4,7 @@ import asyncio
 from typing import Protocol
 
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, Outcome, Statistics
+from heliotrope.links.link import Link, SendOutcome, Statistics
 
 
 class Listener(Protocol):
@@ -90,13 +90,13 @@ class TappedLink:
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> Outcome:
+    ) -> SendOutcome:
         """Send a message; see `links.link.Link`."""
         self._listener.posted(data, self._clock.monotonic())
         await self._goes.wait()
         begin = self._clock.monotonic()
         outcome = await self.inner.send(data, expires=expires, hold=hold)
-        if outcome is Outcome.SENT and (expires is None or begin < expires):
+        if outcome is SendOutcome.SENT and (expires is None or begin < expires):
             self._listener.sent(data, begin)
         return outcome
 
