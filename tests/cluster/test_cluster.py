@@ -263,7 +263,7 @@ def test_a_heliostat_that_falls_silent_is_reported_with_its_beam() -> None:
         assert alarm.severity is Severity.ALARM
         assert alarm.text.startswith(
             "A1: no answer for 10 s; its last state was TRACKING; "
-            "the place of its beam is unknown. "
+            "the position of its beam is unknown. "
         )
         rows = field.plant.status().nodes()
         assert rows["heard_ms"][0] > 9000

@@ -149,7 +149,7 @@ class Polling:
             last = "never heard" if node.heard_at < self._started else "its state was never heard"
         else:
             last = f"its last state was {states.STATES[node.state]}"
-            last += "; the place of its beam is unknown" if out else ""
+            last += "; the position of its beam is unknown" if out else ""
         self._reports.alarm(
             alarms.NODE_SILENT.raised(node.name, worse=out, silence=limit, last=last)
         )

@@ -118,7 +118,7 @@ NO_ANSWER = Refusal(
     "Check that the heliostat is live, and ask again.",
 )
 
-#: All of them, in the order of the reference.
+#: All kinds of refusal, in the order of the reference.
 KINDS: tuple[Refusal, ...] = tuple(
     kind for kind in tuple(globals().values()) if isinstance(kind, Refusal)
 )

@@ -2,8 +2,8 @@
 
 Begin with `CONDITIONS`, the rows of the table, and `evaluate`, which turns readings and time into
 the actions that are demanded. `Proof` records that every heliostat obeyed an emergency order.
-`JoinLimiter` bounds how many heliostats join the receiver. `Alarm` is what people are told, and
-`heliotrope.safety.alarms` lists every kind of alarm beside the rows.
+`JoinLimiter` bounds the rate at which heliostats join the receiver. `Alarm` is a message to people,
+and `heliotrope.safety.alarms` lists every kind of alarm beside the rows.
 
 Nothing here reads a clock, a sensor or a link.
 """

@@ -1,6 +1,6 @@
-"""Every alarm that is no row of the safety table, as data: severity, text, consequence, remedy.
+"""The alarms beside the rows of the safety table, as data: severity, text, consequence, remedy.
 
-The places that raise an alarm fill in its text: ``NODE_SILENT.raised("H12", ...)``. So each text
+The code that raises an alarm fills in its text: ``NODE_SILENT.raised("H12", ...)``. So each text
 stands once, and `docs/reference/alarms.md` and the operator's handbook are checked against this
 table and the rows of `safety.conditions`.
 """
@@ -23,9 +23,9 @@ class Alarm:
         Name of the row or of the `AlarmKind`; the cluster, heliostat, target or sensor it is about,
         "" for the plant.
     severity, text
-        For the operator.
+        Severity, and text for the operator.
     active
-        False when it is over.
+        Whether it still holds; False ends it.
     """
 
     kind: ClassVar[str] = "alarm"
@@ -38,26 +38,26 @@ class Alarm:
 
 @dataclass(frozen=True)
 class AlarmKind:
-    """An alarm that the code can raise.
+    """A kind of alarm.
 
     Attributes
     ----------
     name
-        Its name on the wire and on the page.
+        Name on the wire and on the page.
     watcher
-        The tier that raises it.
+        Tier that raises it.
     severity
-        The usual one.
+        Usual severity.
     meaning
-        When it is raised.
+        Circumstances in which it is raised.
     text
         What is wrong and where, with ``{subject}`` and other fields to be filled in.
     consequence, remedy
         What happens by itself, and what the operator should do: a sentence each.
     over
-        The text when it is over; "" if it never ends by itself.
+        Text when it is over; "" if it never ends by itself.
     worse
-        The severity in the worse case that ``meaning`` names, if there is one.
+        Severity in the worse case that ``meaning`` names, if there is one.
     """
 
     name: str
@@ -80,7 +80,7 @@ class AlarmKind:
         return Alarm(self.name, subject, severity, self.line(subject=subject, **fields))
 
     def ended(self, subject: str = "", **fields: object) -> Alarm:
-        """Return that the alarm about a subject is over."""
+        """Return the message that the alarm about a subject is over."""
         text = (self.over or "{subject} {name}: over").format(
             subject=subject, name=self.name, **fields
         )
@@ -92,7 +92,7 @@ TIME_WENT_BACK = AlarmKind(
     _PLANT,
     Severity.EMERGENCY,
     "The monotonic clock of the plant's or a cluster's machine went back or gave no number.",
-    "the monotonic time went from {before:g} s to {now:g} s; restart this controller",
+    "the monotonic time went from {before:g} s to {now:g} s",
     "DEFOCUS of the field; nothing ages or releases meanwhile.",
     "Restart the controller and replace its machine.",
     over="the monotonic time runs forwards again",
@@ -104,15 +104,15 @@ UNKNOWN_READING = AlarmKind(
     "A reading arrives that no row of the safety table uses.",
     "reading {reading!r} is in no row of the safety table, so nothing watches it",
     "The reading is ignored.",
-    "Correct its name.",
+    "Correct the name of the reading.",
     over="every reading belongs to a row again",
 )
 PARAMETERS_DIFFER = AlarmKind(
     "parameters_differ",
     _PLANT,
     Severity.WARNING,
-    "A local controller stores other parameters than the plant wants.",
-    "{subject}: stored parameters differ from what is wanted: {items}",
+    "A local controller stores parameters that differ from the wanted ones.",
+    "{subject}: stored parameters differ from the wanted ones: {items}",
     "They are pushed as soon as there is a command authority and the heliostat's state allows it.",
     "Nothing to do; if it returns, replace the controller's flash memory.",
 )
@@ -144,7 +144,7 @@ BEAM_BLOCKED = AlarmKind(
     "{subject}: {reason}",
     "Automatic control leaves it where it is and tries again every five minutes.",
     "Give it another aim point, or correct the volume in the plant file.",
-    over="{subject}: it has left the place from which no way was clear",
+    over="{subject}: it has left the blocked position",
 )
 CAMERA = AlarmKind(
     "camera",
@@ -171,7 +171,7 @@ ORDER_UNACKNOWLEDGED = AlarmKind(
     _CLUSTER,
     Severity.EMERGENCY,
     "A heliostat has not acknowledged DEFOCUS or STOW within a second.",
-    "{subject} has not acknowledged {order}; the place of its beam is unknown",
+    "{subject} has not acknowledged {order}; the position of its beam is unknown",
     "The cluster repeats the order until it is acknowledged.",
     "Keep people away from its beam and inspect the heliostat.",
     over="{subject} has acknowledged",
@@ -182,7 +182,7 @@ NODE_SILENT = AlarmKind(
     Severity.WARNING,
     "A local controller does not answer; an alarm if its beam was out when it was last heard.",
     "{subject}: no answer for {silence:g} s; {last}",
-    "The cluster goes on asking it.",
+    "The cluster keeps polling it.",
     "Assume that its beam has not moved; check its supply and its cable.",
     over="{subject}: it answers again",
     worse=Severity.ALARM,
@@ -222,7 +222,7 @@ LEASE_REFUSED = AlarmKind(
     Severity.ALARM,
     "The plant's lease is out of range.",
     "{problem}",
-    "The lease is not taken; when the last one ends, the cluster defocuses.",
+    "The cluster ignores the lease, and defocuses when the last valid one ends.",
     "Correct the plant's settings lease and autonomy.",
     over="the plant's lease is accepted again",
 )
@@ -258,7 +258,7 @@ STATE_UNWRITABLE = AlarmKind(
     over="the cluster's epoch is stored again",
 )
 
-#: All of them, by name.
+#: All kinds of alarm, by name.
 KINDS: dict[str, AlarmKind] = {
     kind.name: kind for kind in tuple(globals().values()) if isinstance(kind, AlarmKind)
 }

@@ -1,4 +1,4 @@
-"""What a row of the safety table is made of."""
+"""The parts of a row of the safety table."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from heliotrope.errors import InputError
 
 
 class Act(IntEnum):
-    """What is done, from weak to strong; the strongest wins."""
+    """The acts, from weak to strong; the strongest wins."""
 
     ALARM = 0
     REFUSE_NEW = 1
@@ -18,12 +18,12 @@ class Act(IntEnum):
 
     @property
     def text(self) -> str:
-        """What it means."""
+        """The act in words."""
         return _ACT_TEXTS[self]
 
 
 _ACT_TEXTS = {
-    Act.ALARM: "the operator is told; no motion starts or stops",
+    Act.ALARM: "the operator is alerted; no motion starts or stops",
     Act.REFUSE_NEW: "new motions are refused, except DEFOCUS, STOW and LOCK; running motions go on",
     Act.HOLD: "heliostats stop where they are, and new motions are refused as by REFUSE_NEW",
     Act.DEFOCUS: "beams leave the receiver now; pre-empts every motion except stowing",
@@ -32,7 +32,7 @@ _ACT_TEXTS = {
 
 
 class Scope(IntEnum):
-    """What an action applies to."""
+    """The part of the plant that an action applies to."""
 
     HELIOSTAT = 0
     CLUSTER = 1
@@ -40,7 +40,7 @@ class Scope(IntEnum):
 
 
 class Severity(StrEnum):
-    """How serious an alarm or event is; the same word on the wire, in the store and on the page."""
+    """Severity of an alarm or event; the same word on the wire, in the store and on the page."""
 
     INFO = "info"
     WARNING = "warning"
@@ -49,7 +49,7 @@ class Severity(StrEnum):
 
     @property
     def rank(self) -> int:
-        """From 0, the least serious."""
+        """Rank from 0, the least serious."""
         return tuple(Severity).index(self)
 
     @classmethod
@@ -63,7 +63,7 @@ class Severity(StrEnum):
 
 
 class Role(IntEnum):
-    """Who may acknowledge; a higher role may acknowledge for a lower one.
+    """Role that may acknowledge; a higher role may acknowledge for a lower one.
 
     The console's engineer acts as supervisor, and people are shown that title.
     """
@@ -87,7 +87,7 @@ class Watcher(Enum):
 
 @dataclass(frozen=True)
 class Reading:
-    """A value in the unit of its row, and when it was taken, monotonic s."""
+    """A value in the unit of its row, and its time, monotonic s."""
 
     value: float
     at: float
@@ -100,9 +100,9 @@ class Condition:
     Attributes
     ----------
     name
-        Unique.
+        Unique name.
     watcher
-        The tier that evaluates it.
+        Tier that evaluates it.
     reading, unit
         Key of the reading, and its unit: "s", "m/s", "rad", "share" (1 is 100 %), "count" or
         "yes/no" (1 is yes).
@@ -112,23 +112,23 @@ class Condition:
         The row trips at ``trips`` or beyond, and may release at ``releases`` or on its safe side.
         ``trips`` above ``releases`` means that large values are bad.
     act, scope, severity
-        What is done, to what, and how serious it is.
+        The act, the part of the plant that it applies to, and the severity.
     budget
-        From the fault to the finished action, s.
+        Longest time from the fault to the finished action, s.
     then_stow
-        From the trip to STOW in place of ``act``, s; infinite for never.
+        Time from the trip to STOW in place of ``act``, s; infinite for never.
     delay
-        How long the value must be beyond ``trips``, s.
+        Time that the value must be beyond ``trips``, s.
     clear_for
-        How long fresh readings must be safe before release, s.
+        Time that fresh readings must be safe before release, s.
     stale_after
         Age from which a reading counts as its worst case, s; not used with ``ages``.
     ages
-        The reading is an age or a silence, which grows until the next reading.
+        Whether the reading is an age or a silence, which grows until the next reading.
     role
-        Who must acknowledge; None if the row does not latch.
+        Role that must acknowledge; None if the row does not latch.
     release
-        How it ends, in words.
+        Condition of its end, in words.
     remedy
         What the operator should do: a sentence.
     """
@@ -225,12 +225,12 @@ class Condition:
 
     @property
     def limit(self) -> str:
-        """The trip in words, as " (limit 3 s)"; "" where yes or no, or one, is enough."""
+        """The trip in words, as " (limit 3 s)"; "" for a row of yes or no, or of a count."""
         return "" if self.unit in ("yes/no", "count") else f" (limit {self.shown(self.trips)})"
 
     @property
     def consequence(self) -> str:
-        """What happens by itself: a sentence."""
+        """The automatic action: a sentence."""
         target = {Scope.HELIOSTAT: "the heliostat", Scope.CLUSTER: "the cluster"}
         whole = target.get(self.scope, "the field")
         text = {

@@ -17,7 +17,7 @@ _OPERATOR, _SUPERVISOR = Role
 
 #: Lease of the plant to a cluster, and of a cluster's sun vector to its local controllers, s.
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0
-#: From a defocus that nobody lifts to STOW, s.
+#: Time from a defocus to STOW, unless the defocus is lifted, s.
 _PATIENCE = 30.0
 
 
@@ -27,7 +27,7 @@ def conditions(autonomy: float = 0.0) -> tuple[Condition, ...]:
     Parameters
     ----------
     autonomy
-        How long clusters may go on without the plant, s. Set it above 0 only where a hard-wired
+        Time that clusters may go on without the plant, s. Set it above 0 only where a hard-wired
         emergency line reaches every cluster.
 
     Raises

@@ -1,9 +1,9 @@
 """The evaluation of the safety table: a pure function of readings, state and time.
 
-The plant, the clusters and the local controllers each watch the rows that name them. A row says
-which reading trips it, at which value and after which delay; what is then done to what; how
-serious it is; whether it latches and who must acknowledge it; and when it releases. Nothing here
-reads a clock or a sensor: readings and time (monotonic seconds) are arguments.
+The plant, the clusters and the local controllers each watch the rows that name them. A row gives
+the reading that trips it, the value and the delay; the act, its scope and its severity; whether it
+latches and which role must acknowledge it; and when it releases. Nothing here reads a clock or a
+sensor: readings and time (monotonic seconds) are arguments.
 
 Rules for every row:
 
@@ -39,13 +39,13 @@ class Track:
         Last good reading (``None`` before the first) and its time, s; before the first, the
         time of the start.
     beyond_since
-        When the value went beyond the trip, s; None while it is not.
+        Time at which the value went beyond the trip, s; None while it is not.
     safe_since
         Time of the first of an unbroken run of safe readings, s; None if the last is not safe.
     tripped_at
-        When the row tripped, s; None while it is not tripped.
+        Time at which the row tripped, s; None while it is not tripped.
     cleared
-        The cause has gone and only the acknowledgement is missing.
+        Whether the cause has gone and only the acknowledgement is missing.
     acknowledged_by
         The person who acknowledged the last trip.
     """
@@ -74,22 +74,22 @@ class SafetyState:
 
 @dataclass(frozen=True)
 class Action:
-    """What a tripped row demands.
+    """The demand of a tripped row.
 
     Attributes
     ----------
     act, scope, subject
-        What to do, and to what: the name of the cluster or heliostat, "" for the field.
+        The act and its scope; the name of the cluster or heliostat, "" for the field.
     condition, severity, budget
-        Of the row; s.
+        Name, severity and budget (s) of the row.
     since
-        When it tripped, monotonic s.
+        Time of the trip, monotonic s.
     new
-        It tripped, or became a STOW, in this evaluation.
+        Whether it tripped, or became a STOW, in this evaluation.
     waits
-        Only an acknowledgement is missing.
+        Whether only an acknowledgement is missing.
     text, remedy
-        What is wrong and what is done, and what the operator should do.
+        What is wrong and what happens by itself, and what the operator should do.
     """
 
     act: Act
@@ -118,7 +118,7 @@ def start(
     Parameters
     ----------
     table
-        The rows to evaluate, as of `conditions` and `watched_by`.
+        The rows to evaluate, from `conditions` and `watched_by`.
     now
         Monotonic seconds; the ages of readings that never come count from here.
     subjects
@@ -155,11 +155,11 @@ def narrowed(state: SafetyState, name: str, subjects: Iterable[str]) -> SafetySt
     Parameters
     ----------
     state
-        As of `start` or the last evaluation.
+        State from `start` or the last evaluation.
     name
-        Of the row.
+        Name of the row.
     subjects
-        Those with a reading.
+        Subjects with a reading.
     """
     tracks = {
         key: track
@@ -183,7 +183,7 @@ def evaluate(
         By name of the reading and subject. The reading of subject "" serves where a
         subject has none of its own.
     state
-        As `start` or the last evaluation gave it.
+        State from `start` or the last evaluation.
     now
         Monotonic seconds. A time before the last one is a broken clock: DEFOCUS of the
         field is demanded, and nothing ages or releases.
@@ -297,7 +297,7 @@ def _act(row: Condition, tripped_for: float) -> Act:
 
 
 def _said(row: Condition, track: Track, now: float) -> str:
-    """Return in words what the row is judged by."""
+    """Return, in words, the value that the row is judged by."""
     counts = _counting(row, track.value, track.seen, now)
     if math.isinf(counts):
         return f"no reading of {row.what} for {now - track.seen:.1f} s, so the worst case counts"

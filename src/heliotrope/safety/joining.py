@@ -8,7 +8,7 @@ from heliotrope.errors import InputError
 
 @dataclass(frozen=True)
 class JoinLimiter:
-    """Bounds how many heliostats join the receiver.
+    """The bound on the rate at which heliostats join the receiver.
 
     In any span of T seconds at most ``burst + rate · T`` heliostats join.
 

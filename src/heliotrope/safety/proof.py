@@ -7,7 +7,8 @@ from dataclasses import dataclass, field, replace
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Reading
 
-#: From the order to the last acknowledgement, to beams off the receiver, and to stow, s.
+#: Longest time from the order to the last acknowledgement, to beams off the receiver, and to
+#: stow, s.
 ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
 #: Limit of the flux on the receiver after a defocus, as a share of the nominal.
 FLUX_LIMIT = 0.10
@@ -17,7 +18,7 @@ FLUX_AGE = 5.0
 
 @dataclass(frozen=True)
 class ProofReport:
-    """How far an emergency order has been carried out.
+    """The progress of an emergency order.
 
     Attributes
     ----------
@@ -29,7 +30,7 @@ class ProofReport:
         Whether a fresh reading, taken after the order, shows the flux below its limit; None while
         there is still time for that.
     complete
-        Every heliostat has acknowledged and is done, and the flux is proven.
+        Whether every heliostat has acknowledged and is done, and the flux is proven.
     """
 
     unacknowledged: tuple[str, ...]
@@ -68,11 +69,11 @@ class Proof:
     nodes
         Heliostats that must obey.
     acknowledged, done
-        When each of them acknowledged the order and carried it out, s.
+        Time at which each of them acknowledged the order and carried it out, s.
     flux
         Last reading of the flux after the order, as a share of the nominal.
     refused
-        Count of reports that prove nothing: from other heliostats, or from before the order.
+        Number of reports that prove nothing: from other heliostats, or from before the order.
     """
 
     order: str
@@ -96,7 +97,7 @@ class Proof:
 
     @property
     def budget(self) -> float:
-        """From the order to the finished action, s."""
+        """Longest time from the order to the finished action, s."""
         return DEFOCUS_BUDGET if self.order == "DEFOCUS" else STOW_BUDGET
 
     def with_acknowledged(self, node: str, at: float) -> "Proof":
@@ -136,7 +137,7 @@ class Proof:
         return node in self.nodes and math.isfinite(at) and at >= self.ordered_at
 
     def report(self, now: float) -> ProofReport:
-        """Return what is proven at ``now``, and which heliostats are late."""
+        """Return the progress at ``now``, with the heliostats that are late."""
         silent = self.nodes - set(self.acknowledged)
         open_ = self.nodes - set(self.done)
         late = {n for n, at in self.acknowledged.items() if at - self.ordered_at > ORDER_BUDGET}
