@@ -211,14 +211,14 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
     dialog.locator("text=Add…").click()
     page.fill("dialog:last-of-type [name=name]", "desk-1")
     page.fill("dialog:last-of-type [name=password]", "long enough for it")
-    page.click("dialog:last-of-type >> text='Make account'")
+    page.click("dialog:last-of-type >> text='Create account'")
     row = dialog.locator("tr:has-text('desk-1')")
     row.wait_for()
     row.locator("select").select_option("operator")
     dialog.locator(".hx-told:has-text('desk-1: operator')").wait_for()
     assert people.account("desk-1").role == "operator"
     row.locator("text=New password").click()
-    page.click("dialog:last-of-type >> text='Make'")
+    page.click("dialog:last-of-type >> text='Create'")
     word = dialog.locator(".hx-secret").inner_text()
     assert verify_password(people.account("desk-1").password_hash, word)
     row.locator("text=Disable").click()
@@ -234,10 +234,10 @@ def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], 
     _menu(page, "API tokens")
     assert page.locator(".q-menu >> text=People").count() == 0
     dialog = page.locator("dialog.wide")
-    dialog.locator("text=Make…").click()
+    dialog.locator("text=Create…").click()
     page.fill("dialog:last-of-type [name=label]", "nightly")
     assert page.locator("dialog:last-of-type [name=role] option").all_inner_texts() == ["viewer"]
-    page.click("dialog:last-of-type >> text='Make'")
+    page.click("dialog:last-of-type >> text='Create'")
     secret = dialog.locator(".hx-secret").inner_text()
     assert people.token(secret, time.time()).label == "nightly"
     dialog.locator("tr:has-text('nightly') >> text=Revoke").click()
@@ -275,8 +275,8 @@ def test_dark_and_light(enter: Callable[[str], Any]) -> None:
 def test_calibration_is_seen(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page = enter("viewer")
     page.click(".hx-tabs >> text=Calibration")
-    page.wait_for_selector(".hx-calibration td:has-text('learnt')", timeout=60_000)
-    row = page.inner_text(".hx-calibration tbody tr:has-text('learnt') >> nth=0")
+    page.wait_for_selector(".hx-calibration td:has-text('✓ calibrated')", timeout=60_000)
+    row = page.inner_text(".hx-calibration tbody tr:has-text('✓ calibrated') >> nth=0")
     assert any(target in row for target in field.live.operations.targets)
     page.select_option(".hx-tools select", "error")
     assert page.evaluate("heliotrope.store.error.some(e => e > 0 && e < 3e-3)")

@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 
 class Attempts:
-    """Counts failures by key within a time span.
+    """The failures by key within a time span.
 
     Parameters
     ----------
@@ -14,7 +14,7 @@ class Attempts:
     monotonic
         Returns the time, s.
     largest
-        Number of keys that are kept; the oldest go first.
+        Number of keys that are kept; the oldest are dropped first.
     """
 
     def __init__(

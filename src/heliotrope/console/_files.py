@@ -1,7 +1,7 @@
 """The page's files served from memory: one turn of the plant's loop each, and no thread.
 
 The page has some thirty files. Reading one from the disk takes a thread and several turns of the
-loop, which the plant needs too, and compressing it again for every viewer takes more.
+loop, which the plant needs too; compressing it again for every viewer takes even more.
 """
 
 import gzip
@@ -37,7 +37,7 @@ KEPT, PLAIN = f"/console/{TAG}", "/console/static"
 
 
 class Files:
-    """An ASGI middleware that remembers the files of the page.
+    """An ASGI middleware that keeps the files of the page in memory.
 
     Parameters
     ----------

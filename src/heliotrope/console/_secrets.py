@@ -8,7 +8,7 @@ import argon2
 
 from heliotrope.errors import InputError
 
-#: Shortest password, and longest, so that nobody makes the server hash a book.
+#: Shortest and longest password; a longer one would cost the server too much to hash.
 SHORTEST, LONGEST = 10, 200
 _HASHER = argon2.PasswordHasher()
 #: Verified where there is no account, so that both cases take the same time.
@@ -50,7 +50,7 @@ def new_password() -> str:
 
 
 def csrf_of(session: str) -> str:
-    """Return the word that a page must send with every change in a session."""
+    """Return the CSRF word that a page must send with every change in a session."""
     return hmac.new(session.encode(), b"heliotrope csrf", hashlib.sha256).hexdigest()
 
 

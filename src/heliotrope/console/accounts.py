@@ -99,7 +99,7 @@ async def own_password(
         raise
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
-    console.operations.logbook.event("people", who.person.name, "has changed the own password")
+    console.operations.logbook.event("people", who.person.name, "has changed their password")
 
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
@@ -126,11 +126,11 @@ async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
 async def new_account(
     console: Here, who: Engineer, given: models.NewAccount
 ) -> models.AccountState:
-    """Make an account."""
+    """Create an account."""
     kept = await _hashed(console, given.password)
     made = await asyncio.to_thread(console.people.add, given.name, kept, given.role, console.now())
     console.operations.logbook.event(
-        "people", who.person.name, f"account {given.name} made, {given.role}"
+        "people", who.person.name, f"account {given.name} created, {given.role}"
     )
     return _account(made)
 
@@ -167,9 +167,9 @@ async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
 
 @router.post("/tokens", response_model=models.TokenState, status_code=201, tags=["people"])
 async def new_token(console: Here, who: Anyone, given: models.NewToken) -> models.TokenState:
-    """Make a token for a program; its secret is shown in this answer only."""
+    """Create a token for a program; its secret is shown in this answer only."""
     if who.by != "session":
-        raise HTTPException(403, "a token cannot make tokens; sign in to do so")
+        raise HTTPException(403, "a token cannot create tokens; sign in to do so")
     if ROLES[given.role] > who.person.role:
         raise HTTPException(403, f"token: role {given.role} is higher than your own")
     made, secret = await asyncio.to_thread(
@@ -181,7 +181,7 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
         86_400.0 * given.days,
     )
     console.operations.logbook.event(
-        "people", who.person.name, f"token {given.label} made, {given.role}"
+        "people", who.person.name, f"token {given.label} created, {given.role}"
     )
     return models.TokenState(**asdict(made), secret=secret)
 
@@ -212,7 +212,7 @@ def _address(request: Request) -> str:
 
 
 def _whose(who: Caller) -> str:
-    """Return the name whose tokens a person may see, "" for everybody's."""
+    """Return the name of the person whose tokens a caller may see, "" for all."""
     return "" if who.person.role >= Role.ENGINEER else who.person.name
 
 

@@ -32,9 +32,9 @@ from heliotrope.plant.operations.operations import Operations
 REFUSALS: dict[int | str, dict[str, Any]] = {
     401: {"model": models.Problem, "description": "Not signed in"},
     403: {"model": models.Problem, "description": "The role is too low"},
-    404: {"model": models.Problem, "description": "There is none of that name"},
+    404: {"model": models.Problem, "description": "Unknown name"},
     409: {"model": models.Problem, "description": "Not accepted now; nothing was sent"},
-    422: {"model": models.Problem, "description": "What was sent cannot be used"},
+    422: {"model": models.Problem, "description": "The request cannot be used"},
     503: {"model": models.Problem, "description": "It cannot be recorded now; nothing was sent"},
 }
 #: Age of a view that all viewers share, s.
@@ -54,9 +54,9 @@ def answer(value: Any) -> JSONResponse:
 def shared(
     console: Console, request: Request, key: str, make: Callable[[], Any], fresh: float = FRESH
 ) -> Response:
-    """Return a view that is the same for everybody, encoded once for all who ask together.
+    """Return a view that is the same for everybody, encoded once for all callers of a moment.
 
-    It holds nothing of the person who asks, so its compressed length reveals no secret.
+    It holds nothing of the caller, so its compressed length reveals no secret.
     """
     now, kept = time.monotonic(), console.shared.get(key)
     if kept is None or now - kept[0] >= fresh:
@@ -153,7 +153,7 @@ async def flux(console: Here, request: Request, who: Anyone, name: Named) -> Res
     "/targets/{name}/photograph",
     tags=["calibration"],
     response_class=Response,
-    responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "None was taken yet"}},
+    responses={200: {"content": {"image/jpeg": {}}}, 204: {"description": "No photograph yet"}},
 )
 async def photograph(console: Here, request: Request, who: Anyone, name: Named) -> Response:
     """Return the last photograph of a target, annotated with the findings of the software."""

@@ -29,8 +29,8 @@ from heliotrope.store.records import StoreError
 
 ABOUT = (
     "Reads and commands a heliostat field. Sign in (POST /api/v1/session) or send a token "
-    "(Authorization: Bearer). In a session, all that changes anything needs the header "
-    "X-CSRF-Token with the word that the sign-in answered."
+    "(Authorization: Bearer). In a session, every change needs the header X-CSRF-Token with the "
+    "word that the answer to the sign-in gave."
 )
 
 

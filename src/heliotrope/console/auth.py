@@ -69,7 +69,7 @@ class Console:
     async def keep_authority(self) -> None:
         """Renew the authority for a holder whose page or program has been present recently.
 
-        The authority lasts by the plant's time, which may run faster than people do.
+        The authority expires by the plant's time, which may run faster than that of people.
         """
         while True:
             await asyncio.sleep(0.2 * self.operations.plant.authority.lifetime)

@@ -36,7 +36,7 @@ def authority_of(console: Console, who: Caller) -> models.AuthorityState:
 
 
 async def _told(console: Console) -> None:
-    """Wait until a new token is known: clusters hear it with a lease, their nodes a second later.
+    """Wait until a new token is known: clusters get it with a lease, their nodes a second later.
 
     Until then the field would refuse commands.
     """

@@ -71,7 +71,7 @@ class Guard:
         if not host_known(console, headers.get("host", "")):
             return 421, "this machine is not known here by that name; see --name"
         if "transfer-encoding" in headers:
-            return 411, "a body is to be sent with its length"
+            return 411, "send the length of the body (Content-Length)"
         length = headers.get("content-length", "0")
         if not length.isdigit() or int(length) > LARGEST:
             return 413, f"the body is longer than {LARGEST} bytes"

@@ -40,7 +40,7 @@ def rows_of(operations: Operations) -> npt.NDArray[Any]:
 
 
 class Stream:
-    """Makes the messages, and tells the waiting viewers about each.
+    """The maker of the messages, which wakes the waiting viewers for each.
 
     Parameters
     ----------

@@ -108,7 +108,7 @@ class Who(BaseModel):
     role: str
     by: str = Field(description='"session" or "token"')
     expires: float | None = Field(description="POSIX s")
-    csrf: str = Field("", description="To be sent as X-CSRF-Token with all that changes anything")
+    csrf: str = Field("", description="Send it as X-CSRF-Token with every change")
 
 
 class Whom(Strict):
@@ -194,7 +194,7 @@ class OwnPassword(Strict):
 
 
 class GivenPassword(BaseModel):
-    """A password made for a person; it is shown in this answer only."""
+    """A new password of a person; it is shown in this answer only."""
 
     name: str
     password: str
@@ -214,7 +214,7 @@ class TicketState(BaseModel):
     identity: str
     command: str
     heliostats: int
-    counted: dict[str, int] = Field(description="How many heliostats are at each stage")
+    counted: dict[str, int] = Field(description="Number of heliostats at each stage")
     finished: bool
     good: bool = Field(description="Whether every heliostat is done")
     text: str
@@ -227,7 +227,7 @@ class AuthorityState(BaseModel):
     holder: str
     role: str
     mine: bool
-    lifetime: float = Field(description="How long it lasts without being kept up, s")
+    lifetime: float = Field(description="Life without renewal, s")
 
 
 class KeepOut(BaseModel):
@@ -246,11 +246,11 @@ class FieldState(BaseModel):
     clusters: list[str]
     cluster: list[int] = Field(description="Place in clusters")
     size: float = Field(description="Larger side of a mirror, m, the median")
-    tower: Place = Field(description="Middle of the receivers, ENU, m")
+    tower: Place = Field(description="Centre of the receivers, ENU, m")
     receivers: list[str]
     targets: list[str]
     keep_outs: list[KeepOut]
-    surfaces: list[str] = Field(description="What `on` of a row counts")
+    surfaces: list[str] = Field(description="Places that `on` of a row names")
     states: list[str]
     faults: list[str]
 
@@ -281,7 +281,7 @@ class AccountState(BaseModel):
 
 
 class TokenState(BaseModel):
-    """A token of a program; its secret is shown once, when it is made."""
+    """A token of a program; its secret is shown once, when it is created."""
 
     key: str
     name: str

@@ -10,7 +10,7 @@ FIRST = "engineer"
 
 
 def first_start(people: People, now: float) -> str | None:
-    """Make the first account if there is none.
+    """Create the first account if there is none.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def first_start(people: People, now: float) -> str | None:
 
     Returns
     -------
-    Its password, to be printed once; None if there are accounts already.
+    The account's password, to be printed once; None if there are accounts already.
     """
     if not people.empty():
         return None

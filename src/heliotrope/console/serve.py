@@ -15,7 +15,7 @@ from heliotrope.store.people import People
 
 
 class _Server(uvicorn.Server):
-    """Leaves signals to the owner of the process, which stows the field before it ends."""
+    """A server that leaves signals to the owner of the process, which stows the field first."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

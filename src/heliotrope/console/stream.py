@@ -34,7 +34,7 @@ ROW = np.dtype(
 
 
 class RemoteError(HeliotropeError):
-    """The console refused a request, or cannot be reached (``status`` 0)."""
+    """The refusal of a request by the console; ``status`` is 0 if it cannot be reached."""
 
     def __init__(self, text: str, status: int = 0) -> None:
         super().__init__(text)

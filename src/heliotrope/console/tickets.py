@@ -11,7 +11,7 @@ KEPT = 200
 
 
 class Tickets:
-    """Keeps the last tickets by their identity in the audit."""
+    """The last tickets, by their identity in the audit."""
 
     def __init__(self) -> None:
         self._kept: OrderedDict[str, Ticket] = OrderedDict()

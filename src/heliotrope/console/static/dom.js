@@ -1,4 +1,4 @@
-// Small things to build the page from. Text always goes in as text, never as markup.
+// Building blocks of the page. Text is always inserted as text, never as markup.
 import { store } from "./live.js";
 
 export function h(tag, given = {}, ...children) {
@@ -39,7 +39,7 @@ export function facts(pairs) {
     h("div", { className: extra ?? "" }, h("dt", {}, name), h("dd", {}, value))));
 }
 
-// Calls `load` now and whenever `key()` changes, or every some seconds; never twice at once.
+// Calls `load` now, whenever `key()` changes, and every `every` seconds; never twice at once.
 export function refreshed(load, { key = () => "", every = Infinity } = {}) {
   let busy = false, last = "", at = -Infinity, over = false;
   const look = async () => {
@@ -84,7 +84,7 @@ export function chart(canvas, series, night) {
   c.clearRect(0, 0, wide, high);
   const points = series.flatMap((line) => line.points).filter(([, v]) => v > 0);
   c.font = "11px system-ui, sans-serif"; c.fillStyle = night ? "#aab4bf" : "#57606a";
-  if (!points.length) { c.fillText("no measurement has come to its end yet", 12, high / 2); return; }
+  if (!points.length) { c.fillText("no measurement has finished yet", 12, high / 2); return; }
   const times = points.map(([t]) => t), values = points.map(([, v]) => v);
   const first = Math.min(...times), last = Math.max(...times, first + 60);
   const low = Math.log10(Math.min(...values, 0.1)) - 0.1, top = Math.log10(Math.max(...values, 20)) + 0.05;

@@ -1,4 +1,4 @@
-// EMERGENCY: on its own, so that it works when all else is slow or broken. One click or key press.
+// EMERGENCY: a script of its own, so that it works when everything else is slow or broken. One click or key press.
 (() => {
   const button = document.getElementById("emergency");
   const say = document.getElementById("emergency-said");

@@ -1,11 +1,11 @@
-// What the page knows of the plant: the live stream, decoded into one table, and the way to the API.
-// Everything that is shown comes from here; nothing here shows anything.
+// The page's data: the live stream, decoded into one table, and access to the API.
+// Everything that is shown comes from here; nothing is drawn here.
 
 export const STATES = ["UNCONFIGURED", "STOWED", "STOWING", "APPROACHING", "IDLE", "TRACKING",
   "DEFOCUSED", "LOCKED", "SEARCHING", "FAULT"];
 export const STALE = 255;
 const ROW = 24; // bytes of a row; see docs/reference/api-http.md
-const LATE = 3000; // ms after which what was last heard is no longer shown as live
+const LATE = 3000; // ms after which the last data is no longer shown as live
 
 const meta = (name) => document.querySelector(`meta[name="${name}"]`)?.content ?? "";
 export const me = { name: meta("heliotrope-person"), role: meta("heliotrope-role") };
@@ -28,7 +28,7 @@ class Store extends EventTarget {
   }
 
   async start() {
-    this.connect(); // its first message is soon here; it waits for the field
+    this.connect(); // messages that come before the field are kept in `early`
     this.field = await api("GET", "field");
     const n = this.field.names.length;
     this.index = new Map(this.field.names.map((name, row) => [name, row]));

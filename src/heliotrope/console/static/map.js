@@ -52,7 +52,7 @@ export class FieldMap {
     window.heliotropeMap = this; // for measurements of its rate
   }
 
-  // Tells measurements when the field was first seen live.
+  // Marks the time at which the field is first shown live, for measurements.
   drawn() {
     if (!this.seen && store.live && this.x) { this.seen = true; performance.mark("heliotrope-ready"); }
   }
@@ -109,7 +109,7 @@ export class FieldMap {
     this.moved = this.dirty = true;
   }
 
-  // Rows by colour, so that the colour changes as seldom as there are classes.
+  // Rows by colour, so that the colour changes only once for each class.
   classes() {
     if (this.order) return this.order;
     const view = VIEWS[this.view], colours = view.colours();
@@ -183,7 +183,7 @@ export class FieldMap {
   }
 
   drawKeepOuts(c, night) {
-    // Where no beam may be.
+    // Keep-out volumes.
     c.strokeStyle = c.fillStyle = night ? "#ff8a5c" : "#c04a00"; c.lineWidth = 1.5; c.setLineDash([6, 4]);
     for (const { name, outline } of store.field.keep_outs) {
       const places = outline.map(([east, north]) => this.toScreen(east, north));
@@ -196,7 +196,7 @@ export class FieldMap {
   }
 
   drawMarks(c, half, night) {
-    // Shape besides colour: faults carry a cross; what is stale is hollow when there is room.
+    // Shape besides colour: faults carry a cross; stale heliostats are hollow when there is room.
     const n = this.x.length, ink = night ? "#ffffff" : "#000000";
     c.lineWidth = 1.5;
     for (let row = 0; row < n; row++) {
@@ -234,7 +234,7 @@ export class FieldMap {
       c.beginPath(); c.arc(px, py, half + 5, 0, 2 * Math.PI); c.stroke();
       const text = `${name} → ${ring}`;
       c.font = "600 11px sans-serif"; c.textAlign = "left"; c.fillStyle = night ? "#12161be0" : "#f4f5f6e0";
-      // On the side where there is room for it.
+      // On the side that has room for it.
       const wide = c.measureText(text).width, left = px + half + 10 + wide > this.width ? px - half - 10 - wide : px + half + 10;
       c.fillRect(left - 3, py - 8, wide + 6, 16);
       c.fillStyle = night ? "#f2b134" : "#8a5a00";

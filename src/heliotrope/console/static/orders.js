@@ -1,10 +1,10 @@
-// The command bar: to whom, what, and what became of it. All of it goes through the API.
+// The command bar: scope, command, result. Everything goes through the API.
 import { api, me, store } from "./live.js";
 import { ask, count, h } from "./dom.js";
 
 export const say = (text, bad) => store.emit("said", { text, bad });
 
-// Does something and says what became of it.
+// Runs an action and shows its result.
 export async function act(what, name) {
   try {
     const done = await what();
@@ -25,7 +25,7 @@ async function follow(ticket) {
 
 let scope = "selection";
 
-function whom() {
+function recipients() {
   if (scope === "field") return { names: [], text: `all ${count(store.field.names.length)} heliostats` };
   let rows = [...store.selection];
   if (scope === "cluster") {
@@ -39,7 +39,7 @@ function whom() {
 
 async function order(name, title, make, fields, sure) {
   let to;
-  try { to = whom(); } catch (error) { say(`${title}: ${error.message}`, true); return; }
+  try { to = recipients(); } catch (error) { say(`${title}: ${error.message}`, true); return; }
   let values = {};
   if (fields || (sure && to.names.length !== 1)) {
     values = await ask(`${title}: ${to.text}`, fields ?? [], title);
@@ -48,7 +48,7 @@ async function order(name, title, make, fields, sure) {
   await act(() => make(to.names, values), title);
 }
 
-// Declares where the axes stand: nothing moves, but all that it does afterwards hangs on it.
+// Declares the position of the axes: nothing moves, but every later motion depends on it.
 async function zero() {
   const rows = [...store.selection];
   if (rows.length !== 1) { say("Zero: select exactly one heliostat; counts differ from one to the next", true); return; }
@@ -83,7 +83,7 @@ const ORDERS = [
 ];
 
 export function bar(box) {
-  // The bar may need two lines; the rest of the page has what is left.
+  // The bar may need two lines; the page gets the rest of the height.
   new ResizeObserver(() => document.body.style.setProperty("--foot", `${box.parentElement.offsetHeight}px`)).observe(box);
   const said = h("div", { className: "hx-said", role: "status" });
   if (me.role === "viewer") {
@@ -132,7 +132,7 @@ export function whoCommands(box) {
     text.textContent = mine ? "You have command" : head.holder ? `${head.holder} has command` : "Nobody has command";
     text.className = mine ? "good" : "";
     button.textContent = mine ? "Release" : "Take command";
-    // Kept up only while somebody has this page before them.
+    // Renewed only while this page is visible.
     if (mine && !document.hidden && performance.now() - kept > 4000) {
       kept = performance.now();
       api("PUT", "authority").catch(() => {});

@@ -96,7 +96,7 @@ function heliostatView(one) {
     facts([["Cluster", one.cluster], ["Heard", one.live ? `${number(one.age, 1)} s ago` : `${span(one.age)} ago`],
       ["Fault", one.live ? one.fault : "unknown", one.live && one.fault !== "none" ? "bad" : stale], ["Aims at", one.on || "nothing"],
       ["Aim E, N, U (m)", point(one.aim)], ["Standby E, N, U (m)", point(one.standby)],
-      ["Stands at E, N, U (m)", one.position.map((v) => number(v, 1)).join(", ")], ["Mirror", `${number(one.width, 1)} × ${number(one.height, 1)} m`],
+      ["Position E, N, U (m)", one.position.map((v) => number(v, 1)).join(", ")], ["Mirror", `${number(one.width, 1)} × ${number(one.height, 1)} m`],
       ["Predicted error", one.error === null ? "never calibrated" : `${mrad(one.error)} mrad`],
       one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
       ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
@@ -143,7 +143,7 @@ export function calibration(box) {
     const running = view.running.map((r) => h("li", {}, h("b", {}, r.heliostat), ` on ${r.target}: ${r.stage}`, h("em", {}, ` since ${clock(r.since)}`)));
     const key = (text, colour, dashed) => h("span", {}, h("i", { className: dashed ? "dashed" : "", style: `color:${colour}` }), text);
     body.replaceChildren(
-      h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "At work" : `Off: ${view.reason}`),
+      h("div", { className: "hx-row" }, h("b", { className: view.on ? "good" : "warn" }, view.on ? "Running" : `Off: ${view.reason}`),
         canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("PUT", "calibration", { on: !view.on }), "calibration") }, view.on ? "Switch off" : "Switch on") : ""),
       facts([["Calibrated", count(view.done)], ["Waiting", count(view.waiting)], ["Failed", count(view.failed)]]),
       h("ul", { className: "hx-list" }, running.length ? running : h("li", {}, "no measurement in progress")),
@@ -154,7 +154,7 @@ export function calibration(box) {
       table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target],
         ["Before", (r) => mrad(r.before), "num"], ["After", (r) => mrad(r.after), "num"], ["Predicted", (r) => mrad(r.predicted), "num"],
         truth ? ["True before → after", (r) => `${mrad(r.truth_before)} → ${mrad(r.truth_after)}`, "num"] : ["", () => ""],
-        ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓ learnt" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
+        ["", (r) => h("span", { className: r.outcome === "calibrated" ? "good" : "warn", title: r.text }, r.outcome === "calibrated" ? "✓ calibrated" : r.text.split(";")[0])]], view.results.slice(0, 60), (r) => look(r.heliostat)));
     chart(lines, [["median", "APPROACHING"], ["percentile_90", "APPROACHING", [5, 4]], ["truth_median", "SEARCHING"], ["truth_percentile_90", "SEARCHING", [5, 4]]]
       .map(([field, colour, dash]) => ({ points: view.quality.map((p) => [p.at, 1e3 * p[field]]), colour: colourOf(colour), dash })), dark());
   };
@@ -227,7 +227,7 @@ export function schedule(box) {
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
       h("h3", {}, "Excluded from calibration"),
       holds.length ? table([["Heliostat", (r) => r.heliostat], ["By", (r) => r.who], ["Since", (r) => clock(r.since)], ["Why", (r) => r.reason],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "unhold") }, "Release") : "")]], holds)
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "release") }, "Release") : "")]], holds)
         : h("p", { className: "hx-hint" }, "None."));
   }, { every: 5 });
 }

@@ -1,4 +1,4 @@
-// Accounts and tokens: in windows over the page, since nobody needs them at work. All through the API.
+// Accounts and tokens: in windows over the page, since they are rarely needed. Everything goes through the API.
 import { api, me } from "./live.js";
 import { ask, h, table } from "./dom.js";
 import { say } from "./orders.js";
@@ -6,7 +6,7 @@ import { say } from "./orders.js";
 const day = (at) => (at ? new Date(1e3 * at).toISOString().slice(0, 10) : "never");
 const button = (text, onclick) => h("button", { type: "button", className: "hx-button", onclick }, text);
 
-// A window whose contents are made anew after whatever is done in it.
+// A window that redraws its contents after each action in it.
 function open(title, fill) {
   const body = h("div"), told = h("p", { className: "hx-told", role: "status" });
   const dialog = h("dialog", { className: "hx-dialog wide" }, h("h2", {}, title), body, told,
@@ -36,15 +36,15 @@ export const people = () => open("People", async (done) => {
   const acts = (one) => (one.name === me.name ? h("span", { className: "hx-hint" }, "you") : h("div", { className: "hx-orders" },
     button(one.disabled ? "Enable" : "Disable", () => done(async () => { await api("PATCH", path(one.name), { disabled: !one.disabled }); return `${one.name} is ${one.disabled ? "enabled" : "disabled"}`; })),
     button("New password", () => done(async () => {
-      if (!await ask(`Make a new password for ${one.name}? The old one and all sessions end.`, [], "Make")) return "";
+      if (!await ask(`Create a new password for ${one.name}? The old password and all sessions end.`, [], "Create")) return "";
       return once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`)).password);
     }))));
   const add = button("Add…", () => done(async () => {
     const given = await ask("New account", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
-      { name: "password", label: "Password (at least 10 characters)", type: "password" }], "Make account");
+      { name: "password", label: "Password (at least 10 characters)", type: "password" }], "Create account");
     if (!given) return "";
     await api("POST", "accounts", given);
-    return `account ${given.name} made, ${given.role}`;
+    return `account ${given.name} created, ${given.role}`;
   }));
   return [table([["Name", (r) => r.name], ["Role", role], ["Since", (r) => day(r.created)],
     ["", (r) => h("span", { className: r.disabled ? "warn" : "good" }, r.disabled ? "disabled" : "enabled")], ["", acts]], rows), h("div", { className: "hx-row" }, add)];
@@ -57,13 +57,13 @@ export const tokens = () => open("API tokens", async (done) => {
     await api("DELETE", `tokens/${encodeURIComponent(one.key)}`);
     return `${one.label} is revoked`;
   }));
-  const make = button("Make…", () => done(async () => {
+  const make = button("Create…", () => done(async () => {
     const given = await ask("New token for a program", [{ name: "label", label: "Purpose" },
-      { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "90" }], "Make");
+      { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "90" }], "Create");
     return given ? once(`Secret of ${given.label}`, (await api("POST", "tokens", { ...given, days: Number(given.days) })).secret) : "";
   }));
-  return [rows.length ? table([["For", (r) => r.label], ["Of", (r) => r.name], ["Role", (r) => r.role], ["Until", (r) => day(r.expires)],
-    ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "No token."), h("div", { className: "hx-row" }, make)];
+  return [rows.length ? table([["Purpose", (r) => r.label], ["Owner", (r) => r.name], ["Role", (r) => r.role], ["Expires", (r) => day(r.expires)],
+    ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "No tokens."), h("div", { className: "hx-row" }, make)];
 });
 
 export async function password() {

@@ -1,4 +1,4 @@
-// One part of the page within the frame: what is in it is drawn by console.js.
+// One part of the page within the frame; console.js draws its contents.
 export default {
   props: { kind: String, base: String },
   render() { return Vue.h("div", { class: `hx-view hx-${this.kind}` }); },
