@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from heliotrope.airborne.plan.waypoints import read_litchi, read_qgc, read_wpml
 from heliotrope.cli.drone.plan import plan
 from heliotrope.errors import InputError
 from heliotrope.field.example import prototype
 from heliotrope.field.formats.plant_file import write_plant
+from support.waypoint_files import read_litchi, read_qgc, read_wpml
 
 
 @pytest.fixture

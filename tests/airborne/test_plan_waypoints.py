@@ -23,14 +23,12 @@ from heliotrope.airborne.plan.waypoints import (
     Mission,
     litchi,
     qgc,
-    read_litchi,
-    read_qgc,
-    read_wpml,
     wpml,
 )
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.geometry import FloatArray, angle_between, as_float, geodetic_to_enu
 from support.flight_case import staggered
+from support.waypoint_files import read_litchi, read_qgc, read_wpml
 
 SPACES = {"k": "http://www.opengis.net/kml/2.2", "w": "http://www.dji.com/wpmz/1.0.2"}
 FENCE = as_float([[-400.0, -400.0], [400.0, -400.0], [400.0, 400.0], [-400.0, 400.0]])

@@ -1,8 +1,8 @@
 """Plans of a drone's campaign: clusters, poses, hover patterns, sorties and waypoint files.
 
 Begin with `plan_flight`, which takes a plant and `PlanSettings`, and write its plan
-with `write_plan`. Waypoint files are read and written by
-`heliotrope.airborne.plan.waypoints`; `heliotrope.airborne.plan.flight_map` draws a map.
+with `write_plan`. `heliotrope.airborne.plan.waypoints` writes waypoint files,
+`heliotrope.airborne.plan.flight_map` draws a map.
 """
 
 from heliotrope.airborne.plan.airspace import Airspace, KeepOut, tower
