@@ -11,15 +11,13 @@ import pytest
 from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera, look_at, project, rays, undistort
 from heliotrope.geometry import FloatArray
-from heliotrope.imaging.lens import (
+from heliotrope.imaging.lens import calibrate_chessboard, calibrate_corners, find_chessboard
+from heliotrope.imaging.pose import (
     CENTER_SIGMA,
     INNER,
     POSE,
     CameraFit,
-    calibrate_chessboard,
-    calibrate_corners,
     calibrate_marks,
-    find_chessboard,
     resection,
 )
 

@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from heliotrope.field.camera import Camera
     from heliotrope.field.plant import Plant
     from heliotrope.imaging.frame import Frame
-    from heliotrope.imaging.lens import CameraFit, Lens
+    from heliotrope.imaging.lens import Lens
+    from heliotrope.imaging.pose import CameraFit
     from heliotrope.imaging.targets.teaching import Taught, Wish
 
 app = typer.Typer(help="Calibrate and teach target cameras.", no_args_is_help=True)

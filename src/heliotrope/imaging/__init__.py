@@ -5,7 +5,7 @@
 - `spots`: background, spots and their quality.
 - `photograph`: read one photograph; `campaign`: many, into sightings; `memory`: models of empty
   targets; `log`: facts about photographs; `annotate`: draw the result.
-- `lens`: calibrate lenses and locate cameras; the camera model is `heliotrope.field.camera`.
+- `lens`: calibrate lenses; `pose`: locate cameras. The camera model is `heliotrope.field.camera`.
 - `motion`: did a beam move between two frames?
 - `synthetic`: rendered frames with exact truth. Simulations import it themselves.
 
@@ -16,13 +16,7 @@ from heliotrope.imaging.annotate import annotate
 from heliotrope.imaging.campaign import Job, Outcome, process_many, to_sightings
 from heliotrope.imaging.files import find_images, read_image, write_image
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.lens import (
-    CameraFit,
-    Lens,
-    calibrate_chessboard,
-    calibrate_marks,
-    resection,
-)
+from heliotrope.imaging.lens import Lens, calibrate_chessboard
 from heliotrope.imaging.log import Entry, Log, read_log
 from heliotrope.imaging.memory import Memory
 from heliotrope.imaging.motion import (
@@ -40,6 +34,7 @@ from heliotrope.imaging.photograph import (
     read_crop,
     read_photograph,
 )
+from heliotrope.imaging.pose import CameraFit, calibrate_marks, resection
 from heliotrope.imaging.sources import Source, average, keep, open_source
 from heliotrope.imaging.spots.background import EmptyTarget
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason

@@ -21,7 +21,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, as_float
 from heliotrope.imaging.frame import Frame
-from heliotrope.imaging.lens import CameraFit, calibrate_marks, resection
+from heliotrope.imaging.pose import CameraFit, calibrate_marks, resection
 
 CORNERS = ("upper_left", "upper_right", "lower_right", "lower_left")
 #: Kinds of marks that can be taught.
