@@ -122,7 +122,8 @@ def pages() -> dict[str, str]:
                     lines += [f"- `{name}`", ""]
                 else:
                     written.add(place)
-                    lines += [f"::: {place}", "    options: {heading_level: 3}", ""]
+                    lines += [f"::: heliotrope.{room}.{name}"]
+                    lines += ["    options: {heading_level: 3}", ""]
         found[f"{package}.md"] = "\n".join(lines).rstrip() + "\n"
     lines = ["# The library", "", _lead(_source("")), ""]
     links = [(name, place) for name, place in _listed("")]

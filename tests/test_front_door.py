@@ -60,6 +60,12 @@ def test_setup_refuses_an_old_python(tmp_path: Path) -> None:
     assert not (tmp_path / "venv").exists()
 
 
+def test_library_pages_are_current() -> None:
+    command = [sys.executable, "scripts/library_pages.py", "--check"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 def test_parameters_page_is_current() -> None:
     code = (
         "import runpy, sys; m = runpy.run_path('scripts/parameters_page.py'); "
