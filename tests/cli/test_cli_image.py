@@ -12,7 +12,6 @@ import pytest
 from heliotrope.calibration.sighting_table import read_sightings
 from heliotrope.cli import main
 from heliotrope.field.example import azimuth_elevation
-from heliotrope.field.formats.paint import Tower, write_tower
 from heliotrope.field.formats.plant_file import write_plant
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
@@ -351,7 +350,8 @@ def test_bad_input_is_one_line(
 
 
 def test_plant_without_targets_is_refused(tmp_path: Path, call: Any) -> None:
-    write_tower(Tower(ORIGIN, (), ()), tmp_path / "tower-measurements.json")
+    tower = {"power_plant_properties": {"coordinates": list(ORIGIN)}}
+    (tmp_path / "tower-measurements.json").write_text(json.dumps(tower), encoding="utf-8")
     write_image(_photograph((0.5, 0.3), 1).frame, tmp_path / "a.png")
     code, _, err = call(tmp_path / "a.png", "--plant", tmp_path / "tower-measurements.json")
     assert code == 2

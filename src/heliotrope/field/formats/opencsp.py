@@ -43,8 +43,6 @@ COLUMNS = (
 FACET_COLUMNS = ("Facet id", "X", "Y", "Z")
 
 _COUNTS = ("Num. Facets", "Num. Rows", "Num. Cols")
-#: Centroids that agree to this (m) stand in the same row, column or place.
-SAME_PLACE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)

@@ -408,62 +408,6 @@ def read_calibration_properties(path: str | Path) -> CalibrationProperties:
     )
 
 
-def write_calibration_properties(found: CalibrationProperties, path: str | Path) -> None:
-    """Write one calibration measurement in the newer style of keys."""
-    document: dict[str, object] = {
-        "motor_position": {
-            f"axis_{axis}_motor_position": count for axis, count in enumerate(found.motors, start=1)
-        },
-        "target_name": found.target,
-        "focal_spot": {name: list(spot) for name, spot in found.focal_spots.items()},
-    }
-    for name in ("sun_elevation", "sun_azimuth"):
-        value = getattr(found, f"{name}_deg")
-        if np.isfinite(value):
-            document[name] = value
-    write_text(path, json.dumps(document, indent=1) + "\n")
-
-
-def write_tower(tower: Tower, path: str | Path) -> None:
-    """Write the tower's measurements: reference point, targets and receivers.
-
-    Positions are written as WGS84; what is read again is the same within 1e-8 m.
-
-    Raises
-    ------
-    InputError
-        If a receiver has no corners, which the format needs.
-    """
-
-    def geodetic(point: FloatArray) -> list[float]:
-        return [float(v) for v in enu_to_geodetic(point, tower.origin)]
-
-    names = ("upper_left", "upper_right", "lower_right", "lower_left")
-    document: dict[str, object] = {"power_plant_properties": {"coordinates": list(tower.origin)}}
-    for target in tower.targets:
-        corners = dict(zip(names, target.corners, strict=True))
-        points = {"center": target.center, **target.markers, **corners}
-        document[target.name] = {
-            "type": "planar",
-            "normal_vector": target.normal.tolist(),
-            "coordinates": {name: geodetic(np.asarray(p)) for name, p in points.items()},
-        }
-    for receiver in tower.receivers:
-        if receiver.corners is None:
-            raise InputError(f"receiver {receiver.name}: PAINT needs its four corners; add them")
-        outer = {
-            f"receiver_outer_{n}": geodetic(c) for n, c in zip(names, receiver.corners, strict=True)
-        }
-        document[receiver.name] = {
-            "type": receiver.kind,
-            "normal_vector": receiver.normal.tolist(),
-            "radius": receiver.radius,
-            "opening_angle": float(np.degrees(receiver.opening_angle)),
-            "coordinates": {"center": geodetic(receiver.center), **outer},
-        }
-    write_text(path, json.dumps(document, indent=1) + "\n")
-
-
 def write_heliostat(heliostats: Heliostats, name: str, origin: Origin, path: str | Path) -> None:
     """Write the properties of one heliostat, its calibrated parameters folded in.
 
