@@ -358,7 +358,7 @@ def test_what_a_field_refuses() -> None:
         field.order("JUMP")
     with pytest.raises(InputError, match="field: fault 11; give 1 to 10"):
         field.fail(np.array([0]), 11)
-    with pytest.raises(InputError, match=r"drives: a play of -1.0 steps and a chance of 0.0"):
+    with pytest.raises(InputError, match=r"drives: play of -1.0 steps, probability 0.0"):
         field_of(field.mechanism, play=-1.0)
-    with pytest.raises(InputError, match=r"a chance of 1.5 to lose one; give 0 or more"):
+    with pytest.raises(InputError, match=r"probability 1.5 of losing one; give 0 or more"):
         field_of(field.mechanism, miss=1.5)

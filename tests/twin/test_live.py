@@ -90,7 +90,7 @@ def test_a_paced_loop_goes_at_its_speed_and_waits_for_the_late() -> None:
         assert loop.time() == pytest.approx(seen[-1] + 1.0, abs=0.3)
         assert loop.lag == pytest.approx(39.0 - LATE, abs=0.3)
     for bad in (0.0, -1.0, 2000.0):
-        with pytest.raises(InputError, match="simulated seconds in a second"):
+        with pytest.raises(InputError, match="simulated seconds per second"):
             PacedLoop(bad)
 
 
@@ -376,10 +376,10 @@ def test_what_a_live_plant_refuses() -> None:
 
     async def main(clock: VirtualClock) -> None:
         halves = {"a": group.take([0, 1, 2]), "b": group.take([3, 4, 5])}
-        with pytest.raises(InputError, match="2 groups of heliostats; the simulation takes one"):
+        with pytest.raises(InputError, match="2 groups of heliostats; the simulation supports one"):
             LivePlant(replace(design, groups=halves), clock, EXACT)
         mixed = replace(group, cluster=("A", "B", "A", "B", "A", "B"))
-        with pytest.raises(InputError, match="cluster A do not stand together"):
+        with pytest.raises(InputError, match="cluster A are not consecutive"):
             LivePlant(replace(design, groups={"a": mixed}), clock, EXACT)
         with pytest.raises(InputError, match="no camera with a known position"):
             LivePlant(replace(design, cameras=()), clock, LiveOptions(threads=0))

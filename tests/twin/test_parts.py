@@ -26,7 +26,7 @@ def test_flash_takes_what_came_before_the_cut() -> None:
     held = flash.read(16, 8)
     assert held[:3] == bytes(3)
     assert held[4:] == b"\xff" * 4
-    with pytest.raises(ValueError, match="flash: 1 bytes at 16 were written before; erase"):
+    with pytest.raises(ValueError, match="flash: 1 bytes at 16 are already written; erase"):
         flash.write(16, b"\0")
     flash.erase(0)
     assert flash.read(16, 8) == b"\xff" * 8
@@ -126,7 +126,9 @@ def test_the_bus_does_to_frames_what_its_faults_say() -> None:
             await bus.transmit(wire.encode(wire.Frame(1, 0, 1, 1, b"")))
 
     run_virtual(main)
-    with pytest.raises(InputError, match=r"bus faults: a chance of loss of 1.5; give 0 to 1"):
+    with pytest.raises(
+        InputError, match=r"bus faults: the probability of loss is 1.5; give 0 to 1"
+    ):
         BusFaults(loss=1.5)
 
 

@@ -1,9 +1,9 @@
-"""Cameras of a simulated plant: what they see of the beams on its targets.
+"""Cameras of a simulated plant, which see the beams on its targets.
 
 Both fit the port `plant.ports.Cameras`. `ExactCamera` gives the true centroid with noise of a
 known covariance. `RenderedCamera` draws the frame with all light that is on the target at that
 moment, whichever mirrors it comes from, and reads it as photographs of a real plant are read.
-Neither knows more of the heliostat that is asked for than a real camera could.
+Neither knows more about the measured heliostat than a real camera could.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ PEAK = 0.7
 
 @dataclass(frozen=True)
 class TrueMirror:
-    """One mirror as it stands.
+    """True position and size of one mirror.
 
     Attributes
     ----------
@@ -75,9 +75,9 @@ class FieldSnapshot:
     clock
         Clock of the plant.
     mirrors
-        Gives all mirrors whose light may be on a target.
+        Returns all mirrors whose light may be on a target.
     sun
-        Gives the unit vector to the sun, (3,).
+        Returns the unit vector to the sun, (3,).
     latency
         Time from the request for a photograph to the middle of its exposure, s.
     """
@@ -173,7 +173,9 @@ class ExactCamera:
             )
         values, vectors = np.linalg.eigh(plane)
         if not np.allclose(plane, plane.T, rtol=1e-9, atol=0.0) or values.min() < 0.0:
-            raise InputError("exact camera: a covariance must be symmetric and nowhere below 0 m²")
+            raise InputError(
+                "exact camera: a covariance must be symmetric and positive semidefinite"
+            )
         self._sight = sight
         self._plane = plane
         # Its root; a Cholesky factor would not exist for a covariance of 0.
@@ -200,7 +202,7 @@ class ExactCamera:
         """Do nothing: exact centroids need no empty photograph."""
 
     def view(self, target: str) -> CameraView:
-        """Return what was seen last of a target."""
+        """Return the last picture of a target."""
         return self._views.get(target, CameraView(target, 0, 0.0, b""))
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -309,7 +311,7 @@ class RenderedCamera:
             if len(scene.targets) > 1 or scene.beams:
                 raise InputError(
                     f"rendered camera: the scene of {names} has {len(scene.targets)} targets and "
-                    f"{len(scene.beams)} beams; give one target and no beam: mirrors throw them"
+                    f"{len(scene.beams)} beams; give one target and no beam: mirrors add beams"
                 )
         self._sight, self._scenes = sight, {s.targets[0].name: s for s in scenes}
         self._optics, self._settings = optics or Optics(), settings or PhotographSettings()
@@ -362,7 +364,7 @@ class RenderedCamera:
         self._empty[target] = seen.frame
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
-        """Return the beam that is seen on a target; the camera does not know whose it is.
+        """Return the beam seen on a target; the camera does not know its heliostat.
 
         Raises
         ------

@@ -1,8 +1,8 @@
 """A board of a heliostat, true to the firmware: a real `lcu.node.Node` on simulated hardware.
 
 The board has flash, a millisecond counter, two motors with step timers, and a supply that may
-fail at any instant, within a write of flash too. `Board` is a `twin.bus.Station`; `step` lets its
-time go on. A `Witness` sees all that happens, and the board does not know what for.
+fail at any instant, even within a write of flash. `Board` is a `Station` of a bus; `step` advances
+its time. A `Witness` sees all its actions without affecting them.
 """
 
 import contextlib
@@ -23,23 +23,23 @@ from heliotrope.twin.boards.motors import MotorAxis
 from heliotrope.twin.boards.outfit import Outfit, sha256
 from heliotrope.twin.wind import Wind
 
-#: Longest pauses between two looks of the main loop: while steps are made; while the sun is
-#: followed; at rest. A board looks far more often. This is the worst that the core allows for
-#: the first, and saves time for the others.
+#: Longest intervals between two passes of the main loop: while steps are made; while the sun is
+#: followed; at rest. A real board loops far more often. The first is the worst that the core
+#: allows; the others save time.
 MOVING, FOLLOWING, RESTING = 0.05, 0.1, 0.5
 
 
 class Witness(Protocol):
-    """Who sees what a board does."""
+    """An observer of a board's actions."""
 
     def acted(self, board: "Board", what: str, now: float) -> None:
-        """Note that a board has done something: "bytes", "tick", "boot" or "cut"."""
+        """Note an action of a board: "bytes", "tick", "boot" or "cut"."""
         ...
 
     def stepped(
         self, board: "Board", axis: int, direction: int, count: int, interval_us: int
     ) -> None:
-        """Note a segment that a board has ordered of its timer."""
+        """Note a segment that a board has sent to its timer."""
         ...
 
 
@@ -67,15 +67,15 @@ class Board:
     Parameters
     ----------
     outfit
-        What it is.
+        The heliostat: name, addresses, mechanism, journal.
     seed
-        Of flash, motors and chance.
+        Seed of flash, motors and random choices.
     ticks
-        Its counter of milliseconds.
+        Its millisecond counter.
     play, miss
         Of the motors; see `MotorAxis`.
     wind
-        That turns the mirror; None: there is none.
+        Wind that turns the mirror; None: no wind.
 
     Attributes
     ----------
@@ -84,11 +84,11 @@ class Board:
     axes
         Motors.
     slip
-        By how much the motors stand beyond the node's counts: set at each boot, steps.
+        Position of the motors beyond the node's counts, steps: set at each boot.
     now
-        True time of what happens, in s.
+        True time of the last event, in s.
     tilt
-        What the accelerometer says, or None.
+        Reading of the accelerometer, or None.
     """
 
     def __init__(
@@ -124,11 +124,11 @@ class Board:
     # -- the supply --------------------------------------------------------------------
 
     def power_on(self, now: float) -> None:
-        """Boot, unless it runs; flash may fail within the boot."""
+        """Boot, unless the board runs; flash may fail within the boot."""
         if self.node is not None:
             return
         self.now = now
-        # Where the journal's counts are not those of the motors, the board slips.
+        # Where the journal's counts differ from those of the motors, the board slips.
         journal = Journal(self.flash)
         journal.load()
         self.slip = [
@@ -153,7 +153,7 @@ class Board:
         self._tell("boot")
 
     def power_off(self, now: float, *, warned: bool = False) -> None:
-        """Cut the supply; ``warned``: the brown-out detector sees it come."""
+        """Cut the supply; ``warned``: the brown-out detector notices in time."""
         self._to(now)
         if self.node is None:
             return
@@ -181,10 +181,10 @@ class Board:
         if self.witness is not None:
             self.witness.acted(self, what, self.now)
 
-    # -- what happens ------------------------------------------------------------------
+    # -- events ------------------------------------------------------------------------
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Take bytes from the bus; return what it answers at once."""
+        """Take bytes from the bus; return the immediate answer."""
         self._to(now)
         if self.node is None:
             return b""
@@ -198,7 +198,7 @@ class Board:
         return self._spoken()
 
     def step(self, now: float) -> bytes:
-        """Let the main loop look once; return what it says by itself."""
+        """Run one pass of the main loop; return the bytes that it sends by itself."""
         self._to(now)
         if self.node is None:
             return b""
@@ -218,7 +218,7 @@ class Board:
         return out
 
     def due(self, now: float) -> float:
-        """Return when the main loop should look next, in s: earlier is always allowed."""
+        """Return when the main loop should run next, in s: earlier is always allowed."""
         node = self.node
         if node is None:
             return math.inf
@@ -230,12 +230,12 @@ class Board:
         if busy or own.motion.following():
             pause = MOVING if busy else FOLLOWING
         if own.sun.fresh():
-            # At the end of the lease it looks at once, as a board does.
+            # At the end of the lease the loop runs at once, as on a real board.
             left = (own.config.lease_ms - own.sun.age_ms() + 1) / 1000.0
             pause = min(pause, max(0.0, now - self._looked) + left)
         return self._looked + pause
 
-    # -- what is true ------------------------------------------------------------------
+    # -- truth -------------------------------------------------------------------------
 
     @property
     def controller(self) -> Controller | None:
@@ -248,13 +248,12 @@ class Board:
         return -1 if self.node is None else self.node.controller.state
 
     def mirror(self, *, believed: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Return vertex (3,), m, and unit normal (3,), at the time of what happened last.
+        """Return vertex (3,), m, and unit normal (3,), at the time of the last event.
 
         Parameters
         ----------
         believed
-            Whether what has slipped and the wind are taken out: where the node thinks that it
-            stands.
+            Whether to leave out slip and wind: the position that the node believes.
         """
         counts = [axis.joint for axis in self.axes]
         if believed:
@@ -272,7 +271,7 @@ class Board:
         sun
             Direction to the sun, (3,).
         believed
-            As of `mirror`.
+            As in `mirror`.
         """
         vertex, normal = self.mirror(believed=believed)
         return vertex, 2.0 * (normal @ sun) * normal - sun
@@ -280,7 +279,7 @@ class Board:
     def miss(
         self, sun: FloatArray, point: "tuple[float, float, float]", *, believed: bool = False
     ) -> float:
-        """Return how far the ray passes a point, m; infinite if it goes away from it."""
+        """Return the distance of the ray from a point, m; infinite if it leads away from it."""
         vertex, ray = self.beam(sun, believed=believed)
         way = np.subtract(point, vertex)
         along = float(way @ ray)

@@ -1,8 +1,8 @@
 """A bus in this process: the cluster at one end, boards or a vectorised field at the other.
 
-It implements `control.link.Bus`: one transaction at a time, the urgent next, and nothing after its
-expiry. Bytes take their time at the baud rate. Faults are drawn by a seed and may be changed at
-any moment (`BusFaults`). Whatever stands on the bus is a `Station`.
+It implements `links.link.Bus`: one transaction at a time, urgent ones next, and nothing after its
+expiry. Bytes take their time at the baud rate. Faults are drawn from a seed and may be changed at
+any moment (`BusFaults`). Everything connected to the bus is a `Station`.
 """
 
 import asyncio
@@ -21,46 +21,46 @@ _BITS = 10
 
 
 class Station(Protocol):
-    """What stands on a bus."""
+    """A device connected to a bus."""
 
     def hear(self, data: bytes, now: float) -> bytes:
-        """Take bytes at a time in s, and return what is answered at once, b"" if nothing."""
+        """Take bytes at a time in s, and return the immediate answer, b"" if there is none."""
         ...
 
 
 class Tap(Protocol):
-    """Who listens to all that goes on, without disturbing it."""
+    """A listener to all traffic, which does not disturb it."""
 
     def sent(self, frame: bytes, now: float) -> None:
-        """Note what the master sent."""
+        """Note bytes that the master sent."""
         ...
 
     def heard(self, place: int, data: bytes, how: str, now: float) -> None:
-        """Note what a station is about to hear, and how it came: "whole", or by which fault."""
+        """Note bytes that a station is about to receive, and how: "whole", or by which fault."""
         ...
 
     def answered(self, data: bytes, how: str, now: float) -> None:
-        """Note what the master hears."""
+        """Note bytes that the master receives."""
         ...
 
 
 @dataclass(frozen=True)
 class BusFaults:
-    """What a bus does to frames, in either direction and for each station by itself.
+    """Faults that a bus applies to frames, in either direction and for each station separately.
 
     Parameters
     ----------
     loss, corruption, burst, duplication, late, delay
-        Chances, 0 to 1: nothing comes; one bit is inverted; a run of bytes is noise; it comes
-        twice; it comes only when the next frame is sent (out of order, or between others); an
-        answer takes longer, up to the time that is waited for it.
+        Probabilities, 0 to 1: nothing arrives; one bit is inverted; a run of bytes is noise; the
+        frame arrives twice; it arrives only when the next frame is sent (out of order, or between
+        others); an answer takes longer, up to the time limit of the wait.
     stuck
-        A transmitter holds the line: nobody hears anything.
+        A transmitter holds the line: nobody receives anything.
 
     Raises
     ------
     InputError
-        A chance outside 0 to 1.
+        A probability outside 0 to 1.
     """
 
     loss: float = 0.0
@@ -75,11 +75,11 @@ class BusFaults:
         for name in ("loss", "corruption", "burst", "duplication", "late", "delay"):
             value = getattr(self, name)
             if not 0.0 <= value <= 1.0:
-                raise InputError(f"bus faults: a chance of {name} of {value}; give 0 to 1")
+                raise InputError(f"bus faults: the probability of {name} is {value}; give 0 to 1")
 
     @property
     def any(self) -> bool:
-        """Whether it does anything."""
+        """Whether any fault is set."""
         return self.stuck or any(
             (self.loss, self.corruption, self.burst, self.duplication, self.late, self.delay)
         )
@@ -103,15 +103,15 @@ class TwinBus:
     Parameters
     ----------
     clock
-        Of the bus; its monotonic time is that of the stations.
+        Clock of the bus; its monotonic time is that of the stations.
     stations
-        Who hears every frame.
+        Devices that receive every frame.
     seed
-        Of the faults.
+        Seed of the faults.
     baud_rate
-        Bits in a second; 0: bytes take no time.
+        Bits per second; 0: bytes take no time.
     turn_around
-        From the end of a frame to the answer, in s.
+        Time from the end of a frame to the answer, in s.
     tap
         Listens to everything.
 
@@ -120,7 +120,7 @@ class TwinBus:
     faults
         See `BusFaults`; may be set at any moment.
     plugged
-        Whether the port is there; False as when its adapter is pulled out.
+        Whether the port is present; False simulates an adapter that is pulled out.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class TwinBus:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the bus is closed for good."""
         return self._closing.is_set()
 
     async def run(self) -> None:
@@ -161,13 +161,13 @@ class TwinBus:
         await self._closing.wait()
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the bus for good."""
         self._closing.set()
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
     ) -> SendOutcome:
-        """Send a frame that nobody answers, and wait until it is out.
+        """Send a frame that is not answered, and wait until it is out.
 
         Raises
         ------
@@ -190,7 +190,7 @@ class TwinBus:
         urgent: bool = False,
         complete: Callable[[bytes], bool] | None = None,
     ) -> bytes:
-        """Send a frame and return what is answered, b"" if nothing is.
+        """Send a frame and return the answer, b"" if there is none.
 
         Raises
         ------
@@ -211,7 +211,7 @@ class TwinBus:
                 took = max(took, self._chance.uniform(took, timeout))
             whole = complete(answer) if complete and answer else answer.endswith(b"\0")
             if not answer or took > timeout or not whole:
-                # Nobody ends the wait early: an answer that is damaged or cut has no end.
+                # Wait to the end: a damaged or truncated answer has no terminator.
                 await asyncio.sleep(timeout)
                 return answer if took <= timeout else b""
             await asyncio.sleep(took)
@@ -233,7 +233,7 @@ class TwinBus:
     # -- the wire --------------------------------------------------------------------------
 
     def carry(self, frame: bytes) -> bytes:
-        """Bring a frame of the master to all stations now; return what comes back."""
+        """Bring a frame of the master to all stations now; return their answers."""
         if self._tap is not None:
             self._tap.sent(frame, self._clock.monotonic())
         return self._back(self.inject(frame, late=True))
@@ -246,9 +246,9 @@ class TwinBus:
         frame
             Bytes.
         how
-            What the tap is told of bytes that no fault of the bus touches.
+            Reported to the tap for bytes that no fault of the bus touches.
         late
-            Whether what was kept back before comes now, after these.
+            Whether bytes that were held back arrive now, after these.
         """
         if self.faults.stuck:
             return b""
@@ -257,7 +257,7 @@ class TwinBus:
         for place in range(len(self.stations)):
             answer += self._bring(place, frame, how)
         for place, old in kept:
-            # An answer that comes between others is lost in them.
+            # An answer that arrives between others is lost in them.
             self._hear(place, old, "late")
         return bytes(answer)
 
@@ -298,7 +298,7 @@ class TwinBus:
             elif self._happens(faults.burst):
                 answer, how = damaged(answer, self._chance, burst=True), "damaged"
         elif self._late_answers and answer:
-            # An answer of before comes first, as from a node that took too long.
+            # A late answer arrives first, as from a node that took too long.
             answer, how = self._late_answers.pop(0) + answer, "late"
         if self._tap is not None and answer:
             self._tap.answered(answer, how, self._clock.monotonic())

@@ -1,4 +1,4 @@
-"""Clocks that drift and jump, and times that come and go: what a cluster is told in simulation."""
+"""Clocks that drift and jump, and sources of time that fail, for simulated clusters."""
 
 import asyncio
 from collections.abc import Callable
@@ -9,28 +9,28 @@ from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import Clock, VirtualClock, gps_seconds, utc_of_gps
 
-#: How long a jump is told, s.
+#: How long a jump is reported, s.
 SETTLE = 5.0
 
 
 class SimulatedTime:
-    """A `TimeKeeper` that tells a true time, with faults that may be set at any moment.
+    """A `TimeKeeper` with a true time, and faults that may be set at any moment.
 
     Parameters
     ----------
     clock
-        Its ``monotonic`` says how much time has passed; its ``utc`` at the start is the truth.
+        Its ``monotonic`` measures the time passed; its ``utc`` at the start is the truth.
     error
-        Bound that it tells while nothing is wrong, in s.
+        Error bound that it reports while nothing is wrong, in s.
 
     Attributes
     ----------
     offset
-        By how much the told time is wrong, in s; set by `jump`.
+        Error of the reported time, in s; set by `jump`.
     detects
-        Whether a jump is told as one; a keeper that hides jumps is the worse fault.
+        Whether a jump is reported as one; a keeper that hides jumps is the worse fault.
     quality
-        What it tells of its source; "none" comes with no bound.
+        Quality that it reports; "none" has no error bound.
     """
 
     def __init__(self, clock: Clock, error: float = 0.05) -> None:
@@ -47,17 +47,17 @@ class SimulatedTime:
         self.quality: Quality = "gps"
 
     def jump(self, seconds: float) -> None:
-        """Set the told time forward, or back."""
+        """Set the reported time forward, or back."""
         self.offset += seconds
         self._jumped_at = self._clock.monotonic()
 
     @property
     def true_gps(self) -> float:
-        """GPS seconds as they are."""
+        """True GPS seconds."""
         return self._gps + self._clock.monotonic() - self._begin
 
     def time(self) -> Time:
-        """Return the time as it is told."""
+        """Return the reported time."""
         now = self._clock.monotonic()
         gps = self.true_gps + self.offset
         error = self._error if self.quality != "none" else float("inf")
@@ -65,7 +65,7 @@ class SimulatedTime:
         return Time(utc_of_gps(gps).timestamp(), gps, error, self.quality, jumped)
 
     async def run(self) -> None:
-        """Wait until it is closed: it has nothing to do."""
+        """Wait until closed: there is nothing to do."""
         await self._closing.wait()
 
     async def close(self) -> None:
@@ -74,16 +74,16 @@ class SimulatedTime:
 
 
 class DriftingClock:
-    """A computer's clocks: an oscillator that is off, and a calendar that may be set.
+    """A computer's clocks: an inaccurate oscillator, and a calendar that may be set.
 
     Parameters
     ----------
     source
-        Gives true monotonic seconds.
+        Returns true monotonic seconds.
     start
-        UTC at the moment of making.
+        UTC when the clock is made.
     drift
-        By how much it runs fast, ratio: 50e-6 is a poor quartz.
+        Relative excess of its rate: 50e-6 is a poor quartz.
     """
 
     def __init__(self, source: Callable[[], float], start: datetime, drift: float = 0.0) -> None:
@@ -92,11 +92,11 @@ class DriftingClock:
         self._inner = VirtualClock(source, start, rate=1.0 + drift)
 
     def monotonic(self) -> float:
-        """Return its own seconds: they never go back, and know no jumps."""
+        """Return the oscillator's seconds: they never go back or jump."""
         return self._inner.monotonic()
 
     def utc(self) -> datetime:
-        """Return what it takes for UTC."""
+        """Return the calendar's UTC."""
         return self._inner.utc()
 
     def jump(self, seconds: float) -> None:

@@ -6,18 +6,18 @@ from heliotrope.errors import HeliotropeError
 
 
 class PowerCutError(HeliotropeError):
-    """The supply failed within a write or an erasure: nothing of the board runs on."""
+    """The supply failed within a write or an erasure: the board stops at once."""
 
 
 class NorFlash:
-    """NOR flash in memory that refuses what real flash cannot do.
+    """NOR flash in memory that refuses operations that real flash cannot perform.
 
     Parameters
     ----------
     seed
-        Of the bits that a cut leaves.
+        Seed of the bits that a cut leaves.
     block_size, blocks
-        In bytes, and their number.
+        Bytes of a block, and number of blocks.
 
     Attributes
     ----------
@@ -27,7 +27,7 @@ class NorFlash:
         At a cut, all bytes of the operation hold some of their new bits and some of the old, as
         if a page took them in any order; else only the byte of the cut does.
     erasures
-        Of each block.
+        Count for each block.
 
     Raises
     ------
@@ -53,7 +53,9 @@ class NorFlash:
     def write(self, offset: int, data: bytes) -> None:
         """Clear the bits that are clear in ``data``."""
         if self._cells[offset : offset + len(data)] != b"\xff" * len(data):
-            raise ValueError(f"flash: {len(data)} bytes at {offset} were written before; erase")
+            raise ValueError(
+                f"flash: {len(data)} bytes at {offset} are already written; erase them"
+            )
         self._change(offset, data)
 
     def erase(self, block: int) -> None:

@@ -1,9 +1,9 @@
-"""Step timers and motors of one heliostat: what becomes of the segments that a board emits.
+"""Step timers and motors of one heliostat: they play the segments that a board emits.
 
-A segment is ``count`` pulses, the interval waited after each. The timer plays those of an axis one
-after the other; what is not yet played when the supply fails is never made. Pulses turn the
-motor; the joint follows behind the play of the gear (backlash), and a motor that is overloaded
-misses some.
+A segment is ``count`` pulses, with an interval after each. The timer plays the segments of an axis
+one after the other; segments not yet played when the supply fails are never made. Pulses turn the
+motor; the joint follows behind the play of the gear (backlash), and an overloaded motor misses
+some pulses.
 """
 
 import random
@@ -16,22 +16,22 @@ class MotorAxis:
     Parameters
     ----------
     count
-        Where it stands, steps.
+        Initial position, steps.
     play
-        Play of the gear, steps: after a reversal the joint stands for so long.
+        Play of the gear, steps: after a reversal the joint stands still for this many.
     miss
-        Chance of a segment to lose one of its steps.
+        Probability that a segment loses one of its steps.
     chance
-        Draws.
+        Source of random numbers.
 
     Attributes
     ----------
     emitted
-        Sum of all signed steps that were ordered, from the count at the start.
+        Sum of all signed steps ordered, from the count at the start.
     turned
-        Where the motor stands, steps.
+        Position of the motor, steps.
     joint
-        Where the joint stands, in steps of the motor: with it when it came from below, up to
+        Position of the joint, in steps of the motor: equal to it after motion from below, up to
         ``play`` above it after a reversal.
     missed
         Steps missed so far.
@@ -64,7 +64,7 @@ class MotorAxis:
         """Make the pulses that are due until a time in s."""
         while self._queue:
             direction, count, interval_us = self._queue[0]
-            # The interval is waited after each pulse: the first one comes at once.
+            # The interval follows each pulse: the first pulse comes at once.
             due = 1 + int((now - self._free_at) * 1e6 / interval_us) if now >= self._free_at else 0
             made = min(count, due)
             self._turn(direction, made - self._done)
@@ -86,7 +86,7 @@ class MotorAxis:
         self.joint = min(max(self.joint, float(self.turned)), self.turned + self.play)
 
     def stop(self) -> int:
-        """Stop at once; returns the signed steps that were ordered and not made."""
+        """Stop at once; return the signed steps that were ordered and not made."""
         undone = sum(direction * count for direction, count, _ in self._queue)
         if self._queue:
             undone -= self._queue[0][0] * self._done

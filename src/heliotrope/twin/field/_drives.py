@@ -47,7 +47,7 @@ class Drives:
         self._play = np.array(np.broadcast_to(np.asarray(play, dtype=np.float64), counts.shape))
         if not (self._play >= 0.0).all() or not 0.0 <= miss <= 1.0:
             raise InputError(
-                f"drives: a play of {self._play.min()} steps and a chance of {miss} to lose one; "
+                f"drives: play of {self._play.min()} steps, probability {miss} of losing one; "
                 "give 0 or more, and 0 to 1"
             )
         self._miss = miss

@@ -78,7 +78,7 @@ class Field:
     machine
         Limits and resting places, the same for all; with a standby point.
     believed
-        Mechanisms that the controllers are told of; None: the true ones.
+        Mechanisms that the controllers store; None: the true ones.
     play, miss, seed
         See `Drives`.
     wind
@@ -99,7 +99,7 @@ class Field:
     edition
         Rises with every change: a reading at the same edition is still valid.
     journals
-        What the controllers store.
+        Journals of the controllers.
     aim
         (N, 3), m.
 

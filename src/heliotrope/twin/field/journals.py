@@ -1,4 +1,4 @@
-"""What the local controllers of a vectorised field store, and what they believe by it."""
+"""Journals of the local controllers of a vectorised field, and the beliefs they give."""
 
 import struct
 from binascii import crc32
@@ -26,7 +26,7 @@ class Journals:
     Parameters
     ----------
     believed
-        Mechanisms that the controllers are told of at first, (N,).
+        Mechanisms stored at first, (N,).
     machine
         Limits and resting places, the same for all.
 
@@ -103,7 +103,7 @@ class Journals:
         return self._items[row]
 
     def store(self, row: int, items: dict[str, bytes]) -> None:
-        """Let a controller take items into its journal, and believe them."""
+        """Let a controller take items into its journal, and use them."""
         self.items(row).update(items)
         if "armature" in items:
             self.armatures[row] = struct.unpack(CODES_OF["armature"], items["armature"])

@@ -21,7 +21,7 @@ from heliotrope.twin.boards.outfit import Outfit, own_items, sha256
 
 #: Most boards that one process can run.
 MOST = 64
-#: Errors above this are of a mirror on its way, or on a target, rad.
+#: Larger errors belong to a mirror on its way, or on a target, rad.
 _ON_ITS_WAY = 0.05
 
 
@@ -40,7 +40,7 @@ class BoardField:
     names
         Heliostats.
     truth, believed
-        Mechanisms as they stand, and as the boards are told, (N,).
+        True mechanisms, and those that the boards store, (N,).
     machine
         Limits and resting places, the same for all.
     seed
@@ -49,7 +49,7 @@ class BoardField:
     Attributes
     ----------
     boards
-        In the order of the names; `bus` switches them on.
+        One for each name, in the same order; switched on by `bus`.
 
     Raises
     ------
@@ -90,7 +90,7 @@ class BoardField:
         return TwinBus(self._clock, [*made])
 
     def advance(self, milliseconds: int) -> None:
-        """Let each board run when it is due; its time is the clock's."""
+        """Run each board when it is due; its time is the clock's."""
         del milliseconds
         now = self._clock.monotonic()
         for board in self.boards:
@@ -103,7 +103,7 @@ class BoardField:
         return np.stack([n for _, n in pairs]), np.stack([v for v, _ in pairs])
 
     def errors(self, sun: FloatArray, aims: FloatArray) -> FloatArray:
-        """Return the error of each normal against its aim (N, 3), rad, (N,); NaN if none tracks."""
+        """Return the error of each normal at its aim (N, 3), rad, (N,); NaN if not tracking."""
         normal, vertex = self.stand()
         wanted = bisector(sun, normalize(aims - vertex))
         off = np.arcsin(np.clip(np.linalg.norm(np.cross(normal, wanted), axis=-1), 0.0, 1.0))

@@ -1,10 +1,10 @@
 """A simulated world for a plant: a field on buses, clusters, cameras, and the truth.
 
-`World` is handed to `plant.assembly.PlantAssembly` as its ports. Everything runs in one event loop:
+`World` provides the ports of `plant.assembly.PlantAssembly`. Everything runs in one event loop:
 the plant's program and its operations, a cluster program for each bus, the field in ticks of 50 ms.
-Mirrors stand as a quick installation leaves them; the plant is told of perfect ones, and learns
+Mirrors have the errors of a quick installation; the plant assumes perfect ones, and learns
 from photographs. The clock decides the speed: a `VirtualClock` on a `PacedLoop` (real time times a
-speed) or on a `VirtualLoop` (as fast as it goes).
+speed) or on a `VirtualLoop` (as fast as possible).
 """
 
 import asyncio
@@ -52,13 +52,13 @@ from heliotrope.twin.live.near_link import NearLink, near_pair
 
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
-#: Most ticks that are made up at once after a pause.
+#: Largest number of ticks made up at once after a pause.
 _MOST_TICKS = 20
-#: Step counts of each heliostat are asked for each second in plants up to this size, and every few
+#: Step counts of each heliostat are requested each second in plants up to this size, and every few
 #: seconds in larger ones.
 _SMALL, _STEPS_EVERY = 320, 5
-#: A calibration that removes what a quick installation leaves, with the deviation of a beam that
-#: this world has, rad.
+#: Settings of a calibration that removes the errors of a quick installation, with the deviation
+#: of a beam in this world, rad.
 CYCLE = CycleSettings(
     shots=4, interval=2.0, least=3, model=(*MODELS["malan8"], "canting"), sigma=2e-4
 )
@@ -66,7 +66,7 @@ CYCLE = CycleSettings(
 
 @dataclass(frozen=True)
 class WorldOptions:
-    """How a world is simulated.
+    """Options of a simulated world.
 
     Attributes
     ----------
@@ -77,7 +77,8 @@ class WorldOptions:
     threads
         Threads for photographs; 0 in virtual time.
     installed
-        Makes the true mechanisms from the nominal ones; None: as roughly as Malan's stood.
+        Makes the true mechanisms from the nominal ones; None: with errors as large as in Malan's
+        field.
     boards
         Whether each heliostat is a firmware-true board; for small plants.
     centroid
@@ -94,13 +95,13 @@ class WorldOptions:
     def __post_init__(self) -> None:
         if self.threads < 0 or not self.centroid >= 0.0:
             raise InputError(
-                f"simulated plant: {self.threads} threads, centroids of {self.centroid} m²; give 0 "
-                "or more of both"
+                f"simulated plant: {self.threads} threads, centroid variance {self.centroid} m²; "
+                "give 0 or more for both"
             )
 
 
 class Forgetful:
-    """An audit that keeps nothing, for plants that are only looked at."""
+    """An audit that stores nothing, for plants that are only looked at."""
 
     def begin(self, record: Record) -> None:
         """Take a record."""
@@ -116,12 +117,12 @@ class Forgetful:
 
 
 class World:
-    """What a plant is connected to in simulation.
+    """The simulated surroundings of a plant.
 
     Parameters
     ----------
     design
-        As the plant knows it: heliostats of one group with one machine table, each on a cluster;
+        The plant: heliostats of one group with one machine table, each on a cluster;
         its mechanisms count as nominal.
     clock
         Clock of the loop that it will run in.
@@ -133,7 +134,7 @@ class World:
     names
         Heliostats, in the order of the design.
     truth
-        Mechanisms as they stand, (N,).
+        True mechanisms, (N,).
     field
         The simulated heliostats.
     links
@@ -143,21 +144,21 @@ class World:
     cameras
         Cameras of the targets.
     beats
-        Ticks that were left out because the machine was too slow.
+        Ticks left out because the machine was too slow.
 
     Raises
     ------
     InputError
-        Several groups, clusters that do not stand together, a target without a camera, or a
-        machine table that is missing or incomplete.
+        Several groups, a cluster whose heliostats are not consecutive, a target without a camera,
+        or a machine table that is missing or incomplete.
     """
 
     def __init__(self, design: Plant, clock: Clock, options: WorldOptions | None = None) -> None:
         chosen = options or WorldOptions()
         if len(design.groups) != 1:
             raise InputError(
-                f"simulated plant: {len(design.groups)} groups of heliostats; the simulation takes "
-                "one group"
+                f"simulated plant: {len(design.groups)} groups of heliostats; the simulation "
+                "supports one group"
             )
         self.design, self.clock, self.options = design, clock, chosen
         (group,) = design.groups.values()
@@ -181,19 +182,19 @@ class World:
         place = {name: row for row, name in enumerate(self.names)}
         for k, (name, members) in enumerate(homes.items()):
             self._wire(name, [place[member] for member in members], spread_phase(k, len(homes)))
-        # The plant orders its rows cluster by cluster, the field as the design has them.
+        # The plant orders its rows by cluster, the field in the order of the design.
         self._rows = np.array([place[name] for members in homes.values() for name in members])
         aims = default_aims(design, self.names, design.position, None)
         self._aims = np.stack([aims[name] for name in self.names])
         self.cameras = self._new_cameras()
 
-    # -- putting it together ---------------------------------------------------------------
+    # -- assembly --------------------------------------------------------------------------
 
     def _wire(self, name: str, rows: list[int], phase: float) -> None:
         """Make a cluster with its bus, and its link to the plant."""
         if rows != list(range(rows[0], rows[0] + len(rows))):
             raise InputError(
-                f"simulated plant: the heliostats of cluster {name} do not stand together in the "
+                f"simulated plant: the heliostats of cluster {name} are not consecutive in the "
                 "plant file; sort them by cluster"
             )
         span = range(rows[0], rows[0] + len(rows))
@@ -301,18 +302,18 @@ class World:
 
 
 def machine_of(design: Plant) -> Machine:
-    """Return the machine of the heliostats of a design, which must all have the same.
+    """Return the machine table of a design's heliostats, which must all have the same.
 
     Raises
     ------
     InputError
-        None, different ones, or one without a standby point.
+        No machine table, different ones, or one without a standby point.
     """
     machines = {design.machine(name) for name in design.names}
     if len(machines) != 1:
         raise InputError(
             f"simulated plant: {len(machines)} different machines in the plant file; the "
-            "simulation takes heliostats with equal limits and resting places"
+            "simulation needs heliostats with equal limits and resting places"
         )
     (machine,) = machines
     if machine.standby is None:

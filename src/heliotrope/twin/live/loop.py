@@ -71,7 +71,7 @@ class PacedLoop(asyncio.SelectorEventLoop):
     ) -> None:
         if not 0.0 < speed <= 1000.0:
             self._closed = True  # BaseEventLoop.__del__ asks for it
-            raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds in a second")
+            raise InputError(f"speed {speed}: give above 0 to 1000 simulated seconds per second")
         self._pace = _Pace(speed, start, wall)
         super().__init__(self._pace)
 

@@ -10,7 +10,7 @@ from collections import deque
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import LinkClosedError, SendOutcome, Statistics
 
-#: Most messages that wait at an end; beyond that the oldest is dropped, as at any link.
+#: Largest number of messages waiting at an end; beyond it the oldest is dropped, as at any link.
 _CAPACITY = 256
 
 
@@ -20,7 +20,7 @@ class NearLink:
     Attributes
     ----------
     name
-        What it leads to.
+        Name of the other end.
     plugged
         Whether this end is plugged in; unplug one to cut the line.
     other
@@ -37,7 +37,7 @@ class NearLink:
 
     @property
     def connected(self) -> bool:
-        """Whether both ends are there."""
+        """Whether both ends are present."""
         other = self.other
         here = not self.closed and other is not None and not other.closed
         now = here and self.plugged and other is not None and other.plugged
@@ -48,7 +48,7 @@ class NearLink:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the link is closed for good."""
         return self._closing.is_set()
 
     @property
@@ -58,11 +58,11 @@ class NearLink:
 
     @property
     def problem(self) -> str:
-        """Why it is not connected."""
+        """Why the link is not connected."""
         return "" if self.connected else "the line is cut"
 
     async def run(self) -> None:
-        """Wait until it is closed."""
+        """Wait until the link is closed."""
         await self._closing.wait()
 
     async def send(
@@ -103,13 +103,13 @@ class NearLink:
             await self._news.wait()
 
     async def close(self) -> None:
-        """Close it for good."""
+        """Close the link for good."""
         self._closing.set()
         self._news.set()
 
 
 def near_pair(clock: Clock, names: tuple[str, str]) -> tuple[NearLink, NearLink]:
-    """Return two ends: the first leads to the second name, as the plant's end to its cluster."""
+    """Return two ends: the first bears the second name, as the plant's end names its cluster."""
     first, second = NearLink(names[1], clock), NearLink(names[0], clock)
     first.other, second.other = second, first
     return first, second

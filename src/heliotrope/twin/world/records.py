@@ -78,7 +78,7 @@ class SimulatedAudit:
         """
         self._disk.check()
         if record.identity in self._disk.records:
-            raise InputError(f"audit: a record {record.identity} exists; identities are unique")
+            raise InputError(f"audit: record {record.identity} exists; identities are unique")
         self._disk.records[record.identity] = record
 
     def finish(self, identity: str, result: str, at: str) -> None:

@@ -59,7 +59,7 @@ LOOK, JUDGE = 0.2, 0.5
 _SUN_EVERY = 30.0
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
-#: With so few mirrors they join one at a time.
+#: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(join_rate=0.5, join_burst=1)
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
