@@ -29,7 +29,7 @@ from heliotrope.plant.aims import spread
 from heliotrope.plant.audit import STOPPED, AuditError, JsonLines, Record, read
 from heliotrope.plant.authority import Authority, Person, RefusedError, Role
 from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.joining import Job, JoinQueue
+from heliotrope.plant.joining import JoiningJob, JoinQueue
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.tickets import Ticket
 from support.lcu_machines import STANDBY, STOW, heliostat, items_of_heliostat
@@ -272,7 +272,7 @@ def test_who_waits_too_long_to_join_is_given_up() -> None:
     clock = VirtualClock()
     queue = JoinQueue(1.0, 1)
     ticket = Ticket("1", "TRACK", ("A", "B", "C"), clock, 60.0)
-    queue.put(Job(ticket, "TRACK", (), 7, deque(("A", "B", "C")), until=2.0))
+    queue.put(JoiningJob(ticket, "TRACK", (), 7, deque(("A", "B", "C")), until=2.0))
     assert queue.admit(0.0, 7) == []
     ((job, part),) = queue.admit(1.0, 7)
     assert (job.ticket, part) == (ticket, ("A",))

@@ -14,13 +14,13 @@ from heliotrope import safety
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.safety import (
     CONDITIONS,
+    AcknowledgeRole,
     Act,
     Action,
     Condition,
     JoinLimiter,
     Proof,
     Reading,
-    Role,
     SafetyState,
     Scope,
     Severity,
@@ -169,32 +169,32 @@ def test_latched_rows_need_their_person(name: str) -> None:
     row = ROWS[name]
     run = Run(name).feed(bad, row.delay + 1.0)
 
-    def refused(who: str, role: Role) -> str:
+    def refused(who: str, role: AcknowledgeRole) -> str:
         state, why = safety.acknowledge(run.state, name, who, role)
         assert state is run.state
         return why
 
-    assert "the cause has not gone" in refused("Ada", Role.SUPERVISOR)
+    assert "the cause has not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
     run.feed(good, row.clear_for + 1.0)
-    assert "needs a person's name" in refused("  ", Role.SUPERVISOR)
-    if row.role is Role.SUPERVISOR:
-        assert "engineer must acknowledge, not operator" in refused("Ada", Role.OPERATOR)
+    assert "needs a person's name" in refused("  ", AcknowledgeRole.SUPERVISOR)
+    if row.role is AcknowledgeRole.SUPERVISOR:
+        assert "engineer must acknowledge, not operator" in refused("Ada", AcknowledgeRole.OPERATOR)
     assert run.feed(good, 1000.0).actions, "time alone must not release"
-    run.state, why = safety.acknowledge(run.state, name, "Ada", Role.SUPERVISOR)
+    run.state, why = safety.acknowledge(run.state, name, "Ada", AcknowledgeRole.SUPERVISOR)
     assert why == ""
     assert run.state.tracks[name, ""].acknowledged_by == "Ada"
     assert run.feed(good, 1.0).actions == []
     # The next trip is a new one.
     run.feed(bad, row.delay + 1.0)
     assert run.state.tracks[name, ""].acknowledged_by == ""
-    assert "the cause has not gone" in refused("Ada", Role.SUPERVISOR)
+    assert "the cause has not gone" in refused("Ada", AcknowledgeRole.SUPERVISOR)
 
 
 def test_acknowledgements_that_mean_nothing_are_refused() -> None:
     run = Run("wind_gust_stow", "operator_emergency").feed(0.0, 1.0)
 
     def why(name: str, subject: str = "") -> str:
-        return safety.acknowledge(run.state, name, "Ada", Role.SUPERVISOR, subject)[1]
+        return safety.acknowledge(run.state, name, "Ada", AcknowledgeRole.SUPERVISOR, subject)[1]
 
     assert "nothing to acknowledge" in why("operator_emergency")
     assert "no such condition" in why("earthquake")
@@ -208,7 +208,7 @@ def test_a_cleared_cause_that_returns_cannot_be_acknowledged() -> None:
     run = Run(row.name).feed(1.5, 3.0).feed(0.5, row.clear_for + 1.0)
     # 0.95 does not trip, but is not safe either.
     run.feed(0.95, 0.5)
-    _, why = safety.acknowledge(run.state, row.name, "Ada", Role.SUPERVISOR)
+    _, why = safety.acknowledge(run.state, row.name, "Ada", AcknowledgeRole.SUPERVISOR)
     assert "95 %, not yet back at 90 %" in why
 
 

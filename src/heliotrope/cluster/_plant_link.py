@@ -26,7 +26,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
-from heliotrope.safety import Alarm, Role, alarms
+from heliotrope.safety import AcknowledgeRole, Alarm, alarms
 
 #: Life of a message to the plant, s.
 _NEWS_LIFE = 5.0
@@ -105,9 +105,9 @@ class PlantLink:
 
     def _take_acknowledgement(self, message: Acknowledge) -> None:
         try:
-            role = Role[message.role.upper()]
+            role = AcknowledgeRole[message.role.upper()]
         except KeyError:
-            known = " or ".join(each.name.lower() for each in Role)
+            known = " or ".join(each.name.lower() for each in AcknowledgeRole)
             refusal = f"role {message.role!r} is not known; give {known}"
         else:
             refusal = self._watch.acknowledge(message.condition, message.who, role)

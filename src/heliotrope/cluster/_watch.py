@@ -8,12 +8,12 @@ from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.timekeeping import Time
 from heliotrope.links.messages import Lease
 from heliotrope.safety import (
+    AcknowledgeRole,
     Act,
     Action,
     Alarm,
     Condition,
     Reading,
-    Role,
     SafetyState,
     Watcher,
     acknowledge,
@@ -203,7 +203,7 @@ class Watch:
                 Alarm(action.condition, self._cluster, action.severity, action.line)
             )
 
-    def acknowledge(self, condition: str, who: str, role: Role) -> str:
+    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole) -> str:
         """Acknowledge a row that latches; return why that is refused, "" if it is accepted."""
         self._state, refusal = acknowledge(self._state, condition, who, role)
         return refusal

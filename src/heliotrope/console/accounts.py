@@ -25,8 +25,8 @@ from heliotrope.store.people import Account
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
 
-def _who(who: Caller) -> models.Who:
-    return models.Who(
+def _who(who: Caller) -> models.CallerState:
+    return models.CallerState(
         name=who.person.name,
         role=who.person.role.name.lower(),
         by=who.by,
@@ -35,21 +35,21 @@ def _who(who: Caller) -> models.Who:
     )
 
 
-@router.get("/session", response_model=models.Who, tags=["people"])
-async def session(who: Anyone) -> models.Who:
+@router.get("/session", response_model=models.CallerState, tags=["people"])
+async def session(who: Anyone) -> models.CallerState:
     """Return the signed-in person."""
     return _who(who)
 
 
 @router.post(
     "/session",
-    response_model=models.Who,
+    response_model=models.CallerState,
     tags=["people"],
     responses={429: {"model": models.Problem, "description": "Too many failures"}},
 )
 async def sign_in(
     console: Here, request: Request, response: Response, given: models.LogIn
-) -> models.Who:
+) -> models.CallerState:
     """Sign in: the answer sets the session's cookie."""
     if not same_origin(console, request):
         raise HTTPException(403, "this page comes from another site; sign in at the console itself")
@@ -65,7 +65,7 @@ async def sign_in(
     )
     account = await console.read(lambda: console.people.account(given.name))
     role = account.role if account is not None else "viewer"
-    return models.Who(
+    return models.CallerState(
         name=given.name, role=role, by="session", expires=expires, csrf=_secrets.csrf_of(secret)
     )
 

@@ -79,7 +79,7 @@ async def health(console: Here) -> dict[str, Any]:
     return {"ok": True, "version": __version__}
 
 
-@router.get("/field", response_model=models.FieldState, tags=["field"])
+@router.get("/field", response_model=models.FieldDesign, tags=["field"])
 async def field(console: Here, request: Request, who: Anyone) -> Response:
     """Return everything about the field that does not change."""
     del who
@@ -230,7 +230,7 @@ async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 
     return shared(console, request, f"schedule {limit}", lambda: console.operations.schedule(limit))
 
 
-@router.get("/holds", response_model=models.many(models.Hold), tags=["calibration"])
+@router.get("/holds", response_model=models.many(models.HeldHeliostat), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
     """Return the heliostats that are excluded from calibration."""
     del who

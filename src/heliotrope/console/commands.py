@@ -87,7 +87,7 @@ async def take(console: Here, who: Operator) -> models.AuthorityState:
 
 
 @router.post("/authority/seize", response_model=models.AuthorityState, tags=["authority"])
-async def seize(console: Here, who: Operator, why: models.Reason) -> models.AuthorityState:
+async def seize(console: Here, who: Operator, why: models.GivenReason) -> models.AuthorityState:
     """Break another person's command authority and take it."""
     console.operations.seize_authority(who.person, why.reason)
     await _told(console)
@@ -112,15 +112,15 @@ async def release(console: Here, who: Operator) -> models.AuthorityState:
 
 
 @router.post("/stow", response_model=models.TicketState, tags=["commands"])
-async def stow(console: Here, who: Operator, whom: models.Whom) -> models.TicketState:
+async def stow(console: Here, who: Operator, order: models.SomeHeliostats) -> models.TicketState:
     """Send heliostats to stow; needs no authority."""
-    return console.tickets.put(console.operations.stow(who.person, whom.heliostats))
+    return console.tickets.put(console.operations.stow(who.person, order.heliostats))
 
 
 @router.post("/defocus", response_model=models.TicketState, tags=["commands"])
-async def defocus(console: Here, who: Operator, whom: models.Whom) -> models.TicketState:
+async def defocus(console: Here, who: Operator, order: models.SomeHeliostats) -> models.TicketState:
     """Take beams off the receiver; needs no authority."""
-    return console.tickets.put(console.operations.defocus(who.person, whom.heliostats))
+    return console.tickets.put(console.operations.defocus(who.person, order.heliostats))
 
 
 @router.post("/commands", response_model=models.TicketState, tags=["commands"])
@@ -177,9 +177,9 @@ async def standby(console: Here, who: Operator, order: models.StandbyOrder) -> m
 
 
 @router.post("/automatic", status_code=204, tags=["commands"])
-async def automatic(console: Here, who: Operator, whom: models.Whom) -> None:
+async def automatic(console: Here, who: Operator, order: models.SomeHeliostats) -> None:
     """Give heliostats to automatic control, which raises and calibrates them."""
-    console.operations.give_back(who.person, whom.heliostats)
+    console.operations.give_back(who.person, order.heliostats)
 
 
 @router.put("/calibration", response_model=models.CalibrationView, tags=["calibration"])
@@ -189,16 +189,18 @@ async def switch(console: Here, who: Operator, to: models.Switch) -> JSONRespons
     return answer(console.operations.calibration())
 
 
-@router.post("/holds", response_model=models.many(models.Hold), tags=["calibration"])
+@router.post("/holds", response_model=models.many(models.HeldHeliostat), tags=["calibration"])
 async def hold(console: Here, who: Operator, order: models.HoldOrder) -> JSONResponse:
     """Exclude heliostats from calibration."""
     console.operations.hold(who.person, order.heliostats, order.reason)
     return answer(console.operations.holds())
 
 
-@router.post("/holds/release", response_model=models.many(models.Hold), tags=["calibration"])
-async def unhold(console: Here, who: Operator, whom: models.Whom) -> JSONResponse:
+@router.post(
+    "/holds/release", response_model=models.many(models.HeldHeliostat), tags=["calibration"]
+)
+async def unhold(console: Here, who: Operator, order: models.SomeHeliostats) -> JSONResponse:
     """Return heliostats to calibration."""
-    names = whom.heliostats or [one.heliostat for one in console.operations.holds()]
+    names = order.heliostats or [one.heliostat for one in console.operations.holds()]
     console.operations.unhold(who.person, names)
     return answer(console.operations.holds())

@@ -101,7 +101,7 @@ class LogIn(Strict):
     password: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-class Who(BaseModel):
+class CallerState(BaseModel):
     """The caller: name and role in this plant, and the way of signing in."""
 
     name: str
@@ -111,20 +111,20 @@ class Who(BaseModel):
     csrf: str = Field("", description="Send it as X-CSRF-Token with every change")
 
 
-class Whom(Strict):
+class SomeHeliostats(Strict):
     """Some heliostats, or all."""
 
     heliostats: Names = []
 
 
-class CommandOrder(Whom):
+class CommandOrder(SomeHeliostats):
     """A command of the wire with its values, see the table of messages."""
 
     command: Annotated[str, Field(pattern=r"^[A-Z_]{2,20}$")]
     values: Annotated[list[Number], Field(max_length=8)] = []
 
 
-class AimOrder(Whom):
+class AimOrder(SomeHeliostats):
     """Aim heliostats at a receiver or target by its name, or at points by heliostat, ENU, m."""
 
     where: Words = ""
@@ -137,7 +137,7 @@ class StandbyOrder(Strict):
     points: Annotated[dict[Name, Point], Field(min_length=1, max_length=200_000)]
 
 
-class Reason(Strict):
+class GivenReason(Strict):
     """The reason."""
 
     reason: Words
@@ -157,7 +157,7 @@ class Acknowledged(Strict):
     subject: Words = ""
 
 
-class HoldOrder(Whom):
+class HoldOrder(SomeHeliostats):
     """Heliostats to exclude from calibration, and the reason."""
 
     heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
@@ -230,14 +230,14 @@ class AuthorityState(BaseModel):
     lifetime: float = Field(description="Life without renewal, s")
 
 
-class KeepOut(BaseModel):
+class KeepOutOutline(BaseModel):
     """A keep-out volume, as seen on a map."""
 
     name: str
     outline: list[tuple[float, float]] = Field(description="East and north of its corners, m")
 
 
-class FieldState(BaseModel):
+class FieldDesign(BaseModel):
     """Everything about the field that does not change, in the order of all its rows."""
 
     plant: str
@@ -249,7 +249,7 @@ class FieldState(BaseModel):
     tower: Place = Field(description="Centre of the receivers, ENU, m")
     receivers: list[str]
     targets: list[str]
-    keep_outs: list[KeepOut]
+    keep_outs: list[KeepOutOutline]
     surfaces: list[str] = Field(description="Places that `on` of a row names")
     states: list[str]
     faults: list[str]
@@ -304,4 +304,4 @@ FluxView, HeliostatView = model_of(flux.FluxView), model_of(views.HeliostatView)
 ClusterRow, AlarmRow = model_of(views.ClusterRow), model_of(views.AlarmRow)
 EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
 CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)
-Hold, EmergencyView = model_of(views.Hold), model_of(views.EmergencyView)
+HeldHeliostat, EmergencyView = model_of(views.HeldHeliostat), model_of(views.EmergencyView)

@@ -173,7 +173,7 @@ class Ask:
 class Acknowledge:
     """A person acknowledges a latched row of the cluster's safety table, shown by an `Alarm`.
 
-    ``role`` is the name of a `safety.Role`. `Progress` says DONE, or REFUSED and why.
+    ``role`` is the name of a `safety.AcknowledgeRole`. `Progress` says DONE, or REFUSED and why.
     """
 
     kind: ClassVar[str] = "acknowledge"

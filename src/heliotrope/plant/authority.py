@@ -36,9 +36,12 @@ class Role(IntEnum):
         return self.name.lower()
 
     @property
-    def acknowledges_as(self) -> safety.Role:
+    def acknowledges_as(self) -> safety.AcknowledgeRole:
         """The role in the safety table, where an engineer acts as supervisor; a viewer has none."""
-        return {Role.OPERATOR: safety.Role.OPERATOR, Role.ENGINEER: safety.Role.SUPERVISOR}[self]
+        return {
+            Role.OPERATOR: safety.AcknowledgeRole.OPERATOR,
+            Role.ENGINEER: safety.AcknowledgeRole.SUPERVISOR,
+        }[self]
 
 
 #: Wire commands that an operator may give; all others need an engineer.

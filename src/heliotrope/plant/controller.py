@@ -50,7 +50,7 @@ from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
-from heliotrope.plant.joining import Job, Joiner, JoinQueue
+from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
@@ -162,7 +162,9 @@ class PlantController:
             self.settings.patience,
         )
         self._joining = JoinQueue(self.settings.join_rate, self.settings.join_burst)
-        self._joiner = Joiner(self._joining, self._orders, self._ways, self.settings.join_life)
+        self._joiner = JoinDispatcher(
+            self._joining, self._orders, self._ways, self.settings.join_life
+        )
         self._sync = ParameterSync(
             self.field, self.wanted, self._orders, self._clusters, self._tell
         )
@@ -622,7 +624,7 @@ class PlantController:
         token: int,
     ) -> None:
         until = self.now() + self.settings.join_wait
-        self._joining.put(Job(ticket, name, values, token, deque(heliostats), until))
+        self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))
 
     def _accept(
         self,

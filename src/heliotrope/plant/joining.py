@@ -11,7 +11,7 @@ from heliotrope.safety import JoinLimiter
 
 
 @dataclass
-class Job:
+class JoiningJob:
     """A command that brings heliostats to the receiver, and those of them that still wait.
 
     Attributes
@@ -37,16 +37,16 @@ class JoinQueue:
 
     def __init__(self, rate: float, burst: int) -> None:
         self._limiter = JoinLimiter(rate, burst)
-        self._jobs: deque[Job] = deque()
+        self._jobs: deque[JoiningJob] = deque()
 
     def __len__(self) -> int:
         return sum(len(job.waiting) for job in self._jobs)
 
-    def put(self, job: Job) -> None:
+    def put(self, job: JoiningJob) -> None:
         """Add a job at the end."""
         self._jobs.append(job)
 
-    def admit(self, now: float, token: int) -> list[tuple[Job, tuple[str, ...]]]:
+    def admit(self, now: float, token: int) -> list[tuple[JoiningJob, tuple[str, ...]]]:
         """Return the heliostats that may go now; drop jobs of an earlier command authority."""
         for job in self._jobs:
             if job.token != token:
@@ -73,14 +73,14 @@ class JoinQueue:
         self._jobs = deque(job for job in self._jobs if job.waiting)
 
     @staticmethod
-    def _fail(job: Job, text: str, heliostats: frozenset[str] | None = None) -> None:
+    def _fail(job: JoiningJob, text: str, heliostats: frozenset[str] | None = None) -> None:
         gone = [name for name in job.waiting if heliostats is None or name in heliostats]
         job.ticket.advance(gone, Stage.FAILED, text)
         left = set(gone)
         job.waiting = deque(name for name in job.waiting if name not in left)
 
 
-class Joiner:
+class JoinDispatcher:
     """The sending of heliostats whose turn has come, if the way of their beams is clear now.
 
     The sun has moved since the aim was accepted, and the heliostat may point anywhere. So the sweep

@@ -10,10 +10,10 @@ Nothing here reads a clock, a sensor or a link.
 
 from heliotrope.safety.alarms import Alarm, AlarmKind
 from heliotrope.safety.condition import (
+    AcknowledgeRole,
     Act,
     Condition,
     Reading,
-    Role,
     Scope,
     Severity,
     Watcher,
@@ -45,6 +45,7 @@ __all__ = [
     "DEFOCUS_BUDGET",
     "ORDER_BUDGET",
     "STOW_BUDGET",
+    "AcknowledgeRole",
     "Act",
     "Action",
     "Alarm",
@@ -54,7 +55,6 @@ __all__ = [
     "Proof",
     "ProofReport",
     "Reading",
-    "Role",
     "SafetyState",
     "Scope",
     "Severity",

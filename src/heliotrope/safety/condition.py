@@ -62,7 +62,7 @@ class Severity(StrEnum):
         return next((each for each in cls if each == word.lower()), cls.ALARM)
 
 
-class Role(IntEnum):
+class AcknowledgeRole(IntEnum):
     """Role that may acknowledge; a higher role may acknowledge for a lower one.
 
     The console's engineer acts as supervisor, and people are shown that title.
@@ -74,7 +74,7 @@ class Role(IntEnum):
     @property
     def title(self) -> str:
         """The role as the control room knows it."""
-        return "operator" if self is Role.OPERATOR else "engineer"
+        return "operator" if self is AcknowledgeRole.OPERATOR else "engineer"
 
 
 class Watcher(Enum):
@@ -150,7 +150,7 @@ class Condition:
     clear_for: float = 2.0
     stale_after: float = 5.0
     ages: bool = False
-    role: Role | None = None
+    role: AcknowledgeRole | None = None
     release: str = ""
     remedy: str = ""
 

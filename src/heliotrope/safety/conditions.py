@@ -7,13 +7,13 @@ The wind limits are common for heliostats of tens of square metres; replace them
 import math
 
 from heliotrope.errors import InputError
-from heliotrope.safety.condition import Act, Condition, Role, Scope, Severity, Watcher
+from heliotrope.safety.condition import AcknowledgeRole, Act, Condition, Scope, Severity, Watcher
 
 _PLANT, _CLUSTER, _NODE = Watcher.PLANT, Watcher.CLUSTER, Watcher.NODE
 _ALARM, _REFUSE, _HOLD, _DEFOCUS, _STOW = Act
 _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
-_OPERATOR, _SUPERVISOR = Role
+_OPERATOR, _SUPERVISOR = AcknowledgeRole
 
 #: Lease of the plant to a cluster, and of a cluster's sun vector to its local controllers, s.
 PLANT_LEASE, SUN_LEASE = 3.0, 6.0

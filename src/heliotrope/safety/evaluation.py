@@ -22,7 +22,15 @@ from dataclasses import dataclass, field, replace
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.safety import alarms
-from heliotrope.safety.condition import Act, Condition, Reading, Role, Scope, Severity, Watcher
+from heliotrope.safety.condition import (
+    AcknowledgeRole,
+    Act,
+    Condition,
+    Reading,
+    Scope,
+    Severity,
+    Watcher,
+)
 from heliotrope.safety.proof import DEFOCUS_BUDGET
 
 #: Key of a track: name of the condition, and of the cluster or heliostat ("" for all).
@@ -330,7 +338,7 @@ def _strangers(readings: Mapping[Key, Reading], state: SafetyState, now: float) 
 
 
 def acknowledge(
-    state: SafetyState, condition: str, who: str, role: Role, subject: str = ""
+    state: SafetyState, condition: str, who: str, role: AcknowledgeRole, subject: str = ""
 ) -> tuple[SafetyState, str]:
     """Return the state after a person's acknowledgement, and why it was refused ("" if it was not).
 

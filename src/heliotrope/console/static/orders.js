@@ -112,7 +112,7 @@ export function bar(box) {
   return store.on("said", ({ text, bad }) => { said.textContent = text; said.title = text; said.classList.toggle("bad", Boolean(bad)); });
 }
 
-// Who has the authority, and the button to take it and give it back.
+// The holder of the authority, and the button to take it and give it back.
 export function whoCommands(box) {
   const text = h("span"), button = h("button", { className: "hx-button" });
   box.append(text, me.role === "viewer" ? "" : button);

@@ -12,13 +12,13 @@ from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.safety import (
+    AcknowledgeRole,
     Act,
     Action,
     Alarm,
     Condition,
     Proof,
     Reading,
-    Role,
     Scope,
     Watcher,
     acknowledge,
@@ -205,7 +205,7 @@ class TableWatch:
         self._told = found
         return news
 
-    def acknowledge(self, condition: str, who: str, role: Role, subject: str) -> str:
+    def acknowledge(self, condition: str, who: str, role: AcknowledgeRole, subject: str) -> str:
         """Acknowledge a row; return why it is refused, "" if it is not."""
         self._state, refusal = acknowledge(self._state, condition, who, role, subject)
         if not refusal:

@@ -24,7 +24,7 @@ from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.operations.views import CalibrationView, Hold, Planned
+from heliotrope.plant.operations.views import CalibrationView, HeldHeliostat, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
@@ -117,7 +117,7 @@ class AutomaticControl:
         self.book = CalibrationBook(plant, "malan8" if cycle is None else cycle.settings.model)
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
-        self.holds: dict[str, Hold] = self._keeping.holds(self._utc())
+        self.holds: dict[str, HeldHeliostat] = self._keeping.holds(self._utc())
         self._raising = Raising(
             plant,
             logbook,
@@ -159,7 +159,7 @@ class AutomaticControl:
         for name in heliostats:
             self._plant.field.place(name)
         for name in heliostats:
-            self.holds[name] = Hold(name, who, reason, now)
+            self.holds[name] = HeldHeliostat(name, who, reason, now)
         self._keeping.hold(heliostats, reason, who, now)
 
     def unhold(self, who: str, heliostats: Sequence[str]) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.operations.views import CalibrationEntry, Hold
+from heliotrope.plant.operations.views import CalibrationEntry, HeldHeliostat
 from heliotrope.store.records import Records, StoreError, VisitEntry
 
 #: Time between removals of old events, s.
@@ -125,12 +125,12 @@ class Keeping:
 
     # -- holds and events ------------------------------------------------------------------
 
-    def holds(self, now: float) -> dict[str, Hold]:
+    def holds(self, now: float) -> dict[str, HeldHeliostat]:
         """Return the holds kept before; ``now`` in POSIX s."""
         if self._records is None:
             return {}
         return {
-            name: Hold(name, hold.person, hold.reason, hold.since)
+            name: HeldHeliostat(name, hold.person, hold.reason, hold.since)
             for name, hold in self._records.holds(now).items()
             if name in self._names
         }

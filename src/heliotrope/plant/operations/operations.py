@@ -37,8 +37,8 @@ from heliotrope.plant.operations.views import (
     EmergencyView,
     EventRow,
     FieldFrame,
+    HeldHeliostat,
     HeliostatView,
-    Hold,
     PacketRow,
     Planned,
     Summary,
@@ -308,7 +308,7 @@ class Operations:
         """Return the plan of the next visits."""
         return self.automatic.plan(limit)
 
-    def holds(self) -> tuple[Hold, ...]:
+    def holds(self) -> tuple[HeldHeliostat, ...]:
         """Return the heliostats kept out of calibration."""
         return tuple(self.automatic.holds.values())
 

@@ -438,7 +438,7 @@ class CameraView:
 
 
 @dataclass(frozen=True)
-class Hold:
+class HeldHeliostat:
     """A heliostat kept out of calibration: the person, the reason, and the time (POSIX s)."""
 
     heliostat: str

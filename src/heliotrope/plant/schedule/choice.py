@@ -19,7 +19,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray, angle_between, tangent_axes
 from heliotrope.optics.beam import SUN_RADIUS
-from heliotrope.plant.schedule.knowledge import FieldKnowledge, Look
+from heliotrope.plant.schedule.knowledge import FieldKnowledge, VisitYield
 from heliotrope.plant.schedule.settings import Settings, Weather
 
 #: Heliostats judged exactly at a time; most chunks of a decision once a visit is found, and before.
@@ -372,7 +372,14 @@ class Judge:
         return best
 
     def _told(
-        self, moment: Moment, row: int, target: str, look: Look, k: int, seen: float, overdue: bool
+        self,
+        moment: Moment,
+        row: int,
+        target: str,
+        look: VisitYield,
+        k: int,
+        seen: float,
+        overdue: bool,
     ) -> Assignment:
         span = float(self._time(look.drive[k], np.array(seen)))
         before = float(np.sqrt(moment.square[row]))

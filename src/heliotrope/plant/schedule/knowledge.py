@@ -38,7 +38,7 @@ Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Look:
+class VisitYield:
     """The expected yield of a visit of each of K heliostats to a target, at one sun.
 
     Attributes
@@ -160,7 +160,7 @@ class Knowledge:
         shots: int,
         sigma: float,
         counts: FloatArray | None = None,
-    ) -> Look:
+    ) -> VisitYield:
         """Return the expected yield of visits of heliostats to a target.
 
         Parameters
@@ -192,7 +192,7 @@ class Knowledge:
         slope = np.sqrt(shots) * slope
         gain = _gain.variance_gain(covariance, slope, self._form[self._like[rows]])
         drive = _drive_time(some.drives.table, aimed, counts)
-        return Look(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
+        return VisitYield(able, aimed.normal, drive, slope, gain, sigma**2 * (seen + 2.0))
 
     def assume(self, row: int, slope: FloatArray, now: float) -> None:
         """Assume that a visit with this slope (2, P) has been made."""
@@ -317,7 +317,7 @@ class FieldKnowledge:
         sun: FloatArray,
         target: Target,
         counts: FloatArray | None,
-    ) -> Look:
+    ) -> VisitYield:
         """Return the expected yield of visits of heliostats of one group; see `Knowledge.look`."""
         settings, known = self._settings, self._groups[int(self.group[rows[0]])]
         return known.look(

@@ -2,21 +2,21 @@
 
 Begin with `CalibrationCycle`: it sends a heliostat to a target, takes photographs (plainly, or with
 a search for the beam: `Centring`), fits them, and lets the plant believe a better calibration.
-`Visit` is the way there and back; `Camera` is the protocol of a camera.
+`Visit` is the way there and back; `TargetCamera` is the protocol of a camera.
 """
 
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle, CycleResult
-from heliotrope.plant.visits.photographs import Camera, Photographs, Shot
+from heliotrope.plant.visits.photographs import Photographs, Shot, TargetCamera
 from heliotrope.plant.visits.settings import Centring, CycleSettings
 from heliotrope.plant.visits.visit import Visit
 
 __all__ = [
     "CalibrationCycle",
-    "Camera",
     "Centring",
     "CycleResult",
     "CycleSettings",
     "Photographs",
     "Shot",
+    "TargetCamera",
     "Visit",
 ]

@@ -28,12 +28,12 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.visits.photographs import (
-    Camera,
     Centred,
     Photographing,
     Photographs,
     Plain,
     Shot,
+    TargetCamera,
     Tell,
 )
 from heliotrope.plant.visits.settings import Centring, CycleSettings
@@ -116,7 +116,7 @@ class CalibrationCycle:
     def __init__(
         self,
         plant: PlantController,
-        camera: Camera,
+        camera: TargetCamera,
         settings: CycleSettings | None = None,
         centring: Centring | None = None,
     ) -> None:

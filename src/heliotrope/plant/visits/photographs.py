@@ -54,7 +54,7 @@ class Shot:
     reasons: tuple[str, ...] = ()
 
 
-class Camera(Protocol):
+class TargetCamera(Protocol):
     """A camera that photographs targets and reads the photographs."""
 
     async def photograph(self, target: Target, heliostat: str) -> Shot:
@@ -92,7 +92,7 @@ class Photographing(Protocol):
 class Plain:
     """Photographs of the beam where it is, without search or centring."""
 
-    def __init__(self, camera: Camera, settings: CycleSettings) -> None:
+    def __init__(self, camera: TargetCamera, settings: CycleSettings) -> None:
         self._camera, self._settings = camera, settings
 
     async def take(self, visit: Visit, tell: Tell) -> Photographs:
@@ -114,7 +114,7 @@ class Plain:
 class Centred:
     """Photographs of a beam that is searched for, centred, and moved over the target."""
 
-    def __init__(self, camera: Camera, settings: CycleSettings, centring: Centring) -> None:
+    def __init__(self, camera: TargetCamera, settings: CycleSettings, centring: Centring) -> None:
         self._camera, self._settings, self._centring = camera, settings, centring
 
     async def take(self, visit: Visit, tell: Tell) -> Photographs:
@@ -224,7 +224,7 @@ class _Light:
     place: FloatArray
 
 
-async def _photograph(camera: Camera, visit: Visit) -> Shot:
+async def _photograph(camera: TargetCamera, visit: Visit) -> Shot:
     shot = await camera.photograph(visit.target, visit.heliostat)
     if visit.state != states.TRACKING:
         raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")
