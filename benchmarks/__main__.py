@@ -1,6 +1,6 @@
 """``python -m benchmarks NAME [--json] [--quick]``; NAME may be all.
 
-``all`` keeps every result in benchmarks/results, unless it is a quick one.
+``all`` keeps every result in benchmarks/results, except with ``--quick``.
 """
 
 import argparse
@@ -17,7 +17,7 @@ NAMES = (
     "tracking", "calibration", "imaging", "sun", "field", "startup", "bus", "frames", "clusters",
     "control", "plant", "airborne", "console", "day",
 )  # fmt: skip
-#: Columns of a table that goes to a file or a pipe.
+#: Width of a table that goes to a file or a pipe, characters.
 WIDTH = 180
 
 
@@ -82,7 +82,7 @@ def _show(result: dict[str, Any]) -> None:
 
 
 def main() -> int:
-    """Run what is asked for; return the exit code."""
+    """Run the benchmarks named on the command line; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("name", nargs="?", help=f"all, {', '.join(NAMES)}")
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -1,9 +1,8 @@
 """The peers of the tracking benchmark: the same method in whole-array NumPy.
 
-Written as fast as NumPy allows: components first, so that every operation runs over
-contiguous memory (vectors last take two to four times as long), blocks of rows that stay
-in the processor's cache, and no trigonometry inside the iteration but what SciPy's
-Rotation needs.
+As fast as NumPy allows: components first, so that every operation runs over contiguous memory
+(vectors last take two to four times as long); blocks of rows that stay in the processor's cache; no
+trigonometry inside the iteration except what SciPy's Rotation needs.
 """
 
 from collections.abc import Callable
@@ -35,13 +34,13 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def by_formula(axis: Array, sine: Array, cosine: Array, u: Array) -> Array:
-    """Turn by Rodrigues' formula."""
+    """Turn vectors by Rodrigues' formula."""
     along = (1.0 - cosine) * _dot(axis, u)
     return np.asarray(cosine * u + sine * _cross(axis, u) + along * axis)
 
 
 def by_rotation(axis: Array, sine: Array, cosine: Array, u: Array) -> Array:
-    """Turn by SciPy's Rotation, which wants vectors last."""
+    """Turn vectors by SciPy's Rotation, which takes the components as the last axis."""
     turn = Rotation.from_rotvec((axis * np.arctan2(sine, cosine)).T)
     return np.asarray(turn.apply(u.T).T)
 

@@ -1,10 +1,9 @@
-"""ARTIST's kinematic reconstruction on its own PAINT data, where both are at hand.
+"""ARTIST's kinematic reconstruction on its own PAINT data, where both are available.
 
-ARTIST (github.com/ARTIST-Association/ARTIST) reads PAINT measurements and a scenario of
-its own, so that it cannot be given the benchmark's synthetic field: what is compared is
-the time a heliostat. benchmarks/README.md says how to set it up. The calls are those of
-its tutorial on kinematic reconstruction; they have not been run on the machine where this
-was written.
+ARTIST (github.com/ARTIST-Association/ARTIST) reads PAINT measurements and a scenario of its own,
+not the benchmark's synthetic field, so only the time for a heliostat can be compared.
+benchmarks/README.md explains the setup. The calls are those of ARTIST's tutorial on kinematic
+reconstruction; they have not been run here.
 """
 
 import importlib.util
@@ -19,7 +18,7 @@ SIGHTINGS = 30
 
 
 def why_skipped() -> str | None:
-    """Return why ARTIST is not among the contenders, None if it is."""
+    """Return why ARTIST is missing from the contenders, None if it is among them."""
     try:
         found = importlib.util.find_spec("artist.core.kinematics_reconstructor")
     except ImportError:

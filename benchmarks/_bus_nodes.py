@@ -1,6 +1,6 @@
-"""A process that answers on a port like all local controllers of a bus.
+"""A process that answers on a port as all local controllers of a bus would.
 
-Its argument is the port's path, or the number of a file that it was given.
+Its argument is the path of the port, or the number of an open file that it inherits.
 """
 
 import os
@@ -14,7 +14,7 @@ _STATUS = (5, 0x11, 0, 86_400, 950, 24_100, 31, 0x1234ABCD, 3)
 
 
 def answer(frame: wire.Frame) -> bytes:
-    """Return what the local controller that is asked answers."""
+    """Return the answer of the local controller that a question addresses."""
     sender = wire.Sender(frame.to, 1)
     sender.count = frame.sequence - 1
     if frame.name == "QUERY_STEPS":
@@ -25,7 +25,7 @@ def answer(frame: wire.Frame) -> bytes:
 
 
 def main() -> None:
-    """Answer until the port is gone."""
+    """Answer questions until the port is closed."""
     name = sys.argv[1]
     port = int(name) if name.isdigit() else os.open(name, os.O_RDWR | os.O_NOCTTY)
     tty.setraw(port)

@@ -15,8 +15,8 @@ def threshold_centroid(
 ) -> FloatArray | None:
     r"""Return the intensity-weighted centroid between two thresholds, m in the face's plane, (2,).
 
-    After Malan, §5.6, (5.2)-(5.4), as understood here; the thesis's text was not available,
-    and the constants are ours. The empty target is subtracted, d = v - b, and
+    Our reading of Malan, §5.6, (5.2)-(5.4); the text of the thesis was not available, and
+    the constants are ours. The empty target is subtracted, d = v - b, and
 
     .. math:: w = d \text{ where } t_{low} < d \text{ and } v < t_{high}, \text{ else } 0,
               \qquad t_{low} = \bar d + low (d_{max} - \bar d)

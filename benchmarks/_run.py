@@ -1,4 +1,4 @@
-"""What the benchmarks share: timing, memory, the machine, and keeping the results."""
+"""Shared by the benchmarks: timing, memory, the machine, and storage of results."""
 
 import json
 import os
@@ -26,7 +26,7 @@ PACKAGES = (
     "pandas",
     "pyarrow",
 )
-#: Others that take more than this part of the cores make a measurement doubtful.
+#: A measurement is doubtful if other programs take more than this share of the cores.
 BUSY = 0.1
 
 Call = Callable[[], Any]
@@ -34,23 +34,23 @@ Row = dict[str, str | int | float | None]
 
 
 class BenchmarkError(RuntimeError):
-    """A benchmark that cannot be run, or whose contenders do not do the same."""
+    """A benchmark cannot be run, or its contenders differ in their results."""
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a benchmark found.
+    """Result of a benchmark.
 
     Attributes
     ----------
     rows
-        One a size and contender, all with the same keys; the keys name the units.
+        One row for each size and contender, all with the same keys; the keys name the units.
     headline
         The result in one line.
     figures
-        What holds for all rows.
+        Figures that hold for all rows.
     within_budget
-        Whether the budget of the design is kept; None if there is none at these sizes.
+        Whether the budget of the design is kept; None if it has no budget for these sizes.
     """
 
     rows: list[Row]
@@ -69,7 +69,7 @@ class Times:
 
 
 class Neighbours:
-    """Counts what other programs take of the processors, from now on.
+    """Measures how much of the processors other programs take from now on.
 
     The load average cannot tell them from the benchmark itself, and lags by a minute.
     """
@@ -85,7 +85,7 @@ class Neighbours:
         return time.perf_counter(), busy, sum(os.times()[:4])
 
     def cores(self) -> float:
-        """Return how many cores the others have kept busy since then."""
+        """Return the number of cores that other programs have kept busy since then."""
         wall, busy, own = (b - a for a, b in zip(self._start, self._now(), strict=True))
         return max(0.0, busy - own) / wall if wall > 0.0 else 0.0
 
@@ -110,7 +110,7 @@ def _revision() -> str | None:
 
 
 def machine() -> dict[str, Any]:
-    """Return what the figures are measured on, and when."""
+    """Return the machine, the versions and the date of a measurement."""
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     models = [line.split(":", 1)[1].strip() for line in cpuinfo if line.startswith("model name")]
     return {
@@ -127,7 +127,7 @@ def machine() -> dict[str, Any]:
 
 
 def timed(contenders: dict[str, Call], repeats: int) -> dict[str, Times]:
-    """Time contenders in turn, after a round to warm up: a disturbance meets all of them."""
+    """Time contenders in turn, after a round to warm up, so that a disturbance affects all."""
     walls: dict[str, list[float]] = {name: [] for name in contenders}
     works: dict[str, list[float]] = {name: [] for name in contenders}
     for call in contenders.values():
@@ -145,7 +145,7 @@ def timed(contenders: dict[str, Call], repeats: int) -> dict[str, Times]:
 
 
 def peak_bytes(call: Call) -> int:
-    """Return how much more memory Python and NumPy hold at the worst moment of a call."""
+    """Return the peak growth of the memory of Python and NumPy during a call, bytes."""
     tracemalloc.start()
     try:
         before = tracemalloc.get_traced_memory()[0]
@@ -156,12 +156,12 @@ def peak_bytes(call: Call) -> int:
 
 
 def agree(what: str, apart: float, limit: float, unit: str) -> float:
-    """Return how far the contenders are apart.
+    """Return the largest difference between the contenders.
 
     Raises
     ------
     BenchmarkError
-        If that is not within the limit.
+        If it exceeds the limit.
     """
     if not apart <= limit:
         raise BenchmarkError(
@@ -172,7 +172,7 @@ def agree(what: str, apart: float, limit: float, unit: str) -> float:
 
 
 def keep(name: str, result: dict[str, Any]) -> Path:
-    """Write a result beside its place and rename it."""
+    """Write a result to its file, whole or not at all."""
     RESULTS.mkdir(exist_ok=True)
     path = RESULTS / f"{name}.json"
     part = path.with_suffix(".part")

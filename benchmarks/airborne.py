@@ -1,8 +1,8 @@
-"""Reading a drone's photographs, relative to their decoding: mirrors and lamp found per second.
+"""Reading of a drone's photographs: mirrors and lamp found per second, relative to decoding.
 
-A rendered flight over 72 mirrors with four facets, 12 megapixels as JPEG. The time is that of the
-work of `heliotrope drone evaluate` on one photograph: from the decoded picture, and from the file
-with one process and with one for each core. The design sets no budget; the reference is the
+A rendered flight over 72 mirrors with four facets, 12 megapixels as JPEG. Timed is the work of
+`heliotrope drone evaluate` on one photograph: from the decoded picture, and from the file with one
+process and with one for each core. The design sets no budget; the reference is the
 decoding in the same run. Memory is that of this process, including the rendering.
 """
 
@@ -82,7 +82,7 @@ def _work(photo: Photo, camera: LedCamera, stand: MirrorPoses) -> tuple[int, int
 
 
 def _rate(processes: int, count: int, photo: Photo, camera: LedCamera, stand: MirrorPoses) -> float:
-    """Return photographs a second with this many processes, without their start."""
+    """Return photographs per second with this many processes, their start not counted."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         warm = [pool.submit(_work, photo, camera, stand) for _ in range(2 * processes)]
         found = {future.result() for future in warm}

@@ -1,8 +1,8 @@
-"""The serial bus: how long a transaction and a poll cycle of 32 take, beside the wire's own time.
+"""The serial bus: time of a transaction and of a poll cycle of 32, beside the wire's own time.
 
-Master and local controllers are programs of their own. The wire between them is a pseudo-terminal
-alone, which carries bytes at once and so shows what the programs take, or the tests' bus of
-pseudo-terminals, whose bytes take the time of a UART.
+Master and local controllers run as separate programs. Between them is either one pseudo-terminal,
+which carries bytes at once and so shows the time that the programs take, or the tests' bus of
+pseudo-terminals, on which bytes take the time of a UART.
 """
 
 import asyncio
@@ -52,7 +52,7 @@ def _nodes(port: str, given: tuple[int, ...] = ()) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _line(baud_rate: int | None) -> Iterator[str]:
-    """Give the master's port, with local controllers at its other end; None: unpaced."""
+    """Yield the master's port, with local controllers at its other end; None: unpaced."""
     if baud_rate is not None:
         with PacedBus(2, baud_rate) as bus, _nodes(bus.paths[1]):
             yield bus.paths[0]

@@ -1,8 +1,8 @@
-"""The estimator beside SciPy's least squares and Nelder-Mead, and ARTIST where it is at hand.
+"""The estimator beside SciPy's least squares and Nelder-Mead, and ARTIST where it is installed.
 
-All but ARTIST minimise the same cost, square loss and prior, from the same start. SciPy
-takes one heliostat after another, with Heliotrope's kinematics and its own differences.
-Heliotrope gives covariances as well.
+All but ARTIST minimise the same cost, square loss and prior, from the same start. SciPy fits one
+heliostat after another, with Heliotrope's kinematics and its own finite differences. Heliotrope
+also returns covariances.
 """
 
 import math
@@ -22,12 +22,12 @@ from heliotrope.mechanism import kinds, parameters
 SIGHTINGS = 30
 NOISE = 3e-4
 NAMES = (*parameters.MODELS["malan8"], "canting", "azimuth_scale", "elevation_scale")
-#: For 10,000 heliostats, square loss.
+#: Budget of the design for 10,000 heliostats with square loss.
 BUDGET_S, BUDGET_SIZE = 3.0, 10_000
-#: How often each size is timed.
+#: Number of timings of each size.
 REPEATS = {10: 20, 100: 20, 1000: 10, 10_000: 7, 100_000: 1}
 SQUARE: dict[str, Any] = {"loss": "square", "adapt_scale": False}
-#: Evaluations of the cost that Nelder-Mead is given for one heliostat.
+#: Most evaluations of the cost by Nelder-Mead for one heliostat.
 EVALUATIONS = 20_000
 
 
@@ -83,7 +83,7 @@ def _least_squares(nominal: Any, seen: Any, sample: int) -> np.ndarray:
 
 
 def _nelder_mead(nominal: Any, seen: Any, sample: int, evaluations: int) -> np.ndarray:
-    """Return parameters over their priors, (sample, P), after so many evaluations at most."""
+    """Return parameters over their priors, (sample, P), after at most ``evaluations``."""
     options = {
         "maxfev": evaluations,
         "maxiter": evaluations,
@@ -119,7 +119,7 @@ def _row(contender: str, size: int, best: float, median: float) -> dict[str, Any
 
 
 def _peers(quick: bool, size: int) -> list[dict[str, Any]]:
-    """SciPy's solvers, timed on a sample of the field, and checked against ours."""
+    """Return rows of SciPy's solvers, timed on a sample of the field and checked against ours."""
     sample, few, evaluations = (3, 1, 500) if quick else (20, 2, EVALUATIONS)
     nominal, seen = _case(size)
     found = fit(nominal, seen, NAMES, **SQUARE)

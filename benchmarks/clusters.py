@@ -1,9 +1,9 @@
-"""Cluster controllers: what one of 32 heliostats takes of a core in a second, alone or among many.
+"""Cluster controllers: processor time per second of one with 32 heliostats, alone or among many.
 
-A bus that answers at once with frames made before, and a link that carries nothing: what is
-measured is the cluster alone, without bus, heliostats, network and plant. Processor time is taken
-in virtual time. How late a cluster has told of its second is measured in real time, with the
-seconds of all clusters in phase and spread: in phase, the last waits for all others.
+The bus answers at once with prepared frames and the link carries nothing, so that only the cluster
+is measured, without bus, heliostats, network and plant. Processor time is measured in virtual time.
+The delay of a cluster's status is measured in real time, with the seconds of all clusters in phase
+and spread: in phase, the last waits for all others.
 """
 
 import asyncio
@@ -36,7 +36,7 @@ ANSWERS: dict[str, tuple[str, tuple[int, ...]]] = {
 
 
 class ReadyBus:
-    """A bus whose answers were made before, once for all buses."""
+    """A bus with prepared answers, shared by all buses."""
 
     connected, closed = True, False
     _answers: ClassVar[dict[bytes, bytes]] = {}
@@ -45,10 +45,10 @@ class ReadyBus:
         self.frames = 0
 
     async def run(self) -> None:
-        """Nothing is to be kept open."""
+        """Do nothing: there is nothing to open."""
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: there is nothing to close."""
 
     async def transmit(
         self, frame: bytes, *, expires: float | None = None, urgent: bool = False
@@ -74,7 +74,7 @@ class ReadyBus:
 
     @classmethod
     def ready(cls, frame: bytes) -> bytes:
-        """Make the answer to a question."""
+        """Return the answer to a question."""
         (asked,) = wire.Reader().feed(frame)
         name, values = ANSWERS[asked.name]
         number = messages.NUMBER_OF[name]
@@ -85,7 +85,7 @@ class ReadyBus:
 
 
 class LeasingLink:
-    """A link from which a lease comes every second, and that keeps what was sent last."""
+    """A link that brings a lease every second and keeps the last message sent."""
 
     name, connected, silent_for, problem = "plant", True, 0.0, ""
 
@@ -98,15 +98,15 @@ class LeasingLink:
 
     @property
     def closed(self) -> bool:
-        """Whether it was closed for good."""
+        """Whether the link was closed for good."""
         return self._closing.is_set()
 
     async def run(self) -> None:
-        """Wait to be closed."""
+        """Wait until the link is closed."""
         await self._closing.wait()
 
     async def close(self) -> None:
-        """End ``run``."""
+        """Close the link, which ends `run`."""
         self._closing.set()
 
     async def send(
@@ -120,7 +120,7 @@ class LeasingLink:
         return SendOutcome.SENT
 
     async def receive(self) -> bytes:
-        """Give a lease after a second."""
+        """Return a lease after a second."""
         try:
             async with asyncio.timeout(1.0):
                 await self._closing.wait()
@@ -139,7 +139,7 @@ def _cluster(
 
 
 def _prepare() -> None:
-    """Make all questions, which clusters do once in a process, and their answers."""
+    """Make all questions and their answers, once in a process."""
     for address in range(1, HELIOSTATS + 1):
         for sequence in range(1, SEQUENCES + 1):
             for question in (STATUS, STEPS):
@@ -173,7 +173,7 @@ def _measure(count: int, seconds: int) -> Row:
 
 
 def _lateness(count: int, seconds: int, *, spread: bool) -> tuple[float, float]:
-    """Return how late clusters have told of a second, in s: half of them, and the last."""
+    """Return the delay of the clusters' status after a second, s: median and last."""
     late: list[float] = []
 
     async def main() -> None:
@@ -186,7 +186,7 @@ def _lateness(count: int, seconds: int, *, spread: bool) -> tuple[float, float]:
             part[2].told = lambda phase=phase: late.append((keeper.time().gps_s - phase) % 1.0)
             parts.append(part)
         async with running(*(part[2] for part in parts)), running(*(part[0] for part in parts)):
-            # They find their phase in a tenth of a second at a time.
+            # Clusters approach their phase by a tenth of a second at a time.
             await asyncio.sleep(6.0)
             late.clear()
             await asyncio.sleep(float(seconds))
@@ -196,7 +196,7 @@ def _lateness(count: int, seconds: int, *, spread: bool) -> tuple[float, float]:
 
 
 def _heard(link: LeasingLink) -> int:
-    """How many heliostats the last status tells of as heard within a second."""
+    """Return the number of heliostats heard within a second, by the last status."""
     status = decode(link.last)
     assert isinstance(status, ClusterStatus)
     return int(np.sum(status.nodes()["heard_ms"] < 1000))

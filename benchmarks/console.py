@@ -1,11 +1,11 @@
 """The console under load: 10,000 heliostats, 50 viewers and 5 operators, and one page in a browser.
 
-The plant (the twin, all clusters, the console) is a process of its own, as ``heliotrope run`` has
-it; who looks is in a second one, Chromium in others. All of them share the machine: on two cores
-that is the hardest part of it. First the page is alone with the plant: how soon it is ready, how
-many frames a second it draws while the map is panned. Then everybody looks, and somebody clicks
-EMERGENCY in the page: how long until the last local controller has heard DEFOCUS on its bus, and
-until the plant knows the acknowledgement of each.
+The plant (twin, all clusters, console) is one process, as under ``heliotrope run``; the viewers are
+a second, Chromium others. All share the machine: with two cores that is the hardest part. First the
+page is alone with the plant: the time until it is ready, and the frames per second that it draws
+while the map is panned. Then all viewers connect, and EMERGENCY is clicked in the page: the time
+until the last local controller has heard DEFOCUS on its bus, and until the plant has the
+acknowledgement of each.
 """
 
 import asyncio
@@ -28,29 +28,29 @@ ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
 NAME, PASSWORD = "engineer", "a long enough password"
 VIEWERS, OPERATORS = 50, 5
 READY_S, FRAMES, EMERGENCY_S, MESSAGES = 3.0, 20.0, 1.0, 1.0
-#: Pans the map by a little in each frame, for some milliseconds; gives the frames in a second.
+#: Pans the map a little in each frame for some milliseconds; returns the frames per second.
 PAN = """span => new Promise(done => { const map = window.heliotropeMap; let frames = 0, begin = 0;
   const turn = now => { begin ||= now;
     if (now - begin >= span) return done(1e3 * frames / (now - begin));
     frames += 1; map.pan(frames % 120 < 60 ? 3 : -3, 1 - 2 * (frames % 2));
     requestAnimationFrame(turn); };
   requestAnimationFrame(turn); })"""
-#: What the tabs of the page ask for besides the stream, and how often, s; each has one open.
+#: Requests of the page's tabs besides the stream, and their intervals, s; one tab is open.
 ASKED = {"receivers/receiver/flux": 10.0, "clusters": 3.0, "calibration": 3.0, "alarms": 4.0}
 
 
 class Heard:
-    """When each heliostat has heard DEFOCUS since it was asked for the last time."""
+    """Times at which each heliostat heard DEFOCUS since the last `begin`."""
 
     def __init__(self, count: int) -> None:
         self._who, self.at = np.zeros(count, dtype=np.bool_), 0.0
 
     def begin(self) -> None:
-        """Forget."""
+        """Forget all times."""
         self._who[:], self.at = False, 0.0
 
     def took(self, name: str, rows: range) -> None:
-        """Note who took a command."""
+        """Note which heliostats took a command."""
         if name == "DEFOCUS" and not self.at:
             self._who[rows.start : rows.stop] = True
             if self._who.all():
@@ -58,7 +58,7 @@ class Heard:
 
 
 def serve(pipe: Connection, folder: str, heliostats: int) -> None:
-    """Run a plant with its console; answer what the pipe asks. The body of a process."""
+    """Run a plant with its console and answer requests from the pipe; the body of a process."""
     from heliotrope.twin.live.loop import PacedLoop
 
     with asyncio.Runner(loop_factory=lambda: PacedLoop(1.0)) as runner:
@@ -127,7 +127,7 @@ async def _serve(pipe: Connection, folder: Path, heliostats: int) -> None:
 
 
 def _acknowledged(plant: Any) -> list[float]:
-    """Return a list into which the time goes when the last heliostat has acknowledged."""
+    """Return a list that receives the time when the last heliostat has acknowledged."""
     from heliotrope.links.messages import Stage
     from heliotrope.plant.emergency import EmergencyOrder
 
@@ -146,7 +146,7 @@ def _acknowledged(plant: Any) -> list[float]:
 
 
 class _Longest:
-    """The longest time that the loop was held, s."""
+    """Longest time that the event loop was blocked, s."""
 
     wait = 0.0
 
@@ -158,7 +158,7 @@ class _Longest:
 
 
 def look(pipe: Connection, address: str, tokens: list[str], viewers: int) -> None:
-    """Look, as many people do; tell the pipe what came. The body of a process."""
+    """Run many viewers and report to the pipe what they received; the body of a process."""
     asyncio.run(_look(pipe, address, tokens, viewers))
 
 
@@ -185,7 +185,7 @@ async def _look(pipe: Connection, address: str, tokens: list[str], viewers: int)
 
 
 async def _view(address: str, token: str, came: list[tuple[int, float, int]]) -> None:
-    """Follow the stream, and only count: a browser has a machine of its own."""
+    """Follow the stream and only count: in a plant, a browser runs on a machine of its own."""
     import json
 
     from websockets.asyncio.client import connect
@@ -202,7 +202,7 @@ async def _view(address: str, token: str, came: list[tuple[int, float, int]]) ->
 async def _ask(
     address: str, token: str, answers: list[float], number: int, *, operator: bool
 ) -> None:
-    """Ask for what a page asks for; an operator sends heliostats to stow besides."""
+    """Make the requests of a page; an operator also sends heliostats to stow."""
     import httpx
 
     rng = np.random.default_rng(number)
@@ -254,7 +254,7 @@ def _told(pipe: Connection, question: str) -> Any:
 
 
 def _page(playwright: Any, address: str, span: float) -> tuple[Any, Row]:
-    """Open the page; return it, and how it does alone."""
+    """Open the page; return it, and its figures while no one else is connected."""
     browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
     page = browser.new_page(viewport={"width": 1600, "height": 900})
     page.set_default_timeout(60_000)
@@ -281,7 +281,7 @@ def _page(playwright: Any, address: str, span: float) -> tuple[Any, Row]:
 
 
 def _load(plant: Connection, people: Connection, page: Any, span: float) -> Row:
-    """Let everybody look, then click; return how it went."""
+    """Connect all viewers, click EMERGENCY, and return the figures."""
     cpu, begun = _told(plant, "begin"), time.time()
     _told(people, "begin")
     page.wait_for_timeout(1e3 * span)
@@ -325,7 +325,7 @@ def _measure(heliostats: int, people: int, span: float) -> Row:
             raise BenchmarkError("the plant was not there within three minutes")
         address, tokens, _ = plant.recv()
         if people == VIEWERS:
-            # The plant is at work: heliostats leave stow, cameras look.
+            # The plant is at work: heliostats leave stow, cameras take photographs.
             time.sleep(30.0)
         with sync_playwright() as playwright:
             page, row = _page(playwright, address, span / 4.0)

@@ -1,10 +1,10 @@
-"""A whole field under real cluster controllers: what it takes of a core, and how soon it is safe.
+"""A whole field under real cluster controllers: its processor time, and how soon it is safe.
 
 Clusters of 32 heliostats, each on a bus whose heliostats are rows of the vectorised twin, which
-goes on in ticks of 50 ms with the integers of the boards. Time is virtual; the bus takes none, so
-that to the time from an order to the last heliostat the three calls on the wire are to be added
-(4 ms at 115,200 baud). The limit of processor time, half a core, is that of the design; what the
-clusters alone take is in ``clusters``.
+advances in ticks of 50 ms with the integer arithmetic of the boards. Time is virtual and the bus
+takes none: add the three calls on the wire (4 ms at 115,200 baud) to the time from an order to the
+last heliostat. The limit of processor time, half a core, is the design's; ``clusters`` measures the
+clusters alone.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ CORES, ORDER_S, DEFOCUS_S, STOW_S, DARK = 0.5, 1.0, 30.0, 300.0, 0.1
 
 
 class Line:
-    """The plant's end and the cluster's in one: what is put in comes out at once."""
+    """Both ends of a link, the plant's and the cluster's: a message arrives at once."""
 
     name, connected, silent_for, problem = "plant", True, 0.0, ""
 
@@ -49,22 +49,22 @@ class Line:
         self.closed = False
 
     async def run(self) -> None:
-        """Nothing is to be kept open."""
+        """Do nothing: there is nothing to open."""
 
     async def close(self) -> None:
-        """End what waits."""
+        """Close the link, which ends all waits."""
         self.closed = True
         self._waiting.put_nowait(None)
 
     async def send(
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> SendOutcome:
-        """Take what the plant is told."""
+        """Take a message for the plant."""
         del data, expires, hold
         return SendOutcome.SENT
 
     def put(self, data: bytes) -> None:
-        """Bring a message of the plant."""
+        """Deliver a message of the plant."""
         self._waiting.put_nowait(data)
 
     async def receive(self) -> bytes:
@@ -76,7 +76,7 @@ class Line:
 
 
 class Heard:
-    """Who has heard DEFOCUS since `begin`, and when the last one did."""
+    """Heliostats that have heard DEFOCUS since `begin`, and the time of the last."""
 
     def __init__(self, count: int) -> None:
         self._who = np.zeros(count, dtype=np.bool_)
@@ -84,12 +84,12 @@ class Heard:
         self.at = math.nan  # `time.perf_counter` of the last, s
 
     def begin(self) -> None:
-        """Forget."""
+        """Forget all times."""
         self._who[:] = False
         self.left = len(self._who)
 
     def took(self, name: str, rows: range) -> None:
-        """Note who took a command."""
+        """Note which heliostats took a command."""
         if name == "DEFOCUS" and self.left:
             part = self._who[rows.start : rows.stop]
             self.left -= len(part) - int(part.sum())
@@ -110,7 +110,7 @@ class Bench:
     longest: float = 0.0  # wall time of a second, s
 
     def tell(self, message: Message) -> None:
-        """Tell all clusters."""
+        """Send a message to all clusters."""
         data = encode(message)
         for line in self.lines:
             line.put(data)
@@ -121,7 +121,7 @@ class Bench:
         return self.field.flux(vector(utc, SITE), RECEIVER, RADIUS)
 
     async def live(self, seconds: float, until: Callable[[], bool] | None = None) -> float:
-        """Let time pass, at most until something holds; return how long that took, s."""
+        """Let time pass until a condition holds or the time is over; return the time taken, s."""
         begin, wall = self.clock.monotonic(), time.perf_counter()
         for tick in range(round(20 * seconds)):
             if tick % 20 == 0:
@@ -151,7 +151,7 @@ def _field(count: int) -> Field:
 
 
 def _on_receiver(field: Field, clock: VirtualClock) -> None:
-    """Bring the field to the receiver without clusters: that is not what is measured."""
+    """Bring the field to the receiver without clusters; this is not measured."""
     field.order("AIM", aim=RECEIVER)
     for second in range(130):
         utc = clock.utc().timestamp() - 130 + second
@@ -189,7 +189,7 @@ def _measure(count: int) -> Row:
             async with running(*clusters):
                 row = await _through(bench, heard, count, len(clusters))
             bench.leases = False
-            # The clusters are gone; the field is alone.
+            # The clusters have ended; the field is on its own.
             row["stow_after_cluster_loss_s"] = await bench.live(
                 STOW_S, lambda: bool((field.state == states.STOWED).all())
             )
@@ -199,7 +199,7 @@ def _measure(count: int) -> Row:
 
 
 async def _through(bench: Bench, heard: Heard, count: int, clusters: int) -> Row:
-    """Track; an order; the loss of the plant; a jump of the clock: each ends in the dark."""
+    """Measure tracking, an order, the loss of the plant and a jump of the clock; return figures."""
 
     def dark() -> bool:
         return bench.flux() < DARK
@@ -215,7 +215,7 @@ async def _through(bench: Bench, heard: Heard, count: int, clusters: int) -> Row
     at = bench.clock.monotonic()
     while heard.left and bench.clock.monotonic() - at < ORDER_S:
         await asyncio.sleep(0.001)
-    # The loop sleeps only when nobody has anything to do: all have acknowledged by now.
+    # The loop sleeps only when no task has anything to do: all have acknowledged by now.
     order, order_wall = bench.clock.monotonic() - at, heard.at - wall
     order_cpu = time.process_time() - cpu
     row: Row = {
@@ -237,7 +237,7 @@ async def _through(bench: Bench, heard: Heard, count: int, clusters: int) -> Row
 
 
 async def _back(bench: Bench) -> None:
-    """Back to the receiver."""
+    """Bring the field back to the receiver."""
     await bench.live(3)
     bench.tell(Acknowledge("k", "clock_jump", "operator", "operator"))
     bench.tell(Command("r", "REFOCUS", token=TOKEN))

@@ -204,7 +204,7 @@ class Days:
         many = believed[np.zeros(len(times), dtype=np.intp)]
         counts = aim_at(many, suns, surface, SightingLimits()).counts
         pose = self.truth[np.full(len(times), row)].pose(counts)
-        # The plane goes on beyond the target: a search would have found the beam.
+        # The plane extends beyond the target: a search would have found the beam.
         seen = surface.intersect(pose.vertex, reflect(suns, pose.normal))
         away = np.linalg.norm(seen - pose.vertex, axis=1)[:, None]
         shift = self.noise * away * self.chance.standard_normal((len(times), 2))

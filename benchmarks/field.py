@@ -1,4 +1,4 @@
-"""Reading and writing plant files beside bare pandas on the same table.
+"""Reading and writing of plant files, beside bare pandas on the same table.
 
 Pandas reads numbers and texts; Heliotrope also checks every value and builds mechanisms.
 """

@@ -1,8 +1,8 @@
-"""Damaged frames that a receiver takes for true: version 2, and Malan's packet beside it.
+"""Damaged frames that a receiver accepts: version 2, and Malan's packet for comparison.
 
 A frame (or packet) is damaged at random in one of five ways, and a fresh receiver reads it between
 whole ones. A *false accept* is a frame that comes out and was never sent. Frames that survive
-because the damage missed them (an insertion after the end, say) are no false accepts.
+because the damage missed them (an insertion after the end, say) do not count.
 """
 
 import os
@@ -46,7 +46,7 @@ def _size(code: str) -> int:
 
 
 def damaged(way: str, data: bytes, other: bytes, draw: list[int], noise: bytes) -> bytes:
-    """Return ``data`` damaged in a way; ``draw`` are three numbers drawn from 2^30."""
+    """Return ``data`` damaged in one way; ``draw`` holds three random numbers below 2^30."""
     at = draw[0] % len(data)
     size = 1 + draw[1] % LONGEST
     if way == "flip":  # one to three bits
@@ -64,15 +64,15 @@ def damaged(way: str, data: bytes, other: bytes, draw: list[int], noise: bytes) 
 
 
 def _accepted(data: bytes, packets: bool) -> list[bytes]:
-    """Return what a receiver takes, as what covers all that it says."""
+    """Return the frames that a receiver accepts, each encoded again."""
     if packets:
-        # Told apart by silence, as the thesis's receiver does not: the best that it can be.
+        # Silence separates the packets, which the thesis's receiver does not use: its best case.
         return [data] if packet12.parse(data) is not None else []
     return [wire.encode(frame) for frame in wire.Reader().feed(data + b"\0")]
 
 
 def share(job: tuple[int, int, bool]) -> Table:
-    """Return counts by (format, way, what became of it) of some trials of a seed."""
+    """Return counts by (format, way of damage, outcome) of some trials of a seed."""
     seed, trials, packets = job
     rng = np.random.default_rng([61, seed, packets])
     known = frames(rng, packets)
@@ -95,7 +95,7 @@ def share(job: tuple[int, int, bool]) -> Table:
 
 
 def sliding(size: int) -> int:
-    """Return how many packets a receiver finds in noise that looks at every byte."""
+    """Return the number of packets that a receiver finds in noise by trying every byte."""
     noise = np.frombuffer(np.random.default_rng(62).bytes(size), np.uint8).astype(np.int64)
     total = np.convolve(noise, np.ones(packet12.SIZE - 1, np.int64), "valid")[:-1]
     return int(np.count_nonzero(total % 256 == noise[packet12.SIZE - 1 :]))

@@ -34,7 +34,7 @@ from heliotrope.imaging.targets.rectify import rectify
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.optics.mirror_image import gaussian_beam
 
-#: Greatest time from a photograph to a sighting, in times of its decoding.
+#: Greatest time from a photograph to a sighting, as a multiple of its decoding.
 BUDGET = 1.5
 #: The design's photograph.
 SIZE = (1600, 1200)
@@ -96,7 +96,7 @@ def _contenders(path: Path, targets: tuple[Target, ...]) -> dict[str, Call]:
 
 
 def _rate(path: Path, targets: tuple[Target, ...], processes: int, count: int) -> float:
-    """Return photographs per second with a number of processes, without their start."""
+    """Return photographs per second with this many processes, their start not counted."""
     with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
         warm = [pool.submit(_to_sighting, path, targets) for _ in range(4 * processes)]
         places = [future.result() for future in warm]

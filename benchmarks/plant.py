@@ -1,8 +1,7 @@
-"""The plant with 10,016 heliostats on 313 clusters: CPU for a second of operation and an emergency.
+"""The plant with 10,016 heliostats in 313 clusters: CPU for a second of operation, an emergency.
 
-The links are replaced by ones that take and give messages at once, so what is measured is the
-plant alone: decoding and keeping each cluster's status, leases, the safety table, the order, and
-all answers to it.
+Its links take and give messages at once, so that only the plant is measured: decoding and keeping
+each cluster's status, leases, the safety table, the order, and all answers to it.
 """
 
 import asyncio
@@ -36,18 +35,18 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.sun import Site
 
 MEMBERS = 32
-#: Where no beam of the benchmark goes.
+#: A place that no beam of the benchmark reaches.
 VOLUMES = (
     Box("house", (0.0, -300.0, 5.0), (30.0, 20.0, 10.0)),
     Cylinder("mast", (900.0, 0.0, 0.0), (900.0, 0.0, 60.0), 2.0),
 )
-#: Half a core is for the plant and the twin together.
+#: Budget: half a core for the plant and the twin together.
 BUDGET_S = 0.5
 ORDER_BUDGET_S = 1.0
 
 
 class _Direct:
-    """A link that is always there."""
+    """A link that is always connected."""
 
     silent_for, problem, connected = 0.0, "", True
 
@@ -107,7 +106,7 @@ def _design(clusters: int) -> Plant:
 
 
 class _Run:
-    """One plant, and what its parts took, s of CPU."""
+    """A plant, and the CPU time that its parts took, s."""
 
     def __init__(
         self,
@@ -127,7 +126,7 @@ class _Run:
         )
         self.rows = np.zeros(len(design), NODE)
         self.rows["state"] = states.TRACKING
-        # All stand where their beams are on the receiver.
+        # All stand with their beams on the receiver.
         everybody = np.arange(len(design), dtype=np.intp)
         aims = np.broadcast_to(design.receivers[0].center, (len(design), 3))
         found = self.plant.beams.poses(everybody, aims, self.plant.sun_vector())
@@ -155,7 +154,7 @@ class _Run:
             link.arrived.put_nowait(encode(status))
 
     async def steady(self) -> float:
-        """CPU for a second of operation, the clusters' encoding of the status taken out."""
+        """Return the CPU for a second of operation without the clusters' encoding of the status."""
         await asyncio.sleep(0.1)
         self._report(greet=True)
         await asyncio.sleep(2.0)
@@ -174,7 +173,7 @@ class _Run:
         return spent / self.seconds
 
     async def emergency(self) -> tuple[float, float]:
-        """CPU from the order until it is with all links, and for all answers to it."""
+        """Return the CPU until an order has reached all links, and for all answers to it."""
         for link in self.links:
             link.sent.clear()
         begin = time.process_time()

@@ -1,8 +1,8 @@
 """Tracking of 1 to 1,000,000 heliostats beside NumPy and SciPy's Rotation.
 
-All run the same method to the same limit: the closed-form pair of angles inside a fixed
-point on the vertex, until the beam is within 1e-9 m of its aim. Heliotrope gives drive
-counts within the stops, pose, residual and status as well; its peers give angles alone.
+All run the same method to the same limit: the closed-form pair of angles inside a fixed-point
+iteration on the vertex, until the beam is within 1e-9 m of its aim. Heliotrope also returns drive
+counts within the stops, pose, residual and status; its peers return angles only.
 """
 
 import math
@@ -21,7 +21,7 @@ from heliotrope.mechanism.tracking import Branch, Tracking, track
 SUN = np.array([0.3, -0.6, 0.7]) / np.linalg.norm([0.3, -0.6, 0.7])
 AIM = np.array([0.0, 0.0, 120.0])
 TOLERANCE = 1e-9
-#: On two threads, at 100,000 heliostats.
+#: Budget on two threads, at 100,000 heliostats.
 BUDGET_NS, BUDGET_SIZE = 250.0, 100_000
 REPEATS = {1: 200, 1000: 100, 100_000: 25, 1_000_000: 5}
 AZEL, ARBITRARY = "azimuth-elevation", "arbitrary axes"
@@ -39,7 +39,7 @@ class Contender:
 
     @property
     def key(self) -> str:
-        """Name it among the others."""
+        """Return the name in the table."""
         return f"{self.name}/{self.branches}/{self.threads}"
 
 
@@ -131,7 +131,7 @@ def _rows(kind: str, size: int) -> list[dict[str, Any]]:
 
 
 def _add_growth(before: list[dict[str, Any]], rows: list[dict[str, Any]]) -> None:
-    """Fill in the exponent by which the time grows from one size to the next."""
+    """Fill in the exponent of the growth of time from one size to the next."""
     for small, large in zip(before, rows, strict=True):
         ratio = large["heliostats"] / small["heliostats"]
         cost = large["best_ns_per_heliostat"] / small["best_ns_per_heliostat"]
