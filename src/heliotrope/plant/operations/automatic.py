@@ -175,7 +175,8 @@ class AutomaticControl:
 
     async def halt(self, limit: float = 5.0) -> None:
         """Give up all work, and wait for visits under way to end, ``limit`` s at most."""
-        self._raising.wanted[:] = self._on = False
+        self._on = False
+        self._raising.give_up()
         self.give_way()
         until = self._plant.now() + limit
         while self._visiting() and self._plant.now() < until:
@@ -280,7 +281,7 @@ class AutomaticControl:
         """Hold the authority while nobody else wants it; give up in an emergency and at night."""
         plant, wanted = self._plant, self._raising.wanted
         if plant.emergency_on:
-            wanted[:] = False
+            self._raising.give_up()
         grant, since = plant.authority.grant, plant.now() - self._gave_way_at
         if self._has_authority():
             plant.authority.keep(AUTOMATIC, self._token)

@@ -76,6 +76,10 @@ class Raising:
         self.wanted[rows] = wanted
         self._busy_until[rows] = -math.inf
 
+    def give_up(self) -> None:
+        """Take all heliostats out of automatic control."""
+        self.wanted[:] = False
+
     def release(self, heliostat: str) -> None:
         """Allow a new command to a heliostat at once: its visit to a target has ended."""
         self._busy_until[self._plant.field.place(heliostat)] = -math.inf
