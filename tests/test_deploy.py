@@ -57,6 +57,14 @@ def test_every_alarm_is_in_the_handbook() -> None:
     assert rows("## Alarms") == {row.name for row in CONDITIONS} | set(alarms.KINDS)
 
 
+def test_every_refusal_is_in_the_handbook_and_on_the_page() -> None:
+    names_of = [kind.name for kind in refusals.KINDS]
+    assert rows("## Refusals") == set(names_of)
+    assert len(names_of) == len(set(names_of))
+    page = (ROOT / "docs" / "reference" / "alarms.md").read_text(encoding="utf-8")
+    assert [name for name in names_of if f"| {name} |" not in page] == []
+
+
 def test_alarms_are_raised_from_the_table_only() -> None:
     """No place in the code names an alarm by a text of its own."""
     found = []
@@ -96,7 +104,7 @@ def test_every_refusal_of_the_table_is_raised() -> None:
 def test_the_page_of_alarms_is_current() -> None:
     script = runpy.run_path(str(ROOT / "scripts" / "alarms_page.py"))
     page = script["PAGE"].read_text(encoding="utf-8")
-    assert page == script["page"](), "run scripts/alarms_page.py to write the page anew"
+    assert page == script["page"](), "run scripts/alarms_page.py to write the page again"
     for name in {row.name for row in CONDITIONS} | set(alarms.KINDS):
         assert f"| `{name}` |" in page
 
