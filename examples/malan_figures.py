@@ -1,7 +1,7 @@
-"""Redraws figures 3.5 and 4.6 to 4.9 of Malan's thesis: ``python malan_figures.py FOLDER``.
+"""Redraw figures 3.5 and 4.6 to 4.9 of Malan's thesis: ``python malan_figures.py FOLDER``.
 
-Figures 4.6 to 4.9 show the path of a heliostat's beam on the plane of the aim over a day if one
-thing is wrong by one unit: the pedestal leans, an encoder's zero is off, the axes are not
+Figures 4.6 to 4.9 show the path of a heliostat's beam on the plane of the aim over a day with a
+single error of one unit: the pedestal leans, an encoder's zero is off, the axes are not
 perpendicular, the survey is wrong. Positions, dates and sizes that the thesis does not give are
 ours.
 """
@@ -118,7 +118,7 @@ def intercept() -> Figure:
 
 
 def main(folder: str | Path) -> list[Path]:
-    """Write the figures into a folder; returns their paths."""
+    """Write the figures into a folder; return their paths."""
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
     made = {"3.5": intercept(), **{number: paths(number) for number in FIGURES}}

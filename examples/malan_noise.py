@@ -1,4 +1,4 @@
-"""Malan's noise study (figure 4.11): the effect of a centroid's noise on the beam.
+"""Repeat Malan's noise study (figure 4.11): the effect of a centroid's noise on the beam.
 
 ``python malan_noise.py [FOLDER]``. His geometry: Stellenbosch, a heliostat 30.8 m south and
 19.2 m east of the tower with its pivot 1.2 m up, a target 13 m up; a measurement every half
@@ -49,7 +49,7 @@ def suns(day: datetime, every: timedelta = timedelta(minutes=30)) -> FloatArray:
 
 
 def nominal(mirrors: int, worm_ratio: float = 0.0) -> Mechanism:
-    """Return ``mirrors`` copies of the heliostat as drawn."""
+    """Return ``mirrors`` copies of the nominal heliostat."""
     drives = (direct(), direct(min_angle=-0.2, max_angle=1.8, worm_ratio=worm_ratio))
     places = np.tile(POSITION, (mirrors, 1))
     return kinds.azimuth_elevation(places, pivot_height=1.2, drives=drives)
@@ -150,7 +150,7 @@ def study(
 
 
 def main(folder: Path) -> Path:
-    """Draw the normalised error against the noise; returns the picture's path."""
+    """Draw the normalised error against the noise; return the picture's path."""
     noises = np.array([0.002, 0.005, 0.01, 0.02, 0.05])
     figure = Figure(figsize=(7.0, 4.5), layout="constrained")
     ax = figure.subplots()

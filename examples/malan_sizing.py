@@ -1,7 +1,7 @@
-"""The sizing arithmetic of chapter 3 of Malan's thesis, line by line: ``python malan_sizing.py``.
+"""Repeat the sizing arithmetic of chapter 3 of Malan's thesis: ``python malan_sizing.py``.
 
 From the thesis: 5 MWe, about 10,000 heliostats of 5 m². Inputs marked "ours" are not in its text;
-with them the arithmetic meets its numbers.
+with them the arithmetic gives its numbers.
 """
 
 import math

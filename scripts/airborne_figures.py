@@ -1,4 +1,4 @@
-"""The pictures of docs/tutorial/airborne.md and docs/explanation/airborne.md.
+"""Draw the pictures of docs/tutorial/airborne.md and docs/explanation/airborne.md.
 
 ``python scripts/airborne_figures.py [FOLDER]`` runs the tutorial up to the evaluation in a
 temporary folder and writes the plan's map, a photograph and one heliostat to FOLDER (default
@@ -25,14 +25,14 @@ from heliotrope.airborne.simulate.trial import TrialConditions, four_facets, tri
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "tutorial" / "airborne.md"
 BLOCK = re.compile(r"```(?P<kind>python|console)\n(?P<body>.*?)^```", re.DOTALL | re.MULTILINE)
-#: Heading of the page after which there are no more pictures.
+#: Heading on the page after the last picture.
 LAST = "## All points"
 #: Photograph, its rows that show mirrors, and its enlargement.
 SHOWN, ROWS, SCALE = "photographs/C1-8/DJI_0013.JPG", slice(110, 450), 1.5
 
 
 def run(text: str) -> dict[str, Any]:
-    """Run the blocks of a page here; returns the names that its Python defines."""
+    """Run the blocks of a page in this folder; return the names that its Python defines."""
     names: dict[str, Any] = {"__name__": "__page__"}
     for block in BLOCK.finditer(text):
         if block["kind"] == "python":

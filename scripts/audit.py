@@ -1,10 +1,10 @@
-"""Checks the installed packages without a network: pinned versions, and allowed licences.
+"""Check the installed packages without a network: pinned versions, and allowed licences.
 
 python scripts/audit.py [--json]
 
-Known vulnerabilities are not looked up, which needs a service (see docs/how-to/deploy.md).
-The exit code is 1 if a package is not pinned at the installed version, or its licence is not
-known or not allowed.
+It does not look up known vulnerabilities, which needs a service (see docs/how-to/deploy.md). The
+exit code is 1 if a package is not pinned at the installed version, or its licence is unknown or not
+allowed.
 """
 
 import argparse
@@ -16,16 +16,16 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-#: Tools of the environment itself; no package of ours asks for them.
+#: Tools of the environment itself, which no package of ours requires.
 TOOLS = frozenset({"pip", "setuptools", "wheel", "uv", "heliotrope"})
-#: Words of licences that may be used by, and shipped with, a program under MIT.
+#: Words of licences whose packages a program under MIT may use and ship.
 ALLOWED = (
     "mit", "bsd", "0bsd", "apache", "isc", "psf", "python software foundation", "python-2.0",
     "cnri-python", "mpl", "mozilla public license", "lgpl", "lesser general public", "hpnd",
     "historical permission", "zlib", "unlicense", "public domain", "cc0", "zpl", "eupl",
     "epl", "eclipse", "edl", "blueoak", "ofl",
 )  # fmt: skip
-#: Licences that the metadata of a package does not tell; where they were read.
+#: Licences missing from a package's metadata, with the place where they were read.
 KNOWN: dict[str, str] = {}
 
 
@@ -36,11 +36,11 @@ class Package:
     Attributes
     ----------
     name, version, licence
-        As its metadata say; the name normalised.
+        From its metadata; the name is normalised.
     pinned
         Version in the constraints, "" if there is none.
     problem
-        What is wrong, "" if nothing is.
+        Problem of the package, "" if it has none.
     """
 
     name: str
@@ -51,7 +51,7 @@ class Package:
 
 
 def normal(name: str) -> str:
-    """Return a package's name as PEP 503 has it."""
+    """Return a package's name in the form of PEP 503."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
@@ -63,7 +63,7 @@ def constraints(text: str) -> dict[str, str]:
 
 
 def licence_of(found: Distribution) -> str:
-    """Return the licence that a package's metadata name, in one line."""
+    """Return the licence named in a package's metadata, in one line."""
     meta = found.metadata
     said = [meta.get("License-Expression") or ""]
     said += [
@@ -77,7 +77,7 @@ def licence_of(found: Distribution) -> str:
 
 
 def judge(name: str, version: str, licence: str, pins: dict[str, str]) -> Package:
-    """Return a package with what is wrong with it."""
+    """Return a package with its problem, if any."""
     pinned, licence = pins.get(name, ""), licence or KNOWN.get(name, "")
     problem = ""
     if not pinned:
@@ -92,7 +92,7 @@ def judge(name: str, version: str, licence: str, pins: dict[str, str]) -> Packag
 
 
 def allowed(licence: str) -> bool:
-    """Whether a licence, or one of several to choose from, is among the allowed ones."""
+    """Return whether a licence, or one of several to choose from, is allowed."""
     words = re.split(r"\s+or\s+", licence.lower())
     return any(_known(part) for part in words)
 
@@ -103,7 +103,7 @@ def _known(text: str) -> bool:
 
 
 def audit() -> list[Package]:
-    """Return all installed packages but the tools of the environment."""
+    """Return all installed packages except the tools of the environment."""
     pins = constraints((ROOT / "constraints.txt").read_text(encoding="utf-8"))
     found = {normal(one.metadata["Name"]): one for one in distributions() if one.metadata["Name"]}
     return [
@@ -114,7 +114,7 @@ def audit() -> list[Package]:
 
 
 def main() -> None:
-    """Print what is wrong."""
+    """Print the problems."""
     parser = argparse.ArgumentParser(description="Pinned versions and licences of the packages.")
     parser.add_argument("--json", action="store_true", help="all packages, as JSON")
     given = parser.parse_args()

@@ -10,7 +10,7 @@ class PrivateModules(Contract):
     Attributes
     ----------
     container
-        Package whose packages keep their underscore modules to themselves.
+        Package whose inner packages keep their underscore modules private.
     """
 
     type_name = "private_modules"
@@ -18,7 +18,7 @@ class PrivateModules(Contract):
     container = fields.StringField()
 
     def check(self, graph: grimp.ImportGraph, verbose: bool) -> ContractCheck:  # noqa: ARG002
-        """Look at every module whose path has a part that begins with an underscore."""
+        """Check every module with a part of its path that begins with an underscore."""
         depth = str(self.container).count(".") + 1
         found = []
         for module in sorted(graph.modules):
@@ -35,7 +35,7 @@ class PrivateModules(Contract):
         return ContractCheck(kept=not found, metadata={"found": found})
 
     def render_broken_contract(self, check: ContractCheck) -> None:
-        """Print one line for each import."""
+        """Print one line for each forbidden import."""
         for importer, line, module in check.metadata["found"]:
             output.print_error(
                 f"{importer}:{line} imports {module}, which belongs to its own package: "

@@ -1,9 +1,9 @@
-"""Build what a board needs: python scripts/firmware.py rp2|esp32|stm32 [FOLDER].
+"""Build the files of a board: python scripts/firmware.py rp2|esp32|stm32 [FOLDER].
 
-The local controller's core is made small (see shrink.py); all modules are compiled by mpy-cross,
-but for `main.py`, which MicroPython starts as text, and `settings.py`, which is to be edited. The
-compiled modules are put into an image of MicroPython's ROMFS too: from there they run in place and
-take no heap.
+The local controller's core is shrunk (see shrink.py). mpy-cross compiles all modules except
+`main.py`, which MicroPython starts as text, and `settings.py`, which is edited for each board. The
+compiled modules also go into an image of MicroPython's ROMFS, from which they run in place and take
+no heap.
 """
 
 import shutil
@@ -20,7 +20,7 @@ FIRMWARE = ROOT / "firmware"
 BOARDS = ("rp2", "esp32", "stm32")
 #: The compiled modules, for a board that has a partition for them.
 IMAGE = "code.romfs"
-#: What `loop.py` uses of the core.
+#: Names of the core that `loop.py` uses.
 ROOTS = (
     ("node", "Node"),
     ("controller", "SUPPLY"),
@@ -35,7 +35,7 @@ def compiled(text: str, name: str, into: Path) -> None:
     Raises
     ------
     SystemExit
-        mpy-cross refuses it; its own words are told.
+        If mpy-cross refuses the module, with its message.
     """
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / Path(name).name
@@ -57,7 +57,7 @@ def image(folder: Path, into: Path) -> None:
     Raises
     ------
     SystemExit
-        mpremote refuses; its own words are told.
+        If mpremote refuses, with its message.
     """
     done = subprocess.run(  # noqa: S603 - mpremote itself, which needs no board for this
         [sys.executable, "-m", "mpremote", "romfs", "-o", str(into), "build", str(folder)],
@@ -70,19 +70,19 @@ def image(folder: Path, into: Path) -> None:
 
 
 def build(board: str, into: Path) -> list[Path]:
-    """Make the files of a board in a folder, which is emptied first; returns them.
+    """Write the files of a board into a folder, which is emptied first, and return them.
 
     Raises
     ------
     SystemExit
-        An unknown board.
+        If the board is unknown.
     """
     if board not in BOARDS:
         raise SystemExit(f"firmware: board {board!r}: must be one of {', '.join(BOARDS)}")
     shutil.rmtree(into, ignore_errors=True)
     (into / "lcu").mkdir(parents=True)
     core = shrink(ROOTS)
-    # The constants that loop.py takes by name from the core stay there by name.
+    # Constants that loop.py takes from the core by name keep their names there.
     core["controller"] += "".join(
         f"{name} = {value}\n" for name, value in _named(ROOTS[1:]).items()
     )
@@ -104,7 +104,7 @@ def _named(keys: tuple[tuple[str, str], ...]) -> dict[str, int]:
 
 
 def main(arguments: list[str]) -> None:
-    """Build, and tell how the files come to the board."""
+    """Build, and print how to copy the files to the board."""
     if not 1 <= len(arguments) <= 2:
         raise SystemExit("firmware: say which board: python scripts/firmware.py rp2|esp32|stm32")
     board = arguments[0]

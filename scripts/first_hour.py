@@ -1,8 +1,8 @@
-"""Makes the pictures of the tutorial of the first hour, from `heliotrope run` itself.
+"""Make the pictures of the tutorial of the first hour by `heliotrope run`.
 
 python scripts/first_hour.py [--heliostats 320] [--speed 2] [--learnt 6] [--into docs/images]
 
-It prints how long each step took, and the lines of the plant.
+It prints the time that each step took, and the lines of the plant.
 """
 
 import argparse
@@ -42,7 +42,7 @@ class Plant:
         print(f"{time.monotonic() - self.begun:6.1f} s  {text}", flush=True)
 
     def told(self, pattern: str, within: float = 120.0) -> str:
-        """Wait for a line, and return the group of its match."""
+        """Wait for a line that matches, and return its group."""
         until = time.monotonic() + within
         while time.monotonic() < until:
             for line in self.lines:
@@ -52,13 +52,13 @@ class Plant:
         raise SystemExit(f"no line with {pattern!r} within {within:g} s")
 
     def end(self) -> None:
-        """Ctrl-C."""
+        """End the process as Ctrl-C does."""
         self._process.terminate()
         self._process.wait(400.0)
 
 
 def take(page: Any, plant: Plant, learnt: int, into: Path) -> None:
-    """Walk through the hour."""
+    """Follow the steps of the tutorial."""
 
     def shot(name: str) -> None:
         page.wait_for_timeout(1000)

@@ -1,4 +1,4 @@
-"""Print how the house is built: packages, floors, imports, and what should not be there.
+"""Print the structure of the code: packages, floors, imports, and what should not be there.
 
 ``python scripts/house.py [ROOT]`` (``make house``) reads the imports of ``src/heliotrope`` from the
 source, without running it, and the floors from import-linter's contract in ``pyproject.toml``.
@@ -34,29 +34,29 @@ _LOOK = (
 
 @dataclass
 class Module:
-    """One source file with what it imports of the house."""
+    """One source file, with its imports from this project."""
 
     name: str
     path: Path
     lines: int
     face: bool
     skips: int = 0
-    #: Names it takes from other modules: (module, name or "").
+    #: Names imported from other modules: (module, name or "").
     taken: list[tuple[str, str]] = field(default_factory=list)
-    #: Where a face's names come from.
+    #: Modules that the names of a face come from.
     homes: dict[str, tuple[str, str]] = field(default_factory=dict)
     #: Public names of a face.
     offers: list[str] = field(default_factory=list)
 
     @property
     def room(self) -> str:
-        """The package it belongs to, or the module itself if it lies at the top."""
+        """The package of the module, or the module itself if it lies at the top."""
         parts = self.name.split(".")
         return parts[1] if len(parts) > 1 else ""
 
 
 def modules(root: Path) -> dict[str, Module]:
-    """Read all modules below ``root/src``."""
+    """Return all modules below ``root/src``."""
     source = root / "src"
     found: dict[str, Module] = {}
     for path in sorted((source / NAME).rglob("*.py")):
@@ -98,7 +98,7 @@ def _read(module: Module, known: dict[str, Module]) -> None:
 
 
 def home(known: dict[str, Module], origin: str, name: str) -> str:
-    """Return the module that a name really comes from, through the faces of packages."""
+    """Return the module that defines a name, looked up through the faces of packages."""
     for _ in range(10):
         module = known.get(origin)
         if module is None or not name or name not in module.homes:
@@ -108,7 +108,7 @@ def home(known: dict[str, Module], origin: str, name: str) -> str:
 
 
 def arrows(known: dict[str, Module], *, through_faces: bool) -> dict[str, set[str]]:
-    """Return which modules each module imports, itself left out."""
+    """Return the modules that each module imports, itself left out."""
     found: dict[str, set[str]] = {}
     for module in known.values():
         ends = {
@@ -119,7 +119,7 @@ def arrows(known: dict[str, Module], *, through_faces: bool) -> dict[str, set[st
 
 
 def circles(known: dict[str, Module]) -> list[tuple[str, ...]]:
-    """Return the sets of files that import each other, also over others (Tarjan 1972)."""
+    """Return the sets of files that import each other, directly or not (Tarjan 1972)."""
     graph = {
         name: {e for e in ends if not known[e].face}
         for name, ends in arrows(known, through_faces=True).items()
@@ -153,7 +153,7 @@ def circles(known: dict[str, Module]) -> list[tuple[str, ...]]:
 
 
 def floors(root: Path) -> list[list[str]]:
-    """Return the floors from the top down, as import-linter holds them."""
+    """Return the floors from the top down, from import-linter's contract."""
     with (root / "pyproject.toml").open("rb") as file:
         contracts = tomllib.load(file)["tool"]["importlinter"]["contracts"]
     layers = next(c["layers"] for c in contracts if c["type"] == "layers")
@@ -196,7 +196,7 @@ def orphans(known: dict[str, Module]) -> list[str]:
             offered = {home(known, *module.homes[n]) for n in module.offers if n in module.homes}
             used |= offered
             used |= {f"{module.name}.{n}" for n in module.offers}
-            # The command line's own rooms are put together in their faces.
+            # The faces of the command line's rooms assemble them.
             if module.room == "cli":
                 used |= graph[module.name]
     return sorted(
@@ -206,7 +206,7 @@ def orphans(known: dict[str, Module]) -> list[str]:
 
 
 def repeated(known: dict[str, Module]) -> dict[str, int]:
-    """Return the names of classes that stand in several modules, with their count."""
+    """Return the names of classes that several modules define, with their count."""
     count: Counter[str] = Counter()
     for module in known.values():
         tree = ast.parse(module.path.read_text(encoding="utf-8"))
@@ -215,7 +215,7 @@ def repeated(known: dict[str, Module]) -> dict[str, int]:
 
 
 def rooms(known: dict[str, Module], levels: list[list[str]]) -> list[tuple[str, int, int, int]]:
-    """Return package, inner rooms, files and lines, from the top floor down."""
+    """Return each package with its rooms, files and lines, from the top floor down."""
     per: dict[str, list[Module]] = defaultdict(list)
     for module in known.values():
         per[module.room].append(module)
@@ -231,7 +231,7 @@ def rooms(known: dict[str, Module], levels: list[list[str]]) -> list[tuple[str, 
 
 
 def between(known: dict[str, Module]) -> dict[str, set[str]]:
-    """Return which packages each package imports."""
+    """Return the packages that each package imports."""
     found: dict[str, set[str]] = defaultdict(set)
     for name, ends in arrows(known, through_faces=False).items():
         for end in ends:
@@ -242,7 +242,7 @@ def between(known: dict[str, Module]) -> dict[str, set[str]]:
 
 
 def reduced(graph: dict[str, set[str]]) -> list[tuple[str, str]]:
-    """Return the arrows that no way over other packages implies."""
+    """Return the imports that no chain over other packages implies."""
 
     def below(name: str) -> set[str]:
         seen: set[str] = set()
@@ -311,7 +311,7 @@ def drawing(known: dict[str, Module], levels: list[list[str]]) -> str:
 
 
 def main() -> int:
-    """Print the house."""
+    """Print the structure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("root", nargs="?", type=Path, default=Path(__file__).parents[1])
     parser.add_argument("--check", action="store_true", help="status 1 if something is wrong")

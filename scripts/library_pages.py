@@ -1,8 +1,8 @@
 """Write the pages of the library: each package's public names, as its ``__all__`` lists them.
 
 ``python scripts/library_pages.py`` writes ``docs/reference/library/``; with ``--check`` it ends
-with status 1 if a page is not what it would write. A name that several faces offer is described
-once, in the package that defines it.
+with status 1 if a page differs from what it would write. A name that several faces offer is
+described once, in the package that defines it.
 """
 
 import argparse
@@ -21,7 +21,7 @@ ORDER = (
 
 
 def _face(path: Path) -> tuple[list[str], dict[str, str]]:
-    """Return the public names of a face, and the modules that they come from."""
+    """Return the public names of a face, with the modules that they come from."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     names: list[str] = []
     homes: dict[str, str] = {}
@@ -45,7 +45,7 @@ def _defined(path: Path) -> list[str]:
 
 
 def _described(place: str) -> bool:
-    """Whether a name has a definition of its own: not one of several that share a statement."""
+    """Return whether a name has a definition of its own, not one shared with other names."""
     module, _, name = place.rpartition(".")
     if _source(place.removeprefix("heliotrope.")).exists():
         return True
@@ -72,7 +72,7 @@ def _source(room: str) -> Path:
 
 
 def _home(place: str) -> str:
-    """Return where a name is defined, through the faces of packages."""
+    """Return the module that defines a name, looked up through the faces of packages."""
     for _ in range(10):
         module, _, name = place.rpartition(".")
         path = _source(module.removeprefix("heliotrope").lstrip("."))
@@ -141,7 +141,7 @@ def pages() -> dict[str, str]:
 
 
 def main() -> int:
-    """Write the pages, or compare them."""
+    """Write the pages, or compare them with those on disk."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
     given = parser.parse_args()

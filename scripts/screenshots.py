@@ -1,8 +1,8 @@
-"""Makes the pictures of the console for the documentation, from a plant of the twin at work.
+"""Make the pictures of the console for the documentation, from a simulated plant at work.
 
 python scripts/screenshots.py [--heliostats 320] [--learnt 8] [--speed 4] [--into docs/images]
 
-console-field.png is the console-light.png of ``--heliostats 10000 --learnt 0 --speed 1``.
+console-field.png is console-light.png made with ``--heliostats 10000 --learnt 0 --speed 1``.
 """
 
 import argparse
@@ -73,7 +73,7 @@ class Shown:
         keeper.close()
 
     def close(self) -> None:
-        """End it."""
+        """End the plant and its console."""
         self._over.set()
         self._thread.join()
 

@@ -1,11 +1,11 @@
-"""Make the local controller's modules small for a board: the same code with less memory.
+"""Shrink the local controller's modules for a board: the same code in less memory.
 
-Done here, because MicroPython cannot do it for itself:
+MicroPython does none of this itself:
 
-- whole numbers that are constants stand in place of their names, in other modules too;
-- what nothing on a board calls is left out (the sender's side of the wire, texts for people);
-- docstrings, annotations and what is for the type checker only are left out, and the texts of
-  ValueError, which a board answers with "value out of range".
+- integer constants replace their names, in other modules too;
+- code that no board calls is left out (the sender's side of the wire, texts for people);
+- docstrings, annotations and code for the type checker are left out, and the texts of ValueError,
+  which a board answers with "value out of range".
 
 Nothing else changes, so a traceback names the same functions.
 """
@@ -26,7 +26,7 @@ Documented = TypeVar("Documented", ast.FunctionDef, ast.ClassDef)
 
 
 class Module:
-    """One module, parsed, with what it defines and what it takes from others."""
+    """One parsed module, with the names that it defines and imports."""
 
     def __init__(self, name: str, text: str) -> None:
         self.name = name
@@ -47,7 +47,7 @@ class Module:
                 self.definitions[word] = node
 
     def meant(self, node: ast.AST) -> "Key | None":
-        """Return the definition that an expression names, None if it names none of ours."""
+        """Return the definition that an expression names, None if it is not in these modules."""
         if isinstance(node, ast.Name):
             if node.id in self.taken:
                 return self.taken[node.id]
@@ -80,9 +80,9 @@ def _defined(node: ast.stmt) -> list[str]:
 
 
 def constants(modules: dict[str, Module], loaded: dict[str, ModuleType]) -> dict[Key, int]:
-    """Return the whole numbers that are defined once, at the top of a module, in capitals.
+    """Return the integers that are defined once, at the top of a module, in capitals.
 
-    Texts that are made of others when their module is imported are written out in place.
+    Texts composed of others at import are written out in place.
     """
     found = {}
     for name, module in modules.items():
@@ -96,7 +96,7 @@ def constants(modules: dict[str, Module], loaded: dict[str, ModuleType]) -> dict
 
 
 class _Inliner(ast.NodeTransformer):
-    """Puts constants in place of their names; drops docstrings and annotations."""
+    """Replaces names of constants by their values; drops docstrings and annotations."""
 
     def __init__(self, module: Module, numbers: dict[Key, int]) -> None:
         self.module, self.numbers = module, numbers
@@ -151,11 +151,11 @@ def _undocumented(node: Documented) -> Documented:
 
 
 class _Reach:
-    """What is called from some definitions, directly or through others.
+    """The definitions that are called from some roots, directly or through others.
 
-    A method counts as called if its name stands anywhere in what is called, as an attribute or
-    as a word of a text (the state table names the motions). That is more than needed, never less.
-    Of the classes that are roots all public methods are called.
+    A method counts as called if its name occurs anywhere in called code, as an attribute or as a
+    word of a text (the state table names the motions). That keeps more than needed, never less. All
+    public methods of a class that is a root count as called.
     """
 
     def __init__(self, modules: dict[str, Module], roots: Iterable[Key]) -> None:
@@ -221,7 +221,7 @@ class _Reach:
 
 
 def _emit(module: Module, reach: _Reach) -> str:
-    """Return a module's text with nothing but what is reached."""
+    """Return a module's text with only the definitions that are called."""
     body: list[ast.stmt] = []
     for node in module.tree.body:
         names = _defined(node)
@@ -250,14 +250,14 @@ def shrink(roots: Iterable[Key], folder: Path = CORE, package: str = PACKAGE) ->
     Parameters
     ----------
     roots
-        What the board calls: module and name.
+        Definitions that the board calls: module and name.
     folder, package
-        Where the modules lie, and under which name they can be imported here.
+        Folder of the modules, and the package that they are imported from here.
 
     Raises
     ------
     KeyError
-        A root that no module defines.
+        If no module defines a root.
     """
     modules = {
         path.stem: Module(path.stem, path.read_text(encoding="utf-8"))

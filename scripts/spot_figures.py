@@ -1,4 +1,4 @@
-"""Accuracy of spots on real photographs of Jülich: figures and contact sheets.
+"""Print the accuracy of spots on real photographs of Jülich, and write contact sheets.
 
 python scripts/spot_figures.py DATA [OUT]
 
@@ -27,9 +27,9 @@ from heliotrope.imaging.photograph import Photograph, read_crop, read_photograph
 
 Floats = npt.NDArray[np.float64]
 
-#: The crops are in older coordinates: metres east, north, up to add.
+#: The crops are in older coordinates: metres east, north and up to be added.
 OLDER = np.array([1.626, 0.054, 0.0])
-#: Peaks of the simulated beams over the mean background.
+#: Peaks of the simulated beams, as multiples of the mean background.
 CONTRASTS = (0.25, 0.5, 1.0, 2.0)
 #: χ² of two dimensions at 68 % and 95 %.
 ELLIPSES = (2.279, 5.991)
@@ -71,14 +71,14 @@ def compose(
     beam
         Flux of the beam, any unit, (H, W).
     shift
-        Of the beam to the right and down, px; light that leaves the picture is lost, but still
-        counts in the truth.
+        Shift of the beam to the right and down, px; light that leaves the picture is lost, but
+        still counts in the truth.
     contrast
         Ratio of the beam's peak to the mean background.
     peak
         Brightest pixel, as a share of full scale.
     name
-        Of the frame.
+        Name of the frame.
 
     Raises
     ------
@@ -117,15 +117,15 @@ class Compared:
     Attributes
     ----------
     name
-        Of the picture.
+        Name of the picture.
     photograph
-        As read.
+        The photograph as read.
     target
         Target that the beam was sent to.
     apart
         Distances from the published centroids by extractor, m.
     references
-        Distance between the two, m.
+        Distance between the two published centroids, m.
     """
 
     name: str
@@ -160,7 +160,7 @@ def _compared(
 
 
 def raw(data: Path) -> Iterator[Compared]:
-    """Give the raw frames that have references."""
+    """Yield the raw frames that have references."""
     tower = read_tower(data / "tower-measurements.json")
     for path in sorted((data / "images" / "target-camera").glob("*-raw.png")):
         beside = path.with_name(path.name.replace("-raw.png", "-calibration-properties.json"))
@@ -170,7 +170,7 @@ def raw(data: Path) -> Iterator[Compared]:
 
 
 def crops(data: Path) -> Iterator[Compared]:
-    """Give the crops of heliostat AA39."""
+    """Yield the crops of heliostat AA39."""
     tower = read_tower(data / "tower-measurements.json")
     for path in sorted((data / "images" / "aa39-cropped").glob("*_cropped.png")):
         beside = path.with_name(path.name.replace("_cropped.png", "-calibration-properties.json"))
@@ -179,7 +179,7 @@ def crops(data: Path) -> Iterator[Compared]:
 
 
 def compositions(data: Path, each: int, seed: int = 0) -> Iterator[tuple[float, Hybrid]]:
-    """Give seeded compositions of empty targets and beams, ``each`` for every contrast."""
+    """Yield seeded compositions of empty targets and beams, ``each`` for every contrast."""
     folder = data / "images" / "hybrid"
     empty = [read_image(p).grey for p in sorted((folder / "emptyTargetImages").glob("*.png"))]
     beams = [read_image(p).grey for p in sorted((folder / "fluxImages").glob("*.png"))]
@@ -201,13 +201,13 @@ def hybrid_target(data: Path) -> Target:
 
 
 def hybrid_error(hybrid: Hybrid, target: Target) -> tuple[float, float, Photograph]:
-    """Return the error, pixels, its square over the covariance, and what was seen."""
+    """Return the error, px, its squared Mahalanobis distance, and the photograph read."""
     photograph = read_crop(hybrid.frame, target)
     spots = photograph.readings[0].spots
     if not spots:
         return float("nan"), float("nan"), photograph
     picture = photograph.faces[0].picture
-    # The picture is square and the target is not: rows are stretched back.
+    # The picture is square but the target is not: stretch the rows back.
     stretch = hybrid.frame.size[1] / picture.shape[0]
     column, row = picture.pixels(spots[0].spot.centroid)
     miss = np.array([column, (row + 0.5) * stretch - 0.5]) - hybrid.truth

@@ -1,17 +1,17 @@
-"""How well spots are found and judged, on rendered frames whose truth is known.
+"""Measure how well spots are found and judged, on rendered frames with known truth.
 
-``python scripts/spot_rates.py [FRAMES] [SEED]`` draws frames of an 8 m target seen from 200 m
-over the whole range of conditions, reads each one three times, with a frame without the beam that
-was taken just before, with a model of the empty target learnt from a dozen earlier frames, and
-from the frame alone, and prints a table for each: bias and scatter of the centroid, coverage of its
-ellipses, and which frames were accepted.
+``python scripts/spot_rates.py [FRAMES] [SEED]`` draws frames of an 8 m target seen from 200 m over
+the whole range of conditions. It reads each frame in three ways: with a frame taken just before
+without the beam, with a model of the empty target learnt from a dozen earlier frames, and alone.
+For each way it prints a table: bias and scatter of the centroid, coverage of its ellipses, and the
+frames accepted.
 
 A frame is *clean* if it shows exactly one beam, with 99 % of its energy on the target, a
 contrast of 0.25 or more, at most 5 % of its light clipped, marks and beam not smeared, and no
 flare. A clean frame that is refused is a wrong reject. A frame that is accepted though its
 centroid is off by more than 0.1 m (0.5 mrad at 200 m), or though it shows no beam, is a wrong
-accept. Two beams so near together that they are one to the eye ("merged beams") are no fault
-of one frame alone; what becomes of them is counted apart.
+accept. Two beams so close that they look like one ("merged beams") cannot be told from a single
+frame; they are counted separately.
 """
 
 import sys
@@ -47,7 +47,7 @@ from heliotrope.imaging.synthetic.rendering import (
 from heliotrope.optics.mirror_image import Beam, reflected_beam
 
 TARGET = example_target(8.0)
-#: Off by more than this is wrong, m.
+#: A centroid farther off than this is wrong, m.
 WRONG = 0.1
 #: Brightness of the ambient light on white paint, W/m².
 AMBIENT = 150.0
@@ -59,20 +59,20 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class World:
-    """What stays from frame to frame, and what is known of it.
+    """Camera and target that stay from frame to frame, and the reader's knowledge of them.
 
     Attributes
     ----------
     number
-        Which.
+        Number of the world.
     paint_kind
         "even", "stained", "jointed" or "patched".
     camera
-        As it is.
+        The true camera.
     known
-        What the reader is told of it.
+        The camera as given to the reader.
     paint, surroundings
-        As they are.
+        The true paint and surroundings.
     """
 
     number: int
@@ -90,19 +90,19 @@ class Case:
     Attributes
     ----------
     condition
-        What is special about it.
+        Name of the condition.
     scene
-        What there is to see.
+        The scene to render.
     main
-        Index of the beam that is meant; None if there is none.
+        Index of the beam to be measured; None if there is none.
     clean
-        Whether nothing is wrong with it as far as the scene tells.
+        Whether the scene makes the frame clean.
     expected
-        What the reader is told of the beam.
+        The beam that the reader expects.
     gamma
-        What the reader is told of the camera's response.
+        Response of the camera as given to the reader.
     fault
-        Reasons of which one should be named; empty if none.
+        Reasons of which the reader should name one; empty if none.
     """
 
     condition: str
@@ -116,24 +116,24 @@ class Case:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a frame.
+    """Result of reading a frame.
 
     Attributes
     ----------
     condition
         See `Case`.
     seed
-        Of the frame: ``case(world, rng)`` with it gives the frame again.
+        Seed of the frame: ``case(world, rng)`` with it draws the frame again.
     clean, accepted, named
-        Whether it is clean, was accepted, and a right reason was named.
+        Whether the frame is clean, was accepted, and was refused for a right reason.
     error
-        Of the centroid, east and up, m; NaN if there is none.
+        Error of the centroid, east and up, m; NaN without a centroid.
     mahalanobis
-        Square of the error over its covariance; NaN if there is none.
+        Squared Mahalanobis distance of the error; NaN without a centroid.
     reasons
-        That were named.
+        Reasons named.
     faint
-        Contrast below 0.25.
+        Whether the contrast is below 0.25.
     """
 
     condition: str
@@ -148,17 +148,17 @@ class Outcome:
 
     @property
     def off(self) -> float:
-        """Of the centroid, m; NaN if there is none."""
+        """Distance of the centroid from the truth, m; NaN without a centroid."""
         return float(np.hypot(*self.error))
 
     @property
     def wrong_accept(self) -> bool:
-        """Accepted, though it should not have been."""
+        """Whether the frame was accepted but should not have been."""
         return self.accepted and not self.off <= WRONG
 
     @property
     def wrong_reject(self) -> bool:
-        """Refused, though nothing is wrong with it."""
+        """Whether the frame was refused although it is clean."""
         return self.clean and not self.accepted
 
 
@@ -166,7 +166,7 @@ class Outcome:
 
 
 def world(number: int, seed: int, size: tuple[int, int] = (1600, 1200)) -> World:
-    """Return a camera, and a target as it has aged."""
+    """Return a camera and an aged target."""
     rng = np.random.default_rng([seed, number])
     kind = ("even", "stained", "jointed", "patched")[number % 4]
     camera = example_camera(
@@ -240,7 +240,7 @@ def stored_beam(number: int) -> Beam:
 
 
 def placed(rng: Rng, beam: Beam, share: tuple[float, float] = (0.99, 1.0)) -> Beam:
-    """Return the beam where a share of its energy between two bounds falls on the target."""
+    """Return the beam moved so that a share of its energy within bounds falls on the target."""
     reach = 3.7 if share[1] == 1.0 else 5.0
     for _ in range(400):
         moved = beam.shifted(rng.uniform(-reach, reach, 2))
@@ -251,14 +251,14 @@ def placed(rng: Rng, beam: Beam, share: tuple[float, float] = (0.99, 1.0)) -> Be
 
 
 def lit(beam: Beam, contrast: float, motion: tuple[float, float] = (0.0, 0.0)) -> Thrown:
-    """Return a beam whose peak is so many times the ambient light."""
+    """Return the beam with its peak at a multiple of the ambient light."""
     return Thrown("target", beam, contrast * AMBIENT / beam.peak, motion)
 
 
 def expectation(rng: Rng, thrown: Thrown, place: World, sensor: Sensor) -> Expectation:
-    """Return what a plant knows of a beam beforehand: power to a tenth, length to a tenth.
+    """Return a plant's prior knowledge of a beam: power and length to a tenth.
 
-    The power is told over the ambient light, or over exposure and gain.
+    The power is relative to the ambient light, or to exposure and gain.
     """
     width, length = np.sqrt(np.linalg.eigvalsh(thrown.beam.second_moments)) * np.exp(
         rng.normal(0.0, 0.1, 2)
@@ -335,7 +335,7 @@ def shadow(rng: Rng, place: World) -> Case:
 
 
 def soft(rng: Rng, place: World) -> Case:
-    """Out of focus, a little or beyond use."""
+    """A frame out of focus, a little or beyond use."""
     base = plain(rng, place)
     per_metre = pixels_per_metre(place.camera)
     defocus = float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))) * per_metre
@@ -351,7 +351,7 @@ def soft(rng: Rng, place: World) -> Case:
 
 
 def shaken(rng: Rng, place: World) -> Case:
-    """The camera moved during the exposure."""
+    """A frame during which the camera moved."""
     base = plain(rng, place)
     per_metre = pixels_per_metre(place.camera)
     length = min(float(np.exp(rng.uniform(np.log(0.02), np.log(0.8)))) * per_metre, 99.0)
@@ -364,7 +364,7 @@ def shaken(rng: Rng, place: World) -> Case:
 
 
 def moving(rng: Rng, place: World) -> Case:
-    """The beam moved during the exposure."""
+    """A frame during which the beam moved."""
     base = plain(rng, place)
     (thrown,) = base.scene.beams
     told = expectation(rng, thrown, place, base.scene.sensor)
@@ -406,7 +406,7 @@ def ghost(rng: Rng, place: World) -> Case:
 
 
 def cloud(rng: Rng, place: World) -> Case:
-    """Clouds before the sun; what the beam should be is known."""
+    """A beam weakened by clouds; its expected power is known."""
     base = plain(rng, place)
     told = expectation(rng, base.scene.beams[0], place, base.scene.sensor)
     left = rng.uniform(0.05, 1.0)
@@ -423,7 +423,7 @@ def cloud(rng: Rng, place: World) -> Case:
 
 
 def clipped(rng: Rng, place: World) -> Case:
-    """Exposed for too long."""
+    """An overexposed frame."""
     base = plain(rng, place)
     scene = exposed(base.scene, float(np.exp(rng.uniform(np.log(0.95), np.log(3.0)))))
     return replace(base, condition="clipped", scene=scene)
@@ -442,7 +442,7 @@ def two(rng: Rng, place: World) -> Case:
 
 
 def merged(rng: Rng, place: World) -> Case:
-    """Two beams on the target, nearer together than that."""
+    """Two beams on the target, closer than their mean diameters at half their height."""
     base = plain(rng, place)
     (thrown,) = base.scene.beams
     beam = thrown.beam
@@ -504,7 +504,7 @@ def empty(rng: Rng, place: World) -> Case:
 
 
 def dark(rng: Rng, place: World) -> Case:
-    """Next to no ambient light, with a beam or without."""
+    """Almost no ambient light, with a beam or without."""
     base = plain(rng, place)
     (thrown,) = base.scene.beams
     with_beam = rng.random() < 0.6
@@ -540,7 +540,7 @@ def curved(rng: Rng, place: World) -> Case:
 
 
 def noisy(rng: Rng, place: World) -> Case:
-    """Few electrons."""
+    """A frame of few electrons, with strong noise."""
     base = plain(rng, place)
     before = base.scene.sensor
     electrons = rng.uniform(300.0, 3000.0)
@@ -558,7 +558,7 @@ CONDITIONS: dict[Callable[[Rng, World], Case], float] = {
 
 
 def pixels_per_metre(camera: Camera) -> float:
-    """Return the scale at the target."""
+    """Return the scale at the target, px/m."""
     assert camera.position is not None
     return float(camera.matrix[0, 0] / np.linalg.norm(TARGET.center - camera.position))
 
@@ -567,7 +567,7 @@ def pixels_per_metre(camera: Camera) -> float:
 
 
 def case(place: World, seed: tuple[int, int, int]) -> Case:
-    """Return the frame of a world that a seed draws."""
+    """Return the frame of a world for a seed."""
     rng = np.random.default_rng(seed)
     kinds = list(CONDITIONS)
     weights = np.array(list(CONDITIONS.values()))
@@ -575,7 +575,7 @@ def case(place: World, seed: tuple[int, int, int]) -> Case:
 
 
 def learn(place: World, seed: int, frames: int = 12) -> EmptyTarget | None:
-    """Return what a dozen earlier frames without a beam say of the empty target."""
+    """Return the model of the empty target from a dozen earlier frames without a beam."""
     model = None
     for k in range(frames):
         rng = np.random.default_rng((seed, place.number, 10_000 + k))
@@ -587,9 +587,9 @@ def learn(place: World, seed: int, frames: int = 12) -> EmptyTarget | None:
 
 
 def before(drawn: Case, seed: tuple[int, int, int]) -> Frame:
-    """Return a frame that was taken some seconds before, without any beam.
+    """Return a frame taken some seconds before, without any beam.
 
-    Meanwhile light has changed by a tenth, a little unevenly, and shadows have moved by some
+    Since then the light has changed by a tenth, a little unevenly, and shadows have moved by some
     centimetres.
     """
     rng = np.random.default_rng((*seed, 1))
@@ -611,7 +611,7 @@ def look(
     model: EmptyTarget | None = None,
     without: Frame | None = None,
 ) -> Photograph:
-    """Read a frame."""
+    """Return the reading of a frame."""
     settings = PhotographSettings(
         expectations={"target": drawn.expected},
         gamma=drawn.gamma,
@@ -625,7 +625,7 @@ def look(
 def judge(
     drawn: Case, seed: tuple[int, int, int], rendered: Rendered, photograph: Photograph
 ) -> Outcome:
-    """Compare a reading with the truth."""
+    """Return a reading compared with the truth."""
     reading = photograph.readings[0]
     nan = float("nan")
     error, square = np.full(2, nan), nan
@@ -652,7 +652,7 @@ def judge(
 
 
 def run(task: tuple[int, int, int, tuple[int, int]]) -> list[tuple[Outcome, ...]]:
-    """Read so many frames of one world, in the ways of `WAYS`."""
+    """Return results for some frames of one world, for each of `WAYS`."""
     import cv2
 
     cv2.setNumThreads(1)
@@ -680,7 +680,7 @@ def _outcome(
     try:
         photograph = look(place, drawn, rendered, model, without)
     except InputError:
-        # The target is not found in the frame without the beam: the frame counts as refused.
+        # Without the target in the frame without the beam, the frame counts as refused.
         clean = drawn.clean and rendered.beams[drawn.main or 0].share_clipped <= 0.05
         nan = (float("nan"), float("nan"))
         return Outcome(drawn.condition, key, clean, False, False, nan, float("nan"), ("no pair",))
@@ -701,7 +701,7 @@ def measure(
     size: tuple[int, int] = (1600, 1200),
     worlds: int = WORLDS,
 ) -> list[list[Outcome]]:
-    """Return what comes of so many frames, for each of `WAYS`."""
+    """Return the results for ``frames`` frames, for each of `WAYS`."""
     tasks = [(n, seed, -(-frames // worlds), size) for n in range(worlds)]
     if processes == 1:
         read = [each for task in tasks for each in run(task)]
@@ -712,7 +712,7 @@ def measure(
 
 
 def report(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the table, line by line."""
+    """Return the lines of the table."""
     lines = [
         (
             f"{'condition':<17}{'count':>6}{'clean':>6}{'taken':>7}{'east':>7}{'up':>7}{'rms':>7}"

@@ -1,4 +1,4 @@
-"""Write diagram and tables of docs/explanation/local-controller.md from the state table."""
+"""Write the diagram and tables of docs/explanation/local-controller.md from the state table."""
 
 import math
 import re
@@ -19,7 +19,7 @@ PLACES = {
     "STOWING": (1.9, 2.5), "APPROACHING": (3, 0), "DEFOCUSED": (3, 2.5), "IDLE": (4.6, 0.75),
     "TRACKING": (5.0, 2.5), "SEARCHING": (4.0, 3.9),
 }  # fmt: skip
-#: Events that lead out of nearly every state to one: said below the diagram, not drawn.
+#: Events that lead from nearly every state to one: listed below the diagram, not drawn.
 COMMON = ("LOCK", "FAULTED", "STOW")
 WIDE, HIGH, BOX = 220, 120, (132, 34)
 
@@ -40,14 +40,14 @@ def _centre(name: str) -> tuple[float, float]:
 
 
 def _border(name: str, dx: float, dy: float) -> tuple[float, float]:
-    """Where a line from the middle of a box in this direction leaves it."""
+    """Return the point where a line from the middle of a box in a direction leaves it."""
     x, y = _centre(name)
     scale = min(BOX[0] / 2 / abs(dx) if dx else math.inf, BOX[1] / 2 / abs(dy) if dy else math.inf)
     return x + scale * dx, y + scale * dy
 
 
 def _arrow(pair: tuple[str, str], events: list[str], both: bool) -> str:
-    """One arrow with its events; beside its opposite, if there are both."""
+    """Return one arrow with its events; drawn beside its opposite if there are both."""
     (x, y), (u, v) = _centre(pair[0]), _centre(pair[1])
     length = math.hypot(u - x, v - y)
     side = (-(v - y) / length, (u - x) / length)
@@ -119,7 +119,7 @@ def table() -> str:
 
 
 def _generated() -> str:
-    """Return what stands between the page's marks."""
+    """Return the text between the page's marks."""
     parts = ["![States and what leads from one to another](../images/local-controller-states.svg)"]
     common = ", ".join(COMMON)
     parts.append(
@@ -142,7 +142,7 @@ def _generated() -> str:
 
 
 def page() -> str:
-    """Return the page with its generated part made anew."""
+    """Return the page with its generated part replaced."""
     text = PAGE.read_text(encoding="utf-8")
     marks = "<!-- states: begin -->", "<!-- states: end -->"
     found = re.search(f"{marks[0]}.*{marks[1]}", text, re.DOTALL)

@@ -1,4 +1,4 @@
-"""What the model leaves on the measurements of Jülich: the tables and pictures of the docs.
+"""Analyse the residuals of the model at Jülich: tables and pictures for the documentation.
 
 ``python scripts/what_is_left.py DATA [FOLDER]`` with the folder of the data and, by default,
 docs/images for the pictures. Prints the tables of docs/explanation/what-is-left.md.
@@ -51,7 +51,7 @@ def robust(group: Heliostats, seen: Sightings, train: FloatArray, model: tuple[s
 
 
 def ladder(group: Heliostats, seen: Sightings) -> list[tuple[str, list[str]]]:
-    """Return held-out figures of one addition after the other, by split."""
+    """Return the held-out figures after each addition to the model, by split."""
     still = drift.default_processes(group.mechanism)
     hours = tuple(p for p in still if p.group == "hours")
     zeros = drift.zeros(group.mechanism)
@@ -100,7 +100,7 @@ def ladder(group: Heliostats, seen: Sightings) -> list[tuple[str, list[str]]]:
 
 
 def explained(found: Learned, group: Heliostats) -> None:
-    """Print how much of what is left each possible cause explains, heliostat by heliostat."""
+    """Print the share of the residuals that each possible cause explains, by heliostat."""
     seen = found.sightings
     rest = 1e3 * left_out_errors(found)
     day = seen.time / DAY
@@ -137,14 +137,14 @@ def explained(found: Learned, group: Heliostats) -> None:
 
 
 def _gain(columns: FloatArray, rest: FloatArray) -> float:
-    """Share of the variance that a regression explains."""
+    """Return the share of the variance that a regression explains."""
     x = np.c_[np.ones(len(columns)), columns.astype(float)]
     fitted = x @ np.linalg.lstsq(x, rest, rcond=None)[0]
     return float(1.0 - ((rest - fitted) ** 2).sum() / ((rest - rest.mean(axis=0)) ** 2).sum())
 
 
 def _spindle(found: Learned, rest: FloatArray) -> None:
-    """Search a periodic error of each jack over its stroke: periods of 0.5 to 20 mm."""
+    """Search each jack for a periodic error over its stroke, with periods of 0.5 to 20 mm."""
     seen = found.sightings
     periods = np.geomspace(0.5e-3, 20e-3, 400)
     for axis, name in ((0, "elevation"), (1, "azimuth")):
@@ -168,7 +168,7 @@ def _spindle(found: Learned, rest: FloatArray) -> None:
 
 
 def in_time(found: Learned, still: Learned, folder: Path) -> None:
-    """Draw how alike two errors of one heliostat are, by the time between them."""
+    """Draw the correlation of two errors of one heliostat, by the time between them."""
     seen = found.sightings
     edges = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 6.0, 24.0, 96.0, 24 * 14.0, 24 * 60.0, 24 * 400.0])
     figure = Figure(figsize=(7.0, 4.2), layout="constrained")
@@ -200,7 +200,7 @@ def in_time(found: Learned, still: Learned, folder: Path) -> None:
 
 
 def history(found: Learned, group: Heliostats, folder: Path) -> None:
-    """Draw the zeros of some heliostats as they are believed to have moved."""
+    """Draw the estimated drift of the zeros of some heliostats."""
     figure = Figure(figsize=(9.0, 7.5), layout="constrained")
     axes = figure.subplots(4, 1, sharex=True)
     names = found.names

@@ -52,7 +52,7 @@ All except the MAC prevents accidents; it does not stop a person at the bus.
 
 
 def meanings() -> dict[int, str]:
-    """Return the comment above each row of the table, by number."""
+    """Return the comment above each row of the table, by number of the message."""
     text = Path(messages.__file__).read_text(encoding="utf-8")
     found = {}
     for comment, number in re.findall(r"((?:^    # .*\n)+)^    \((0x[0-9A-F]{2}), ", text, re.M):

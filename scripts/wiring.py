@@ -10,7 +10,7 @@ ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "how-to" / "firmware.md"
 PICTURE = ROOT / "docs" / "images" / "wiring.svg"
 BOARDS = ("rp2", "esp32", "stm32")
-#: Row of the table: key in PINS, place in it (-1: the key's only one), what, where to.
+#: Row of the table: key in PINS, place in it (-1: its only pin), signal, destination.
 ROWS = (
     ("bus", 0, "UART out", "transceiver DI"), ("bus", 1, "UART in", "transceiver RO"),
     ("drive", -1, "bus driver", "transceiver DE and /RE"),
@@ -42,7 +42,7 @@ PARTS = (
 
 
 def pins(board: str) -> dict[str, Any]:
-    """Return the pins of a board's settings as shipped."""
+    """Return the pins in a board's settings as shipped."""
     return dict(runpy.run_path(str(ROOT / "firmware" / board / "settings.py"))["PINS"])
 
 
@@ -117,7 +117,7 @@ def picture() -> str:
 
 
 def page(text: str) -> str:
-    """Return the page with its table of pins made anew."""
+    """Return the page with its table of pins replaced."""
     return re.sub(
         r"(<!-- pins -->\n).*?(<!-- end of pins -->)",
         lambda found: f"{found.group(1)}\n{table()}\n\n{found.group(2)}",
