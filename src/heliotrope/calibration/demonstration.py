@@ -35,7 +35,7 @@ def measure(
     nominal, truth
         Mechanisms as commanded and as built, (N,).
     target, site
-        Where the beams are sent; place and air.
+        Target of the beams; place and air.
     days
         Days of measurement.
     noise
@@ -91,7 +91,7 @@ def track_day(
     Parameters
     ----------
     group
-        With its calibration.
+        Heliostats with their calibration.
     truth
         Mechanisms as built, (N,).
     aim, site, day

@@ -73,7 +73,7 @@ def split(
     Parameters
     ----------
     sightings
-        Of any number of heliostats.
+        Sightings of any number of heliostats.
     kind
         "random"; "chronological" (the earliest are for training); or "neighbour" (whole
         neighbourhoods of source directions are held out). A random choice flatters: it

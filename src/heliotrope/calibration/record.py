@@ -1,8 +1,8 @@
-"""What is believed of one heliostat: the record that a calibration makes, once.
+"""The belief about one heliostat: the record that a calibration makes, once.
 
-The learner makes a `HeliostatCalibration` from a fit. Everybody else (automatic control, schedule,
-beam checks, local controllers, store, pages) holds a reference to that same record; nobody fits or
-inverts again. `CalibrationOutcome` says what became of an attempt, whether or not it made a record.
+The learner makes a `HeliostatCalibration` from a fit. All others (automatic control, schedule, beam
+checks, local controllers, store, pages) hold a reference to that same record; none fits or inverts
+again. `CalibrationOutcome` is the outcome of an attempt, whether or not it made a record.
 """
 
 from dataclasses import dataclass, field
@@ -26,7 +26,7 @@ Identities = npt.NDArray[np.int64]
 
 
 class Provenance(StrEnum):
-    """Where the sightings behind a calibration come from."""
+    """Source of the sightings behind a calibration."""
 
     CAMERA = "camera"
     DRONE = "drone"
@@ -34,7 +34,7 @@ class Provenance(StrEnum):
 
 
 class CalibrationOutcome(StrEnum):
-    """What became of an attempt to calibrate one heliostat."""
+    """Outcome of an attempt to calibrate one heliostat."""
 
     CALIBRATED = "calibrated"
     NO_BEAM = "no_beam"
@@ -76,7 +76,7 @@ class HeliostatCalibration:
     names, values
         Parameters, and their deviations from the nominal mechanism, rad, m or 1, (P,).
     covariance
-        Of the values, with the noise scaled to the residuals, (P, P).
+        Covariance of the values, with the noise scaled to the residuals, (P, P).
     prior
         Standard deviations of the priors that the covariance stands on, (P,).
     before, after

@@ -103,7 +103,7 @@ def sightings(
     sigma
         Standard deviation of the ray's direction, rad of beam, (M,).
     source_covariance, destination_covariance
-        Of the ends, in addition to sigma; m² for a point and rad² for a direction: a
+        Covariances of the ends, in addition to sigma; m² for a point and rad² for a direction: a
         variance equal in every direction, () or (M,), or matrices, (3, 3) or (M, 3, 3).
 
     Raises
@@ -226,7 +226,7 @@ def bisector_covariance(s: Sightings, vertex: npt.ArrayLike, axes: npt.ArrayLike
     s
         M sightings.
     vertex
-        Of their mirrors, ENU metres, (M, 3).
+        Vertices of their mirrors, ENU metres, (M, 3).
     axes
         Two unit axes across each bisector, (M, 2, 3).
     """
@@ -260,9 +260,9 @@ def of_measurements(
     Parameters
     ----------
     measurements
-        As read from files.
+        Measurements as read from files.
     heliostats
-        With the names in the measurements.
+        Heliostats that include the names in the measurements.
     sigma
         Standard deviation of a centroid as seen from the mirror, rad of beam.
     """

@@ -1,4 +1,4 @@
-"""How well mechanisms are known, and how far their beams are expected to miss.
+"""Uncertainty of mechanisms, and the expected error of their beams.
 
 Priors and sightings give `precision`, the information on the parameters; its inverse is their
 covariance C. With B the derivative of the beam's direction by the parameters, the beam from one
@@ -100,7 +100,7 @@ def expected_error(
     names
         The P parameters of ``covariance``.
     covariance
-        Of the parameters, (P, P) or (M, P, P).
+        Covariance of the parameters, (P, P) or (M, P, P).
     sun, aim
         Unit vectors to the sun and aim points (m), ENU, (3,) or (M, 3).
     noise
@@ -351,7 +351,7 @@ def year_map(
     aim
         Aim point, (3,).
     latitude_deg
-        Of the site.
+        Latitude of the site, °.
     size
         Steps of declination and of hour angle.
     """

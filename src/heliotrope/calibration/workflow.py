@@ -71,7 +71,7 @@ def read_field_sightings(
     Parameters
     ----------
     plant
-        With one group of heliostats.
+        Plant with one group of heliostats.
     place
         The folder or file that the plant was read from.
     table

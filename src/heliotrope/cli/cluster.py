@@ -1,4 +1,4 @@
-"""``heliotrope cluster``: the controller of a cluster, for real."""
+"""``heliotrope cluster``: the controller of a real cluster."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

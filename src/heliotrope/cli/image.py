@@ -143,13 +143,13 @@ class Place:
     Attributes
     ----------
     targets, cameras
-        Of the plant.
+        Targets and cameras of the plant.
     site
         Its reference point.
     names
-        Of its heliostats; empty if the file has none.
+        Names of its heliostats; empty if the file has none.
     folder
-        Of the plant file; taught pictures lie there.
+        Folder of the plant file, with the taught pictures.
     """
 
     targets: "tuple[Target, ...]"

@@ -1,4 +1,4 @@
-"""The camera model of the house: a pinhole with a distorting lens, posed in ENU.
+"""The camera model: a pinhole with a distorting lens, posed in ENU.
 
 One convention serves target cameras and drones. Camera axes are x right, y down, z forward.
 ``R_enu_camera`` turns them into ENU, so its columns are the camera's axes and
@@ -61,7 +61,7 @@ class Camera:
     targets
         Names of the targets in view; empty means any.
     source
-        Where frames come from: a folder, a video, an address, a device.
+        Source of frames: a folder, a video, an address or a device.
     deviation
         RMS residual of the calibration, px; 0 if it was never calibrated.
     """

@@ -20,7 +20,7 @@ class Facets:
     Attributes
     ----------
     center
-        From the mirror's vertex, m, (N, F, 3).
+        Centres of the facets from the mirror's vertex, m, (N, F, 3).
     half_width, half_height
         Vectors from a facet's centre to the middle of its right and its upper edge, m,
         (N, F, 3); their cross product is the facet's normal.

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Of Okabe and Ito, told apart by the colour-blind too; neighbouring clusters differ.
+#: Colours of Okabe and Ito, told apart by the colour-blind too; neighbouring clusters differ.
 _COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00")
 #: Side of the part that is drawn to scale, in diagonals of a mirror.
 _PART = 14.0

@@ -57,9 +57,9 @@ def watching_camera(target: Target, name: str, away: float, height: float, aside
     name
         Name of the camera.
     away, aside
-        From the target's centre along its normal and to the right of it, m.
+        Distances from the target's centre along its normal and to the right of it, m.
     height
-        Of the camera above the plant's reference, m.
+        Height of the camera above the plant's reference, m.
     """
     position = target.center + away * target.normal + aside * target.axes[0]
     position[2] = height

@@ -83,7 +83,7 @@ class HeliostatSize:
 
     @property
     def reach(self) -> float:
-        """Least distance of two pivots, m: a diagonal, both offsets, and the clearance."""
+        """Least distance between two pivots, m: a diagonal, both offsets, and the clearance."""
         swing = np.hypot(np.hypot(self.width, self.height) / 2.0, self.pivot_offset)
         return float(2.0 * swing + self.clearance)
 
@@ -197,9 +197,9 @@ def radial_staggered(count: int, mirror: HeliostatSize, ground: Ground) -> Place
 
 
 def _ring_step(radius: float, zone: float, mirror: HeliostatSize, ground: Ground) -> float:
-    """From a ring to the next, m."""
+    """Return the distance from one ring to the next, m."""
     dense = 0.5 * np.sqrt(3.0) * mirror.reach
-    # Where the next ring begins a zone its azimuths are others: no stagger can be counted on.
+    # A ring that begins a zone has other azimuths, so no stagger can be relied on.
     seen = 0.5 * mirror.height / np.sin(ground.elevation(radius))
     step = float(max(dense, seen))
     return float(max(step, mirror.reach)) if radius + step >= 2.0 * zone else step
@@ -302,7 +302,7 @@ def _triangles(around: FloatArray, radius: float, step: float) -> FloatArray:
 
 
 def _central(along: FloatArray, room: int) -> FloatArray:
-    """What has room of a ring, row or arc: its middle."""
+    """Return the middle part of a ring, row or arc that has room."""
     first = max(0, (len(along) - room) // 2)
     return along[first : first + room]
 
@@ -377,7 +377,7 @@ def stepped_machine(mechanism: Mechanism, receiver: Receiver) -> Machine:
     mechanism
         Nominal, (N,); its drives have a speed and stops.
     receiver
-        Where beams go in operation.
+        Receiver of the beams in operation.
     """
     drives = Drive(np.reshape(mechanism.drives.table, (-1, 2, slot.DRIVE_SLOTS))[0])
     ends = [drives.counts(drives.table[:, end]) for end in (slot.MIN_ANGLE, slot.MAX_ANGLE)]
@@ -487,7 +487,7 @@ def lay_out(
 
 
 def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
-    """In proportion to the field, m."""
+    """Return the height of a tower in proportion to the field, m."""
     area = heliostats * mirror.width * mirror.height
     return float(np.clip(80.0 * np.sqrt(area / 50_000.0), 30.0, 250.0))
 
@@ -495,12 +495,12 @@ def _tower_height(heliostats: int, mirror: HeliostatSize) -> float:
 def _middle(
     height: float, pivot: float, facing: float, both: bool
 ) -> tuple[tuple[Target, ...], tuple[Camera, ...], Receiver]:
-    """Targets, cameras and the receiver, in proportion to the height of the tower."""
+    """Return targets, cameras and the receiver, in proportion to the height of the tower."""
     share = height / 80.0
     aside, up, away = 45.0 * share, 36.0 * share, 150.0 * share
     right = direction(facing - 0.5 * np.pi, 0.0)
     base = np.array([0.0, 0.0, pivot])
-    # Seen by who looks at the tower. For two fields each has its own target.
+    # As seen by someone who faces the tower. Each of two fields has its own target.
     ways = {"left": (-1.0, facing), "right": (1.0, facing + np.pi if both else facing)}
     targets, cameras = [], []
     for name, (side, front) in ways.items():

@@ -35,7 +35,7 @@ class Mark:
     stroke
         Width of the strokes of a corner or a tee, m.
     turn
-        Of the drawing, counterclockwise as seen from the front, rad.
+        Rotation of the drawing, counterclockwise as seen from the front, rad.
     code
         For a tag, OpenCV dictionary and number, "4X4_50:7" or "APRILTAG_36h11:7"; for a
         picture, its file beside the plant file.

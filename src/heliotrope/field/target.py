@@ -58,7 +58,7 @@ class Target:
 
     @property
     def _across(self) -> FloatArray:
-        """From the left edge to the right edge."""
+        """Vector from the left edge to the right edge, m, (3,)."""
         c = self.corners
         return np.asarray(0.5 * (c[1] + c[2] - c[0] - c[3]))
 

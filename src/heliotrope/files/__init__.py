@@ -1,7 +1,7 @@
 """Reading and writing files safely, with errors that name the file and the place in it.
 
 - `text`: whole text files and binary files; written whole or not at all.
-- `json`, `xml`: documents whose values know where they stand.
+- `json`, `xml`: documents whose values know their place in the file.
 - `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
   there, because pydantic is slow to load.
 - `cells`: tables (CSV, Parquet) cell by cell, and times in ISO 8601.

@@ -10,7 +10,7 @@ from heliotrope.files.text import read_text
 
 
 class JsonNode:
-    """A value in a JSON document that knows where it stands.
+    """A value in a JSON document that knows its place there.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class JsonNode:
         return FormatError(self.path, problem, self.where)
 
     def has(self, key: str) -> bool:
-        """Whether this is an object with such a key."""
+        """Return whether this is an object with such a key."""
         return isinstance(self.value, dict) and key in self.value
 
     def __getitem__(self, key: str) -> "JsonNode":

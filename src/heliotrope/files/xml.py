@@ -35,7 +35,7 @@ class XmlElement:
         return dict(self.attributes).get(name)
 
     def elements(self, *tags: str) -> Iterator["XmlElement"]:
-        """Give the child elements, only those with one of ``tags`` if any are given."""
+        """Yield the child elements, only those with one of ``tags`` if any are given."""
         return (child for child in self.children if not tags or child.tag in tags)
 
 

@@ -168,7 +168,7 @@ class Mechanism:
         Parameters
         ----------
         values
-            For each name the deviation from this mechanism, in rad, m or 1;
+            Deviation from this mechanism by name, in rad, m or 1;
             shape (...) or anything that broadcasts to it.
 
         Raises

@@ -64,7 +64,7 @@ class Machine:
     Attributes
     ----------
     axes
-        Of the primary and the secondary drive.
+        Tables of the primary and the secondary drive.
     stow
         Position of both axes at stow, steps.
     defocus

@@ -42,7 +42,7 @@ class TrackingStatus(IntEnum):
 
     @property
     def text(self) -> str:
-        """One sentence on what it means."""
+        """Meaning of the status, one clause."""
         return _TEXTS[self]
 
 

@@ -349,7 +349,7 @@ class ExpectedError:
     Attributes
     ----------
     covariance
-        To the right of and above the aim as seen from the mirror, rad², (M, 2, 2); NaN where
+        Covariance right of and above the aim as seen from the mirror, rad², (M, 2, 2); NaN where
         the pose is out of reach.
     reachable
         Whether the mechanism reaches the pose, (M,).

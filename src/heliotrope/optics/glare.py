@@ -63,7 +63,7 @@ class Hazard(IntEnum):
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The effect in words."""
         return _HAZARD_TEXTS[self]
 
 
@@ -155,7 +155,8 @@ def glare_of_many(corneal: npt.ArrayLike, subtended: npt.ArrayLike, eye: Eye = D
     Parameters
     ----------
     corneal, subtended
-        Of each source, W/m² and rad, (..., N); sources of 0 W/m² or 0 rad are dark.
+        Irradiance and subtended angle of each source, W/m² and rad, (..., N); sources of 0 W/m² or
+        0 rad are dark.
 
     Notes
     -----

@@ -36,7 +36,7 @@ def intercept_circle(
     Parameters
     ----------
     radius
-        Of the aperture, m, (...).
+        Radius of the aperture, m, (...).
     sigma
         Standard deviation per axis of the beam on the aperture's plane, m, (...), as
         `beam_sigma` gives it; with ``sigma_up`` that of the horizontal axis.
@@ -85,7 +85,7 @@ def intercept_rectangle(
     Parameters
     ----------
     width, height
-        Of the aperture, m, (...).
+        Size of the aperture, m, (...).
     sigma, sigma_up, right, up
         As for `intercept_circle`.
 

@@ -60,7 +60,7 @@ class Entries:
     first, last
         Distances along the beam of the first and last contact, m, (N, V).
     point
-        On the axis at the first contact, ENU, (N, V, 3).
+        Point on the axis at the first contact, ENU, (N, V, 3).
     irradiance
         Largest value on the axis from the first to the last contact, W/m², (N, V); 0 where
         clear.
@@ -138,7 +138,7 @@ class Sweep:
     distance
         Along the beam to the contact, m, (N, V).
     point
-        On the axis at the contact, ENU, (N, V, 3).
+        Point on the axis at the contact, ENU, (N, V, 3).
     irradiance
         Largest value on the axis within the volume in that pose, W/m², (N, V); 0 where
         clear.

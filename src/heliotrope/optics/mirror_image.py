@@ -44,7 +44,7 @@ class Beam:
     step
         Between samples, m.
     origin
-        Of sample [0, 0], metres right of and above the target's centre, (2,).
+        Place of sample [0, 0], metres right of and above the target's centre, (2,).
     """
 
     flux: FloatArray
@@ -95,7 +95,7 @@ class Beam:
 
     @cached_property
     def power(self) -> float:
-        """W."""
+        """Power, W."""
         return float(self.flux.sum() * self.step**2)
 
     @cached_property
@@ -209,11 +209,11 @@ def gaussian_beam(
     sigma_major, sigma_minor
         Standard deviations along its axes, m; a circle if only one is given.
     angle
-        Of the major axis from the right, counterclockwise as seen from the front, rad.
+        Angle of the major axis from the right, counterclockwise as seen from the front, rad.
     power
         W.
     step
-        Of the grid, m; default a twelfth of the smaller σ.
+        Step of the grid, m; default a twelfth of the smaller σ.
     """
     minor = sigma_major if sigma_minor is None else sigma_minor
     _above_zero("gaussian beam: sigma_major", sigma_major, "m")
@@ -253,7 +253,7 @@ def flat_top_beam(
     power
         W.
     step
-        Of the grid, m; default a sixtieth of the smaller side. The border is one step wide.
+        Step of the grid, m; default a sixtieth of the smaller side. The border is one step wide.
     round_
         Ellipse instead of rectangle.
     """
@@ -308,7 +308,7 @@ def reflected_beam(
     sun
         Unit vector to the sun, ENU, (3,).
     width, height
-        Of the mirror, m; ignored if facets are given.
+        Size of the mirror, m; ignored if facets are given.
     aim
         ENU metres, (3,); default: the target's centre. Sets the normal by the bisector law.
     normal
@@ -334,7 +334,7 @@ def reflected_beam(
         Share and W/m². Their product with the area and the cosine of incidence is the power;
         shading, blocking and atmospheric extinction are not included.
     step
-        Of the grid, m.
+        Step of the grid, m.
     elements
         Each facet is divided into the square of this number.
 
@@ -393,7 +393,7 @@ def equal_facets(width: float, height: float, count: tuple[int, int], focal: flo
     Parameters
     ----------
     width, height
-        Of the whole mirror, m.
+        Size of the whole mirror, m.
     count
         Columns and rows.
     focal

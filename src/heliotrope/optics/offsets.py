@@ -31,7 +31,7 @@ class ImageOffsets:
     Attributes
     ----------
     right, up
-        From the aim, as seen from the heliostat, m, (...).
+        Distances from the aim, as seen from the heliostat, m, (...).
     slant
         Distance from the nominal vertex to the aim, m, (...).
     normal, beam

@@ -176,7 +176,7 @@ def position(times: Times, site: Site, *, algorithm: str = "spa") -> SunPosition
     Parameters
     ----------
     times
-        Of any shape (...): see ``Times``. Numbers are unix seconds (UTC).
+        Times of any shape (...); see `Times`. Numbers are unix seconds (UTC).
     site
         Place, pressure and temperature.
     algorithm
@@ -250,7 +250,7 @@ def events(
     site
         Place, pressure and temperature.
     elevation
-        Of the sun's centre when it rises and sets, rad. By default the convention for
+        Elevation of the sun's centre when it rises and sets, rad. By default the convention for
         the upper limb, −0.8333° of true elevation.
     apparent
         Whether ``elevation`` is apparent. It must then not be negative, because the

@@ -74,7 +74,7 @@ class FieldFit:
     values
         Deviations from the nominal mechanism, rad, m or 1, (N, P).
     covariance
-        Of the values, (N, P, P), with the noise scaled to the residuals.
+        Covariance of the values, (N, P, P), with the noise scaled to the residuals.
     prior
         Standard deviations of the priors, (N, P).
     scale
@@ -129,7 +129,7 @@ def fit(
     mechanism
         Nominal mechanisms, batch shape (N,).
     sightings
-        Of these heliostats, in any order.
+        Sightings of these heliostats, in any order.
     model
         Name of a model of the parameter table, or names of parameters.
     priors
@@ -141,7 +141,7 @@ def fit(
     keep
         Mask of the sightings to use, (M,).
     max_iterations
-        Of Levenberg-Marquardt, for each heliostat and each estimate of the scale.
+        Most steps of Levenberg-Marquardt, for each heliostat and each estimate of the scale.
 
     Raises
     ------

@@ -76,7 +76,7 @@ def whitening(s: Sightings, vertex: FloatArray) -> tuple[FloatArray, FloatArray]
     s
         M sightings.
     vertex
-        Of the mirrors, ENU metres, (M, 3).
+        Vertices of the mirrors, ENU metres, (M, 3).
 
     Returns
     -------

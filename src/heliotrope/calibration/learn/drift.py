@@ -107,7 +107,7 @@ class Hyperparameters:
     tau
         Time constants of the groups in use, days, (G,).
     noise
-        Of a sighting, in units of its sigma.
+        Noise of a sighting, in units of its sigma.
     rate
         Steps per day.
     heavy
@@ -615,7 +615,7 @@ def fit_population(
     Parameters
     ----------
     hyper
-        With the mean and spread under which the members were computed.
+        Hyperparameters under which the members were computed.
     table
         Standard deviations of the parameter table, (P,); 0 where a parameter only drifts.
     members

@@ -77,7 +77,7 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Learned:
-    """What was learnt of N heliostats from M sightings.
+    """Result of learning N heliostats from M sightings.
 
     Attributes
     ----------
@@ -278,7 +278,7 @@ def prepare(
 def relinearise(
     mechanism: Mechanism, sightings: Sightings, prepared: Prepared, members: Sequence[Posterior]
 ) -> Prepared:
-    """Linearise each sighting anew about the posterior of its heliostat at its time.
+    """Linearise each sighting again about the posterior of its heliostat at its time.
 
     A Gauss-Newton step on the whole history: the robust fit may lie far from the posterior with
     population, regimes and drift, and the law of a jack is not linear.
@@ -413,7 +413,7 @@ def learn(
     hyper
         Hyperparameters of the field, if known already.
     loss
-        Of the robust fit.
+        Loss of the robust fit.
     own
         Whether each heliostat's noise and drift may differ from the field's.
     rounds

@@ -35,13 +35,13 @@ class ScoredModel:
     Attributes
     ----------
     name, parameters
-        Of the model.
+        Name and parameters of the model.
     log_predictive
         Mean log probability density of a sighting given the others.
     behind, behind_error
         Distance of ``log_predictive`` to the best candidate's, and its standard error.
     log_evidence
-        Of all sightings under the learnt hyperparameters.
+        Log evidence of all sightings under the learnt hyperparameters.
     """
 
     name: str

@@ -2,7 +2,7 @@
 
 An option is a pair of interval and target with room for some beams. The beam with the greatest
 gain is allocated again and again (greedy choice under capacities, Fisher, Nemhauser & Wolsey
-1978). Gains only fall as heliostats become better known, so an outdated gain is computed anew
+1978). Gains only fall as heliostats become better known, so an outdated gain is computed again
 only when it comes to the top (Minoux 1978). Then beams are moved and exchanged between options
 as long as the sum of squared errors falls, because the greedy choice does not look ahead.
 """
@@ -70,7 +70,7 @@ def allocate(
     covariance, form
         (N, P, P); not changed.
     options
-        In any order.
+        Options in any order.
     worth
         A sighting must lower the heliostat's expected squared error by this share.
     count

@@ -41,7 +41,7 @@ class Timing:
     Attributes
     ----------
     settle
-        From its arrival until it stands still.
+        From the beam's arrival until it stands still.
     exposure
         Exposure of the camera.
     clear

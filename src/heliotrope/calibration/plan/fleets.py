@@ -174,7 +174,7 @@ def plan_each(
     Parameters
     ----------
     fleets
-        With labels.
+        Fleets with labels.
     site, targets
         Place and air; targets with cameras.
     start, stop

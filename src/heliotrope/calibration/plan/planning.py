@@ -285,7 +285,7 @@ def sighting_jacobian(
     counts, sun
         Drive counts (M, D) and unit vectors (M, 3).
     target
-        With the beam at its centre.
+        Target, with the beam at its centre.
     names
         P parameters.
     sigma
@@ -338,7 +338,7 @@ class SightingPlan:
     best_first
         The same if made in order of rank, rad, (K,).
     covariance
-        Of the parameters after all sightings, (P, P).
+        Covariance of the parameters after all sightings, (P, P).
     """
 
     chosen: CandidateSightings

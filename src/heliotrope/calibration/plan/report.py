@@ -175,7 +175,7 @@ def plan_picture(plans: Mapping[str, SightingPlan], possible: CandidateSightings
     Parameters
     ----------
     plans
-        By name of the heliostat.
+        Plans by name of the heliostat.
     possible
         Candidates; their suns are drawn as small dots.
     """
@@ -261,7 +261,7 @@ def campaign_picture(
     found
         The campaign.
     position
-        Of the heliostats, ENU metres, (N, 3).
+        Positions of the heliostats, ENU metres, (N, 3).
     targets
         Names.
     """

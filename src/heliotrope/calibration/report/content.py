@@ -42,7 +42,7 @@ class CalibrationReport:
     plant, group
         The plant, and the name of the group of these heliostats.
     assessment
-        Of a second learning with a part of the sightings held out, or None.
+        Figures of a second learning with a part of the sightings held out, or None.
     ids
         Name of each sighting, for the list of outliers.
     left_out

@@ -46,7 +46,7 @@ class FieldParameters:
     values, covariance
         Deviations (N, P) and their covariance (N, P, P), rad, m or 1.
     noise
-        Of a sighting, in units of its sigma, (N,).
+        Noise of a sighting, in units of its sigma, (N,).
     used
         Number of sightings used, (N,).
     """

@@ -1,4 +1,4 @@
-"""What the commands of a drone's flight share: arguments, options and the bars of progress."""
+"""Shared by the commands of a drone's flight: arguments, options and progress bars."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -52,13 +52,13 @@ OutOption = Annotated[Path, typer.Option(help="Folder for the results.")]
 
 
 def cores(processes: int) -> int:
-    """Return the number of processes to use: as asked for, or one for each core."""
+    """Return the number of processes to use: as given, or one for each core."""
     return processes or len(os.sched_getaffinity(0))
 
 
 @contextmanager
 def stages(quiet: bool) -> Iterator[Callable[[str, int, int], None]]:
-    """Give a function (what, done, all) that draws a bar for each stage of a work."""
+    """Yield a function (what, done, all) that draws a progress bar for each stage."""
     with ExitStack() as stack:
         bars: dict[str, Callable[[int, int], None]] = {}
 

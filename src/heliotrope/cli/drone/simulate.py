@@ -119,7 +119,7 @@ class _Drawing:
         installed: "Installed | None" = None,
         flight: int = 0,
     ) -> int:
-        """Render one flight into a folder; returns the number of photographs."""
+        """Render one flight into a folder; return the number of photographs."""
         from datetime import UTC, datetime, timedelta
 
         from heliotrope.airborne.simulate.rendering import render_flight

@@ -26,7 +26,7 @@ from heliotrope.store.telemetry import Look, Telemetry
 if TYPE_CHECKING:
     from heliotrope.console.serve import ConsoleServer
 
-#: Factor on the time between lines while a console is served: people look at that.
+#: Factor on the time between lines while a console is served: people look at the console.
 _SELDOM = 6.0
 #: Default time between lines, and period of the archive, s.
 EVERY, _ARCHIVED = 10.0, 5.0
@@ -70,7 +70,7 @@ class Shown:
         Raises
         ------
         InputError
-            Settings that contradict each other, or a console that is not installed.
+            If settings contradict each other, or the console is not installed.
         """
         try:
             from heliotrope.console.settings import ConsoleSettings
@@ -92,7 +92,7 @@ def load_console(shown: Shown) -> None:
     Raises
     ------
     InputError
-        The console is not installed, or its address is taken.
+        If the console is not installed, or its address is taken.
     """
     if not shown.console:
         return
@@ -209,7 +209,7 @@ async def console(
     shown: Shown,
     speed: float = 1.0,
 ) -> AsyncIterator[bool]:
-    """Serve the console during a block and print its address; give whether there is one."""
+    """Serve the console during a block and print its address; yield whether there is one."""
     if server is None:
         yield False
         return
@@ -286,7 +286,7 @@ def line(live: PlantAssembly) -> str:
 
 
 def _silent(live: PlantAssembly) -> str:
-    """Return which clusters are silent, and why the first one is."""
+    """Return the silent clusters, and the reason of the first."""
     rows = live.operations.cluster_rows()
     away = [row for row in rows if not row.alive]
     names = ", ".join(row.name for row in away[:3]) + (", …" if len(away) > 3 else "")
@@ -295,7 +295,7 @@ def _silent(live: PlantAssembly) -> str:
 
 
 def begin(design: Plant, shown: Shown) -> asyncio.Event:
-    """Say what begins and load the console; return the event that ends it.
+    """Print what begins and load the console; return the event that ends it.
 
     Raises
     ------

@@ -42,8 +42,8 @@ def run_real(design: Plant, choice: RealChoice, shown: Shown) -> None:
     Raises
     ------
     InputError
-        Files that do not fit together, a group without the machine table that ``--configure``
-        needs, or no place for records.
+        If files do not fit together, a group lacks the machine table that ``--configure``
+        needs, or there is no place for records.
     """
     clock = SystemClock()
     outside = _outside(design, choice, clock)

@@ -71,7 +71,7 @@ class DrivenAxis:
     origin
         Point on it in its parent's frame, m, (3,).
     direction
-        In its parent's frame, of unit length, (3,).
+        Unit vector in its parent's frame, (3,).
     stops
         Least and largest angle, rad, (2,).
     """
@@ -88,7 +88,7 @@ class Surface:
     Attributes
     ----------
     center
-        Of the rectangle in the parent's frame, m, (3,).
+        Centre of the rectangle in the parent's frame, m, (3,).
     axes
         Columns x (width), y (height) and z (normal) in the parent's frame, (3, 3).
     width, height
@@ -112,7 +112,7 @@ class Model:
     primary, secondary
         The driven axes.
     facets
-        In the frame beyond the secondary axis.
+        Facets in the frame beyond the secondary axis.
     angles
         Primary and secondary angle at the start, rad, (2,).
     point, normal
@@ -144,7 +144,7 @@ class PlacedModel:
     position
         ENU metres, (3,).
     orientation
-        From the heliostat's frame to ENU, (3, 3).
+        Rotation from the heliostat's frame to ENU, (3, 3).
     """
 
     name: str
@@ -447,7 +447,7 @@ def to_plant(document: Document, site: Site) -> Plant:
 
 
 def _named(placed: list[PlacedSurface]) -> Iterator[tuple[PlacedSurface, str]]:
-    """Give each surface a name of its own: a node may hold several, or have no name."""
+    """Name each surface uniquely: a node may hold several surfaces, or have no name."""
     taken: set[str] = set()
     for one in placed:
         wanted = name = (one.path[-1] if one.path else "") or "surface"

@@ -54,7 +54,7 @@ class FieldTable:
     names
         Unique.
     location
-        Of the pivots, m east, north and up, (N, 3).
+        Positions of the pivots, m east, north and up, (N, 3).
     facets, rows, columns
         Number of facets, and of rows and columns of them, (N,).
     pivot_height

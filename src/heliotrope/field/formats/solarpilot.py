@@ -65,7 +65,7 @@ class Layout:
     enabled, in_layout
         (N,).
     location
-        Of the pivots, m east, north and above the base pivot, (N, 3).
+        Positions of the pivots, m east, north and above the base pivot, (N, 3).
     focus
         Focal lengths in x and y, m, (N, 2); NaN where the file says NULL.
     cant
