@@ -307,7 +307,6 @@ def measure_field(
     rotation: npt.ArrayLike,
     vertex: npt.ArrayLike,
     *,
-    wanted: npt.ArrayLike | None = None,
     slopes: bool = True,
     budget: Budget | None = None,
     places: npt.ArrayLike | None = None,
@@ -325,8 +324,6 @@ def measure_field(
         Gives the mirror of a row.
     rotation, vertex
         Expected, (N, 3, 3) and (N, 3).
-    wanted
-        Rows to be measured; all if None.
     slopes, budget, mean
         See `measure`.
     places
@@ -338,9 +335,8 @@ def measure_field(
     """
     turns, feet = as_float(rotation), as_float(vertex)
     seen = None if places is None else as_float(places)
-    rows = np.arange(len(names)) if wanted is None else np.unique(np.asarray(wanted, dtype=np.intp))
     found, left_out = [], {}
-    for row in rows.tolist():
+    for row in range(len(names)):
         mine = reflections.of(row)
         if not len(mine):
             left_out[names[row]] = "no reflection in any photograph"

@@ -41,9 +41,7 @@ _RATIOS = np.geomspace(1e-3, 1e2, 11)
 _AREA = (9, 8)
 
 
-def rosner(
-    values: npt.ArrayLike, *, alpha: float = ALPHA, share: float = SHARE
-) -> npt.NDArray[np.bool_]:
+def rosner(values: npt.ArrayLike, *, alpha: float = ALPHA) -> npt.NDArray[np.bool_]:
     """Return the mask of outliers among n values: generalised extreme Studentized deviates.
 
     Parameters
@@ -52,13 +50,11 @@ def rosner(
         (n,), normally distributed but for the outliers.
     alpha
         Probability of calling any of n good values an outlier.
-    share
-        Largest share of outliers.
 
     Raises
     ------
     InputError
-        If alpha or share is not between 0 and 1.
+        If alpha is not between 0 and 1.
 
     Notes
     -----
@@ -66,13 +62,12 @@ def rosner(
     `heliotrope.calibration.learn.outliers.generalised_esd` is the test for a known
     covariance.
     """
-    for name, value in (("alpha", alpha), ("share", share)):
-        if not 0.0 < value < 1.0:
-            raise InputError(f"{name} {value}: it must lie between 0 and 1")
+    if not 0.0 < alpha < 1.0:
+        raise InputError(f"alpha {alpha}: it must lie between 0 and 1")
     data = as_float(values)
     mask = np.zeros(len(data), dtype=np.bool_)
     # Rosner's critical values are accurate from n = 15, and need two values that remain.
-    most = min(int(np.ceil(share * len(data))), len(data) - 3)
+    most = min(int(np.ceil(SHARE * len(data))), len(data) - 3)
     if most < 1:
         return mask
     which, extreme, critical = studentized_deviates(data, most, alpha)

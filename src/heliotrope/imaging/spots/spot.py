@@ -73,8 +73,6 @@ class Spot:
         Share of its area that marks cover.
     area
         m².
-    sharpness
-        Steepest slope of its flank, peaks per metre.
     region
         Its pixels, (H, W), tails included.
     cut
@@ -96,7 +94,6 @@ class Spot:
     edge: float
     covered: float
     area: float
-    sharpness: float
     region: Mask
     cut: float = 0.0
     light: float = float("nan")
@@ -214,7 +211,6 @@ def _measure(
     top = np.unravel_index(int(np.argmax(np.where(core, soft, -1.0))), soft.shape)
     under = float(background.values[top])
     clipped = max(float(np.sum(weight * picture.clipped[box])) / max(total, 1e-12), 0.0)
-    slopes = np.hypot(*np.gradient(soft[box].astype(np.float64), step))
     covariance = _from_background(picture, background, region, box, dx, dy, total)
     hidden = min(max(_FOOT * background.deviation / max(peak, 1e-9), _FOOT_PART), 1.0)
     shift = narrow - centroid
@@ -237,7 +233,6 @@ def _measure(
         edge=edge / max(peak, 1e-9),
         covered=float((picture.marks & core).sum() / core.sum()),
         area=float(core.sum()) * step**2,
-        sharpness=float(slopes[core[box]].max(initial=0.0)) / max(peak, 1e-9),
         region=region,
         cut=float(np.hypot(*outside.shift)),
         light=total * step**2,

@@ -28,6 +28,8 @@ _RADII = np.linspace(0.3, 2.7, 9)
 _TURNS = 32
 #: A square seen at 75° off its normal is this many times as long as wide.
 _OBLIQUE = 4.0
+#: Strokes narrower than this are closed, reduced pixels.
+_BROAD = 17
 #: Numbers of parts of a frame examined and of candidates kept.
 _PARTS, _KEPT = 300, 60
 
@@ -188,7 +190,7 @@ class Lightened:
     reduction: int
 
 
-def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
+def lighten(grey: Image, reduction: int) -> Lightened:
     """Return a frame (H, W) of 8 or 16 bits, reduced, and its morphological closing.
 
     The closing contains no marks. The frame divided by it is the reflectance of a mark over
@@ -200,8 +202,6 @@ def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
         The frame.
     reduction
         Factor by which the frame is reduced.
-    broad
-        Strokes narrower than this are closed, reduced pixels.
     """
     import cv2
 
@@ -213,7 +213,7 @@ def lighten(grey: Image, reduction: int, broad: int = 17) -> Lightened:
         small = cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
     if small.dtype != np.uint8:
         small = small.astype(np.float32)
-    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((broad, broad), np.uint8))
+    closed = cv2.morphologyEx(small, cv2.MORPH_CLOSE, np.ones((_BROAD, _BROAD), np.uint8))
     return Lightened(small, closed, reduction)
 
 

@@ -146,7 +146,7 @@ def rectify(frame: Frame, view: FaceView, grey: Image | None = None) -> Rectifie
     return Rectified(face, values, step, first, surface, marks, clipped, view)
 
 
-def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
+def from_crop(frame: Frame, target: Target) -> Rectified:
     """Return the grid of a picture whose corners are those of its only target.
 
     Parameters
@@ -155,8 +155,6 @@ def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
         The crop, of any size.
     target
         The target that it shows.
-    marks
-        Whether it contains the target's marks.
     """
     import cv2
 
@@ -174,7 +172,7 @@ def from_crop(frame: Frame, target: Target, marks: bool = True) -> Rectified:
     shape = (values.shape[0], values.shape[1])
     first = middle + 0.5 * step * np.array([1 - shape[1], shape[0] - 1])
     printed = np.zeros(shape, dtype=bool)
-    if marks and target.marks:
+    if target.marks:
         printed = _drawn(shape, first, step, _prints(face))
         rim = 2 * int(np.ceil(_RIM / step)) + 1
         printed = cv2.dilate(printed.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
