@@ -19,7 +19,7 @@ def cluster(
     check: Annotated[bool, typer.Option("--check", help="Only read the file.")] = False,
     every: Annotated[float, typer.Option(help="Seconds between lines of the log.")] = 10.0,
 ) -> None:
-    """Run a cluster of heliostats until it is told to end; it then defocuses them."""
+    """Run a cluster of heliostats until SIGTERM or Ctrl-C; it then defocuses them."""
     from heliotrope.errors import InputError
 
     if not 1.0 <= every <= 86400.0:
