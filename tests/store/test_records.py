@@ -364,7 +364,7 @@ class TestOpening:
 
     def test_a_place_where_no_folder_can_be(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("")
-        with pytest.raises(StoreError, match=r"file/data.*may be written"):
+        with pytest.raises(StoreError, match=r"file/data.*can be written"):
             Keeper(tmp_path / "file" / "data")
 
     def test_a_file_that_is_no_database(self, tmp_path: Path) -> None:
