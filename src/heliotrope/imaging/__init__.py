@@ -29,7 +29,6 @@ from heliotrope.imaging.motion import (
 from heliotrope.imaging.photograph import (
     Photograph,
     PhotographSettings,
-    PlacedSpot,
     TargetReading,
     read_crop,
     read_photograph,
@@ -37,6 +36,7 @@ from heliotrope.imaging.photograph import (
 from heliotrope.imaging.pose import CameraFit, calibrate_marks, resection
 from heliotrope.imaging.sources import Source, average, keep, open_source
 from heliotrope.imaging.spots.background import EmptyTarget
+from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason
 from heliotrope.imaging.targets.finding import find_targets
 

@@ -4,7 +4,8 @@ import numpy as np
 
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
-from heliotrope.imaging.photograph import LookedAt, Photograph, PlacedSpot, TargetReading
+from heliotrope.imaging.photograph import LookedAt, Photograph, TargetReading
+from heliotrope.imaging.spots.placed import PlacedSpot
 
 # Blue, green, red: bluish green, vermilion, sky blue, yellow of Okabe and Ito.
 GOOD, BAD, FACE, OTHER = (115, 158, 0), (0, 94, 213), (233, 180, 86), (66, 228, 240)

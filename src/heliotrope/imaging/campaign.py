@@ -24,11 +24,11 @@ from heliotrope.imaging.photograph import (
     LookedAt,
     Photograph,
     PhotographSettings,
-    PlacedSpot,
     TargetReading,
     read_crop,
     read_photograph,
 )
+from heliotrope.imaging.spots.placed import PlacedSpot
 from heliotrope.imaging.targets.view import FaceView
 from heliotrope.sun import Site, vector
 

@@ -1,6 +1,6 @@
 """A frame: the pixels of a photograph, its time and the time's uncertainty."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from typing import Any
@@ -66,6 +66,27 @@ class Frame:
     def full_scale(self) -> float:
         """Greatest possible value of a pixel."""
         return float(np.iinfo(self.pixels.dtype).max)
+
+    def linear(self, gamma: float) -> "Frame":
+        """Return a 16-bit frame whose pixels are proportional to light; itself if gamma is 1.
+
+        Parameters
+        ----------
+        gamma
+            The frame's pixels are light to the power 1/gamma.
+
+        Raises
+        ------
+        InputError
+            If gamma is not from 0.2 to 5.
+        """
+        if gamma == 1.0:
+            return self
+        if not 0.2 <= gamma <= 5.0:
+            raise InputError(f"gamma {gamma} must be from 0.2 to 5; 1 is linear, 2.2 is usual")
+        top = int(self.full_scale)
+        table = np.round(65535.0 * (np.arange(top + 1) / top) ** gamma).astype(np.uint16)
+        return replace(self, pixels=table[self.pixels])
 
     @cached_property
     def grey(self) -> Image:

@@ -1,72 +1,27 @@
 """Read a photograph: its targets, their spots in metres with covariance, reasons against them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from heliotrope.errors import InputError
 from heliotrope.field.camera import Camera
 from heliotrope.field.target import Target
-from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame
 from heliotrope.imaging.spots import background as backgrounds
-from heliotrope.imaging.spots.background import Background, EmptyTarget
+from heliotrope.imaging.spots.background import Background, EmptyTarget, Way
+from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import Expectation, Limits, Reason, judge
-from heliotrope.imaging.spots.spot import Spot, find_spots
+from heliotrope.imaging.spots.spot import find_spots
 from heliotrope.imaging.targets.finding import FoundTarget, Pictures, find_targets
-from heliotrope.imaging.targets.rectify import ACROSS, Rectified, from_crop, rectify
-from heliotrope.imaging.targets.view import Face, FaceView
+from heliotrope.imaging.targets.rectify import LEAST_RIM, Rectified, from_crop, rectify, rim_of
+from heliotrope.imaging.targets.view import FaceView
 
 if TYPE_CHECKING:
     from threadpoolctl import ThreadpoolController
-
-#: Rim of a target whose pixels show part of what lies beyond: least width, multiple of the
-#: softness of the marks' edges, and greatest width, px.
-_LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
-
-
-@dataclass(frozen=True)
-class PlacedSpot:
-    """A spot and its place.
-
-    Attributes
-    ----------
-    spot
-        Its shape, on its face.
-    target
-        The target under its centroid; None beside all targets.
-    plane
-        Metres right of and above the target's centre (of the face's origin if there is no
-        target), (2,).
-    covariance
-        Covariance of ``plane``: spot, view and survey, m², (2, 2).
-    point
-        ENU metres, (3,).
-    covariance_enu
-        Covariance of the point, m², (3, 3); 0 across the plane.
-    pixel
-        Pixel of the frame, (2,).
-    flux
-        Its light over the frame's exposure and gain, full scales m² per second at gain 1,
-        which makes frames of one camera comparable; NaN if exposure or gain is unknown.
-    """
-
-    spot: Spot
-    target: Target | None
-    plane: FloatArray
-    covariance: FloatArray
-    point: FloatArray
-    covariance_enu: FloatArray
-    pixel: FloatArray
-    flux: float = float("nan")
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation along the worse axis, m."""
-        return float(np.sqrt(max(float(np.linalg.eigvalsh(self.covariance)[-1]), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -175,7 +130,7 @@ class PhotographSettings:
     """
 
     limits: Limits = field(default_factory=Limits)
-    background: Literal["auto", "frame", "model", "difference"] = "auto"
+    background: Way = "auto"
     empty: Mapping[str, EmptyTarget] = field(default_factory=dict)
     expectations: Mapping[str, Expectation] = field(default_factory=dict)
     pictures: Pictures = field(default_factory=dict)
@@ -228,20 +183,16 @@ def _read(
     previous: Sequence[FaceView],
     without: Frame | None,
 ) -> Photograph:
-    given, frame = frame, linear(frame, chosen.gamma)
+    given, frame = frame, frame.linear(chosen.gamma)
     found = find_targets(frame, targets, camera, previous, chosen.pictures)
     readings = {f.target.name: TargetReading(f, (), (_missing(f),)) for f in found if not f.found}
     beside: list[PlacedSpot] = []
     faces: list[LookedAt] = []
     grey = np.ascontiguousarray(frame.grey)
-    for view in _views(found):
-        own = [f for f in found if f.view is view]
-        rim = _rim(own)
-        picture = _trimmed(rectify(frame, view, grey), rim)
-        empty = None
-        if without is not None:
-            known = linear(without, chosen.gamma)
-            empty = _trimmed(_empty_picture(known, view, camera, chosen), rim)
+    dark = None if without is None else without.linear(chosen.gamma)
+    for view, own in _by_view(found):
+        picture = rectify(frame, view, grey, rim=rim_of(own))
+        empty = None if dark is None else _empty_picture(dark, view, camera, chosen, rim_of(own))
         seen, on_face = _read_face(picture, chosen, empty, frame.exposure * frame.gain)
         faces.append(seen)
         for result in own:
@@ -266,7 +217,7 @@ def read_crop(
         How to read.
     """
     chosen = settings or PhotographSettings()
-    picture = _trimmed(from_crop(linear(frame, chosen.gamma), target), _LEAST_RIM)
+    picture = from_crop(frame.linear(chosen.gamma), target, rim=LEAST_RIM)
     with _one_thread().limit(limits=1, user_api="blas"):
         seen, spots = _read_face(picture, chosen, None, frame.exposure * frame.gain)
     found = FoundTarget(target, True, "")
@@ -278,66 +229,18 @@ def read_crop(
     )
 
 
-def linear(frame: Frame, gamma: float) -> Frame:
-    """Return a 16-bit frame whose pixels are proportional to light; the frame itself if gamma is 1.
-
-    Parameters
-    ----------
-    frame
-        The frame as the camera gives it.
-    gamma
-        The frame's pixels are light to the power 1/gamma.
-
-    Raises
-    ------
-    InputError
-        If gamma is not from 0.2 to 5.
-    """
-    if gamma == 1.0:
-        return frame
-    if not 0.2 <= gamma <= 5.0:
-        raise InputError(f"gamma {gamma} must be from 0.2 to 5; 1 is linear, 2.2 is usual")
-    top = int(frame.full_scale)
-    table = np.round(65535.0 * (np.arange(top + 1) / top) ** gamma).astype(np.uint16)
-    return replace(frame, pixels=table[frame.pixels])
-
-
-def _rim(found: Sequence[FoundTarget]) -> int:
-    """Return the width of the rim that shows what lies beyond a target, grid pixels."""
-    soft = [m.blur.max() for f in found for m in f.marks if m.used and np.isfinite(m.blur).all()]
-    if not soft:
-        return _LEAST_RIM
-    side = min(min(f.target.width, f.target.height) for f in found)
-    return int(np.clip(np.ceil(_SOFT_RIM * np.median(soft) / side * ACROSS), _LEAST_RIM, _MOST_RIM))
-
-
-def _trimmed(picture: Rectified, rim: int) -> Rectified:
-    """Return a face without the rim of its surface."""
-    import cv2
-
-    inner = cv2.erode(
-        picture.surface.astype(np.uint8),
-        np.ones((2 * rim + 1, 2 * rim + 1), np.uint8),
-        borderType=cv2.BORDER_CONSTANT,
-        borderValue=0,
-    )
-    return replace(picture, surface=inner > 0)
-
-
 def _missing(found: FoundTarget) -> Reason:
     return Reason("target not found", float("nan"), float("nan"), found.reason)
 
 
-def _views(found: Sequence[FoundTarget]) -> list[FaceView]:
-    views: list[FaceView] = []
-    for result in found:
-        if result.view is not None and not any(result.view is v for v in views):
-            views.append(result.view)
-    return views
+def _by_view(found: Sequence[FoundTarget]) -> list[tuple[FaceView, list[FoundTarget]]]:
+    """Return each view of a face with the targets that were found in it."""
+    views = {id(f.view): f.view for f in found if f.view is not None}
+    return [(view, [f for f in found if f.view is view]) for view in views.values()]
 
 
 def _empty_picture(
-    without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings
+    without: Frame, view: FaceView, camera: Camera | None, chosen: PhotographSettings, rim: int
 ) -> Rectified:
     """Return the face in the frame without the beam, searched again: the camera may move."""
     again = find_targets(without, list(view.face.targets), camera, [view], chosen.pictures)
@@ -347,79 +250,17 @@ def _empty_picture(
             f"{without.name or 'the frame without the beam'}: {again[0].reason}; give an empty "
             "frame of the same camera"
         )
-    return rectify(without, known)
+    return rectify(without, known, rim=rim)
 
 
 def _read_face(
     picture: Rectified, chosen: PhotographSettings, empty: Rectified | None, gathered: float
 ) -> tuple[LookedAt, list[PlacedSpot]]:
     """Read one face; ``gathered`` is exposure times gain, s."""
-    background = _background(picture, chosen, empty)
-    spots = [
-        replace(_placed(picture, spot), flux=spot.light / gathered if gathered > 0.0 else np.nan)
-        for spot in find_spots(picture, background)
-    ]
+    background = backgrounds.of_face(picture, chosen.background, chosen.empty.values(), empty)
+    spots = [place(picture, spot, gathered) for spot in find_spots(picture, background)]
     odd = backgrounds.unexplained(picture, background, [s.spot.region for s in spots])
     return LookedAt(picture, background, odd), spots
-
-
-def _background(
-    picture: Rectified, chosen: PhotographSettings, empty: Rectified | None
-) -> Background:
-    way = chosen.background
-    names = [t.name for t in picture.face.targets]
-    model = next((m for m in chosen.empty.values() if m.fits(picture)), None)
-    if way == "auto":
-        ready = model is not None and model.ready
-        way = "difference" if empty is not None else "model" if ready else "frame"
-    if way == "difference":
-        if empty is None:
-            raise InputError("background by difference needs a frame without the beam; give one")
-        return backgrounds.from_difference(picture, empty)
-    if way == "model":
-        if model is None:
-            raise InputError(
-                f"background by model: target {names[0]} has no model; learn one from empty "
-                "frames, or use the frame alone"
-            )
-        return backgrounds.from_model(picture, model)
-    return backgrounds.from_frame(picture)
-
-
-def _placed(picture: Rectified, spot: Spot) -> PlacedSpot:
-    """Place a spot on its target, and add the covariance of the view."""
-    face, view = picture.face, picture.view
-    point = face.point(spot.centroid)
-    covariance, pixel = spot.covariance, picture.pixels(spot.centroid)
-    if view is not None:
-        covariance = covariance + view.covariance_at(spot.centroid)
-        pixel = view.to_pixels(spot.centroid)
-    target = _target_at(face, point)
-    if target is None:
-        axes, plane = face.axes, spot.centroid
-    else:
-        # The targets of a face lie a few millimetres off its plane, and turned by as little.
-        axes, plane = target.axes, target.plane_coordinates(point)
-        point = target.point(plane)
-    return PlacedSpot(
-        spot,
-        target,
-        np.asarray(plane),
-        covariance,
-        np.asarray(point),
-        np.asarray(axes.T @ covariance @ axes),
-        np.asarray(pixel),
-    )
-
-
-def _target_at(face: Face, point: FloatArray) -> Target | None:
-    for target in face.targets:
-        low = target.plane_coordinates(target.corners).min(axis=0)
-        high = target.plane_coordinates(target.corners).max(axis=0)
-        at = target.plane_coordinates(point)
-        if (at >= low).all() and (at <= high).all():
-            return target
-    return None
 
 
 def _reading(

@@ -3,6 +3,7 @@
 - `background`: what a target looks like without beams, from one frame, from an empty frame or
   from a learnt model.
 - `spot`: centroid, covariance and shape of each spot.
+- `placed`: the place of a spot on its target.
 - `quality`: named reasons against a spot, with measured values and limits.
 """
 
@@ -13,6 +14,7 @@ from heliotrope.imaging.spots.background import (
     from_frame,
     from_model,
 )
+from heliotrope.imaging.spots.placed import PlacedSpot, place
 from heliotrope.imaging.spots.quality import REASONS, Expectation, Limits, Reason, judge
 from heliotrope.imaging.spots.spot import Spot, find_spots
 
@@ -22,6 +24,7 @@ __all__ = [
     "EmptyTarget",
     "Expectation",
     "Limits",
+    "PlacedSpot",
     "Reason",
     "Spot",
     "find_spots",
@@ -29,4 +32,5 @@ __all__ = [
     "from_frame",
     "from_model",
     "judge",
+    "place",
 ]

@@ -1,9 +1,10 @@
 """Estimate what a target would look like without beams."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 from zipfile import BadZipFile
 
 import numpy as np
@@ -16,6 +17,8 @@ from heliotrope.imaging.spots._shadow import Edge, border, find_edges, places
 from heliotrope.imaging.spots._shadow import prior as edge_prior
 from heliotrope.imaging.targets.rectify import Mask, Rectified
 
+#: How a background is found; "auto" takes the best that is available.
+Way = Literal["auto", "frame", "model", "difference"]
 #: The fit uses every sixth pixel each way.
 _STRIDE = 6
 #: Order of the polynomial across a target; higher along a longer face.
@@ -265,6 +268,48 @@ def from_model(picture: Rectified, model: EmptyTarget) -> Background:
     # Assume usual paint where a beam has always been.
     known = np.where(model.weight > 0.0, model.reflectance, np.float32(1.0))
     return _fit(picture, known, orders, "model", known)
+
+
+def of_face(
+    picture: Rectified,
+    way: Way,
+    models: Iterable[EmptyTarget] = (),
+    empty: Rectified | None = None,
+) -> Background:
+    """Return the background of a face in the way asked for.
+
+    Parameters
+    ----------
+    picture
+        The face with its beams.
+    way
+        "frame", "model", "difference", or "auto" for the best that is available.
+    models
+        Models of empty faces; the one that fits is taken.
+    empty
+        The same face without beams.
+
+    Raises
+    ------
+    InputError
+        If the way needs a model or an empty face that is not given.
+    """
+    model = next((m for m in models if m.fits(picture)), None)
+    if way == "auto":
+        ready = model is not None and model.ready
+        way = "difference" if empty is not None else "model" if ready else "frame"
+    if way == "difference":
+        if empty is None:
+            raise InputError("background by difference needs a frame without the beam; give one")
+        return from_difference(picture, empty)
+    if way == "model":
+        if model is None:
+            raise InputError(
+                f"background by model: target {picture.face.targets[0].name} has no model; learn "
+                "one from empty frames, or use the frame alone"
+            )
+        return from_model(picture, model)
+    return from_frame(picture)
 
 
 def beams(picture: Rectified, background: Background) -> Mask:

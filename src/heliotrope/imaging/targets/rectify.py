@@ -1,5 +1,6 @@
 """A face seen from its front: the frame's brightness on a grid of metres."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -9,7 +10,7 @@ import numpy.typing as npt
 from heliotrope.field.target import Target
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Frame, Image
-from heliotrope.imaging.targets.finding import face_marks
+from heliotrope.imaging.targets.finding import FoundTarget, face_marks
 from heliotrope.imaging.targets.marks import polygons
 from heliotrope.imaging.targets.view import Face, FaceView, faces
 
@@ -20,6 +21,9 @@ Mask = npt.NDArray[np.bool_]
 ACROSS = 256
 #: Pixels above this share of the full scale may be clipped; tone curves end below it.
 CLIPPED = 0.985
+#: Rim of a target whose pixels show part of what lies beyond: least width, multiple of the
+#: softness of the marks' edges, and greatest width, px.
+LEAST_RIM, _SOFT_RIM, _MOST_RIM = 2, 1.5, 8
 #: Width of the rim masked around marks, m.
 _RIM = 0.06
 
@@ -97,7 +101,16 @@ class Rectified:
         return x.astype(np.float32), y.astype(np.float32)
 
 
-def rectify(frame: Frame, view: FaceView, grey: Image | None = None) -> Rectified:
+def rim_of(found: Sequence[FoundTarget]) -> int:
+    """Return the width of the rim that shows what lies beyond the targets of a face, pixels."""
+    soft = [m.blur.max() for f in found for m in f.marks if m.used and np.isfinite(m.blur).all()]
+    if not soft:
+        return LEAST_RIM
+    side = min(min(f.target.width, f.target.height) for f in found)
+    return int(np.clip(np.ceil(_SOFT_RIM * np.median(soft) / side * ACROSS), LEAST_RIM, _MOST_RIM))
+
+
+def rectify(frame: Frame, view: FaceView, grey: Image | None = None, *, rim: int = 0) -> Rectified:
     """Return a face of a frame on a grid of metres.
 
     Parameters
@@ -108,6 +121,8 @@ def rectify(frame: Frame, view: FaceView, grey: Image | None = None) -> Rectifie
         How the face lies in it.
     grey
         Its brightness, if already computed.
+    rim
+        Width of the rim that the surface leaves out, pixels of the grid; see `rim_of`.
     """
     import cv2
 
@@ -139,14 +154,15 @@ def rectify(frame: Frame, view: FaceView, grey: Image | None = None) -> Rectifie
         & (places[..., 1] <= height - 1)
     )
     surface = _drawn((int(rows), int(columns)), first, step, _outlines(face)) & inside
+    surface = _trimmed(surface, rim)
     marks = _drawn((int(rows), int(columns)), first, step, _prints(face))
     if marks.any():
-        rim = 2 * int(np.ceil(_RIM / step)) + 1
-        marks = cv2.dilate(marks.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
+        wide = 2 * int(np.ceil(_RIM / step)) + 1
+        marks = cv2.dilate(marks.astype(np.uint8), np.ones((wide, wide), np.uint8)) > 0
     return Rectified(face, values, step, first, surface, marks, clipped, view)
 
 
-def from_crop(frame: Frame, target: Target) -> Rectified:
+def from_crop(frame: Frame, target: Target, *, rim: int = 0) -> Rectified:
     """Return the grid of a picture whose corners are those of its only target.
 
     Parameters
@@ -155,6 +171,8 @@ def from_crop(frame: Frame, target: Target) -> Rectified:
         The crop, of any size.
     target
         The target that it shows.
+    rim
+        Width of the rim that the surface leaves out, pixels of the grid.
     """
     import cv2
 
@@ -174,9 +192,26 @@ def from_crop(frame: Frame, target: Target) -> Rectified:
     printed = np.zeros(shape, dtype=bool)
     if target.marks:
         printed = _drawn(shape, first, step, _prints(face))
-        rim = 2 * int(np.ceil(_RIM / step)) + 1
-        printed = cv2.dilate(printed.astype(np.uint8), np.ones((rim, rim), np.uint8)) > 0
-    return Rectified(face, values, step, first, np.ones(shape, dtype=bool), printed, top)
+        wide = 2 * int(np.ceil(_RIM / step)) + 1
+        printed = cv2.dilate(printed.astype(np.uint8), np.ones((wide, wide), np.uint8)) > 0
+    surface = _trimmed(np.ones(shape, dtype=bool), rim)
+    return Rectified(face, values, step, first, surface, printed, top)
+
+
+def _trimmed(surface: Mask, rim: int) -> Mask:
+    """Return a surface without its rim."""
+    import cv2
+
+    if rim == 0:
+        return surface
+    side = 2 * rim + 1
+    inner = cv2.erode(
+        surface.astype(np.uint8),
+        np.ones((side, side), np.uint8),
+        borderType=cv2.BORDER_CONSTANT,
+        borderValue=0,
+    )
+    return inner > 0
 
 
 def _at_least(brightness: Image, limit: float) -> Image:
