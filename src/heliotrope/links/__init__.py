@@ -6,8 +6,8 @@ one implementation, over a `Carrier`: in the same process (`memory_pair`), TCP (
 seals each message in an envelope that proves its age without a common clock.
 
 `encode` and `decode` turn messages (`Lease`, `Command`, `ClusterStatus`, …) into bytes and back.
-`packet12` reads and writes the 12-byte packets of Malan's thesis, for local controllers that
-understand no other.
+A `TappedLink` shows the messages of any link to a listener. `packet12` reads and writes the 12-byte
+packets of Malan's thesis, for local controllers that understand no other.
 
 `Clock` measures every limit; `run_virtual` runs a program in virtual time.
 
@@ -64,6 +64,7 @@ from heliotrope.links.messages import (
     decode,
     encode,
 )
+from heliotrope.links.tapped import LinkListener, TappedLink
 from heliotrope.links.tcp import TcpServer, client_tls, server_tls, tcp_link
 
 __all__ = [
@@ -87,6 +88,7 @@ __all__ = [
     "Link",
     "LinkClosedError",
     "LinkError",
+    "LinkListener",
     "LinkLostError",
     "LinkSettings",
     "MemoryLine",
@@ -98,6 +100,7 @@ __all__ = [
     "Stage",
     "Statistics",
     "SystemClock",
+    "TappedLink",
     "TcpServer",
     "VirtualClock",
     "VirtualLoop",

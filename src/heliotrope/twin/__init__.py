@@ -4,6 +4,7 @@
 - `field`: ten thousand local controllers as arrays.
 - `cameras`, `wind`: cameras that see the simulated beams, and wind that turns the mirrors.
 - `live`: a world for a plant at work; begin with `live.World`.
+- `records`: command records on a simulated disk.
 - `world`, `invariants`: the deterministic simulation with its faults, and the safety invariants
   that it checks at every step.
 """

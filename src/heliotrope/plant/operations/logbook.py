@@ -9,8 +9,9 @@ import numpy as np
 
 from heliotrope.errors import HeliotropeError
 from heliotrope.links.clock import Clock
-from heliotrope.links.link import Link, SendOutcome, Statistics
+from heliotrope.links.link import Link
 from heliotrope.links.messages import ClusterStatus, ProtocolError, decode
+from heliotrope.links.tapped import TappedLink
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
 from heliotrope.safety import Alarm, alarms
@@ -69,7 +70,10 @@ class Logbook:
     def tapped(self, links: Mapping[str, Link]) -> dict[str, Link]:
         """Return the links for the plant, which note every message in this book."""
         self._links.update(links)
-        return {name: _Tapped(name, link, self) for name, link in links.items()}
+        return {
+            name: TappedLink(link, self._clock, _Listener(name, self))
+            for name, link in links.items()
+        }
 
     def packet(self, cluster: str, way: str, data: bytes) -> None:
         """Take a message at a link; ``way`` is "to" or "from"."""
@@ -235,50 +239,25 @@ class Logbook:
         return self._statuses.get(cluster)
 
 
-class _Tapped:
-    """A link that notes every message that passes through it."""
+class _Listener:
+    """Notes the messages at one link in the book."""
 
-    def __init__(self, name: str, link: Link, book: Logbook) -> None:
-        self.name, self._link, self._book = name, link, book
+    def __init__(self, cluster: str, book: Logbook) -> None:
+        self._cluster, self._book = cluster, book
 
-    @property
-    def connected(self) -> bool:
-        return self._link.connected
+    async def posted(self, data: bytes, now: float) -> None:
+        """Wait for nothing: only a message that was sent is noted."""
 
-    @property
-    def closed(self) -> bool:
-        return self._link.closed
+    def sent(self, data: bytes, now: float) -> None:
+        del now  # the book notes its own time
+        self._book.packet(self._cluster, "to", data)
 
-    @property
-    def silent_for(self) -> float:
-        return self._link.silent_for
+    async def waits(self) -> None:
+        """Wait for nothing."""
 
-    @property
-    def problem(self) -> str:
-        return self._link.problem
-
-    @property
-    def statistics(self) -> Statistics:
-        return self._link.statistics
-
-    async def run(self) -> None:
-        await self._link.run()
-
-    async def send(
-        self, data: bytes, *, expires: float | None = None, hold: bool = False
-    ) -> SendOutcome:
-        outcome = await self._link.send(data, expires=expires, hold=hold)
-        if outcome is SendOutcome.SENT:
-            self._book.packet(self.name, "to", data)
-        return outcome
-
-    async def receive(self) -> bytes:
-        data = await self._link.receive()
-        self._book.packet(self.name, "from", data)
-        return data
-
-    async def close(self) -> None:
-        await self._link.close()
+    def received(self, data: bytes, now: float) -> None:
+        del now
+        self._book.packet(self._cluster, "from", data)
 
 
 def _open(row: AlarmRow) -> bool:

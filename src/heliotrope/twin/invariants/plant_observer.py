@@ -18,7 +18,7 @@ from heliotrope.plant.controller import JOINING, PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.tickets import Ticket
 from heliotrope.twin.invariants.invariants import InvariantError, Observer, Violation
-from heliotrope.twin.world.records import RecordsDisk
+from heliotrope.twin.records import RecordsDisk
 
 #: A status waits up to a second, may be in transit for another, and ages are rounded: a value may
 #: be shown this much younger than it is, s.

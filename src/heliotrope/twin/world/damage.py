@@ -12,11 +12,11 @@ from heliotrope.links.in_process import Faults
 from heliotrope.plant.controller import PlantController
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import BusFaults
+from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import Pod
-from heliotrope.twin.world.records import RecordsDisk
 
 #: An order need not be carried out while a fault of these kinds lasts.
 _HINDERS = ("line", "bus", "plant")

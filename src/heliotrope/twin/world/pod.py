@@ -23,6 +23,7 @@ from heliotrope.links.messages import (
     Progress,
     decode,
 )
+from heliotrope.links.tapped import TappedLink
 from heliotrope.safety import Alarm
 from heliotrope.sun import Site
 from heliotrope.twin.boards.board import Board
@@ -32,7 +33,6 @@ from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.intruder import Intruder
-from heliotrope.twin.world.tapped import TappedLink
 
 #: A cluster counts a command's lifetime from its arrival, so the command may be this much older, s.
 UNDER_WAY = 0.8
@@ -64,8 +64,8 @@ class Pod:
         Those in use now.
     clock, time
         The cluster's own; ``time`` is None where it uses its system clock.
-    tap
-        The plant's end of the line; None while no plant runs.
+    tap, ear
+        The plant's end of the line and its listener; None while no plant runs.
     plant
         Observer of the plant; set by the owner.
     counts
@@ -93,6 +93,7 @@ class Pod:
         self.bus = self._new_bus()
         self.link: CarriedLink | None = None
         self.tap: TappedLink | None = None
+        self.ear: PlantEar | None = None
         self.plant: PlantObserver | None = None
         self.counts: Counter[str] = Counter()
         self._running: list[asyncio.Task[None]] = []
@@ -166,7 +167,7 @@ class Pod:
 
 
 class PlantEar:
-    """Listens at the plant's end of one line, and tells both observers.
+    """Listens at the plant's end of one line, reports to both observers, and can freeze the plant.
 
     Parameters
     ----------
@@ -180,10 +181,24 @@ class PlantEar:
         self._pod, self._plant = pod, plant
         self._addresses = {b.outfit.name: b.outfit.address for b in pod.boards}
         self._names: tuple[str, ...] = ()
+        self._goes = asyncio.Event()
+        self._goes.set()
 
-    def posted(self, data: bytes, now: float) -> None:
-        """Judge a message that the plant hands to the link."""
+    def hang(self, *, on: bool) -> None:
+        """Freeze the plant's program, or let it go on, while the connection stays up."""
+        if on:
+            self._goes.clear()
+        else:
+            self._goes.set()
+
+    async def posted(self, data: bytes, now: float) -> None:
+        """Judge a message that the plant hands to the link, which waits while it is frozen."""
         self._plant.posted(len(self._addresses), decode(data), now)
+        await self._goes.wait()
+
+    async def waits(self) -> None:
+        """Let the plant receive, unless it is frozen."""
+        await self._goes.wait()
 
     def sent(self, data: bytes, now: float) -> None:
         """Note a message that has left for the cluster."""

@@ -25,6 +25,7 @@ from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
 from heliotrope.links.clock import VirtualClock, VirtualLoop
+from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
@@ -43,13 +44,12 @@ from heliotrope.twin.boards.outfit import (
 )
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
-from heliotrope.twin.world.records import AssignedDisk, RecordsDisk, SimulatedAudit
-from heliotrope.twin.world.tapped import TappedLink
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
 START = datetime(2026, 6, 21, 9, tzinfo=UTC)
@@ -308,7 +308,8 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.tap = TappedLink(link, self._clock, PlantEar(pod, self.observer))
+            pod.ear = PlantEar(pod, self.observer)
+            pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
         plant = self.plant = PlantController(
@@ -335,7 +336,7 @@ class Simulation:
         self.operator.begins(None)
         self.observer.ended(now)
         for pod in self.pods:
-            pod.tap = None
+            pod.tap = pod.ear = None
             pod.line.drop()
             pod.observer.disturbed(now, crashed=True)
 
@@ -343,8 +344,8 @@ class Simulation:
         """Freeze the plant's program, or let it go on."""
         self.observer.hangs(now, on=on and self.plant is not None)
         for pod in self.pods:
-            if pod.tap is not None:
-                pod.tap.hang(on=on)
+            if pod.ear is not None:
+                pod.ear.hang(on=on)
 
     # -- the world -------------------------------------------------------------------------
 

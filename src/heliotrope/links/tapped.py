@@ -1,21 +1,24 @@
-"""A link with a listener: it hears all traffic of the link's owner, and can freeze the owner."""
+"""A link with a listener that sees all messages of the link's owner, and may hold them up."""
 
-import asyncio
 from typing import Protocol
 
 from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link, SendOutcome, Statistics
 
 
-class Listener(Protocol):
-    """Listener at one end of a link."""
+class LinkListener(Protocol):
+    """A listener at one end of a link."""
 
-    def posted(self, data: bytes, now: float) -> None:
-        """Note a message that the owner hands to the link, whether or not it is delivered."""
+    async def posted(self, data: bytes, now: float) -> None:
+        """Note a message that the owner hands to the link; it is sent when this returns."""
         ...
 
     def sent(self, data: bytes, now: float) -> None:
         """Note a message that has left, and when it was handed to the transport."""
+        ...
+
+    async def waits(self) -> None:
+        """Note that the owner waits for a message; the link is asked when this returns."""
         ...
 
     def received(self, data: bytes, now: float) -> None:
@@ -31,9 +34,9 @@ class TappedLink:
     inner
         The link itself.
     clock
-        True time.
+        Its monotonic time is passed to the listener.
     listener
-        Told of every message.
+        Called for every message.
 
     Attributes
     ----------
@@ -41,18 +44,9 @@ class TappedLink:
         Messages sent through it directly bypass the listener.
     """
 
-    def __init__(self, inner: Link, clock: Clock, listener: Listener) -> None:
+    def __init__(self, inner: Link, clock: Clock, listener: LinkListener) -> None:
         self.inner = inner
         self._clock, self._listener = clock, listener
-        self._goes = asyncio.Event()
-        self._goes.set()
-
-    def hang(self, *, on: bool) -> None:
-        """Freeze the owner's program, or let it go on, while the connection stays up."""
-        if on:
-            self._goes.clear()
-        else:
-            self._goes.set()
 
     @property
     def name(self) -> str:
@@ -71,7 +65,7 @@ class TappedLink:
 
     @property
     def silent_for(self) -> float:
-        """Time since the other end was last known to be alive, s."""
+        """Time since the other end was certainly alive, in s; infinite if it never was."""
         return self.inner.silent_for
 
     @property
@@ -92,8 +86,7 @@ class TappedLink:
         self, data: bytes, *, expires: float | None = None, hold: bool = False
     ) -> SendOutcome:
         """Send a message; see `links.link.Link`."""
-        self._listener.posted(data, self._clock.monotonic())
-        await self._goes.wait()
+        await self._listener.posted(data, self._clock.monotonic())
         begin = self._clock.monotonic()
         outcome = await self.inner.send(data, expires=expires, hold=hold)
         if outcome is SendOutcome.SENT and (expires is None or begin < expires):
@@ -102,7 +95,7 @@ class TappedLink:
 
     async def receive(self) -> bytes:
         """Wait for the next message."""
-        await self._goes.wait()
+        await self._listener.waits()
         data = await self.inner.receive()
         self._listener.received(data, self._clock.monotonic())
         return data
