@@ -7,4 +7,9 @@
 - `records`: command records on a simulated disk.
 - `world`, `invariants`: the deterministic simulation with its faults, and the safety invariants
   that it checks at every step.
+
+Each room shows its own public names. The modules below are imported by name, because cameras load
+the reading of photographs, which boards and buses do not need.
 """
+
+__all__ = ["cameras", "records", "wind"]
