@@ -85,7 +85,11 @@ def test_an_exact_camera_tells_what_is_wrong() -> None:
         turned = replace(here, normal=-here.normal)
         alone = ExactCamera(sight(clock, turned), 0.0)
         assert (await alone.photograph(TARGET, "B")).reasons == ("no beam on the target",)
-        for bad, text in ((np.eye(3), r"shape \(3, 3\)"), (-1.0, "below 0"), (np.nan, "give a")):
+        for bad, text in (
+            (np.eye(3), r"shape \(3, 3\)"),
+            (-1.0, "positive semidefinite"),
+            (np.nan, "give a"),
+        ):
             with pytest.raises(InputError, match=text):
                 ExactCamera(sight(clock), bad)
 
