@@ -1,0 +1,126 @@
+"""The operator page in a browser: what people's safety rests on."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER, browsers, entering, menu
+
+pytestmark = NEEDS_BROWSER
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Sixty-four heliostats with the page, at four times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("safety"), 64, speed=4.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser for this module alone."""
+    yield from browsers()
+
+
+@pytest.fixture
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in as somebody of a role."""
+    yield from entering(field.address, browser)
+
+
+# -- EMERGENCY above everything ----------------------------------------------------------------
+
+
+def _counted(page: Any) -> list[str]:
+    """Answer calls of an emergency in place of the plant; return the list of them."""
+    calls: list[str] = []
+
+    def take(route: Any) -> None:
+        calls.append(route.request.method)
+        route.fulfill(json={"act": "DEFOCUS", "heliostats": 64})
+
+    page.route("**/api/v1/emergency", take)
+    return calls
+
+
+def _open_order(page: Any) -> None:
+    page.evaluate("heliotrope.store.select([3], 3)")
+    page.click(".hx-orders >> text=Hold")
+    page.wait_for_selector("dialog[open]")
+
+
+def _open_people(page: Any) -> None:
+    menu(page, "People")
+    page.click("dialog >> text=Add…")
+    page.wait_for_selector("dialog[open] >> nth=1")
+
+
+def _open_menu(page: Any) -> None:
+    page.click("header >> text=/engineer/")
+    page.wait_for_selector(".q-menu")
+
+
+def _by_mouse(page: Any) -> None:
+    page.click("#emergency", timeout=3000)
+
+
+def _by_touch(page: Any) -> None:
+    page.tap("#emergency", timeout=3000)
+
+
+def _by_key(page: Any) -> None:
+    page.keyboard.press("Alt+e")
+
+
+@pytest.mark.parametrize("width", [1600, 800])
+@pytest.mark.parametrize("give", [_by_mouse, _by_touch, _by_key])
+@pytest.mark.parametrize("lay_over", [_open_order, _open_people, _open_menu])
+def test_emergency_works_above_everything(
+    enter: Callable[..., Any],
+    lay_over: Callable[[Any], None],
+    give: Callable[[Any], None],
+    width: int,
+) -> None:
+    page = enter("engineer", viewport={"width": width, "height": 700}, has_touch=True)
+    calls = _counted(page)
+    lay_over(page)
+    give(page)
+    page.wait_for_selector("#emergency-said:has-text('ordered')", timeout=5000)
+    assert calls == ["POST"]
+
+
+def test_emergency_is_reached_by_tab_from_a_dialog(enter: Callable[..., Any]) -> None:
+    """The rest of the page cannot be reached while a dialog is open; EMERGENCY can."""
+    page = enter("engineer")
+    calls = _counted(page)
+    _open_order(page)
+    reached = set()
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
+        if "emergency" in reached:
+            break
+    assert "emergency" in reached, reached
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#emergency-said:has-text('ordered')")
+    assert calls == ["POST"]
+    # Nothing behind the dialog can be clicked, and the dialog is still there.
+    assert page.locator(".hx-orders button").first.evaluate("b => Boolean(b.closest('[inert]'))")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("dialog", state="detached")
+    assert not page.locator("[inert]").count()
+
+
+def test_every_layer_of_the_page_lies_below_emergency(enter: Callable[..., Any]) -> None:
+    page = enter("engineer")
+    page.evaluate(
+        """() => { const veil = document.createElement('div'); veil.id = 'veil';
+        veil.style = 'position:fixed;inset:0;z-index:2147483646'; document.body.append(veil); }"""
+    )
+    calls = _counted(page)
+    _by_mouse(page)
+    page.wait_for_selector("#emergency-said:has-text('ordered')")
+    assert calls == ["POST"]
