@@ -126,6 +126,16 @@ RECORDS = AlarmKind(
     "Check the disk or the database.",
     over="records are stored again",
 )
+RECORD_REFUSED = AlarmKind(
+    "record_refused",
+    _PLANT,
+    Severity.WARNING,
+    "The store refuses a record for its content; the disk and the database are well.",
+    "a record was refused: {problem}",
+    "This record is lost; all others are stored.",
+    "Report the text.",
+    over="a record was refused: {problem}; the records after it are stored",
+)
 WORK = AlarmKind(
     "work",
     _PLANT,

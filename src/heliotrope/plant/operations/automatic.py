@@ -133,7 +133,7 @@ class AutomaticControl:
                 plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth
             )
         self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
-        self._token, self._sun_at, self._troubled = 0, -math.inf, False
+        self._token, self._sun_at = 0, -math.inf
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()
@@ -338,13 +338,9 @@ class AutomaticControl:
         return visit
 
     async def _look(self) -> None:
-        """Update predicted errors and the field's quality; raise or end the alarm of records."""
+        """Update predicted errors and the field's quality; check the records."""
         self.book.refresh()
         self.book.point(self._utc(), self.truth.all())
         self._keeping.forget(self._utc(), self._settings.events)
-        problem = self._keeping.problem
-        if problem or self._troubled:
-            kind = alarms.RECORDS
-            self._log.take_alarm(kind.raised(problem=problem) if problem else kind.ended())
-        self._troubled = bool(problem)
+        self._log.check_records(self._keeping.problem)
         await self._sleep(_LOOK_EVERY)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
+from heliotrope.safety import Severity
 
 #: State shown for a row older than its limit, whose other values do not count.
 STALE_STATE = 255
@@ -268,7 +269,7 @@ class AlarmRow:
     at: float
     condition: str
     subject: str
-    severity: str
+    severity: Severity
     text: str
     active: bool
     acknowledged_by: str = ""
