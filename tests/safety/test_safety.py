@@ -57,7 +57,13 @@ TRIPS = {
     "ups_on_battery": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "runs on battery: mains power is lost"),
     "ups_charge_low": (0.4, 1.0, Act.STOW, Scope.FIELD, r"UPS is 40 % \(limit 50 %\)"),
     "database_unwritable": (5.5, 0.0, Act.REFUSE_NEW, Scope.FIELD, "not confirmed a write for"),
-    "keep_out_predicted": (1.0, 0.0, Act.HOLD, Scope.HELIOSTAT, "in a keep-out volume or headin"),
+    "keep_out_predicted": (
+        1.0,
+        0.0,
+        Act.DEFOCUS,
+        Scope.HELIOSTAT,
+        "in a keep-out volume or headin",
+    ),
     "node_faults": (0.03, 0.0, Act.REFUSE_NEW, Scope.FIELD, "3 % of the heliostats failed"),
     "node_faults_many": (0.2, 0.0, Act.DEFOCUS, Scope.FIELD, "20 % of the heliostats failed"),
 }
@@ -659,5 +665,5 @@ def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
         readings[row.reading, ""] = Reading(0.0, now)
         state, actions = safety.evaluate(readings, state, now)
         assert {a.subject for a in actions} == tripped
-        assert {a.act for a in actions} <= {Act.HOLD}
+        assert {a.act for a in actions} <= {Act.DEFOCUS}
     assert set(safety.narrowed(state, row.name, ()).tracks) == {(row.name, "")}

@@ -40,6 +40,7 @@ from heliotrope.links.messages import (
     Stage,
 )
 from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
 from heliotrope.plant.aims import BeamCheck, default_aims
 from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
@@ -151,7 +152,7 @@ class PlantController:
         self.beliefs.subscribe(self._believe)
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector)
+        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
         self._clusters = Clusters(members, links, clock, self.counters)
         self._orders = PlantOrders(
             clock,
@@ -185,7 +186,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self.authority,
+            self._ways,
             self.beams.drives,
             self.settings.repeat,
         )
@@ -647,6 +648,16 @@ class PlantController:
             )
         except AuditError as error:
             raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+
+
+def _machines(design: Plant) -> dict[str, Machine]:
+    """Return the machines that the design knows, by heliostat."""
+    return {
+        name: machine
+        for group in design.groups.values()
+        if group.machines
+        for name, machine in zip(group.names, group.machines, strict=True)
+    }
 
 
 def _checked(

@@ -10,7 +10,7 @@ from heliotrope.errors import InputError
 from heliotrope.safety.condition import AcknowledgeRole, Act, Condition, Scope, Severity, Watcher
 
 _PLANT, _CLUSTER, _NODE = Watcher.PLANT, Watcher.CLUSTER, Watcher.NODE
-_ALARM, _REFUSE, _HOLD, _DEFOCUS, _STOW = Act
+_ALARM, _REFUSE, _, _DEFOCUS, _STOW = Act
 _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
 _OPERATOR, _SUPERVISOR = AcknowledgeRole
@@ -268,9 +268,10 @@ def _mirrors() -> tuple[Condition, ...]:
         Condition(
             "keep_out_predicted", _PLANT, "keep_out_predicted", "yes/no",
             "beam in or heading for a keep-out volume",
-            "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _HOLD, _HELIOSTAT,
-            _SERIOUS, 10.0, release="the beam and its way are clear",
-            remedy="Give it another aim point, or stow it.",
+            "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
+            _SERIOUS, 30.0, then_stow=_PATIENCE, release="the beam and its way are clear",
+            remedy="Keep people out of the volume until the alarm is over; then give it another aim"
+            " point.",
         ),
         Condition(
             "node_faults", _PLANT, "node_fault_share", "share",

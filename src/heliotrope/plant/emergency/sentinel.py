@@ -13,7 +13,7 @@ import numpy as np
 from heliotrope.links.clock import Clock
 from heliotrope.links.messages import Progress
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant.authority import Authority
+from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
@@ -24,6 +24,8 @@ from heliotrope.safety import Act, Alarm
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
+#: Longest pause between two orders to one heliostat that does not show them, s.
+LONGEST_PAUSE = 60.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
@@ -37,7 +39,7 @@ class Sentinel:
         Clock of the plant.
     table
         The plant's rows of the safety table.
-    field, orders, joining, authority
+    field, orders, joining, ways
         Of the plant.
     drives
         Of the heliostats, (N, 2), for the proof.
@@ -61,7 +63,7 @@ class Sentinel:
         field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
-        authority: Authority,
+        ways: BeamWatch,
         drives: Drive,
         repeat: float,
     ) -> None:
@@ -69,11 +71,13 @@ class Sentinel:
         self.on = False
         self._called = False
         self._clock, self.table, self._field = clock, table, field
-        self._orders, self._joining, self._authority = orders, joining, authority
+        self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat = drives, repeat
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
+        #: Orders to single heliostats while their rows hold: number, and time of the next.
+        self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
 
     # -- the table -------------------------------------------------------------------------
@@ -117,22 +121,25 @@ class Sentinel:
                 self.send_safe(_TABLE, act, members, text)
 
     def _obey_heliostats(self, now: float) -> None:
-        """Hold heliostats where they are; without a command authority, defocus them instead.
+        """Send heliostats off, and send them again until their rows release.
 
-        A heliostat that has been sent off the receiver is not stopped, even if its state does not
-        show the order yet.
+        A heliostat that has just been sent off has the time to show it.
         """
-        token = self._authority.token
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
-        for name, text in self.table.held().items():
-            if self.on or name in self._sent_off:
+        wanted = self.table.off()
+        self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
+        order = self.order if self.on else None
+        for name, (act, text) in wanted.items():
+            tries, due = self._tries.get(name, (0, -math.inf))
+            whole = order is not None and now - order.at < OFF_SHOWS
+            if name in self._sent_off or now < due or whole:
                 continue
+            self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
+            best = self._ways.way_out(name, again=tries > 0)
+            if order is not None:
+                best = max(best, order.act)
             self._joining.drop(text, frozenset([name]))
-            if token:
-                ticket = self._orders.accept((*_TABLE, "LOCK"), (), (name,), text, late=True)
-                self._orders.command(ticket, "LOCK", (), (name,), token)
-            else:
-                self.send_safe(_TABLE, Act.DEFOCUS, (name,), text)
+            self.send_safe(_TABLE, max(act, best), (name,), text)
 
     # -- orders ----------------------------------------------------------------------------
 

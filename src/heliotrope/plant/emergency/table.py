@@ -219,12 +219,12 @@ class TableWatch:
         acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
         return max(acts, default=None)
 
-    def held(self) -> dict[str, str]:
-        """Return the heliostats to be held from now on, and why."""
+    def off(self) -> dict[str, tuple[Act, str]]:
+        """Return the heliostats that must leave, by name: by which act, and why."""
         return {
-            a.subject: a.text
-            for a in self.actions
-            if a.scope is Scope.HELIOSTAT and a.act is Act.HOLD and a.new and a.subject
+            a.subject: (a.act, a.text)
+            for a in reversed(self.actions)
+            if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject
         }
 
     def caused(self) -> bool:
