@@ -389,13 +389,14 @@ def test_a_lock_holds_until_it_is_released() -> None:
     for name in ("TRACK", "APPROACH", "IDLE", "REFOCUS"):
         assert bench.order(name) == REFUSED_STATE
     assert bench.order("JOG", 0, 5) == REFUSED_STATE
-    bench.sends_sun = bench.sends_time = False
-    bench.run(400)  # somebody may stand at the mirror: no timer moves it
+    bench.sends_sun = False
+    bench.run(400)  # dusk: the cluster is heard, and no timer moves the mirror
     assert bench.made == held
     bench.start(bench.flash)
     assert bench.state == "LOCKED"  # nor a reset
-    bench.sends_sun = bench.sends_time = True
+    bench.sends_sun = True
     bench.run(12)
+    assert bench.made == held
     assert bench.order("DEFOCUS") == DONE
     bench.run(12)
     assert bench.state == "LOCKED"
@@ -403,6 +404,90 @@ def test_a_lock_holds_until_it_is_released() -> None:
     assert bench.order("UNLOCK") == DONE
     assert bench.state == "IDLE"
     assert bench.order("UNLOCK") == REFUSED_STATE
+
+
+def held_by(how: str) -> Bench:
+    """A bench whose mirror holds its beam near the receiver, or seeks it."""
+    if how == "jogged":
+        bench = standing_by()
+        assert bench.order("JOG", 0, 20_000) == DONE
+        bench.run(0.5)
+    elif how == "without its armature":
+        bench = tracking()
+        bench.run(1)
+        items = items_of_heliostat(bench.machine)
+        del items["armature"]
+        journal = controller_journal(bench.flash)
+        bench.flash.data[: 2 * bench.flash.block_size] = b"\xff" * (2 * bench.flash.block_size)
+        journal.load()
+        journal.store(items)
+        bench.start(bench.flash)
+    else:
+        bench = tracking()
+        if how == "searching":
+            assert bench.order("SEARCH", 2e-3, 0.02) == DONE
+        elif how == "at fault":
+            bench.node.on_fault(controller.LIMIT_SWITCH, bench.now, True)
+            bench.node.fault_gone(controller.LIMIT_SWITCH)
+        else:
+            assert bench.order("LOCK") == DONE
+        bench.run(2)
+        if how == "locked over a reset":
+            bench.start(bench.flash)
+    assert bench.state == {
+        "jogged": "IDLE", "without its armature": "UNCONFIGURED", "searching": "SEARCHING",
+        "at fault": "FAULT",
+    }.get(how, "LOCKED")  # fmt: skip
+    return bench
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["locked", "locked over a reset", "jogged", "searching", "at fault", "without its armature"],
+)
+def test_no_state_outlives_its_cluster(how: str) -> None:
+    """Invariants 2 and 13: off the receiver in 30 s, at stow in 5 minutes; a latch stays."""
+    bench = held_by(how)
+    state = bench.state
+    bench.sends_sun = bench.sends_time = False
+    begin = bench.true_ms
+    while bench.miss(AIM) < OFF:
+        bench.run(0.5)
+        assert bench.true_ms - begin < 30_000
+    while tuple(bench.made) != STOW or not bench.controller.motion.still():
+        bench.run(1)
+        assert bench.true_ms - begin < 300_000
+    bench.run(1)
+    assert bench.state == ("STOWED" if how in ("jogged", "searching") else state)
+
+
+def test_a_mirror_that_is_locked_at_stow_stands_still_without_a_cluster() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.order("LOCK") == DONE
+    bench.sends_sun = bench.sends_time = False
+    steps: list[tuple[int, ...]] = []
+    bench.motors.play = lambda *values: steps.append(values)  # type: ignore[method-assign]
+    bench.run(400)
+    assert steps == []
+    assert bench.state == "LOCKED"
+
+
+def test_while_the_cause_of_a_fault_is_present_silence_moves_nothing_at_once() -> None:
+    # The supply falls, and with it the cluster: steps would spoil the record of the counts.
+    for locked in (False, True):
+        bench = tracking()
+        if locked:
+            assert bench.order("LOCK") == DONE
+            bench.run(2)
+        bench.sends_sun = bench.sends_time = False
+        bench.run(5)
+        bench.node.on_supply_failing(bench.now)
+        held = list(bench.made)
+        bench.run(20)
+        assert bench.made == held
+        bench.run(280)  # it was a dip
+        assert tuple(bench.made) == STOW
 
 
 def test_a_fault_stays_until_it_is_cleared() -> None:

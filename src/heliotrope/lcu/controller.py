@@ -65,6 +65,9 @@ STATES_OF = {
     "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": CALIBRATION,
 }  # fmt: skip
 
+#: States that hold a position for as long as the cluster is heard.
+HELD = (states.LOCKED, states.UNCONFIGURED)
+
 #: A clock that changes by more than this (ms) has jumped.
 CLOCK_JUMP_MS = 2000
 MOST_STEPS = 1 << 29
@@ -141,6 +144,7 @@ class Controller:
             if is_place(point):
                 motion.aim = point
         if not self.config.complete():
+            motion.defocus()  # as far as the settings allow
             return self.out
         if looping or not motion.known:
             self.fault = BOOTS if looping else COUNTS
@@ -174,7 +178,8 @@ class Controller:
         fresh = self.sun.look(now_ms, elapsed)
         silent = self._heard.over(now_ms)
         goes_on = self.motion.following() and self.state != states.FAULT
-        if fresh and (goes_on or self.state in states.NEED_SUN):
+        held = self.state in HELD and self.motion.kind == HOLD and not silent
+        if held or (fresh and (goes_on or self.state in states.NEED_SUN)):
             self._dark.start(now_ms, self.config.stow_wait_ms)
         dark = self._dark.over(now_ms)
         self._lapses(fresh, silent, dark)
@@ -189,14 +194,25 @@ class Controller:
                 self._event("LAPSED")
         elif state == states.STOWING and kind == RETURN and not fresh:
             self._event("LAPSED")
-        elif (state == states.DEFOCUSED and dark) or (
-            state == states.FAULT
-            and dark
-            and kind != STOW
-            and self.motion.known
-            and not self.motion.at_stow()
-        ):
+        elif state == states.DEFOCUSED:
+            if dark:
+                self._event("SILENT")
+        elif state == states.FAULT or state in HELD:
+            self._latched_lapses(silent, dark)
+
+    def _latched_lapses(self, silent: bool, dark: bool) -> None:
+        """Leave without a cluster: the latch stays, the mirror goes.
+
+        While the cause of a fault is present, nothing moves before the stow delay is over: the
+        supply may be falling.
+        """
+        motion = self.motion
+        if motion.at_stow() or motion.kind == STOW:
+            return
+        if dark and motion.known and self.config.fits():
             self._event("SILENT")
+        elif silent and motion.kind in (HOLD, MOVE) and not self._present:
+            self._event("LAPSED")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
         """Advance in time; to be called more often than every ``ahead_ms`` during a motion."""

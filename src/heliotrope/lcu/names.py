@@ -30,8 +30,8 @@ EVENTS = {
     "BOOT_FAULT": (INTERNAL, "started complete, a fault latched before the reset"),
     "ARRIVED": (INTERNAL, "the motion is at its end"),
     "SEARCHED": (INTERNAL, "the spiral is at its end"),
-    "LAPSED": (INTERNAL, "the sun is older than its lease"),
-    "SILENT": (INTERNAL, "no fresh sun for the stow delay beyond the lease"),
+    "LAPSED": (INTERNAL, "the sun, or for a mirror that holds, the last message, is too old"),
+    "SILENT": (INTERNAL, "nothing to stay for during the stow delay"),
     "UNREACHABLE": (INTERNAL, "no pose sends the beam to the aim"),
     "FAULTED": (INTERNAL, "a fault has been found"),
 }

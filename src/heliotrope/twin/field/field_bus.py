@@ -175,6 +175,8 @@ class FieldBus:
         elif name in ("DEFOCUS", "STOW"):
             self._field.order(name, self._all)
             self._tell(name, self._rows)
+        else:
+            self._field.hear(self._all)
 
     def _tell(self, name: str, rows: range) -> None:
         if self._took is not None:

@@ -559,7 +559,7 @@ class Observer:
         account.served(now, leased)
         assert board.node is not None
         motion = board.node.controller.motion
-        if board.state in (states.LOCKED, states.UNCONFIGURED) or not motion.known:
+        if board.state == states.UNCONFIGURED or not motion.known:
             return
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
         for why, begin in account.deadlines(now):
