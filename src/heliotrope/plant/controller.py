@@ -40,6 +40,7 @@ from heliotrope.links.messages import (
     Stage,
 )
 from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
 from heliotrope.plant.aims import BeamCheck, default_aims
@@ -576,10 +577,17 @@ class PlantController:
 
     def _believe(self, record: HeliostatCalibration) -> None:
         """Use a new calibration in the beam checks and in the wanted parameters."""
-        mechanism = self.beliefs.present(record.heliostat)[0]
-        row = self.field.place(record.heliostat)
+        self.want(record.heliostat, self.beliefs.present(record.heliostat)[0])
+
+    def want(self, heliostat: str, mechanism: Mechanism) -> None:
+        """Use a mechanism, batch shape (), in the beam checks and in the wanted parameters.
+
+        The local controller is compared, and written when its state allows it.
+        """
+        row = self.field.place(heliostat)
         self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)
-        self.wanted.set(record.heliostat, items_of(mechanism))
+        self.wanted.set(heliostat, items_of(mechanism))
+        self._sync.compare(heliostat)
 
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
         """Return the checksums of the items that a local controller stores, by item.
