@@ -18,6 +18,7 @@ from heliotrope.safety import (
     Act,
     Action,
     Condition,
+    FluxProof,
     JoinLimiter,
     Proof,
     Reading,
@@ -537,7 +538,7 @@ def test_proof_is_complete_only_with_every_node_and_the_flux() -> None:
     assert report.late == ()
     assert "the flux is below its limit" in report.text
     # The reading grows old, and proves nothing any more.
-    assert proof.report(40.0).flux_proven is False
+    assert proof.report(40.0).flux is FluxProof.NOT_BELOW
     assert "flux not proven to be below 10%" in proof.report(40.0).text
 
 
@@ -566,6 +567,19 @@ def test_reports_that_prove_nothing_are_counted_and_left_out() -> None:
         Proof.of("TRACK", (), 0.0)
     with pytest.raises(InputError, match="not a time"):
         Proof.of("STOW", (), math.nan)
+
+
+def test_a_proof_rests_on_the_mirrors_where_nobody_measures_the_flux() -> None:
+    proof = Proof.of("DEFOCUS", ("A1", "A2"), 0.0, flux_measured=False)
+    proof = proof.with_acknowledged("A1", 0.5).with_done("A1", 12.0)
+    report = proof.report(40.0)
+    assert not report.complete, "A2 is not known to be done"
+    assert "1 not done: A2; flux on the receiver not measured" in report.text
+    assert safety.proof_readings(proof, 40.0)["flux_after_emergency", ""].value == 0.0
+    report = proof.with_done("A2", 41.0).report(50.0)
+    assert report.complete
+    assert report.flux is FluxProof.NOT_MEASURED
+    assert report.text.endswith("is done; flux on the receiver not measured")
 
 
 @pytest.mark.parametrize(("share", "trips"), [(0.05, False), (0.12, True), (None, True)])

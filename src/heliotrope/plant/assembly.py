@@ -205,7 +205,7 @@ class PlantAssembly:
     async def _sense(self, sensors: Sensors) -> None:
         """Hand readings of sensors to the safety table as they come."""
         while True:
-            news = await asyncio.to_thread(sensors.read)
+            news = await sensors.news()
             for name, value in news.values.items():
                 self.plant.put(name, value)
             for name, text in news.problems.items():

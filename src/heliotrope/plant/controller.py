@@ -317,19 +317,14 @@ class PlantController:
         return self._orders.open
 
     def put(self, name: str, value: float, subject: str = "") -> None:
-        """Take a sensor's reading for the safety table, made now.
+        """Take a sensor's reading, made now, for the safety table or the proof of an emergency.
 
         Raises
         ------
         UnknownNameError
             If it is not one of the settings' sensors.
         """
-        self._sentinel.table.put(name, value, self.now(), subject)
-
-    def put_flux(self, share: float) -> None:
-        """Take the flux on the receiver as a share of the nominal, measured now, as proof."""
-        if self._sentinel.order is not None:
-            self._sentinel.order.take_flux(share, self.now())
+        self._sentinel.put(name, value, self.now(), subject)
 
     # -- open to anybody -------------------------------------------------------------------
 

@@ -43,9 +43,18 @@ class EmergencyOrder:
         Ticket with the stage of each heliostat.
     """
 
-    def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
+    def __init__(
+        self,
+        act: Act,
+        who: str,
+        reason: str,
+        at: float,
+        ticket: Ticket,
+        *,
+        flux_measured: bool = True,
+    ) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
-        self._proof = Proof.of(act.name, ticket.heliostats, at)
+        self._proof = Proof.of(act.name, ticket.heliostats, at, flux_measured=flux_measured)
         # A proof is a value, so reports of a whole field are added to it together.
         self._told: dict[str, float] = {}
         self._ready: dict[str, float] = {}

@@ -20,7 +20,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import Act, Alarm
+from heliotrope.safety import FLUX_READING, Act, Alarm
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
@@ -147,7 +147,8 @@ class Sentinel:
         """Order DEFOCUS or STOW of the whole field."""
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
-        self.order = EmergencyOrder(act, giver[0], reason, now, ticket)
+        measured = self.table.flux_measured
+        self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
@@ -192,6 +193,12 @@ class Sentinel:
         self._orders.repeat(order.ticket, order.act, order.unacknowledged(tuple(members)))
 
     # -- proof -----------------------------------------------------------------------------
+
+    def put(self, name: str, value: float, at: float, subject: str = "") -> None:
+        """Take a reading of a sensor for the table, or for the proof; see `TableWatch.put`."""
+        self.table.put(name, value, at, subject)
+        if name == FLUX_READING and self.order is not None:
+            self.order.take_flux(value, at)
 
     def take_progress(
         self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress

@@ -12,6 +12,7 @@ from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.safety import (
+    FLUX_READING,
     AcknowledgeRole,
     Act,
     Action,
@@ -44,6 +45,8 @@ OWN_READINGS = frozenset(
 )
 #: Rows that follow from an emergency; by themselves they keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
+#: Readings that the plant makes of a sensor's, and the sensor.
+DERIVED = {"flux_after_emergency": FLUX_READING}
 #: Pause between two computations of the sun's elevation, s.
 SUN_PERIOD = 5.0
 
@@ -152,13 +155,14 @@ class TableWatch:
     ) -> None:
         table = watched_by(rows, Watcher.PLANT)
         self._sensors = frozenset(sensors)
-        known = {row.reading for row in table} - OWN_READINGS
+        known = {row.reading for row in table} - OWN_READINGS | set(DERIVED.values())
         for name in sorted(self._sensors - known):
             raise InputError(
                 f"sensor {name}: no row of the safety table that the plant watches takes it from a "
                 f"sensor; known: {', '.join(sorted(known))}"
             )
-        able = tuple(row for row in table if row.reading in self._sensors | readings.names)
+        fed = {name for name in readings.names if DERIVED.get(name) in self._sensors | {None}}
+        able = tuple(row for row in table if row.reading in self._sensors | fed)
         self.unwatched = tuple(row.name for row in table if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
@@ -168,6 +172,11 @@ class TableWatch:
         self._own = readings
         self._put: dict[tuple[str, str], Reading] = {}
         self._told: dict[tuple[str, str], Alarm] = {}
+
+    @property
+    def flux_measured(self) -> bool:
+        """Whether a sensor feeds the flux on the receiver, for the proof of an emergency."""
+        return FLUX_READING in self._sensors
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
         """Take a reading of a sensor, made at ``at`` (monotonic s).
@@ -179,7 +188,8 @@ class TableWatch:
         """
         if name not in self._sensors:
             raise UnknownNameError("sensor of the plant", name, self._sensors)
-        self._put[name, subject] = Reading(value, at)
+        if name not in DERIVED.values():
+            self._put[name, subject] = Reading(value, at)
 
     def evaluate(self, proof: Proof | None, *, called: bool, now: float) -> list[Alarm]:
         """Evaluate all rows; return the alarms raised and ended since the last time.

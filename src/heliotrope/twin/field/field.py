@@ -37,6 +37,7 @@ from heliotrope.twin.field._among import among
 from heliotrope.twin.field._drives import Drives
 from heliotrope.twin.field._ways import pieces
 from heliotrope.twin.field.journals import Journals
+from heliotrope.twin.sensors import light_share
 from heliotrope.twin.wind import Wind
 
 Rows = npt.NDArray[np.intp]
@@ -646,29 +647,8 @@ class Field:
         return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
-        """Return the share of the field's light that passes a receiver, 0 to 1.
-
-        Parameters
-        ----------
-        sun
-            Direction to the sun, (3,).
-        receiver
-            Its middle, (3,), m.
-        radius
-            Beams whose axis passes nearer than this count as on it, m. Each is weighted by the
-            cosine of its incidence, relative to all beams aimed at the middle.
-        """
-        s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
-        normal, vertex = self.stand()
-        cosine = normal @ s
-        rays = 2.0 * cosine[:, None] * normal - s
-        way = point - vertex
-        along = np.einsum("ij,ij->i", way, rays)
-        off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
-        unit = way / np.linalg.norm(way, axis=1)[:, None]
-        nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
-        on = (along > 0.0) & (off <= radius)
-        return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())
+        """Return the share of the field's light that passes a receiver; see `light_share`."""
+        return light_share(*self.stand(), sun, receiver, radius)
 
 
 def _limit(rows: npt.NDArray[np.void], axis: AxisLimits) -> None:

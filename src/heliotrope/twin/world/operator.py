@@ -20,7 +20,7 @@ from heliotrope.links.messages import Command, encode
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import Act
+from heliotrope.safety import FLUX_READING, Act
 from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
@@ -105,7 +105,7 @@ class Operator:
             due = self._clock.monotonic() + 1.0
             plant = self.plant
             if plant is not None and not self.away:
-                plant.put_flux(self._flux())
+                plant.put(FLUX_READING, self._flux())
                 if plant.authority.grant is None:
                     self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
                 token = self._tokens.get(self._duty.name, 0)

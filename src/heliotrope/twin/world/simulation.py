@@ -29,7 +29,7 @@ from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import conditions
+from heliotrope.safety import FLUX_READING, conditions
 from heliotrope.sun import Site, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
@@ -60,7 +60,7 @@ _SUN_EVERY = 30.0
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: With this few mirrors they join one at a time.
-SETTINGS = PlantSettings(join_rate=0.5, join_burst=1)
+SETTINGS = PlantSettings(join_rate=0.5, join_burst=1, sensors=frozenset({FLUX_READING}))
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
 
