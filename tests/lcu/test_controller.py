@@ -900,3 +900,36 @@ def test_the_watchdog_is_fed_by_whole_ticks() -> None:
     with pytest.raises(TypeError):
         bench.tick()
     assert not bench.fed
+
+
+@pytest.mark.parametrize("broken", ["the lapses", "the lease"])
+@pytest.mark.parametrize("state", ["TRACKING", "SEARCHING", "APPROACHING", "IDLE", "STOWING"])
+def test_the_watchdog_resets_a_board_that_follows_a_sun_it_no_longer_hears(
+    state: str, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = brought_to(state)
+    own = bench.controller
+    monkeypatch.setattr(bench, "check", lambda: None)
+    if broken == "the lapses":
+        monkeypatch.setattr(own, "_lapses", lambda *values: None)
+    else:
+        monkeypatch.setattr(own.sun, "look", lambda *values: True)
+        monkeypatch.setattr(own.sun, "fresh", lambda: True)
+    bench.sends_sun = False
+    bench.run(5)
+    assert bench.fed
+    kind = own.motion.kind
+    bench.run(3)
+    assert (bench.state, own.motion.kind) == (state, kind)
+    assert not bench.fed
+    bench.start(bench.flash)  # a board's watchdog waits 2 s
+    assert bench.state == ("DEFOCUSED" if tuple(bench.made) != STOW else "STOWED")
+
+
+@pytest.mark.parametrize("state", STATES_TO_TRY)
+def test_a_board_that_left_in_time_is_not_reset(state: str) -> None:
+    bench = brought_to(state)
+    bench.sends_sun = bench.sends_time = False
+    for _ in range(60):
+        bench.run(1)
+        assert bench.fed

@@ -23,7 +23,19 @@ from . import messages, states, ticks
 from .config import Config, is_place
 from .journal import ITEMS, items_of
 from .lease import Clock, SunLease
-from .motion import APPROACH, DIAGNOSE, HOLD, MOVE, RETURN, ROUGH_STEPS, STANDBY, STOW, Motion
+from .motion import (
+    APPROACH,
+    DIAGNOSE,
+    HOLD,
+    MOVE,
+    RETURN,
+    ROUGH_STEPS,
+    SEARCH,
+    STANDBY,
+    STOW,
+    TRACK,
+    Motion,
+)
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
@@ -68,6 +80,9 @@ STATES_OF = {
 #: States that hold a position for as long as the cluster is heard.
 HELD = (states.LOCKED, states.UNCONFIGURED)
 
+#: Motions that need the sun. The watchdog resets a board that is in one of them, or in a state that
+#: needs it, for longer than this (ms) beyond the lease: its program no longer does what it should.
+FOLLOWS, LATE_MS = (STANDBY, TRACK, SEARCH, APPROACH, RETURN), 1000
 #: A clock that changes by more than this (ms) has jumped.
 CLOCK_JUMP_MS = 2000
 MOST_STEPS = 1 << 29
@@ -114,6 +129,7 @@ class Controller:
         self._dark, self._heard = ticks.Deadline(), ticks.Deadline()
         self._dark.start(now_ms, config.stow_wait_ms)
         self._heard.start(now_ms, config.silence_ms)
+        self._sunless_ms = 0  # since the last sun; counted without the lease that it checks
         self._present = 0
         self._doubtful = self._aim_locked = False
         self._clock_jumped = self._ticks_jumped = False
@@ -239,7 +255,9 @@ class Controller:
                 # flash would wear it out in a year.
                 self._moving = False
                 self.out.append((AT_REST, one, two))
-        if self.state != states.TRACKING or self.sun.fresh():
+        self._sunless_ms = min(self._sunless_ms + elapsed, 1_000_000)
+        needs_sun = self.state in states.NEED_SUN or motion.kind in FOLLOWS
+        if not needs_sun or self._sunless_ms <= self.config.lease_ms + LATE_MS:
             self.out.append((FEED,))
         return self.out
 
@@ -387,8 +405,8 @@ class Controller:
         if name == "TIME":
             if abs(self.clock.set(values[0], values[1])) > CLOCK_JUMP_MS:
                 self._clock_jumped = True
-        elif name == "SUN":
-            self.sun.take(values, self.clock, now_ms)
+        elif name == "SUN" and self.sun.take(values, self.clock, now_ms):
+            self._sunless_ms = 0
 
     def _answer(self, name: str, values: "tuple[Any, ...]") -> None:
         motion = self.motion
