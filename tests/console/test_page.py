@@ -250,6 +250,7 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
         "document.querySelector('.hx-alert').textContent.includes('acknowledged 640 of 640')"
     )
     page.click(".hx-alert >> text=Withdraw")
+    page.click("dialog >> text='Withdraw'")
     page.click(".hx-tabs >> text=Alarms")
     # Each row can be acknowledged when its cause has gone: the order, then the light.
     end = time.monotonic() + 30.0

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from support.live_console import LiveConsole
-from support.pages import NEEDS_BROWSER, browsers, entering, menu
+from support.pages import NEEDS_BROWSER, browsers, entering, menu, said
 
 pytestmark = NEEDS_BROWSER
 
@@ -124,3 +124,67 @@ def test_every_layer_of_the_page_lies_below_emergency(enter: Callable[..., Any])
     _by_mouse(page)
     page.wait_for_selector("#emergency-said:has-text('ordered')")
     assert calls == ["POST"]
+
+
+# -- after a loss, and after an emergency ------------------------------------------------------
+
+
+def test_after_a_loss_of_many_a_person_presses_resume(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, viewer = enter("operator"), enter("viewer")
+    live = field.live
+
+    def up() -> bool:
+        found = live.operations.summary().states
+        return found.get("IDLE", 0) + found.get("TRACKING", 0) > 40
+
+    field.until(up, 90.0)
+    link = live.links[live.operations.clusters[0]]
+    field.call(lambda: setattr(link, "plugged", False))
+    page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+    page.wait_for_timeout(3000)
+    field.call(lambda: setattr(link, "plugged", True))
+    page.wait_for_selector(".hx-alert.on:has-text('left the receiver without an order')")
+    viewer.wait_for_selector(".hx-alert.on:has-text('left the receiver')")
+    assert not viewer.locator(".hx-alert button").count()
+    page.click(".hx-alert button >> text=Resume")
+    page.click("dialog >> text=Cancel")
+    page.wait_for_timeout(1500)
+    assert field.call(lambda: live.operations.summary().resume)
+    page.click(".hx-alert button >> text=Resume")
+    page.click("dialog >> text='Resume'")
+    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    assert not field.call(lambda: live.operations.summary().resume)
+
+
+def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page = enter("operator")
+    page.click("#emergency")
+    page.wait_for_selector(".hx-plant p:has-text('ordered by operator')")
+    page.click(".hx-alert button >> text=Withdraw")
+    page.wait_for_selector("dialog[open] h2:has-text('Withdraw')")
+    page.click("dialog >> text=Cancel")
+    page.wait_for_timeout(1000)
+    assert field.call(lambda: field.live.plant.emergency_on)
+    page.click(".hx-alert button >> text=Withdraw")
+    page.click("dialog >> text='Withdraw'")
+    field.calm()
+    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
+
+
+def test_a_refused_acknowledgement_is_not_shown_as_done(enter: Callable[..., Any]) -> None:
+    page = enter("operator")
+    row = {"at": 1.0, "condition": "wind_gust_stow", "subject": "", "severity": "alarm"}
+    row |= {"text": "gusts", "active": True, "acknowledged_by": "", "count": 1}
+    page.route("**/api/v1/alarms", lambda route: route.fulfill(json=[row]))
+    refusal = {"detail": "wind_gust_stow: its cause has not gone"}
+    page.route(
+        "**/api/v1/alarms/acknowledge", lambda route: route.fulfill(status=409, json=refusal)
+    )
+    page.click(".hx-tabs >> text=Alarms")
+    page.click(".hx-alarms >> text=Acknowledge all")
+    said(page, "1 of 1 refused: wind_gust_stow: its cause has not gone")

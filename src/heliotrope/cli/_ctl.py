@@ -124,6 +124,8 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{found['holder'] or 'nobody'} has the command authority")
     if found["emergency"]:
         print("EMERGENCY")
+    if found["resume"]:
+        print(f"automatic control waits for Resume: {found['resume']}")
 
 
 @app.command()
@@ -253,6 +255,14 @@ def calibration(
     with _client(context) as client:
         found = client.ask("PUT", "calibration", {"on": on})
     print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
+
+
+@app.command()
+def resume(context: typer.Context) -> None:
+    """Let automatic control go on after a loss of many heliostats."""
+    with _client(context) as client:
+        client.ask("POST", "automatic/resume")
+    print("automatic control resumed")
 
 
 def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:

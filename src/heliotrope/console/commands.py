@@ -182,6 +182,12 @@ async def automatic(console: Here, who: Operator, order: models.SomeHeliostats) 
     console.operations.give_back(who.person, order.heliostats)
 
 
+@router.post("/automatic/resume", status_code=204, tags=["commands"])
+async def resume(console: Here, who: Operator) -> None:
+    """Let automatic control go on after a loss of many heliostats."""
+    console.operations.resume(who.person)
+
+
 @router.put("/calibration", response_model=models.CalibrationView, tags=["calibration"])
 async def switch(console: Here, who: Operator, to: models.Switch) -> JSONResponse:
     """Switch automatic calibration on or off."""

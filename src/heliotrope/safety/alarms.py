@@ -146,6 +146,16 @@ WORK = AlarmKind(
     "Report the text; without this part, command the field by hand.",
     over="automatic control, part {subject}, works again",
 )
+RESUME_NEEDED = AlarmKind(
+    "resume_needed",
+    _PLANT,
+    Severity.ALARM,
+    "More heliostats than the setting `losses` left the receiver within 30 s without an order.",
+    "{count} heliostats left the receiver without an order, seen at {since} UTC",
+    "They have turned away by themselves; automatic control waits and raises nothing.",
+    "Find the cause, make sure that nobody is in the field, then press Resume.",
+    over="automatic control was resumed",
+)
 BEAM_BLOCKED = AlarmKind(
     "beam_blocked",
     _PLANT,

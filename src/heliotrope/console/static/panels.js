@@ -2,7 +2,7 @@
 import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
 import { chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
-import { act, say } from "./orders.js";
+import { act } from "./orders.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
@@ -28,7 +28,7 @@ export function plant(box) {
       ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
       ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
-    proof.replaceChildren(...(head.order.act ? [h("p", { className: head.order.on ? "hx-said bad" : "hx-said" },
+    proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
       `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`)] : []));
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
@@ -186,7 +186,11 @@ export function alarms(box) {
   return refreshed(async () => {
     const rows = await api("GET", "alarms");
     const open = rows.filter((r) => !r.acknowledged_by);
-    const all = async () => { for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => say(error.message, true)); };
+    const all = async () => {
+      const refused = [];
+      for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => refused.push(error.message));
+      if (refused.length) throw new Error(`${refused.length} of ${open.length} refused: ${refused[0]}`);
+    };
     body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, `${open.length} not acknowledged, ${rows.filter((r) => r.active).length} active`),
       canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(all, "acknowledge all") }, "Acknowledge all") : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],

@@ -6,7 +6,8 @@ calibrates it with every target's camera. A failure of one part of automatic con
 event or an alarm, and the rest goes on.
 
 People's commands go through here so that automatic control knows what they want: a heliostat that a
-person has stowed, defocused or locked stays so until a person gives it back.
+person has stowed, defocused or locked stays so until a person gives it back, and one that a person
+has raised and that was lost is left to people.
 """
 
 import asyncio
@@ -50,7 +51,7 @@ from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
 #: People's commands after which automatic control leaves heliostats alone, and those that give them
-#: back to it.
+#: to it until they are lost.
 _AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
 _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
 #: Time between predictions of the flux, s.
@@ -212,6 +213,7 @@ class Operations:
             self.plant.waiting,
             self.logbook.open_alarms,
             self.plant.emergency_on,
+            self.automatic.waits,
             float(extra.pop("lag", 0.0)),
             extra,
         )
@@ -508,13 +510,25 @@ class Operations:
         self.automatic.want(names, wanted=True)
         self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
 
+    def resume(self, person: Person) -> None:
+        """Let automatic control go on after a loss of many heliostats.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        """
+        _operator(person, "resume")
+        self.automatic.resume()
+        self._tell(person, "automatic control resumed", "command")
+
     # -- notes -----------------------------------------------------------------------------
 
     def _meant(self, name: str, heliostats: Sequence[str]) -> None:
         if name in _AWAY:
             self.automatic.want(heliostats, wanted=False)
         elif name in _BACK:
-            self.automatic.want(heliostats, wanted=True)
+            self.automatic.want(heliostats, wanted=True, by_person=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
         some = ", ".join(ticket.heliostats[:3])

@@ -192,9 +192,15 @@ class Viewer:
         plant, order = self._plant, self._plant.emergency
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
+        if not plant.emergency_on:
+            over = f"over: {order.act.name} of the field, ordered by {order.who}"
+            ago = plant.now() - order.at
+            return EmergencyView(
+                False, order.act.name, order.who, order.reason, ago, 0, 0, 0, (), over
+            )
         report, count = order.report(plant.now()), len(order.ticket.heliostats)
         return EmergencyView(
-            plant.emergency_on,
+            True,
             order.act.name,
             order.who,
             order.reason,

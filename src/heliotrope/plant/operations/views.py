@@ -504,6 +504,8 @@ class Summary:
         Number of alarms active or unacknowledged.
     emergency
         Whether an emergency is active.
+    resume
+        Why automatic control waits for a person's Resume, "" if it does not.
     lag
         Delay of the plant's time, s: 0 unless the machine is too slow for a twin's speed.
     extra
@@ -521,5 +523,6 @@ class Summary:
     waiting: int
     alarms: int
     emergency: bool
+    resume: str
     lag: float
     extra: Mapping[str, Any]
