@@ -159,6 +159,61 @@ def test_an_old_or_repeated_sun_gives_nothing() -> None:
     assert bench.true_ms - taken <= 6050
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    ["clock fast by 10 min", "clock slow by 10 min", "longitude", "mirrored", "half a degree"],
+)
+def test_a_sun_that_cannot_follow_from_the_last_one_gives_nothing(wrong: str) -> None:
+    bench = tracking()
+    last = bench.true_ms
+    right = bench.sun
+
+    def sun(second: float) -> np.ndarray:
+        if wrong.startswith("clock"):
+            return right(second + (600 if "fast" in wrong else -600))
+        east, north, up = right(second)
+        turn = math.radians({"longitude": 2.5, "half a degree": 0.5}.get(wrong, 0.0))
+        if wrong == "mirrored":
+            return np.array([-east, north, up])
+        sine, cosine = math.sin(turn), math.cos(turn)
+        return np.array([cosine * east - sine * north, sine * east + cosine * north, up])
+
+    bench.sun = sun  # type: ignore[method-assign]
+    bench.run(7, until="DEFOCUSED")
+    assert bench.state == "DEFOCUSED"
+    assert bench.true_ms - last <= 6050
+    assert bench.controller.sun.leaps >= 4
+    # After the lapse it is taken, as after a start, but STATUS shows it, and nothing tracks again.
+    bench.run(3)
+    assert {"SUN_FRESH", "SUN_JUMPED"} <= flags(bench)
+    assert bench.state == "DEFOCUSED"
+
+
+def test_suns_that_follow_are_taken_however_late_or_rare() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    for _ in range(5):
+        bench.run(5)
+        second = bench.gps_ms() // 1000
+        bench.send("SUN", *bench.sun_values(second - 4))  # after 4 s in transit
+        assert "SUN_FRESH" in flags(bench)
+        bench.send("SUN", *bench.sun_values(second))
+        bench.last_sun_ms = bench.true_ms
+        assert bench.state == "TRACKING"
+    # A night, and a restart in it: the sun has gone round.
+    for restart in (False, True):
+        if restart:
+            bench.start(bench.flash)
+        for _ in range(14):
+            bench.tick(3_600_000)
+        bench.sends_sun = True
+        bench.run(3)
+        bench.sends_sun = False
+        assert "SUN_FRESH" in flags(bench)
+    assert "SUN_JUMPED" not in flags(bench)
+    assert bench.controller.sun.leaps == 0
+
+
 def test_a_sun_that_was_under_way_gives_so_much_less() -> None:
     bench = tracking()
     bench.sends_sun = False

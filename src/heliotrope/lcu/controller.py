@@ -464,6 +464,7 @@ class Controller:
                 self._ticks_jumped,
                 self._present != 0,
                 motion.kind == DIAGNOSE,
+                self.sun.leaps,
             )
         ):
             bits |= bool(value) << i
