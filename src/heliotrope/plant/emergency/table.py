@@ -161,8 +161,8 @@ class TableWatch:
                 f"sensor {name}: no row of the safety table that the plant watches takes it from a "
                 f"sensor; known: {', '.join(sorted(known))}"
             )
-        fed = {name for name in readings.names if DERIVED.get(name) in self._sensors | {None}}
-        able = tuple(row for row in table if row.reading in self._sensors | fed)
+        self._fed = {n for n in readings.names if DERIVED.get(n) in self._sensors | {None}}
+        able = tuple(row for row in table if row.reading in self._sensors | self._fed)
         self.unwatched = tuple(row.name for row in table if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
@@ -196,7 +196,8 @@ class TableWatch:
 
         For ``proof`` and ``called`` see `PlantReadings.take`.
         """
-        readings = {**self._put, **self._own.take(proof, called=called, now=now)}
+        own = self._own.take(proof, called=called, now=now)
+        readings = self._put | {key: each for key, each in own.items() if key[0] in self._fed}
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
             self._state = narrowed(self._state, row.name, subjects)
