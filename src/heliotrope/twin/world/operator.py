@@ -22,14 +22,14 @@ from heliotrope.plant.controller import PlantController
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act
 from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
+from heliotrope.twin.world.worlds import Habits
 
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)
 VIEWER = Person("viewer", Role.VIEWER)
-#: Mean time between two actions, s.
-PAUSE = 2.0
 #: Command that leads on from each state.
 ONWARDS = {
     "": ("APPROACH",), "STOWED": ("APPROACH",),
@@ -50,9 +50,9 @@ class Operator:
     ----------
     clock
         True time.
-    seed
-        Seed of their actions.
-    observer
+    seed, habits
+        Seed of their actions, and how often they take each.
+    observer, beams
         Told of each accepted command.
     names
         Names of the heliostats.
@@ -75,7 +75,9 @@ class Operator:
         self,
         clock: Clock,
         seed: int,
+        habits: Habits,
         observer: PlantObserver,
+        beams: BeamObserver,
         names: Sequence[str],
         pods: Sequence[Pod],
         flux: Callable[[], float],
@@ -84,6 +86,7 @@ class Operator:
         self.away = False
         self.counts: Counter[str] = Counter()
         self._clock, self._observer, self._flux = clock, observer, flux
+        self._beams, self._habits = beams, habits
         self._chance = random.Random(f"operator {seed}")
         self._names, self._pods = sorted(names), pods
         self._duty = ENGINEER
@@ -155,7 +158,7 @@ class Operator:
     async def work(self) -> None:
         """Command without end."""
         while True:
-            await asyncio.sleep(self._chance.expovariate(1 / PAUSE))
+            await asyncio.sleep(self._chance.expovariate(1 / self._habits.pause))
             plant = self.plant
             if plant is None or self.away or self._clock.monotonic() < self._rest_until:
                 continue
@@ -173,7 +176,7 @@ class Operator:
                     self._change,
                     self._astray,
                 ],
-                [60, 14, 8, 4, 2, 3, 5, 4, 4],
+                self._habits.weights,
             )[0]
             does(plant)
             if self._chance.random() < 0.06:
@@ -206,7 +209,9 @@ class Operator:
 
     def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
         self.counts["accepted"] += 1
-        self._observer.accepted(who, token, ticket, what, self._clock.monotonic())
+        now = self._clock.monotonic()
+        self._observer.accepted(who, token, ticket, what, now)
+        self._beams.resumed(ticket.heliostats, what, now)
 
     def _astray(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
@@ -264,7 +269,8 @@ class Operator:
                 ("DIAGNOSE",),
             ]
         ):
-            self._give(plant, what)
+            if what != "IDLE" or self._habits.idle:
+                self._give(plant, what)
 
     def _lock(self, plant: PlantController) -> None:
         self._give(plant, "LOCK", (self._chance.choice(self._names),))
@@ -351,7 +357,7 @@ class Operator:
         whom = (self._chance.choice(pod.boards).outfit.name,)
         what = self._chance.choice(["TRACK", "APPROACH", "REFOCUS", "IDLE"])
         command = Command(f"rogue-{self._number}", what, (), whom, token, 5.0)
-        ear = PlantEar(pod, self._observer)
+        ear = PlantEar(pod, self._observer, self._beams)
         pod.observer.ordered(ear.order(command, now, known=False))
         with contextlib.suppress(LinkClosedError):
             await tap.inner.send(encode(command), expires=now + 5.0)
