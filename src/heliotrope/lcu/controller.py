@@ -160,18 +160,23 @@ class Controller:
             if is_place(point):
                 motion.aim = point
         if not self.config.complete():
-            motion.defocus()  # as far as the settings allow
+            if motion.known:
+                motion.defocus()  # as far as the settings allow
             return self.out
         if looping or not motion.known:
             self.fault = BOOTS if looping else COUNTS
         elif state == states.FAULT:
             self.fault = LATCHED
+        if looping or state in (states.STOWED, states.FAULT):
+            motion.blind = 0  # it was not on the receiver, or has turned away before
         if state == states.LOCKED:
             self._event("BOOT_LOCKED")
         elif self.fault != NO_FAULT:
             self._event("BOOT_FAULT")
         else:
             self._event("BOOT_STOWED" if motion.at_stow() else "BOOT_AWAY")
+        if state in (states.STOWED, states.FAULT) and not looping:
+            motion.blind = 1
         return self.out
 
     # Time.
@@ -227,7 +232,12 @@ class Controller:
             return
         if dark and motion.known and self.config.fits():
             self._event("SILENT")
-        elif silent and motion.kind in (HOLD, MOVE) and not self._present:
+        elif (
+            silent
+            and motion.kind in (HOLD, MOVE)
+            and not self._present
+            and (motion.known or self.state != states.UNCONFIGURED)
+        ):
             self._event("LAPSED")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":

@@ -558,6 +558,8 @@ class Observer:
         board = account.board
         assert board.node is not None
         motion = board.node.controller.motion
+        if not motion.known:
+            return  # it turns away by steps that it counts from anywhere
         for i in (0, 1):
             ordered = board.axes[i].emitted - board.slip[i]
             counted = motion.place(i)
