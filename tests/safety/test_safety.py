@@ -65,6 +65,10 @@ TRIPS = {
         Scope.HELIOSTAT,
         "in a keep-out volume or headin",
     ),
+    "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside its aim"),
+    "pointing_disagrees_many": (120.0, 0.0, Act.DEFOCUS, Scope.FIELD, "counts of 120 heliostats"),
+    "cluster_time_differs": (5.0, 0.0, Act.DEFOCUS, Scope.CLUSTER, "differs from the .* by 5 s"),
+    "cluster_site_differs": (0.04, 0.0, Act.DEFOCUS, Scope.CLUSTER, "site is 2.29° off that of"),
     "node_faults": (0.03, 0.0, Act.REFUSE_NEW, Scope.FIELD, "3 % of the heliostats failed"),
     "node_faults_many": (0.2, 0.0, Act.DEFOCUS, Scope.FIELD, "20 % of the heliostats failed"),
 }

@@ -43,11 +43,12 @@ from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
+from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck, default_aims
 from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
 from heliotrope.plant.audit import Audit, AuditError
 from heliotrope.plant.authority import Authority, Grant, Person, Role
-from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
@@ -154,6 +155,9 @@ class PlantController:
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
+        self._agreement = Agreement(
+            self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
+        )
         self._clusters = Clusters(members, links, clock, self.counters)
         self._orders = PlantOrders(
             clock,
@@ -179,7 +183,12 @@ class PlantController:
     def _guarded(self, rows: Iterable[Condition]) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
         readings = PlantReadings(
-            self.field, self.authority, self._orders, self._ways, self.sun_vector
+            self.field,
+            self.authority,
+            self._orders,
+            self._ways,
+            self._agreement,
+            self.sun_vector,
         )
         return Sentinel(
             self.clock,
@@ -246,6 +255,7 @@ class PlantController:
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
+        self._agreement.take(end.name, status)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -478,6 +488,11 @@ class PlantController:
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self.field.names
         clear, blocked = self._ways.clear(name, numbers, names, self.now())
+        if name in JOINING and (barred := self._sentinel.barred(names)):
+            if len(barred) == len(names):
+                raise BeamError(name, barred)
+            clear = tuple(n for n in clear if n not in barred)
+            blocked |= barred
         ticket = self._accept(person, token, name, numbers, names)
         ticket.block(blocked)
         if name not in SETTINGS:
@@ -581,6 +596,7 @@ class PlantController:
         """
         row = self.field.place(heliostat)
         self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)
+        self._agreement.believe(row, mechanism)
         self.wanted.set(heliostat, items_of(mechanism))
         self._sync.compare(heliostat)
 

@@ -129,6 +129,7 @@ class Sentinel:
         wanted = self.table.off()
         self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
         order = self.order if self.on else None
+        sent: dict[Act, dict[str, str]] = {}
         for name, (act, text) in wanted.items():
             tries, due = self._tries.get(name, (0, -math.inf))
             whole = order is not None and now - order.at < OFF_SHOWS
@@ -138,8 +139,11 @@ class Sentinel:
             best = self._ways.way_out(name, again=tries > 0)
             if order is not None:
                 best = max(best, order.act)
-            self._joining.drop(text, frozenset([name]))
-            self.send_safe(_TABLE, max(act, best), (name,), text)
+            sent.setdefault(max(act, best), {})[name] = text
+        for act, texts in sent.items():
+            why = "; ".join([*texts.values()][:3])
+            self._joining.drop(why, frozenset(texts))
+            self.send_safe(_TABLE, act, tuple(texts), why)
 
     # -- orders ----------------------------------------------------------------------------
 
@@ -223,6 +227,11 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
             )
+
+    def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
+        """Return which heliostats may not join their aims, and why."""
+        barred = self.table.barred()
+        return {name: barred[name] for name in heliostats if name in barred}
 
     def refusal(self, clusters: Iterable[str]) -> str:
         """Return why no new motion may begin in some clusters, "" if it may."""

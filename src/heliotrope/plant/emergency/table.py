@@ -7,6 +7,7 @@ import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.field_state import FieldState
@@ -41,6 +42,10 @@ OWN_READINGS = frozenset(
         "sun_elevation",
         "audit_silence",
         "node_fault_share",
+        "cluster_time_off",
+        "cluster_sun_off",
+        "pointing_error",
+        "pointing_errors",
     }
 )
 #: Rows that follow from an emergency; by themselves they keep none going.
@@ -56,7 +61,7 @@ class PlantReadings:
 
     Parameters
     ----------
-    field, authority, orders, beams
+    field, authority, orders, beams, agreement
         Of the plant.
     sun
         Returns the unit vector to the sun now, (3,).
@@ -73,10 +78,11 @@ class PlantReadings:
         authority: Authority,
         orders: PlantOrders,
         beams: BeamWatch,
+        agreement: Agreement,
         sun: Callable[[], FloatArray],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
-        self._beams, self._sun = beams, sun
+        self._beams, self._agreement, self._sun = beams, agreement, sun
         self._sun_at = -math.inf
         self._elevation = -0.5 * np.pi
         self.names = OWN_READINGS | ({"keep_out_predicted"} if beams.watches else set())
@@ -106,6 +112,7 @@ class PlantReadings:
             ("sun_elevation", ""): Reading(self._elevation, now),
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
             **self._beams.readings(now),
+            **self._agreement.readings(now),
         }
         for name, at in self._field.status_at.items():
             if math.isfinite(at):
@@ -235,6 +242,14 @@ class TableWatch:
         return {
             a.subject: (a.act, a.text)
             for a in reversed(self.actions)
+            if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject and not a.waits
+        }
+
+    def barred(self) -> dict[str, str]:
+        """Return the heliostats that may not join their aims, by name, and why."""
+        return {
+            a.subject: a.text
+            for a in self.actions
             if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject
         }
 
