@@ -3,6 +3,7 @@
 import math
 import struct
 from binascii import crc32
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from heliotrope.lcu.messages import (
     REFUSED_KEY,
     REFUSED_STATE,
 )
+from heliotrope.lcu.motion import HOLD, MOVE
 from support.lcu_machines import (
     ADDRESS,
     AIM,
@@ -421,6 +423,76 @@ def test_tracking_needs_the_safe_way_first() -> None:
     assert halfway.order("REFOCUS") == REFUSED_STATE
     halfway.run(120, until="STOWED")  # a beam that does not go with the sun is not left there
     assert halfway.state == "STOWED"
+
+
+@pytest.mark.parametrize("way", ["by STOW", "by STOW, broken off", "by silence", "by a fault"])
+def test_stow_ends_what_the_safe_way_has_earned(way: str) -> None:
+    """Invariant 3: after a return to stow, or part of it, TRACK needs the safe way again."""
+    bench = tracking()
+    if way == "by silence":
+        bench.sends_sun = bench.sends_time = False
+        bench.run(300, until="STOWED")
+        bench.sends_sun = bench.sends_time = True
+    elif way == "by a fault":
+        bench.node.on_fault(controller.TEMPERATURE, bench.now, False)
+        bench.node.fault_gone(controller.TEMPERATURE)
+        bench.run(200)
+        assert bench.order("CLEAR_FAULT") == DONE
+    else:
+        assert bench.order("STOW") == DONE
+        bench.run(300 if way == "by STOW" else 2, until="STOWED")
+        assert bench.order("LOCK") == DONE
+        bench.run(2)
+        assert bench.order("UNLOCK") == DONE
+    bench.run(3)
+    assert bench.state == ("IDLE" if "broken" in way else "STOWED")
+    assert "READY" not in flags(bench)
+    assert bench.order("IDLE") == DONE
+    for name in ("TRACK", "REFOCUS"):
+        assert bench.order(name) == REFUSED_STATE
+    assert bench.order("SEARCH", 1e-3, 0.01) == REFUSED_STATE
+    assert bench.state == "IDLE"
+    assert bench.controller.motion.kind == HOLD
+
+
+@pytest.mark.parametrize("name", ["TRACK", "SEARCH", "REFOCUS"])
+def test_nothing_goes_onto_the_receiver_without_a_fresh_sun(name: str) -> None:
+    bench = standing_by()
+    assert bench.order("JOG", 0, 100) == DONE
+    bench.sends_sun = False
+    bench.run(8)  # dusk: the cluster is heard, so a jogged mirror stays
+    assert bench.state == "IDLE"
+    assert "READY" in flags(bench)
+    assert "SUN_FRESH" not in flags(bench)
+    values = (2e-3, 0.02) if name == "SEARCH" else ()
+    assert bench.order(name, *values) == REFUSED_STATE
+    assert (bench.state, bench.controller.motion.kind) == ("IDLE", MOVE)
+
+
+def test_the_approach_passes_the_ground_beside_the_tower_and_its_foot_in_this_order() -> None:
+    bench = brought_to("STOWED")
+    assert bench.order("AIM", *AIM) == DONE
+    east, north, up = bench.machine.position
+    half = np.array([STANDBY[0] - east, STANDBY[1] - north]) / 2
+    sine, cosine = 0.5, math.sqrt(0.75)
+    aside = east + cosine * half[0] - sine * half[1], north + sine * half[0] + cosine * half[1], up
+    assert bench.order("APPROACH") == DONE
+    passed: dict[str, list[float]] = {}
+    while bench.state == "APPROACHING":
+        bench.run(0.05)
+        for place, point in (
+            ("beside", aside), ("foot", (*STANDBY[:2], up)), ("standby", STANDBY)
+        ):  # fmt: skip
+            passed.setdefault(place, []).append(bench.miss(point))
+    nearest = {place: int(np.argmin(misses)) for place, misses in passed.items()}
+    assert max(min(misses) for misses in passed.values()) < 1.0
+    assert nearest["beside"] < nearest["foot"] < nearest["standby"]
+    seen = [np.subtract(point, (east, north, up)) for point in bench.controller.motion.way()]
+    for one, other in pairwise(point / np.linalg.norm(point) for point in seen):
+        assert math.acos(min(1.0, one @ other)) < 0.11
+    # From the foot on it rises below the standby point, never beside it.
+    rise = passed["standby"][nearest["foot"] :]
+    assert all(after <= before + 0.5 for before, after in pairwise(rise))
 
 
 def test_approach_needs_sun_and_a_way() -> None:

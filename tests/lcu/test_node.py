@@ -218,6 +218,29 @@ def test_steps_that_the_timer_still_held_are_not_counted_when_the_supply_falls()
     assert [kept.primary, kept.secondary] == bench.made
 
 
+def test_the_last_record_of_a_falling_supply_leaves_out_steps_that_were_not_made() -> None:
+    # The supply dies right after that record: no other one corrects it.
+    bench = tracking()
+    bench.order("STOW")
+    bench.run(6)
+    flash = frail(bench)
+    bench.motors.undone = 37, -11
+    brown_out = bench.journal.brown_out
+
+    def last(primary: int, secondary: int) -> bool:
+        kept = brown_out(primary, secondary)
+        flash.worn = True
+        return kept
+
+    bench.journal.brown_out = last  # type: ignore[method-assign]
+    assert bench.node.on_supply_failing(bench.now)
+    kept = Journal(flash)
+    kept.load()
+    assert [kept.primary, kept.secondary] == bench.made
+    assert kept.rest
+    assert kept.doubt == 0
+
+
 def test_a_minute_without_trouble_is_healthy() -> None:
     bench = tracking()
     bench.start(bench.flash)
