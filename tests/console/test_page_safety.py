@@ -48,7 +48,7 @@ def _counted(page: Any) -> list[str]:
 
 def _open_order(page: Any) -> None:
     page.evaluate("heliotrope.store.select([3], 3)")
-    page.click(".hx-orders >> text=Hold")
+    page.click(".hx-orders >> text=Out of service")
     page.wait_for_selector("dialog[open]")
 
 
@@ -188,3 +188,38 @@ def test_a_refused_acknowledgement_is_not_shown_as_done(enter: Callable[..., Any
     page.click(".hx-tabs >> text=Alarms")
     page.click(".hx-alarms >> text=Acknowledge all")
     said(page, "1 of 1 refused: wind_gust_stow: its cause has not gone")
+
+
+# -- out of service ----------------------------------------------------------------------------
+
+
+def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, viewer = enter("operator"), enter("viewer")
+    name = field.live.names[3]
+    page.evaluate("heliotrope.store.select([3], 3)")
+    page.click(".hx-orders >> text=Out of service")
+    page.fill("dialog [name=reason]", "washing")
+    page.fill("dialog [name=hours]", "2")
+    page.click("dialog >> text='Out of service'")
+    for each in (page, viewer):
+        each.wait_for_selector(".hx-legend .hx-out:has-text('out of service 1')")
+        assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == 3
+    field.until(lambda: field.live.operations.heliostat(name).state == "STOWED", 60.0)
+    page.click(".hx-tabs >> text=Heliostat")
+    page.wait_for_selector(".hx-heliostat dd:has-text('washing (operator, since')")
+    page.wait_for_selector(".hx-heliostat dd:has-text('expected back'):has-text('in stow')")
+    # The whole field is given to automatic control: it stays where it is.
+    page.select_option(".hx-to select", "field")
+    page.click(".hx-orders >> text=Automatic")
+    page.click("dialog >> text='Give to automatic control'")
+    page.wait_for_timeout(5000)
+    assert field.call(lambda: field.live.operations.heliostat(name).state) == "STOWED"
+    page.click(".hx-tabs >> text=Schedule")
+    row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
+    assert "STOWED" in row.inner_text()
+    row.locator("text=Give back").click()
+    page.click("dialog >> text='Give back'")
+    page.wait_for_function("heliotrope.store.out.every((one) => !one)")
+    page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")

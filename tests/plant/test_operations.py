@@ -343,6 +343,7 @@ def test_persons_come_before_the_automat() -> None:
             shown.take_authority(VIEWER)
         for refused in (
             lambda: shown.hold(VIEWER, names[:1], "why"),
+            lambda: shown.unhold(VIEWER, names[:1]),
             lambda: shown.switch_calibration(VIEWER, False),
             lambda: shown.give_back(VIEWER),
             lambda: shown.acknowledge(VIEWER, "records"),
@@ -359,6 +360,9 @@ def test_persons_come_before_the_automat() -> None:
         grant = shown.take_authority(OPERATOR)
         assert shown.summary().holder == "Olga"
         assert shown.calibration().reason == "it is switched off"
+        # The heliostat that was out of service for a moment is on its way back to stow.
+        await asyncio.sleep(10.0)
+        shown.keep_authority(OPERATOR, grant.token)
         shown.command(OPERATOR, grant.token, "APPROACH", names[:1])
         for _ in range(9):
             await asyncio.sleep(5.0)
@@ -391,6 +395,72 @@ def test_persons_come_before_the_automat() -> None:
         assert any("EMERGENCY STOW: a fire" in event.text for event in shown.events())
 
     live(work, AutomaticSettings(wanted=True, calibrate=False))
+
+
+def test_a_heliostat_out_of_service_is_moved_by_nobody() -> None:
+    async def work(plant: LivePlant) -> None:
+        shown, name = plant.operations, plant.names[0]
+        await asyncio.sleep(200.0)
+        assert _states(plant) == ["TRACKING"] * 4
+        shown.hold(OPERATOR, (name,), "washing", 2.0)
+        (lockout,) = shown.holds()
+        assert lockout.until - lockout.since == 7200.0
+        assert "washing (Olga, since 21 Oct 07:03 UTC" in shown.heliostat(name).hold
+        await asyncio.sleep(120.0)
+        assert list(shown.frame().held) == [True, False, False, False]
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+        # Neither automatic control nor a group's command nor a person's moves it.
+        shown.give_back(OPERATOR)
+        shown.give_back(OPERATOR, (name,))
+        await asyncio.sleep(60.0)
+        token = shown.take_authority(ENGINEER).token
+        await asyncio.sleep(3.0)
+        ticket = shown.command(ENGINEER, token, "IDLE")
+        aims = shown.aim_at(ENGINEER, token, (), "receiver")
+        await asyncio.sleep(8.0)
+        for each in (ticket, aims):
+            assert each.blocked == {name: f"out of service: {lockout.text}"}
+        for command in ("APPROACH", "TRACK", "UNLOCK", "JOG", "CLEAR_FAULT", "GOTO"):
+            values = {"JOG": (0, 100), "GOTO": (0, 0)}.get(command, ())
+            with pytest.raises(RefusedError, match=f"{command} {name}: out of service: washing"):
+                shown.command(ENGINEER, token, command, (name,), values)
+        with pytest.raises(RefusedError, match="out of service: washing"):
+            shown.aim_at(ENGINEER, token, (name,), "left")
+        assert _states(plant) == ["STOWED", "IDLE", "IDLE", "IDLE"]
+        # What is safe passes.
+        for safe in (shown.defocus, shown.stow):
+            assert not safe(OPERATOR, (name,)).blocked
+        # Its owner or an engineer gives it back; then it goes up again.
+        other = Person("Otto", Role.OPERATOR)
+        for act in (lambda: shown.unhold(other, (name,)), lambda: shown.hold(other, (name,), "x")):
+            with pytest.raises(RefusedError, match="its owner or an engineer"):
+                act()
+        shown.unhold(OPERATOR, (name,))
+        assert shown.holds() == ()
+        shown.release_authority(ENGINEER, token)
+        shown.give_back(OPERATOR)
+        await asyncio.sleep(200.0)
+        assert _states(plant)[0] == "TRACKING"
+
+    live(work, AutomaticSettings(wanted=True, calibrate=False, margin=0.0))
+
+
+def test_out_of_service_outlasts_a_restart_and_its_time(tmp_path: Path) -> None:
+    keeper = Keeper(tmp_path / "store.sqlite", inline=True)
+    settings_ = AutomaticSettings(wanted=True, calibrate=False, margin=0.0)
+
+    async def take_out(plant: LivePlant) -> None:
+        plant.operations.hold(OPERATOR, plant.names[:1], "a new gear", 0.01)
+
+    async def stay(plant: LivePlant) -> None:
+        await asyncio.sleep(200.0)
+        (lockout,) = plant.operations.holds()
+        assert lockout.until < plant.clock.utc().timestamp()
+        assert _states(plant) == ["STOWED", "TRACKING", "TRACKING", "TRACKING"]
+
+    for work in (take_out, stay):
+        live(work, settings_, records=keeper)
+    keeper.close()
 
 
 async def _cut(plant: LivePlant, cluster: str, seconds: float) -> None:

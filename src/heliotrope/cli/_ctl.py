@@ -257,6 +257,31 @@ def calibration(
     print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
 
 
+@app.command("out-of-service")
+def out_of_service(
+    context: typer.Context,
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
+    reason: Annotated[str, typer.Option(help="Reason, shown to everybody.")],
+    hours: Annotated[
+        float | None, typer.Option(help="Hours until they are expected back.", show_default=False)
+    ] = None,
+) -> None:
+    """Take heliostats out of service: they go to stow, and nobody moves them."""
+    order = {"heliostats": heliostats, "reason": reason, "hours": hours}
+    with _client(context) as client:
+        print_json(client.ask("POST", "holds", order))
+
+
+@app.command("give-back")
+def give_back(
+    context: typer.Context,
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
+) -> None:
+    """Give heliostats back to service, each by its name; nothing moves."""
+    with _client(context) as client:
+        print_json(client.ask("POST", "holds/release", {"heliostats": heliostats}))
+
+
 @app.command()
 def resume(context: typer.Context) -> None:
     """Let automatic control go on after a loss of many heliostats."""

@@ -14,7 +14,7 @@ import asyncio
 import math
 import secrets
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -54,6 +54,7 @@ from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
+from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
 from heliotrope.plant.parameters import ParameterSync
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
@@ -113,6 +114,8 @@ class PlantController:
         Mirrors and keep-out volumes; see `BeamCheck`.
     alarms
         The last alarms, oldest first.
+    out_of_service
+        Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
         Assigned points, ENU, m, (N, 3); NaN where there is none.
 
@@ -152,6 +155,7 @@ class PlantController:
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
+        self.out_of_service: dict[str, Lockout] = {}
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
@@ -487,14 +491,16 @@ class PlantController:
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self.field.names
-        clear, blocked = self._ways.clear(name, numbers, names, self.now())
-        if name in JOINING and (barred := self._sentinel.barred(names)):
-            if len(barred) == len(names):
+        out = self._locked_out(name, names)
+        able = tuple(n for n in names if n not in out)
+        clear, blocked = self._ways.clear(name, numbers, able, self.now())
+        if name in JOINING and (barred := self._sentinel.barred(able)):
+            if len(barred) == len(able):
                 raise BeamError(name, barred)
             clear = tuple(n for n in clear if n not in barred)
             blocked |= barred
         ticket = self._accept(person, token, name, numbers, names)
-        ticket.block(blocked)
+        ticket.block({**blocked, **out})
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -614,6 +620,8 @@ class PlantController:
     def _point(
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
+        out = self._locked_out(name, points)
+        points = {n: point for n, point in points.items() if n not in out}
         names = tuple(points)
         rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
         wanted = points_of(name, points)
@@ -621,7 +629,8 @@ class PlantController:
         self._ways.check_points(name, rows, wanted, tracking)
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
-        ticket = self._accept(person, token, name, values, names, f"{len(groups)} points")
+        ticket = self._accept(person, token, name, values, (*names, *out), f"{len(groups)} points")
+        ticket.block(out)
         if problem := self._ways.points.assign(name, rows, wanted):
             ticket.advance(names, Stage.FAILED, f"not sent, because it cannot be stored: {problem}")
             return ticket
@@ -645,6 +654,16 @@ class PlantController:
     ) -> None:
         until = self.now() + self.settings.join_wait
         self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))
+
+    def _locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
+        """Return which heliostats are out of service, and why; refuse if all of them are."""
+        out = locked_out(self.out_of_service, name, heliostats)
+        if out and len(out) == len(heliostats):
+            first, more = next(iter(out)), f" and {len(out) - 1} more" if len(out) > 1 else ""
+            raise refusals.OUT_OF_SERVICE.error(
+                what=name, heliostat=first, more=more, reason=out[first]
+            )
+        return out
 
     def _accept(
         self,

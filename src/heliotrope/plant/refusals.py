@@ -99,6 +99,18 @@ BEAM_REFUSED = Refusal(
     "{what} {heliostat}{more}: {reason}",
     "Choose another point, or leave out the heliostat that the text names.",
 )
+OUT_OF_SERVICE = Refusal(
+    "out of service",
+    "The heliostat is out of service, and the command would move it.",
+    "{what} {heliostat}{more}: {reason}",
+    "Make sure that nobody is at the mirror, then give it back by name. DEFOCUS and STOW pass.",
+)
+NOT_OWNER = Refusal(
+    "not the owner",
+    "A heliostat that another person took out of service is given back or taken out again.",
+    "{what}: {heliostat} is out of service: {text}; its owner or an engineer gives it back",
+    "Ask the owner or an engineer.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",

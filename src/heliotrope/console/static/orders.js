@@ -77,8 +77,8 @@ const ORDERS = [
     [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
   ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
   ["Zero…", "", zero, "engineer"],
-  ["Hold…", "", () => order("HOLD", "Exclude from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
-    [{ name: "reason", label: "Reason" }]), "free"],
+  ["Out of service…", "", () => order("HOLD", "Out of service", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason, hours: Number(v.hours) || null }),
+    [{ name: "reason", label: "Reason: it goes to stow, and nobody moves it until it is given back by name" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }]), "free"],
   ["Automatic", "", () => order("AUTO", "Give to automatic control", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],
 ];
 

@@ -1,7 +1,7 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
-import { chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
+import { ask, chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
 import { act } from "./orders.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
@@ -101,7 +101,7 @@ function heliostatView(one) {
       one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
       ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
       ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
-      one.hold ? ["On hold", one.hold, "warn"] : null]),
+      one.hold ? ["Out of service", `${one.hold}; ${one.state === "STOWED" ? "in stow" : "NOT IN STOW"}`, "warn"] : null]),
     h("h3", {}, "Drives"),
     one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
       ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
@@ -221,6 +221,13 @@ export function logs(box) {
   return refreshed(load, { key: () => store.head?.events, every: 3 });
 }
 
+const minute = (at) => (at ? new Date(1e3 * at).toISOString().slice(5, 16).replace("T", " ") : "–");
+const stateOf = (name) => h("span", { className: store.stateName(store.index.get(name)) === "STOWED" ? "good" : "bad" }, store.stateName(store.index.get(name)));
+async function giveBack(one) {
+  const sure = await ask(`Give ${one.heliostat} back to service? ${one.who} took it out: ${one.reason}. Make sure that nobody is at the mirror.`, [], "Give back");
+  if (sure) await act(() => api("POST", "holds/release", { heliostats: [one.heliostat] }), `give back ${one.heliostat}`);
+}
+
 export function schedule(box) {
   const body = h("div");
   box.append(body);
@@ -229,9 +236,10 @@ export function schedule(box) {
     body.replaceChildren(h("h3", {}, "Next measurements"),
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
-      h("h3", {}, "Excluded from calibration"),
-      holds.length ? table([["Heliostat", (r) => r.heliostat], ["By", (r) => r.who], ["Since", (r) => clock(r.since)], ["Why", (r) => r.reason],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "release") }, "Release") : "")]], holds)
+      h("h3", {}, "Out of service"),
+      holds.length ? table([["Heliostat", (r) => r.heliostat], ["State", (r) => stateOf(r.heliostat)], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
+        ["Expected back", (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? " overdue" : "")], ["Why", (r) => r.reason],
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, "Give back…") : "")]], holds, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "None."));
   }, { every: 5 });
 }

@@ -26,7 +26,8 @@ from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
 from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.operations.views import CalibrationView, HeldHeliostat, Planned
+from heliotrope.plant.operations.service import Service
+from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
@@ -102,8 +103,8 @@ class AutomaticControl:
         Book of calibrations.
     truth
         True errors, known to a twin only.
-    holds
-        Heliostats that people keep out of calibration, by name.
+    service
+        Heliostats out of service.
     installed
         Tracking error that the priors allow an uncalibrated heliostat, rad.
     """
@@ -126,7 +127,7 @@ class AutomaticControl:
         self.book = CalibrationBook(plant, "malan8" if cycle is None else cycle.settings.model)
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
-        self.holds: dict[str, HeldHeliostat] = self._keeping.holds(self._utc())
+        self.service = Service(plant, self._keeping)
         self._raising = Raising(
             plant,
             logbook,
@@ -170,22 +171,6 @@ class AutomaticControl:
         """Go on after a loss of many heliostats."""
         self._losses.resume()
 
-    def hold(self, who: str, heliostats: Sequence[str], reason: str) -> None:
-        """Keep heliostats out of calibration."""
-        now = self._utc()
-        for name in heliostats:
-            self._plant.field.place(name)
-        for name in heliostats:
-            self.holds[name] = HeldHeliostat(name, who, reason, now)
-        self._keeping.hold(heliostats, reason, who, now)
-
-    def unhold(self, who: str, heliostats: Sequence[str]) -> None:
-        """Give heliostats back to calibration."""
-        for name in heliostats:
-            self._plant.field.place(name)
-            self.holds.pop(name, None)
-        self._keeping.unhold(heliostats, who, self._utc())
-
     def stop(self) -> None:
         """Begin nothing more; to be called before `run` is cancelled."""
         self._stopped = True
@@ -206,12 +191,6 @@ class AutomaticControl:
             self._plant.release_authority(AUTOMATIC, self._token)
 
     # -- views -----------------------------------------------------------------------------
-
-    def held_rows(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats are held, (N,)."""
-        held = np.zeros(len(self._plant.field), dtype=np.bool_)
-        held[[self._plant.field.place(name) for name in self.holds]] = True
-        return held
 
     def view(self) -> CalibrationView:
         """Return the progress of calibration."""
@@ -332,11 +311,13 @@ class AutomaticControl:
     # -- parts of the work -----------------------------------------------------------------
 
     async def _raise(self) -> None:
+        self.service.park()
         if self._plant.emergency_on:
             self._raising.give_up()
         self._raising.lose(self._losses.look(self._raising.wanted))
         if not self._why_idle():
-            await self._raising.step(self._token, self._visiting, self._losses.settling())
+            resting = self._losses.settling() | self.service.rows()
+            await self._raising.step(self._token, self._visiting, resting)
 
     def _visiting(self) -> frozenset[str]:
         if self._calibrating is None:
@@ -346,7 +327,7 @@ class AutomaticControl:
     def _ready(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats may be calibrated now, (N,)."""
         ready = self._plant.field.among(_READY, self._plant.now()) & self._raising.wanted
-        ready &= ~self.held_rows()
+        ready &= ~self.service.rows()
         ready[[self._plant.field.place(name) for name in self._visiting()]] = False
         return ready
 

@@ -48,7 +48,7 @@ class FieldFrame:
     on
         Place in `Operations.aim_names` of the aim of each, uint8, (N,); 0: none.
     held
-        Whether a person keeps it out of calibration, bool, (N,).
+        Whether it is out of service, bool, (N,).
     truth_error
         True tracking error, known to a twin only, rad, float32, (N,); None for a real plant.
     """
@@ -169,7 +169,7 @@ class HeliostatView:
     planned
         Its next visit, if one is planned.
     hold
-        Why a person keeps it out of calibration, "" if nobody does.
+        Why it is out of service, who took it out, and when it is expected back; "" if it is not.
     """
 
     name: str
@@ -436,16 +436,6 @@ class CameraView:
     jpeg: bytes
     reading: tuple[str, ...] = ()
     centroid: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class HeldHeliostat:
-    """A heliostat kept out of calibration: the person, the reason, and the time (POSIX s)."""
-
-    heliostat: str
-    who: str
-    reason: str
-    since: float
 
 
 @dataclass(frozen=True)
