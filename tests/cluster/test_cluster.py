@@ -22,7 +22,7 @@ from heliotrope.links.messages import (
 )
 from heliotrope.safety import Alarm, Severity
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
-from support.clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
+from support.clusters import AIM, TOKEN, Board, Field, boards_in, run
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 
@@ -457,7 +457,7 @@ def test_a_cluster_runs_once() -> None:
 
 
 def test_the_bus_may_be_closed_first() -> None:
-    boards = boards_in("IDLE")
+    boards, start = boards_in("IDLE")
 
     async def main(clock: VirtualClock) -> None:
         field = Field(clock, boards=boards)
@@ -466,7 +466,7 @@ def test_the_bus_may_be_closed_first() -> None:
                 await asyncio.sleep(2.2)
             await asyncio.sleep(2.0)
 
-    run_virtual(main, start=LATER)
+    run_virtual(main, start=start)
 
 
 def test_what_no_plant_says_is_an_alarm() -> None:
