@@ -188,7 +188,7 @@ def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Pat
     plant, row = bench.plant, bench.plant.field.place(NAME)
     other, agreement = DESIGN.heliostat("P5B"), plant._agreement
     before = agreement._armature[row].copy()
-    agreement.believe(row, other)
+    agreement.believe(row, other.armature.table, other.drives.table)
     agreement._look(1.0)
     assert np.array_equal(agreement._armature[row], before)
     plant.field.rows["armature_crc"][row] = crc32(items_of(other)["armature"])

@@ -17,8 +17,7 @@ from heliotrope.geometry import FloatArray, normalize
 from heliotrope.lcu import states
 from heliotrope.links.messages import ClusterStatus
 from heliotrope.mechanism.armature import Armature
-from heliotrope.mechanism.board_items import items_of
-from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.board_items import packed
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
@@ -67,7 +66,7 @@ class Agreement:
     ) -> None:
         self._field, self._points, self._site, self._utc = field, points, site, utc
         self._armature, self._drives = check.armature.table.copy(), check.drives.table.copy()
-        #: New calibrations that the local controllers do not store yet: checksum, armature, drives.
+        #: New parameters that the local controllers do not store yet: checksum, armature, drives.
         self._pending: dict[int, tuple[int, FloatArray, FloatArray]] = {}
         self._time_off = dict.fromkeys(field.clusters, 0.0)
         self._sun_off = dict.fromkeys(field.clusters, 0.0)
@@ -79,10 +78,9 @@ class Agreement:
         self._wrong: dict[str, float] = {}
         self._at = -np.inf
 
-    def believe(self, row: int, mechanism: Mechanism) -> None:
-        """Take a new calibration, which holds once the local controller reports its checksum."""
-        crc = crc32(items_of(mechanism)["armature"])
-        self._pending[row] = crc, mechanism.armature.table, mechanism.drives.table
+    def believe(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
+        """Take new parameters, which hold once the local controller reports their checksum."""
+        self._pending[row] = crc32(packed("armature", tuple(armature))), armature, drives
 
     def take(self, cluster: str, status: ClusterStatus) -> None:
         """Take a cluster's status that has just arrived."""

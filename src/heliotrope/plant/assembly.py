@@ -170,9 +170,11 @@ class PlantAssembly:
 
     def _want(self) -> None:
         """Want every local controller to store the machine table and the last calibration."""
-        for name in self.names:
+        for name, point in zip(self.names, self.plant.standbys, strict=True):
             mechanism = self.plant.beliefs.present(name)[0]
             self.plant.wanted.set(name, items_of(mechanism, self.design.machine(name)))
+            if np.isfinite(point).all():
+                self.plant.wanted.rest(name, tuple(point))
 
     # -- running ---------------------------------------------------------------------------
 

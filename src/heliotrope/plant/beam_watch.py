@@ -149,6 +149,45 @@ class BeamWatch:
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
 
+    def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
+        """Return why new parameters may not be written where a heliostat stands, "" if they may.
+
+        With the present parameters and with the new ones, its beam must be free where it stands
+        and on the way from there to its standby point.
+
+        Parameters
+        ----------
+        heliostat
+            Name of the heliostat, which is at rest.
+        armature, drives
+            The new tables, (18,) and (2, 19).
+        """
+        row = self._field.place(heliostat)
+        if not self._check.volumes or not np.isfinite(self._field.posed_at[row]):
+            return ""
+        present = self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
+        try:
+            for tables in (present, (armature, drives)):
+                self._check.replace(row, *tables)
+                if wrong := self._from_here(np.array([row])):
+                    return wrong[heliostat].partition(";")[0]
+        finally:
+            self._check.replace(row, *present)
+        return ""
+
+    def _from_here(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not go from where they stand to standby, and why."""
+        light = self._sun()
+        here = self._angles(rows, self._field.posed[rows])
+        wrong = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
+        known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
+        good, path = self._to_standby(known, light)
+        wrong |= {
+            self._field.names[row]: "its standby point cannot be reached"
+            for row in np.setdiff1d(known, good)
+        }
+        return wrong | self._check.moving(good, path, light)
+
     def joining(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
     ) -> dict[str, str]:

@@ -39,7 +39,7 @@ from heliotrope.links.messages import (
     ProtocolError,
     Stage,
 )
-from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
@@ -56,7 +56,7 @@ from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
 from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.parameters import ParameterSync
+from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act, Alarm, Condition, conditions
@@ -64,6 +64,8 @@ from heliotrope.sun import fast_vector
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
+#: Commands that move heliostats by their parameters.
+MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
 #: Commands that move nothing.
 SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that assign points; `PlantController.aim` and `standby` prove their beams.
@@ -176,7 +178,7 @@ class PlantController:
             self._joining, self._orders, self._ways, self.settings.join_life
         )
         self._sync = ParameterSync(
-            self.field, self.wanted, self._orders, self._clusters, self._tell
+            self.field, self.wanted, self._orders, self._clusters, self._tell, self._rewriting
         )
         rows = conditions(self.settings.autonomy) if table is None else table
         self._sentinel = self._guarded(rows)
@@ -492,15 +494,10 @@ class PlantController:
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self.field.names
         out = self._locked_out(name, names)
-        able = tuple(n for n in names if n not in out)
+        able, wrong = self._able(name, tuple(n for n in names if n not in out))
         clear, blocked = self._ways.clear(name, numbers, able, self.now())
-        if name in JOINING and (barred := self._sentinel.barred(able)):
-            if len(barred) == len(able):
-                raise BeamError(name, barred)
-            clear = tuple(n for n in clear if n not in barred)
-            blocked |= barred
         ticket = self._accept(person, token, name, numbers, names)
-        ticket.block({**blocked, **out})
+        ticket.block({**wrong, **blocked, **out})
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -572,9 +569,27 @@ class PlantController:
         return self._point(person, token, "STANDBY", points)
 
     def parameters(
-        self, person: Person, token: int, heliostat: str, items: Mapping[str, bytes]
+        self,
+        person: Person,
+        token: int,
+        heliostat: str,
+        items: Mapping[str, bytes],
+        confirmed: str = "",
     ) -> Ticket:
         """Push items of the journal (see `board_items`) to one heliostat, and keep them wanted.
+
+        Items that change its pose are accepted only where its beam is safe: at stow, or standing
+        still where its beam and its way to standby are free with the present parameters and with
+        the new ones.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostat, items
+            Name, and bytes by item.
+        confirmed
+            Why a change above the limit of the settings is right; the audit keeps it.
 
         Raises
         ------
@@ -583,13 +598,62 @@ class PlantController:
         InputError
             Items that no plant pushes.
         """
-        self.field.place(heliostat)
+        row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
-        note = ", ".join(items)
+        before, after = self._tables(heliostat, items)
+        if POSE_ITEMS.intersection(items):
+            self.authority.check(person, token, "PARAMETERS")
+            self._sync.check(heliostat, items)
+            change, limit = change_of_beam(before, after, self._aimed(row)), self.settings
+            if not confirmed.strip() and change > limit.largest_change:
+                raise refusals.CHANGE_TOO_LARGE.error(
+                    heliostat=heliostat, change=1e3 * change, limit=1e3 * limit.largest_change
+                )
+        note = ", ".join(items) + (f"; confirmed: {confirmed}" if confirmed else "")
         ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
         self.wanted.set(heliostat, items)
+        self._use(row, *after)
+        self._joining.drop("its parameters are being written", frozenset([heliostat]))
         self._sync.push(ticket, heliostat, items, token)
         return ticket
+
+    def _use(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
+        """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
+        self.beams.replace(row, armature, drives)
+        self._agreement.believe(row, armature, drives)
+
+    def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
+        """Return the tables of a heliostat's mechanism now, and once items are stored."""
+        row = self.field.place(heliostat)
+        before = self.beams.armature.table[row].copy(), self.beams.drives.table[row].copy()
+        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+
+    def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _aimed(self, row: int) -> FloatArray:
+        """Return the points at which a heliostat may aim, ENU, m, (K, 3)."""
+        own = np.stack([self.aims[row], self.standbys[row]])
+        centers = [receiver.center for receiver in self.design.receivers]
+        centers += [target.center for target in self.design.targets]
+        return np.array([*own[np.isfinite(own).all(axis=-1)], *centers])
+
+    def _able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be given a command, and why the others may not.
+
+        A motion needs the wanted parameters; joining, that no alarm bars the heliostat.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        wrong = self._sync.differing(names) if name in MOTIONS else {}
+        if name in JOINING:
+            wrong |= self._sentinel.barred(names)
+        if wrong and len(wrong) == len(names):
+            raise BeamError(name, wrong)
+        return tuple(n for n in names if n not in wrong), wrong
 
     def _believe(self, record: HeliostatCalibration) -> None:
         """Use a new calibration in the beam checks and in the wanted parameters."""
@@ -601,8 +665,7 @@ class PlantController:
         The local controller is compared, and written when its state allows it.
         """
         row = self.field.place(heliostat)
-        self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)
-        self._agreement.believe(row, mechanism)
+        self._use(row, mechanism.armature.table, mechanism.drives.table)
         self.wanted.set(heliostat, items_of(mechanism))
         self._sync.compare(heliostat)
 
@@ -626,6 +689,9 @@ class PlantController:
         rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
         wanted = points_of(name, points)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
+        moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
+        if wrong := self._sync.differing([names[i] for i in np.flatnonzero(moves)]):
+            raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
@@ -634,6 +700,9 @@ class PlantController:
         if problem := self._ways.points.assign(name, rows, wanted):
             ticket.advance(names, Stage.FAILED, f"not sent, because it cannot be stored: {problem}")
             return ticket
+        if name == "STANDBY":
+            for each, place in zip(names, wanted, strict=True):
+                self.wanted.rest(each, tuple(place))
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)
         moving = {names[i] for i in np.flatnonzero(tracking)} if name == "AIM" else set()
         for point, members in groups.items():

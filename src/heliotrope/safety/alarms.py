@@ -113,8 +113,10 @@ PARAMETERS_DIFFER = AlarmKind(
     Severity.WARNING,
     "A local controller stores parameters that differ from the wanted ones.",
     "{subject}: stored parameters differ from the wanted ones: {items}",
-    "They are pushed as soon as there is a command authority and the heliostat's state allows it.",
-    "Nothing to do; if it returns, replace the controller's flash memory.",
+    "No motion but DEFOCUS and STOW is accepted; they are written as soon as there is a command "
+    "authority and the heliostat stands where its beam is safe.",
+    "Stow it; lock it at stow if more than armature, biases, location and defocus differ. If it "
+    "returns, replace the controller's flash memory.",
 )
 RECORDS = AlarmKind(
     "records",

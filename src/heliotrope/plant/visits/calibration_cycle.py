@@ -25,7 +25,7 @@ from heliotrope.calibration.record import (
 from heliotrope.calibration.sightings import Sightings, camera_target, join
 from heliotrope.geometry import FloatArray, angle_between
 from heliotrope.lcu import states
-from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, differing, items_of
+from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
@@ -282,7 +282,7 @@ class CalibrationCycle:
         present, new = plant.beliefs.present(name), found.mechanism
         large = _moved(present, new, every) > self.settings.large
         try:
-            pushed = await self._push(visit, new[0])
+            pushed = await self._push(visit, new[0], f"fit of {len(every)} sightings")
             if not (large or plant.beliefs.record(name) is None):
                 return found, pushed
             plant.want(name, new[0])
@@ -292,7 +292,7 @@ class CalibrationCycle:
             )
             if not problem:
                 return found, pushed
-            await self._push(visit, present[0])
+            await self._push(visit, present[0], "the new ones were not verified")
         except BaseException:
             # The local controller gets the old parameters as soon as its state allows it.
             plant.want(name, present[0])
@@ -323,27 +323,25 @@ class CalibrationCycle:
         plant.beliefs.take(record)
         return record
 
-    async def _push(self, visit: Visit, mechanism: Mechanism) -> tuple[str, ...]:
-        """Write the items that differ, and read them back."""
+    async def _push(self, visit: Visit, mechanism: Mechanism, why: str) -> tuple[str, ...]:
+        """Write the items that differ, and read them back; ``why`` is for the audit."""
         plant, name = self._plant, visit.heliostat
         wanted = items_of(mechanism)
         missing = differing(wanted, await plant.stored(name))
         if not missing:
             return ()
-        locked = not CALIBRATION_ITEMS.issuperset(missing)
-        if locked:
-            # Drives are only exchanged while nothing can move.
-            await visit.command("LOCK")
+        # Parameters are only exchanged while nothing can move.
+        await visit.command("LOCK")
         items = {item: wanted[item] for item in missing}
-        await visit.obey(plant.parameters(visit.person, visit.token, name, items), 60.0)
+        ticket = plant.parameters(visit.person, visit.token, name, items, confirmed=why)
+        await visit.obey(ticket, 60.0)
         left = differing(wanted, await plant.stored(name))
         if left:
             raise RefusedError(
                 f"{name}: {', '.join(left)} differ when read back; check its flash memory"
             )
-        if locked:
-            await visit.command("UNLOCK")
-            await visit.command("IDLE")
+        await visit.command("UNLOCK")
+        await visit.command("IDLE")
         return missing
 
 

@@ -14,11 +14,14 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import LinkClosedError
 from heliotrope.links.messages import Command, encode
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.parameters import TAKES_POSE
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act
 from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
@@ -287,7 +290,7 @@ class Operator:
         self._give(plant, what, (name,), who, token)
 
     def _parameters(self, plant: PlantController) -> None:
-        """Push two calibration items to one heliostat."""
+        """Push two calibration items to one heliostat, mostly to one whose beam is safe."""
         self.counts["parameters"] += 1
         chance, who = self._chance, self._duty
         items = {
@@ -295,8 +298,10 @@ class Operator:
             "defocus": struct.pack("<ff", chance.uniform(0.08, 0.12), chance.uniform(0.05, 0.06)),
         }
         token = self._tokens.get(who.name, 0)
+        safe = np.flatnonzero(plant.field.among(TAKES_POSE, plant.now()))
+        names = [plant.field.names[row] for row in safe] if chance.random() < 0.8 else self._names
         try:
-            ticket = plant.parameters(who, token, chance.choice(self._names), items)
+            ticket = plant.parameters(who, token, chance.choice(names or self._names), items)
         except RefusedError:
             self.counts["refused"] += 1
             return
