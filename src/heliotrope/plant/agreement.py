@@ -72,7 +72,11 @@ class Agreement:
         self._sun_off = dict.fromkeys(field.clusters, 0.0)
         count = len(field)
         self._since = np.full(count, np.inf)
+        #: Aims at the last look, and when each was seen to change.
+        self._aims, self._aimed_at = points.aims.copy(), np.full(count, -np.inf)
         self._lag = np.full(count, np.inf)
+        #: Whether the axes stand beside their goals, by counts that came at a time, monotonic s.
+        self._stands, self._counted = np.zeros(count, dtype=bool), np.full(count, -np.inf)
         #: Aims at which the beams were found: an assigned aim may wait for its turn.
         self._found = np.full((count, 3), np.nan)
         self._wrong: dict[str, float] = {}
@@ -115,8 +119,13 @@ class Agreement:
         tracking = field.among((states.TRACKING,), now)
         self._since = np.where(tracking, np.minimum(self._since, now), np.inf)
         self._found[~tracking] = np.nan
-        self._lag[~tracking] = np.inf
-        known = np.isfinite(aims).all(axis=-1) & (field.counted_at >= self._since + _SETTLE)
+        changed = ~np.all((aims == self._aims) | (np.isnan(aims) & np.isnan(self._aims)), axis=-1)
+        begins = ~tracking | changed
+        self._lag[begins], self._stands[begins] = np.inf, False
+        self._aimed_at[changed], self._aims[changed] = now, aims[changed]
+        # Counts from before a new aim say nothing about it.
+        begun = np.maximum(self._since, self._aimed_at) + _SETTLE
+        known = np.isfinite(aims).all(axis=-1) & (field.counted_at >= begun)
         rows = np.flatnonzero(tracking & known)
         error = self._errors(rows, now)
         bad = np.flatnonzero(error >= NOTED)
@@ -133,8 +142,12 @@ class Agreement:
         error = self._beside(rows, ends, sun)
         lag = np.abs(ends - here).max(axis=-1)
         # Axes that come no nearer to their goals stand where they are.
-        stands = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
-        self._lag[rows] = lag
+        # In large fields counts are older than a look: the same counts say nothing new.
+        newer = field.counted_at[rows] > self._counted[rows]
+        still = (lag > NOTED) & (lag > self._lag[rows] - _CLOSING)
+        stands = np.where(newer, still, self._stands[rows])
+        self._lag[rows], self._stands[rows] = lag, stands
+        self._counted[rows] = field.counted_at[rows]
         if stands.any():
             beside = self._beside(rows[stands], here[stands], sun[stands])
             error[stands] = np.maximum(error[stands], beside)
