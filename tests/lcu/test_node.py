@@ -177,15 +177,15 @@ def test_flash_that_fails_latches_a_fault_and_the_beam_still_goes() -> None:
 def test_what_flash_does_not_hold_is_not_acknowledged() -> None:
     bench = standing_by()
     flash = frail(bench)
-    assert bench.order("SET_BIAS", 0.01, 0.02) == DONE
+    assert bench.order("SET_DEFOCUS", 0.21, 0.22) == DONE
     flash.worn = True
-    assert bench.order("SET_BIAS", 0.02, 0.02) == NOT_STORED
+    assert bench.order("SET_DEFOCUS", 0.22, 0.22) == NOT_STORED
     assert bench.controller.fault == controller.JOURNAL
     assert bench.state == "FAULT"
     # The old values lie in the other slot.
     kept = Journal(flash)
     kept.load()
-    assert kept.numbers("biases") == pytest.approx((0.01, 0.02))
+    assert kept.numbers("defocus") == pytest.approx((0.21, 0.22))
 
 
 def test_the_supply_falls_amid_a_motion() -> None:

@@ -61,8 +61,9 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     LATCHED,
 ) = range(11)
 
-#: States in which settings may change: those of the calibration, and those of the machine.
-CALIBRATION = (
+#: States in which settings may change: those that move nothing, those of the pose, those of the
+#: machine. The last two change at rest only.
+HARMLESS = (
     states.UNCONFIGURED,
     states.STOWED,
     states.LOCKED,
@@ -70,11 +71,12 @@ CALIBRATION = (
     states.IDLE,
     states.DEFOCUSED,
 )
-MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT, states.IDLE)
+POSE = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT)
+MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
 STATES_OF = {
-    "SET_ARMATURE": CALIBRATION, "SET_BIAS": CALIBRATION, "SET_POSITION": CALIBRATION,
-    "SET_DEFOCUS": CALIBRATION, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
-    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": CALIBRATION,
+    "SET_ARMATURE": POSE, "SET_BIAS": POSE, "SET_POSITION": HARMLESS,
+    "SET_DEFOCUS": HARMLESS, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
+    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": HARMLESS,
 }  # fmt: skip
 
 #: States that hold a position for as long as the cluster is heard.
@@ -590,7 +592,7 @@ class Controller:
         if allowed is None or self.state not in allowed:
             return messages.REFUSED_STATE
         motion, config = self.motion, self.config
-        if allowed is MACHINE and (motion.kind not in (HOLD, MOVE, STOW) or not motion.still()):
+        if allowed is not HARMLESS and (motion.following() or not motion.still()):
             return messages.REFUSED_STATE
         if name == "ZERO":
             if max(abs(values[0]), abs(values[1])) > MOST_STEPS:
@@ -610,6 +612,8 @@ class Controller:
         for item in items:
             if item != "edition" and not config.take(item, items[item]):
                 return messages.BAD_VALUE
+        if allowed is not HARMLESS:
+            motion.hold()  # a defocused mirror does not go on with the sun from another pose
         if name != "SET_ADDRESS":
             motion.rebuild()
         self.out.append((STORE, items))

@@ -88,6 +88,7 @@ class Motion:
         self._start, self._slope = [0.0, 0.0], [0.0, 0.0]
         self._knot_ms = self._renew_ms = self._since_ms = 0
         self._base = HOLD  # what a defocus turns away from
+        self._offset = config.defocus  # by how much: new angles count from the next defocus on
         self._path: list[tuple[float, float, float]] = []
         self._place = 0
         self._spiral: Spiral | None = None
@@ -228,7 +229,7 @@ class Motion:
 
     def _away(self, i: int, angle: float) -> float:
         """Return an angle turned away by the defocus; the other way where a stop is near."""
-        offset = self.config.defocus[i]
+        offset = self._offset[i]
         low, high = self._stops[i]
         if low <= angle + offset <= high:
             return angle + offset
@@ -263,7 +264,7 @@ class Motion:
             self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
             self.blind, self._turns = 0, sense
             self.kind = HOLD
-        self._base = self.kind
+        self._base, self._offset = self.kind, self.config.defocus
         self.kind = DEFOCUS
         self._knot_ms = self._renew_ms = 0
         angles = [0.0, 0.0]
