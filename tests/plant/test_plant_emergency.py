@@ -1,5 +1,6 @@
 """Emergencies of the plant: order, proof, repetition, causes, hysteresis, release."""
 
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from heliotrope.plant.emergency import carried_out
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.safety import FLUX_READING, Act, FluxProof, adjusted, conditions
 from heliotrope.twin.wind import Wind
-from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
+from support.plant_bench import ENGINEER, LEADS, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
 WINDY = PlantSettings(sensors=frozenset({"wind_gust", "receiver_flux", FLUX_READING}))
@@ -384,3 +385,37 @@ def test_done_is_judged_by_state_and_by_axes() -> None:
     for act in (Act.STOW, Act.DEFOCUS):
         assert not judged(act, states.IDLE, 0.0, flags=stowed)
     assert judged(Act.STOW, states.STOWED, 0.0)
+
+
+@pytest.mark.parametrize("act", [Act.DEFOCUS, Act.STOW])
+@pytest.mark.parametrize("seen", [True, False])
+def test_unknown_step_counts_are_never_done(act: Act, seen: bool, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P3B")
+        row = cluster.names.index("P3B")
+        if seen:
+            plant.aims[plant.field.place("P3B")] = (1.0, 0.0, 15.0)
+            cluster.set(states.TRACKING, "P3B")
+            await bench.wait(2.0)
+        # A reset has made its counts unreadable; the cluster reports all it is asked for as done.
+        cluster.rows["flags"][row] = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
+        cluster.set(states.FAULT, "P3B")
+        await bench.wait(2.0)
+        if not seen:
+            plant.field.posed_at[plant.field.place("P3B")] = -np.inf
+        order = plant.raise_emergency("a visitor", act)
+        await bench.wait(10.0)
+        report = order.report(plant.now())
+        assert report.not_done == ("P3B",)
+        assert not report.complete
+        text = r"P3B: step counts unknown, so it is not proven to be off; "
+        last = r"1\d s ago it was TRACKING with its beam at \(1.0, 0.0, 15.0\) m"
+        assert re.search(text + (last if seen else "nothing is known of its beam"), report.text)
+        cluster.rows["flags"][row] = 0
+        cluster.set(LEADS[act.name], "P3B")
+        await bench.wait(2.0)
+        report = order.report(plant.now())
+        assert report.not_done == ()
+        assert "unknown" not in report.text
+
+    play(tmp_path, scene)

@@ -89,9 +89,9 @@ class FieldState:
         Time at which each row was true, monotonic s, (N,); minus infinity if never heard.
     counted_at
         The same of its step counts and goals.
-    posed, posed_at
-        Step counts when they were last known, (N, 2), and that time, (N,): a local controller that
-        has lost its counts goes on reporting numbers, which mean nothing.
+    posed, posed_state, posed_at
+        Step counts when they were last known, (N, 2), the state then, and that time, (N,): a local
+        controller that has lost its counts goes on reporting numbers, which mean nothing.
 
     Raises
     ------
@@ -118,6 +118,7 @@ class FieldState:
         self.heard = np.full(len(pairs), -np.inf)
         self.counted_at = np.full(len(pairs), -np.inf)
         self.posed = np.zeros((len(pairs), 2))
+        self.posed_state = np.zeros(len(pairs), dtype=np.intp)
         self.posed_at = np.full(len(pairs), -np.inf)
         self.failed_at = np.full(len(pairs), -np.inf)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
@@ -158,6 +159,7 @@ class FieldState:
         self.counted_at[mine] = np.where(steps < NEVER, at - 1e-3 * steps, -np.inf)
         known = (steps < NEVER) & (new["flags"] & _UNKNOWN == 0)
         self.posed[mine[known]] = self.counts(mine[known])
+        self.posed_state[mine[known]] = new["state"][known]
         self.posed_at[mine[known]] = self.counted_at[mine[known]]
         return problems
 

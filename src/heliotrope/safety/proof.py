@@ -47,6 +47,8 @@ class ProofReport:
     complete
         Whether every heliostat has acknowledged and is done, and the flux is proven or is not
         measured.
+    unknown
+        What is known of each heliostat of which nothing can show that it is done.
     """
 
     unacknowledged: tuple[str, ...]
@@ -54,6 +56,7 @@ class ProofReport:
     late: tuple[str, ...]
     flux: FluxProof
     complete: bool
+    unknown: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
@@ -65,6 +68,7 @@ class ProofReport:
             if names:
                 shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
                 parts.append(f"{len(names)} {what}: {shown}")
+        parts += self.unknown[:8]
         if self.flux is not FluxProof.BELOW:
             parts.append(self.flux.value)
         return "; ".join(parts)

@@ -10,11 +10,12 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
-from heliotrope.links.messages import Progress
+from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
 from heliotrope.plant.beam_watch import BeamWatch
-from heliotrope.plant.emergency.order import EmergencyOrder
+from heliotrope.plant.emergency.order import COUNTS_UNKNOWN, ON_BEAM, EmergencyOrder
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinQueue
@@ -209,6 +210,11 @@ class Sentinel:
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket."""
         if self.order is not None and ticket is self.order.ticket:
+            if progress.stage is Stage.DONE:
+                flags = self._field.rows["flags"]
+                heliostats = tuple(
+                    n for n in heliostats if not flags[self._field.index[n]] & COUNTS_UNKNOWN
+                )
             self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
@@ -227,11 +233,30 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
             )
+        for row in rows:
+            name = self._field.names[row]
+            if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
+                order.unknown[name] = self._last_of(row, now)
+            else:
+                order.unknown.pop(name, None)
 
     def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
         """Return which heliostats may not join their aims, and why."""
         barred = self.table.barred()
         return {name: barred[name] for name in heliostats if name in barred}
+
+    def _last_of(self, row: int, now: float) -> str:
+        """Return, in words, where a heliostat with unknown step counts was last."""
+        field, points = self._field, self._ways.points
+        text = f"{field.names[row]}: step counts unknown, so it is not proven to be off; "
+        if not math.isfinite(field.posed_at[row]):
+            return text + "nothing is known of its beam"
+        state = int(field.posed_state[row])
+        on_aim = state in (states.TRACKING, states.SEARCHING)
+        place = (points.aims if on_aim else points.standbys)[row]
+        out = state in ON_BEAM and np.isfinite(place).all()
+        beam = f" with its beam at ({', '.join(f'{x:.1f}' for x in place)}) m" if out else ""
+        return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
     def refusal(self, clusters: Iterable[str]) -> str:
         """Return why no new motion may begin in some clusters, "" if it may."""
