@@ -223,3 +223,65 @@ def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
     page.click("dialog >> text='Give back'")
     page.wait_for_function("heliotrope.store.out.every((one) => !one)")
     page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")
+
+
+# -- scope -------------------------------------------------------------------------------------
+
+
+def _take_command(page: Any) -> None:
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority:has-text('You have command')")
+
+
+def _sent(page: Any, *paths: str) -> list[Any]:
+    """Answer some requests in place of the plant; return the list of them."""
+    bodies: list[Any] = []
+
+    def take(route: Any) -> None:
+        bodies.append(route.request.post_data_json)
+        route.fulfill(status=204)
+
+    for path in paths:
+        page.route(f"**/api/v1/{path}", take)
+    return bodies
+
+
+def test_the_scope_follows_the_selection(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    page, name = enter("engineer"), field.live.names[5]
+    sent = _sent(page, "commands", "aim")
+    _take_command(page)
+    scope = page.locator(".hx-to select")
+    for wide in ("field", "cluster"):
+        for button in ("Aim…", "Search…", "Jog…"):
+            page.evaluate("heliotrope.store.select([1, 2], -1)")
+            scope.select_option(wide)
+            page.evaluate("heliotrope.store.select([5], 5)")
+            assert scope.input_value() == "selection"
+            page.click(f".hx-orders >> text={button}")
+            page.wait_for_selector(f"dialog h2:has-text('{name}')")
+            page.click(f"dialog button >> text={button[:-1] if wide == 'field' else 'Cancel'}")
+            page.wait_for_selector("dialog", state="detached")
+    page.wait_for_timeout(500)
+    assert [one["heliostats"] for one in sent] == [[name]] * 3
+    page.click(".hx-authority >> text=Release")
+
+
+def test_motion_of_the_whole_field_asks_once_and_safe_orders_never(
+    enter: Callable[..., Any],
+) -> None:
+    page = enter("engineer")
+    sent = _sent(page, "commands", "stow", "defocus", "automatic")
+    _take_command(page)
+    page.select_option(".hx-to select", "field")
+    for button in ("Approach", "Track", "Standby", "Refocus", "Unlock", "Clear fault", "Automatic"):
+        page.locator(".hx-orders button", has_text=button).first.click()
+        page.wait_for_selector("dialog h2:has-text('all 64 heliostats')")
+        page.keyboard.press("Escape")
+        page.wait_for_selector("dialog", state="detached")
+    assert not sent
+    for button in ("Stow", "Defocus"):
+        page.click(f".hx-orders >> text={button}")
+        page.wait_for_timeout(300)
+        assert not page.locator("dialog").count()
+    assert sent == [{"heliostats": []}] * 2
+    page.click(".hx-authority >> text=Release")
