@@ -6,7 +6,7 @@ import copy
 import functools
 import struct
 from collections.abc import AsyncIterator, Callable, Coroutine
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import Any, TypeVar
 
 from heliotrope.cluster.config import ClusterConfig, Member
@@ -272,12 +272,12 @@ class Field:
         return all(board.node.controller.sun.fresh() for board in self.boards if board.on)
 
 
-#: When fields of new boards begin.
+#: When fields begin whose boards come from another.
 LATER = datetime(2026, 6, 21, 10, 15, tzinfo=UTC)
 
 
 @functools.cache
-def _saved() -> dict[str, tuple[list[Board], datetime]]:
+def _saved() -> dict[str, list[Board]]:
     found = {}
 
     async def main(clock: VirtualClock) -> None:
@@ -286,23 +286,19 @@ def _saved() -> dict[str, tuple[list[Board], datetime]]:
             await field.order("aim", "AIM", *AIM)
             await field.order("approach", "APPROACH")
             await field.until(lambda: set(field.states()) == {"IDLE"}, 300.0)
-            found["IDLE"] = copy.deepcopy(field.boards), clock.utc()
+            found["IDLE"] = copy.deepcopy(field.boards)
             await field.order("track", "TRACK")
             await field.until(lambda: set(field.states()) == {"TRACKING"}, 10.0)
             await asyncio.sleep(20.0)
-            found["TRACKING"] = copy.deepcopy(field.boards), clock.utc()
+            found["TRACKING"] = copy.deepcopy(field.boards)
 
     run_virtual(main)
     return found
 
 
-def boards_in(state: str) -> tuple[list[Board], datetime]:
-    """Two boards in IDLE or TRACKING, and when their field is to begin.
-
-    They refuse a sun that cannot follow from the last one that they took.
-    """
-    boards, at = _saved()[state]
-    return copy.deepcopy(boards), at.replace(microsecond=0) + timedelta(seconds=4)
+def boards_in(state: str) -> list[Board]:
+    """Two boards that are in IDLE, or TRACKING; for a field that begins at `LATER`."""
+    return copy.deepcopy(_saved()[state])
 
 
 def run(
@@ -312,7 +308,7 @@ def run(
     **settings: Any,
 ) -> Field:
     """Run a test in virtual time, on two boards of a state or on new ones, and return its field."""
-    boards, start = boards_in(state) if state else (settings.pop("boards", None), LATER)
+    boards = boards_in(state) if state else settings.pop("boards", None)
 
     async def live(clock: VirtualClock) -> Field:
         field = Field(clock, boards=boards, seed=seed, **settings)
@@ -320,7 +316,7 @@ def run(
             await main(field)
         return field
 
-    return run_virtual(live, seed, start=start)
+    return run_virtual(live, seed, start=LATER)
 
 
 class SlotBus(TwinBus):

@@ -33,10 +33,8 @@ from heliotrope.safety.evaluation import (
 from heliotrope.safety.joining import JoinLimiter
 from heliotrope.safety.proof import (
     DEFOCUS_BUDGET,
-    FLUX_READING,
     ORDER_BUDGET,
     STOW_BUDGET,
-    FluxProof,
     Proof,
     ProofReport,
     proof_readings,
@@ -45,7 +43,6 @@ from heliotrope.safety.proof import (
 __all__ = [
     "CONDITIONS",
     "DEFOCUS_BUDGET",
-    "FLUX_READING",
     "ORDER_BUDGET",
     "STOW_BUDGET",
     "AcknowledgeRole",
@@ -54,7 +51,6 @@ __all__ = [
     "Alarm",
     "AlarmKind",
     "Condition",
-    "FluxProof",
     "JoinLimiter",
     "Proof",
     "ProofReport",

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
-from heliotrope.safety import Severity
 
 #: State shown for a row older than its limit, whose other values do not count.
 STALE_STATE = 255
@@ -48,7 +47,7 @@ class FieldFrame:
     on
         Place in `Operations.aim_names` of the aim of each, uint8, (N,); 0: none.
     held
-        Whether it is out of service, bool, (N,).
+        Whether a person keeps it out of calibration, bool, (N,).
     truth_error
         True tracking error, known to a twin only, rad, float32, (N,); None for a real plant.
     """
@@ -169,7 +168,7 @@ class HeliostatView:
     planned
         Its next visit, if one is planned.
     hold
-        Why it is out of service, who took it out, and when it is expected back; "" if it is not.
+        Why a person keeps it out of calibration, "" if nobody does.
     """
 
     name: str
@@ -269,7 +268,7 @@ class AlarmRow:
     at: float
     condition: str
     subject: str
-    severity: Severity
+    severity: str
     text: str
     active: bool
     acknowledged_by: str = ""
@@ -439,6 +438,16 @@ class CameraView:
 
 
 @dataclass(frozen=True)
+class HeldHeliostat:
+    """A heliostat kept out of calibration: the person, the reason, and the time (POSIX s)."""
+
+    heliostat: str
+    who: str
+    reason: str
+    since: float
+
+
+@dataclass(frozen=True)
 class EmergencyView:
     """The last order to the whole field, with its proof.
 
@@ -494,8 +503,6 @@ class Summary:
         Number of alarms active or unacknowledged.
     emergency
         Whether an emergency is active.
-    resume
-        Why automatic control waits for a person's Resume, "" if it does not.
     lag
         Delay of the plant's time, s: 0 unless the machine is too slow for a twin's speed.
     extra
@@ -513,6 +520,5 @@ class Summary:
     waiting: int
     alarms: int
     emergency: bool
-    resume: str
     lag: float
     extra: Mapping[str, Any]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
-from heliotrope.twin.world.worlds import pause_of, weights_of
 
 #: Everything that can go wrong: kind, weight in the draw, meaning.
 KINDS = {
@@ -76,13 +75,7 @@ class Fault:
 
 
 def drawn(
-    seed: int,
-    seconds: float,
-    heliostats: int,
-    *,
-    pause: float = 12.0,
-    only: Sequence[str] = (),
-    worlds: Sequence[str] = (),
+    seed: int, seconds: float, heliostats: int, *, pause: float = 12.0, only: Sequence[str] = ()
 ) -> list[Fault]:
     """Return the faults of a run, sorted by time.
 
@@ -98,8 +91,6 @@ def drawn(
         Mean time between faults, s.
     only
         Kinds to draw from; () for all.
-    worlds
-        Names of `worlds.WORLDS`; "swarm" draws the weights and the pause of this run.
 
     Raises
     ------
@@ -113,9 +104,7 @@ def drawn(
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
     kinds = list(only or KINDS)
-    weighed = weights_of(worlds, seed, {kind: KINDS[kind][0] for kind in kinds})
-    weights = [weighed[kind] for kind in kinds]
-    pause = pause_of(worlds, seed, pause)
+    weights = [KINDS[kind][0] for kind in kinds]
     found: list[Fault] = []
     at = chance.expovariate(1.0 / pause)
     while at < seconds:
