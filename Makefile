@@ -7,12 +7,14 @@ STAMP := $(VENV)/.installed
 JOBS ?= auto
 # Of `make soak`: simulated runs of six minutes with some thirty faults each.
 RUNS ?= 2000
+# Of `make mutants`.
+SAMPLE ?= 500
 # Of `make run`; see heliotrope run --help.
 OPTIONS ?=
 BOARD ?= rp2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup run test soak lint docs bench house firmware clean
+.PHONY: help setup run test soak mutants lint docs bench house firmware clean
 
 help:  ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort | expand -t 12
@@ -35,6 +37,9 @@ soak: $(STAMP)  ## run the slow tests too
 	@mkdir -p out
 	@$(BIN)/heliotrope simulate --seed 1 --hours 0.1 --runs $(RUNS) --processes $(shell nproc) \
 		--minutes 120 --progress out/soak.jsonl
+
+mutants: $(STAMP)  ## plant 500 small errors in the control code; what finds them (hours; goes on)
+	@$(BIN)/python scripts/mutants.py --sample $(SAMPLE) --progress out/mutants.jsonl
 
 lint: $(STAMP)  ## check style, types and layers
 	@$(BIN)/ruff check .

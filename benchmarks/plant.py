@@ -129,6 +129,7 @@ class _Run:
         # All stand with their beams on the receiver.
         everybody = np.arange(len(design), dtype=np.intp)
         aims = np.broadcast_to(design.receivers[0].center, (len(design), 3))
+        self.plant.aims[:] = aims
         found = self.plant.beams.poses(everybody, aims, self.plant.sun_vector())
         counts = found.chosen(found.counts)
         for axis, name in enumerate(("primary", "secondary")):
@@ -143,7 +144,7 @@ class _Run:
             status = ClusterStatus(
                 link.name,
                 MEMBERS,
-                0.0,
+                self.clock.utc().timestamp(),
                 "gps",
                 1e-3,
                 3.0,
@@ -165,8 +166,8 @@ class _Run:
             await asyncio.sleep(1.0)
             spent += time.process_time() - begin
         for alarm in self.plant.alarms:
-            if alarm.condition == "keep_out_predicted":
-                raise BenchmarkError(f"a beam in a volume: {alarm.text}")
+            if alarm.condition in ("keep_out_predicted", "pointing_disagrees"):
+                raise BenchmarkError(f"a beam where none may be: {alarm.text}")
         live = int(self.plant.field.live(self.clock.monotonic()).sum())
         if live != len(self.names):
             raise BenchmarkError(f"{live} of {len(self.names)} heliostats are live")

@@ -3,6 +3,7 @@
 MicroPython does none of this itself:
 
 - integer constants replace their names, in other modules too;
+- the names of the states, which only the state table uses there, become letters;
 - code that no board calls is left out (the sender's side of the wire, texts for people);
 - docstrings, annotations and code for the type checker are left out, and the texts of ValueError,
   which a board answers with "value out of range".
@@ -12,6 +13,7 @@ Nothing else changes, so a traceback names the same functions.
 
 import ast
 import importlib
+import re
 from collections.abc import Iterable
 from pathlib import Path
 from types import ModuleType
@@ -93,6 +95,20 @@ def constants(modules: dict[str, Module], loaded: dict[str, ModuleType]) -> dict
             elif word.isupper() and type(value) is str and isinstance(node, ast.Assign):
                 node.value = ast.copy_location(ast.Constant(value), node.value)
     return found
+
+
+def letters(module: Module) -> None:
+    """Replace the names in ``STATES`` by letters, and so in columns 1 and 3 of ``TABLE``."""
+    names, table = (module.definitions[word] for word in ("STATES", "TABLE"))
+    assert isinstance(names, ast.Assign)
+    assert isinstance(table, ast.Assign)
+    text: str = ast.literal_eval(table.value)
+    short = {name: chr(ord("A") + i) for i, name in enumerate(ast.literal_eval(names.value))}
+    text = re.sub(
+        r"(?m)^(\w+) (\w+) (\w+)", lambda row: f"{short[row[1]]} {row[2]} {short[row[3]]}", text
+    )
+    table.value = ast.copy_location(ast.Constant(text), table.value)
+    names.value = ast.copy_location(ast.Constant("".join(short.values())), names.value)
 
 
 class _Inliner(ast.NodeTransformer):
@@ -266,6 +282,8 @@ def shrink(roots: Iterable[Key], folder: Path = CORE, package: str = PACKAGE) ->
     }
     loaded = {name: importlib.import_module(f"{package}.{name}") for name in modules}
     numbers = constants(modules, loaded)
+    if "states" in modules:
+        letters(modules["states"])
     for module in modules.values():
         _Inliner(module, numbers).visit(module.tree)
     reach = _Reach(modules, roots)

@@ -7,7 +7,7 @@ import pytest
 
 from heliotrope.cluster import _nodes
 from heliotrope.cluster.memory import Kept
-from heliotrope.lcu import states, wire
+from heliotrope.lcu import messages, states, wire
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.link import LinkError, running
 from heliotrope.links.messages import (
@@ -22,7 +22,7 @@ from heliotrope.links.messages import (
 )
 from heliotrope.safety import Alarm, Severity
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
-from support.clusters import AIM, LATER, TOKEN, Board, Field, boards_in, run
+from support.clusters import AIM, TOKEN, Board, Field, boards_in, run
 
 ALL_STAGES = [Stage.ACCEPTED, Stage.SENT, Stage.ACKNOWLEDGED, Stage.DONE]
 
@@ -197,6 +197,35 @@ def test_an_open_emergency_line_defocuses() -> None:
         assert field.plant.alarms("emergency_line")[0].severity is Severity.EMERGENCY
 
     run(main, "TRACKING", line=lambda: closed[0])
+
+
+def test_no_sun_is_sent_while_the_safety_table_says_dark() -> None:
+    closed = [True]
+    sent: list[tuple[float, str]] = []
+
+    class Heard(TwinBus):
+        def carry(self, frame: bytes) -> bytes:
+            (read,) = wire.Reader().feed(frame)
+            sent.append((self._clock.monotonic(), messages.name_of(read.number)))
+            return super().carry(frame)
+
+    async def main(field: Field) -> None:
+        await asyncio.sleep(3.0)
+        assert "SUN" in {name for _, name in sent}
+        closed[0] = False
+        opened = field.clock.monotonic()
+        await asyncio.sleep(10.0)
+        # The time is sound and the plant's lease lasts: only the table forbids it.
+        after = [name for at, name in sent if at > opened + 1.1]
+        assert "TIME" in after
+        assert "SUN" not in after
+
+    run(
+        main,
+        "TRACKING",
+        line=lambda: closed[0],
+        bus=lambda clock, boards: Heard(clock, [*boards]),
+    )
 
 
 def test_an_emergency_reaches_all_at_once_and_names_who_does_not_answer() -> None:
@@ -457,7 +486,7 @@ def test_a_cluster_runs_once() -> None:
 
 
 def test_the_bus_may_be_closed_first() -> None:
-    boards = boards_in("IDLE")
+    boards, start = boards_in("IDLE")
 
     async def main(clock: VirtualClock) -> None:
         field = Field(clock, boards=boards)
@@ -466,7 +495,7 @@ def test_the_bus_may_be_closed_first() -> None:
                 await asyncio.sleep(2.2)
             await asyncio.sleep(2.0)
 
-    run_virtual(main, start=LATER)
+    run_virtual(main, start=start)
 
 
 def test_what_no_plant_says_is_an_alarm() -> None:

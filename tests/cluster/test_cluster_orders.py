@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from heliotrope.cluster._goals import Goals
+from heliotrope.cluster._reports import Reports
 from heliotrope.cluster.memory import Kept
-from heliotrope.lcu import messages, wire
+from heliotrope.lcu import messages, states, wire
 from heliotrope.lcu.journal import CODES_OF
-from heliotrope.links.messages import Answer, Ask, Command, Parameters, Stage
+from heliotrope.links.messages import Answer, Ask, Command, Parameters, Progress, Stage
 from heliotrope.twin.boards.bus import TwinBus
 from support.clusters import AIM, TOKEN, Board, Field, SlotBus, config_of, run
 from support.lcu_machines import heliostat, items_of_heliostat
@@ -593,5 +595,57 @@ def test_an_emergency_of_one_heliostat_is_told_in_all_its_stages() -> None:
         await field.emergency("stop", "DEFOCUS", "A1")
         assert await final(field, "stop") is Stage.DONE
         assert field.plant.stages("stop", "A1") == ALL_STAGES
+
+    run(main, "IDLE")
+
+
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_nothing_is_done_where_the_step_counts_are_unknown(name: str) -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        field.boards[0].node.controller.motion.known = False
+        await field.emergency("stop", name)
+        assert await final(field, "stop", limit=310.0) is Stage.FAILED
+        assert field.plant.stages("stop", "A1")[-2] is Stage.ACKNOWLEDGED
+        text = f"{name}: its step counts are unknown, so nothing shows where its beam is"
+        assert text in field.plant.text("stop")
+
+    run(main, "IDLE")
+
+
+def test_a_defocus_is_done_when_the_beam_has_left_and_not_when_it_is_acknowledged() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        board = field.boards[0]
+        motion = board.node.controller.motion
+        await field.emergency("stop", "DEFOCUS", "A1")
+        await field.until(lambda: Stage.ACKNOWLEDGED in field.plant.stages("stop", "A1"), 2.0)
+        assert not motion.still()
+        assert Stage.DONE not in field.plant.stages("stop", "A1")
+        assert await final(field, "stop", limit=40.0) is Stage.DONE
+        assert all(abs(motion.goal(i) - motion.place(i)) <= 20 for i in (0, 1))
+
+    run(main, "IDLE")
+
+
+def test_a_defocus_that_leaves_the_axes_where_they_are_is_never_done() -> None:
+    async def main(field: Field) -> None:
+        await field.until(field.sun_is_fresh)
+        node = next(iter(field.cluster.nodes))
+        field.boards[0].on = False
+        reports = Reports()
+        goals = Goals(reports)
+        now = field.clock.monotonic()
+        goals.begin("stop", "DEFOCUS", node, now)
+        # DEFOCUSED as it says, its goals far from where it stands.
+        node.status = (states.DEFOCUSED, *node.status[1:])
+        for k in range(1, 31):
+            node.steps, node.steps_at = (0, 0, 50_000, 0), now + k
+            goals.heard(node, now + k)
+            goals.second(field.cluster.nodes, now + k)
+        assert goals.waits(node)
+        goals.second(field.cluster.nodes, now + 31.0)
+        stages = [m.stage for m in reports.take() if isinstance(m, Progress)]
+        assert stages == [Stage.FAILED]
 
     run(main, "IDLE")

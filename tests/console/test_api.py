@@ -43,8 +43,8 @@ NEEDED = {
     ("POST", "tokens"): "viewer",
     ("DELETE", "tokens/{key}"): "viewer",
     **{("POST", path): "operator" for path in (
-        "aim", "alarms/acknowledge", "authority", "authority/seize", "automatic", "commands",
-        "defocus", "holds", "holds/release", "standby", "stow")},
+        "aim", "alarms/acknowledge", "authority", "authority/seize", "automatic",
+        "automatic/resume", "commands", "defocus", "holds", "holds/release", "standby", "stow")},
     ("PUT", "authority"): "operator",
     ("DELETE", "authority"): "operator",
     ("PUT", "calibration"): "operator",
@@ -57,8 +57,8 @@ NEEDED = {
 }  # fmt: skip
 #: What would change something with an empty body; told by tests of its own.
 ACTS = {("POST", "emergency"), ("DELETE", "emergency"), ("POST", "stow"), ("POST", "defocus"),
-        ("POST", "automatic"), ("POST", "authority"), ("POST", "holds/release"),
-        ("DELETE", "authority")}  # fmt: skip
+        ("POST", "automatic"), ("POST", "automatic/resume"), ("POST", "authority"),
+        ("POST", "holds/release"), ("DELETE", "authority")}  # fmt: skip
 
 
 def test_every_route_has_its_role(console: LiveConsole, ask: Ask) -> None:

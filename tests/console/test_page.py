@@ -1,7 +1,5 @@
 """The operator page in a browser."""
 
-import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,13 +11,9 @@ from heliotrope.console._secrets import verify_password
 from heliotrope.console.people import FIRST, first_start
 from heliotrope.store.keeper import Keeper
 from support.live_console import PASSWORD, LiveConsole
+from support.pages import NEEDS_BROWSER, browsers, entering, menu, said
 
-CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
-ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-pytestmark = pytest.mark.skipif(
-    not os.path.exists(CHROMIUM) and not os.environ.get("CI"),  # noqa: PTH110 - a word of skipif
-    reason=f"{CHROMIUM} is not there: the page is not tested",
-)
+pytestmark = NEEDS_BROWSER
 
 
 @pytest.fixture(scope="module")
@@ -32,45 +26,14 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """A browser without a screen, for this module alone: its loop would stand in others' way."""
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        made = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
-        yield made
-        made.close()
+    """A browser for this module alone."""
+    yield from browsers()
 
 
 @pytest.fixture
-def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[[str], Any]]:
-    """Sign in as somebody of a role; what goes wrong in the page fails the test."""
-    opened, wrong = [], []
-
-    def go(role: str) -> Any:
-        context = browser.new_context(viewport={"width": 1600, "height": 900})
-        context.set_default_timeout(20_000)
-        opened.append(context)
-        page = context.new_page()
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.goto(field.address)
-        page.wait_for_url("**/login")
-        page.fill("[name=name]", role)
-        page.fill("[name=password]", PASSWORD)
-        page.click("button")
-        page.wait_for_selector(".hx-legend b")
-        page.wait_for_function("heliotrope.store.live")
-        return page
-
-    yield go
-    for context in opened:
-        context.close()
-    assert not wrong
-
-
-def _said(page: Any, text: str) -> None:
-    page.wait_for_function(
-        "text => document.querySelector('.hx-bar .hx-said').textContent.includes(text)", arg=text
-    )
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in as somebody of a role."""
+    yield from entering(field.address, browser)
 
 
 def test_log_in_and_look(field: LiveConsole, enter: Callable[[str], Any]) -> None:
@@ -136,7 +99,7 @@ def test_select_by_lasso_and_stow(field: LiveConsole, enter: Callable[[str], Any
     chosen = page.evaluate("heliotrope.store.selected()")
     assert 400 <= len(chosen) < 640
     page.click(".hx-orders >> text=Stow")
-    _said(page, "STOW")
+    said(page, "STOW")
     kept = set(field.live.names) - set(chosen)
 
     def stows() -> bool:
@@ -172,7 +135,7 @@ def test_query_and_detail(field: LiveConsole, enter: Callable[[str], Any]) -> No
     )
     page.fill(".hx-query", "speed > 3")
     page.keyboard.press("Enter")
-    _said(page, 'no field "speed"')
+    said(page, 'no field "speed"')
     page.fill(".hx-query", "cluster = C001 or cluster = C002 and east < 1e9")
     page.keyboard.press("Enter")
     page.wait_for_function("heliotrope.store.selection.size === 64")
@@ -198,14 +161,9 @@ def test_a_tablet_has_all_of_it(field: LiveConsole, enter: Callable[[str], Any])
     assert map_["y"] + map_["height"] <= foot["y"] + 1
 
 
-def _menu(page: Any, title: str) -> None:
-    page.click("header >> text=/engineer|viewer/")
-    page.click(f".q-menu >> text={title}")
-
-
 def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page, people = enter("engineer"), field.keeper.people
-    _menu(page, "People")
+    menu(page, "People")
     dialog = page.locator("dialog.wide")
     dialog.locator("tr:has-text('operator')").first.wait_for()
     dialog.locator("text=Add…").click()
@@ -231,7 +189,7 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
 
 def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], Any]) -> None:
     page, people = enter("viewer"), field.keeper.people
-    _menu(page, "API tokens")
+    menu(page, "API tokens")
     assert page.locator(".q-menu >> text=People").count() == 0
     dialog = page.locator("dialog.wide")
     dialog.locator("text=Create…").click()
@@ -250,12 +208,12 @@ def test_the_own_password_is_changed(field: LiveConsole, enter: Callable[[str], 
     page, people = enter("viewer"), field.keeper.people
     kept = people.account("viewer").password_hash
     for again, text in (("a different one", "differ"), ("one long enough", "")):
-        _menu(page, "Change password")
+        menu(page, "Change password")
         for name, value in (("old", PASSWORD), ("new", "one long enough"), ("again", again)):
             page.fill(f"dialog [name={name}]", value)
         page.click("dialog >> text='Change'")
         if text:
-            _said(page, text)
+            said(page, text)
     page.wait_for_url("**/login")
     assert verify_password(people.account("viewer").password_hash, "one long enough")
     people.change("viewer", time.time(), password_hash=kept)
@@ -292,6 +250,7 @@ def test_emergency_is_one_click(field: LiveConsole, enter: Callable[[str], Any])
         "document.querySelector('.hx-alert').textContent.includes('acknowledged 640 of 640')"
     )
     page.click(".hx-alert >> text=Withdraw")
+    page.click("dialog >> text='Withdraw'")
     page.click(".hx-tabs >> text=Alarms")
     # Each row can be acknowledged when its cause has gone: the order, then the light.
     end = time.monotonic() + 30.0

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from heliotrope.lcu import names, states
+
 ROOT = Path(__file__).parents[2]
 tool: Any = runpy.run_path(str(ROOT / "scripts" / "shrink.py"))
 
@@ -107,3 +109,14 @@ def test_of_the_core_only_what_a_board_runs_is_left() -> None:
     assert "MESSAGES" not in small["messages"]
     for motion in ("hold", "defocus", "stow_directly", "approach", "search", "diagnose"):
         assert f"def {motion}(" in small["motion"]  # called by name from the state table
+
+
+def test_the_states_become_letters_and_every_transition_stays() -> None:
+    space: dict[str, Any] = {}
+    exec(tool["shrink"]([("node", "Node")])["states"], space)
+    assert len(space["TABLE"]) < 0.65 * len(states.TABLE)
+    for state, event, _, _ in names.transitions():
+        assert space["transition"](state, event) == states.transition(state, event)
+    for state in range(len(states.STATES)):
+        for event in (*names.EVENTS, "NONE"):
+            assert space["transition"](state, event) == states.transition(state, event)

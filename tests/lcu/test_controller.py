@@ -3,6 +3,7 @@
 import math
 import struct
 from binascii import crc32
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from heliotrope.lcu.messages import (
     REFUSED_KEY,
     REFUSED_STATE,
 )
+from heliotrope.lcu.motion import HOLD, MOVE
 from support.lcu_machines import (
     ADDRESS,
     AIM,
@@ -157,6 +159,61 @@ def test_an_old_or_repeated_sun_gives_nothing() -> None:
     assert bench.controller.sun.bad == 8
     bench.run(5, until="DEFOCUSED")
     assert bench.true_ms - taken <= 6050
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    ["clock fast by 10 min", "clock slow by 10 min", "longitude", "mirrored", "half a degree"],
+)
+def test_a_sun_that_cannot_follow_from_the_last_one_gives_nothing(wrong: str) -> None:
+    bench = tracking()
+    last = bench.true_ms
+    right = bench.sun
+
+    def sun(second: float) -> np.ndarray:
+        if wrong.startswith("clock"):
+            return right(second + (600 if "fast" in wrong else -600))
+        east, north, up = right(second)
+        turn = math.radians({"longitude": 2.5, "half a degree": 0.5}.get(wrong, 0.0))
+        if wrong == "mirrored":
+            return np.array([-east, north, up])
+        sine, cosine = math.sin(turn), math.cos(turn)
+        return np.array([cosine * east - sine * north, sine * east + cosine * north, up])
+
+    bench.sun = sun  # type: ignore[method-assign]
+    bench.run(7, until="DEFOCUSED")
+    assert bench.state == "DEFOCUSED"
+    assert bench.true_ms - last <= 6050
+    assert bench.controller.sun.leaps >= 4
+    # After the lapse it is taken, as after a start, but STATUS shows it, and nothing tracks again.
+    bench.run(3)
+    assert {"SUN_FRESH", "SUN_JUMPED"} <= flags(bench)
+    assert bench.state == "DEFOCUSED"
+
+
+def test_suns_that_follow_are_taken_however_late_or_rare() -> None:
+    bench = tracking()
+    bench.sends_sun = False
+    for _ in range(5):
+        bench.run(5)
+        second = bench.gps_ms() // 1000
+        bench.send("SUN", *bench.sun_values(second - 4))  # after 4 s in transit
+        assert "SUN_FRESH" in flags(bench)
+        bench.send("SUN", *bench.sun_values(second))
+        bench.last_sun_ms = bench.true_ms
+        assert bench.state == "TRACKING"
+    # A night, and a restart in it: the sun has gone round.
+    for restart in (False, True):
+        if restart:
+            bench.start(bench.flash)
+        for _ in range(14):
+            bench.tick(3_600_000)
+        bench.sends_sun = True
+        bench.run(3)
+        bench.sends_sun = False
+        assert "SUN_FRESH" in flags(bench)
+    assert "SUN_JUMPED" not in flags(bench)
+    assert bench.controller.sun.leaps == 0
 
 
 def test_a_sun_that_was_under_way_gives_so_much_less() -> None:
@@ -368,6 +425,76 @@ def test_tracking_needs_the_safe_way_first() -> None:
     assert halfway.state == "STOWED"
 
 
+@pytest.mark.parametrize("way", ["by STOW", "by STOW, broken off", "by silence", "by a fault"])
+def test_stow_ends_what_the_safe_way_has_earned(way: str) -> None:
+    """Invariant 3: after a return to stow, or part of it, TRACK needs the safe way again."""
+    bench = tracking()
+    if way == "by silence":
+        bench.sends_sun = bench.sends_time = False
+        bench.run(300, until="STOWED")
+        bench.sends_sun = bench.sends_time = True
+    elif way == "by a fault":
+        bench.node.on_fault(controller.TEMPERATURE, bench.now, False)
+        bench.node.fault_gone(controller.TEMPERATURE)
+        bench.run(200)
+        assert bench.order("CLEAR_FAULT") == DONE
+    else:
+        assert bench.order("STOW") == DONE
+        bench.run(300 if way == "by STOW" else 2, until="STOWED")
+        assert bench.order("LOCK") == DONE
+        bench.run(2)
+        assert bench.order("UNLOCK") == DONE
+    bench.run(3)
+    assert bench.state == ("IDLE" if "broken" in way else "STOWED")
+    assert "READY" not in flags(bench)
+    assert bench.order("IDLE") == DONE
+    for name in ("TRACK", "REFOCUS"):
+        assert bench.order(name) == REFUSED_STATE
+    assert bench.order("SEARCH", 1e-3, 0.01) == REFUSED_STATE
+    assert bench.state == "IDLE"
+    assert bench.controller.motion.kind == HOLD
+
+
+@pytest.mark.parametrize("name", ["TRACK", "SEARCH", "REFOCUS"])
+def test_nothing_goes_onto_the_receiver_without_a_fresh_sun(name: str) -> None:
+    bench = standing_by()
+    assert bench.order("JOG", 0, 100) == DONE
+    bench.sends_sun = False
+    bench.run(8)  # dusk: the cluster is heard, so a jogged mirror stays
+    assert bench.state == "IDLE"
+    assert "READY" in flags(bench)
+    assert "SUN_FRESH" not in flags(bench)
+    values = (2e-3, 0.02) if name == "SEARCH" else ()
+    assert bench.order(name, *values) == REFUSED_STATE
+    assert (bench.state, bench.controller.motion.kind) == ("IDLE", MOVE)
+
+
+def test_the_approach_passes_the_ground_beside_the_tower_and_its_foot_in_this_order() -> None:
+    bench = brought_to("STOWED")
+    assert bench.order("AIM", *AIM) == DONE
+    east, north, up = bench.machine.position
+    half = np.array([STANDBY[0] - east, STANDBY[1] - north]) / 2
+    sine, cosine = 0.5, math.sqrt(0.75)
+    aside = east + cosine * half[0] - sine * half[1], north + sine * half[0] + cosine * half[1], up
+    assert bench.order("APPROACH") == DONE
+    passed: dict[str, list[float]] = {}
+    while bench.state == "APPROACHING":
+        bench.run(0.05)
+        for place, point in (
+            ("beside", aside), ("foot", (*STANDBY[:2], up)), ("standby", STANDBY)
+        ):  # fmt: skip
+            passed.setdefault(place, []).append(bench.miss(point))
+    nearest = {place: int(np.argmin(misses)) for place, misses in passed.items()}
+    assert max(min(misses) for misses in passed.values()) < 1.0
+    assert nearest["beside"] < nearest["foot"] < nearest["standby"]
+    seen = [np.subtract(point, (east, north, up)) for point in bench.controller.motion.way()]
+    for one, other in pairwise(point / np.linalg.norm(point) for point in seen):
+        assert math.acos(min(1.0, one @ other)) < 0.16
+    # From the foot on it rises below the standby point, never beside it.
+    rise = passed["standby"][nearest["foot"] :]
+    assert all(after <= before + 0.5 for before, after in pairwise(rise))
+
+
 def test_approach_needs_sun_and_a_way() -> None:
     bench = Bench()
     bench.sends_sun = False
@@ -389,13 +516,14 @@ def test_a_lock_holds_until_it_is_released() -> None:
     for name in ("TRACK", "APPROACH", "IDLE", "REFOCUS"):
         assert bench.order(name) == REFUSED_STATE
     assert bench.order("JOG", 0, 5) == REFUSED_STATE
-    bench.sends_sun = bench.sends_time = False
-    bench.run(400)  # somebody may stand at the mirror: no timer moves it
+    bench.sends_sun = False
+    bench.run(400)  # dusk: the cluster is heard, and no timer moves the mirror
     assert bench.made == held
     bench.start(bench.flash)
     assert bench.state == "LOCKED"  # nor a reset
-    bench.sends_sun = bench.sends_time = True
+    bench.sends_sun = True
     bench.run(12)
+    assert bench.made == held
     assert bench.order("DEFOCUS") == DONE
     bench.run(12)
     assert bench.state == "LOCKED"
@@ -403,6 +531,90 @@ def test_a_lock_holds_until_it_is_released() -> None:
     assert bench.order("UNLOCK") == DONE
     assert bench.state == "IDLE"
     assert bench.order("UNLOCK") == REFUSED_STATE
+
+
+def held_by(how: str) -> Bench:
+    """A bench whose mirror holds its beam near the receiver, or seeks it."""
+    if how == "jogged":
+        bench = standing_by()
+        assert bench.order("JOG", 0, 20_000) == DONE
+        bench.run(0.5)
+    elif how == "without its armature":
+        bench = tracking()
+        bench.run(1)
+        items = items_of_heliostat(bench.machine)
+        del items["armature"]
+        journal = controller_journal(bench.flash)
+        bench.flash.data[: 2 * bench.flash.block_size] = b"\xff" * (2 * bench.flash.block_size)
+        journal.load()
+        journal.store(items)
+        bench.start(bench.flash)
+    else:
+        bench = tracking()
+        if how == "searching":
+            assert bench.order("SEARCH", 2e-3, 0.02) == DONE
+        elif how == "at fault":
+            bench.node.on_fault(controller.LIMIT_SWITCH, bench.now, True)
+            bench.node.fault_gone(controller.LIMIT_SWITCH)
+        else:
+            assert bench.order("LOCK") == DONE
+        bench.run(2)
+        if how == "locked over a reset":
+            bench.start(bench.flash)
+    assert bench.state == {
+        "jogged": "IDLE", "without its armature": "UNCONFIGURED", "searching": "SEARCHING",
+        "at fault": "FAULT",
+    }.get(how, "LOCKED")  # fmt: skip
+    return bench
+
+
+@pytest.mark.parametrize(
+    "how",
+    ["locked", "locked over a reset", "jogged", "searching", "at fault", "without its armature"],
+)
+def test_no_state_outlives_its_cluster(how: str) -> None:
+    """Invariants 2 and 13: off the receiver in 30 s, at stow in 5 minutes; a latch stays."""
+    bench = held_by(how)
+    state = bench.state
+    bench.sends_sun = bench.sends_time = False
+    begin = bench.true_ms
+    while bench.miss(AIM) < OFF:
+        bench.run(0.5)
+        assert bench.true_ms - begin < 30_000
+    while tuple(bench.made) != STOW or not bench.controller.motion.still():
+        bench.run(1)
+        assert bench.true_ms - begin < 300_000
+    bench.run(1)
+    assert bench.state == ("STOWED" if how in ("jogged", "searching") else state)
+
+
+def test_a_mirror_that_is_locked_at_stow_stands_still_without_a_cluster() -> None:
+    bench = Bench()
+    bench.run(1.5)
+    assert bench.order("LOCK") == DONE
+    bench.sends_sun = bench.sends_time = False
+    steps: list[tuple[int, ...]] = []
+    bench.motors.play = lambda *values: steps.append(values)  # type: ignore[method-assign]
+    bench.run(400)
+    assert steps == []
+    assert bench.state == "LOCKED"
+
+
+def test_while_the_cause_of_a_fault_is_present_silence_moves_nothing_at_once() -> None:
+    # The supply falls, and with it the cluster: steps would spoil the record of the counts.
+    for locked in (False, True):
+        bench = tracking()
+        if locked:
+            assert bench.order("LOCK") == DONE
+            bench.run(2)
+        bench.sends_sun = bench.sends_time = False
+        bench.run(5)
+        bench.node.on_supply_failing(bench.now)
+        held = list(bench.made)
+        bench.run(20)
+        assert bench.made == held
+        bench.run(280)  # it was a dip
+        assert tuple(bench.made) == STOW
 
 
 def test_a_fault_stays_until_it_is_cleared() -> None:
@@ -647,9 +859,50 @@ def test_settings_change_in_safe_states_alone() -> None:
     bench.order("IDLE")
     bench.run(5)
     for name, values in settings(bench):
-        calibration = name in ("SET_ARMATURE", "SET_BIAS", "SET_DEFOCUS", "SET_POSITION")
-        # At standby the mirror goes with the sun: nothing of the machine may change.
-        assert bench.order(name, *values) == (DONE if calibration else REFUSED_STATE)
+        # At standby the mirror goes with the sun: nothing that moves it may change.
+        harmless = name in ("SET_DEFOCUS", "SET_POSITION")
+        assert bench.order(name, *values) == (DONE if harmless else REFUSED_STATE)
+    bench.order("DEFOCUS")
+    bench.run(20)
+    assert bench.order("SET_ARMATURE", *settings(bench)[0][1]) == REFUSED_STATE
+
+
+@pytest.mark.parametrize("state", ["LOCKED", "FAULT"])
+def test_settings_of_the_pose_and_the_machine_change_at_rest_alone(state: str) -> None:
+    bench = tracking()
+    if state == "LOCKED":
+        bench.order("STOW")
+        bench.run(6)
+        assert bench.order("LOCK") == DONE  # it slows down
+    else:
+        bench.do(bench.controller.on_fault(controller.SUPPLY, bench.now, False))
+        bench.run(1)  # it turns away, and then goes with the sun
+    for name, values in settings(bench):
+        harmless = name in ("SET_DEFOCUS", "SET_POSITION")
+        assert bench.order(name, *values) == (DONE if harmless else REFUSED_STATE)
+    bench.run(25)
+    if state == "FAULT":
+        assert bench.order("SET_BIAS", 0.01, 0.02) == REFUSED_STATE
+        bench.run(300)  # to stow
+    held = list(bench.made)
+    for name, values in settings(bench):
+        if name != "ZERO":
+            assert bench.order(name, *values) == DONE
+    assert bench.order("SET_BIAS", 0.01, 0.02) == DONE
+    bench.run(20)
+    assert bench.made == held  # taken, and nothing moves by it
+    assert bench.state == state
+
+
+def test_new_angles_of_the_defocus_do_not_move_a_defocused_mirror() -> None:
+    bench = tracking()
+    bench.order("DEFOCUS")
+    bench.run(20)
+    before = list(bench.made)
+    assert bench.order("SET_DEFOCUS", 0.3, 0.3) == DONE
+    bench.run(5)
+    assert bench.state == "DEFOCUSED"
+    assert np.abs(np.subtract(bench.made, before)).max() < 300  # it goes with the sun
 
 
 def test_a_better_armature_makes_a_better_beam() -> None:
@@ -658,12 +911,13 @@ def test_a_better_armature_makes_a_better_beam() -> None:
     rough = table.copy()
     rough[15:18] = rough[15:18] + [0.0, 0.0, 3e-3]
     rough[15:18] /= np.linalg.norm(rough[15:18])
-    assert bench.order("SET_ARMATURE", *rough) == DONE
-    bench.run(5)
-    assert 0.3 < bench.miss(STANDBY) < 1.0
-    assert bench.order("SET_ARMATURE", *table) == DONE
-    bench.run(5)
-    assert bench.miss(STANDBY) < 0.01
+    for numbers, least, most in ((rough, 0.3, 1.0), (table, 0.0, 0.01)):
+        assert bench.order("LOCK") == DONE
+        bench.run(2)
+        assert bench.order("SET_ARMATURE", *numbers) == DONE
+        assert bench.order("UNLOCK") == bench.order("IDLE") == DONE
+        bench.run(5)
+        assert least <= bench.miss(STANDBY) < most
     assert bench.controller.status()[7] == crc32(struct.pack("<18d", *table))
 
 
@@ -674,6 +928,8 @@ def test_a_message_that_stores_needs_key_and_edition() -> None:
     data = bench.sender.frame(ADDRESS, "SET_ARMATURE", TOKEN, life, 1, *table, key=b"x" * 32)
     bench.deliver(data)
     assert bench.answers[-1][1][-1] == REFUSED_KEY
+    bench.order("LOCK")
+    bench.run(2)
     assert bench.order("SET_ARMATURE", *table) == DONE
     data = bench.sender.frame(ADDRESS, "SET_ARMATURE", TOKEN, life, bench.edition, *table, key=KEY)
     bench.deliver(data)
@@ -752,20 +1008,125 @@ def test_after_a_reset_it_defocuses_stows_and_does_not_track(instant_ms: int) ->
     assert bench.true_ms - begin < 300_000
 
 
-def test_unknown_counts_are_a_fault_and_move_nothing() -> None:
-    bench = tracking()
+def forgets(bench: Bench) -> None:
+    """Make the counts unreadable, and reset the board."""
+    bench.run(1)
+    where = bench.pose()
     bench.flash.data[2 * bench.flash.block_size :] = b"\xff" * (4 * bench.flash.block_size)
     bench.start(bench.flash)
+    assert bench.pose()[0] == pytest.approx(where[0])
+
+
+#: Steps of the defocus angles, 0.1 and 0.05 rad, of perfect drives: 0.1 % off.
+AWAY = [30558, 15279]
+
+
+def test_unknown_counts_are_a_fault_and_the_beam_goes_all_the_same() -> None:
+    bench = tracking()
+    forgets(bench)
+    start, begin = list(bench.made), bench.true_ms
     assert bench.state == "FAULT"
     assert {"COUNTS_UNKNOWN", "COUNTS_DOUBTFUL"} <= flags(bench)
-    bench.run(2)
-    assert bench.order("STOW") == bench.order("DEFOCUS") == DONE
-    bench.run(60)
-    assert bench.made == [0, 0]
+    while bench.miss(AIM) < OFF:
+        bench.run(0.5)
+    assert bench.true_ms - begin < 30_000
+    bench.run(20)
+    assert np.abs(np.subtract(bench.made, start)) == pytest.approx(AWAY, rel=2e-3)
+    held = list(bench.made)
+    for name in ("DEFOCUS", "STOW", "DEFOCUS"):  # it does not add up, nor over a reset
+        assert bench.order(name) == DONE
+        bench.run(12)
+        assert bench.made == held
+        bench.start(bench.flash)
+        bench.run(2)
+        held = list(bench.made)
+        assert bench.state == "FAULT"
+        assert "COUNTS_UNKNOWN" in flags(bench)
+        if name == "DEFOCUS":
+            bench.order("LOCK")
+            bench.run(1)
+            break
     assert bench.order("CLEAR_FAULT") == REFUSED_STATE
     assert bench.order("ZERO", *STOW) == DONE
+    assert "COUNTS_UNKNOWN" not in flags(bench)
+    assert bench.order("UNLOCK") == DONE
     assert bench.order("CLEAR_FAULT") == DONE
     assert bench.state == "STOWED"
+
+
+@pytest.mark.parametrize("name", ["DEFOCUS", "STOW"])
+def test_an_order_turns_a_mirror_with_unknown_counts_away_once(name: str) -> None:
+    bench = tracking()
+    forgets(bench)
+    bench.run(30)
+    bench.start(bench.flash)  # it has turned away before: a reset alone moves nothing
+    bench.run(2)
+    start = list(bench.made)
+    bench.run(20)
+    assert bench.made == start
+    for _ in range(3):
+        assert bench.order(name) == DONE
+        bench.run(15)
+    assert np.abs(np.subtract(bench.made, start)) == pytest.approx(AWAY, rel=2e-3)
+    assert bench.state == "FAULT"
+
+
+def test_silence_turns_a_mirror_with_unknown_counts_away() -> None:
+    bench = tracking()
+    assert bench.order("LOCK") == DONE
+    bench.run(2)
+    bench.journal.doubts = 7  # too many cuts without a warning
+    forgets_at = list(bench.made)
+    bench.journal.at_rest(bench.made[0] + 1, bench.made[1])
+    bench.start(bench.flash)
+    assert bench.state == "LOCKED"
+    assert "COUNTS_UNKNOWN" in flags(bench)
+    bench.sends_sun = bench.sends_time = False
+    bench.run(25)
+    assert bench.miss(AIM) > OFF
+    assert np.abs(np.subtract(bench.made, forgets_at)) == pytest.approx(AWAY, rel=2e-3)
+
+
+def test_a_blind_turn_that_a_limit_switch_ends_goes_the_other_way_when_ordered() -> None:
+    bench = tracking()
+    forgets(bench)
+    start = list(bench.made)
+    bench.run(3)
+    bench.node.on_fault(controller.LIMIT_SWITCH, bench.now, True)
+    turned = np.subtract(bench.made, start)
+    assert np.abs(turned).max() > 1000
+    bench.run(1)
+    stopped = list(bench.made)
+    for _ in range(3):
+        assert bench.order("DEFOCUS") == DONE
+        bench.run(20)
+    back = np.subtract(bench.made, stopped)
+    assert np.abs(back) == pytest.approx(np.multiply(AWAY, 2), rel=2e-3)
+    assert (np.sign(back) == -np.sign(turned)).all()
+    # At the end of a turn, a stop of another cause does not send it back to the receiver.
+    again = tracking()
+    forgets(again)
+    again.run(30)
+    again.node.on_fault(controller.TEMPERATURE, again.now, True)
+    held = list(again.made)
+    again.order("DEFOCUS")
+    again.run(20)
+    assert again.made == held
+
+
+def test_a_mirror_at_stow_with_unknown_counts_stays_until_it_is_ordered() -> None:
+    bench = Bench()
+    bench.run(2)
+    bench.journal.doubts = 7
+    bench.journal.at_rest(STOW[0] + 1, STOW[1])
+    bench.start(bench.flash)
+    assert bench.state == "FAULT"
+    start = list(bench.made)
+    bench.run(60)
+    assert bench.made == start
+    assert bench.order("DEFOCUS") == DONE
+    bench.run(20)
+    assert np.abs(np.subtract(bench.made, start)) == pytest.approx(AWAY, rel=2e-3)
 
 
 def test_a_controller_that_boots_again_and_again_stays_in_fault() -> None:
@@ -815,3 +1176,36 @@ def test_the_watchdog_is_fed_by_whole_ticks() -> None:
     with pytest.raises(TypeError):
         bench.tick()
     assert not bench.fed
+
+
+@pytest.mark.parametrize("broken", ["the lapses", "the lease"])
+@pytest.mark.parametrize("state", ["TRACKING", "SEARCHING", "APPROACHING", "IDLE", "STOWING"])
+def test_the_watchdog_resets_a_board_that_follows_a_sun_it_no_longer_hears(
+    state: str, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = brought_to(state)
+    own = bench.controller
+    monkeypatch.setattr(bench, "check", lambda: None)
+    if broken == "the lapses":
+        monkeypatch.setattr(own, "_lapses", lambda *values: None)
+    else:
+        monkeypatch.setattr(own.sun, "look", lambda *values: True)
+        monkeypatch.setattr(own.sun, "fresh", lambda: True)
+    bench.sends_sun = False
+    bench.run(5)
+    assert bench.fed
+    kind = own.motion.kind
+    bench.run(3)
+    assert (bench.state, own.motion.kind) == (state, kind)
+    assert not bench.fed
+    bench.start(bench.flash)  # a board's watchdog waits 2 s
+    assert bench.state == ("DEFOCUSED" if tuple(bench.made) != STOW else "STOWED")
+
+
+@pytest.mark.parametrize("state", STATES_TO_TRY)
+def test_a_board_that_left_in_time_is_not_reset(state: str) -> None:
+    bench = brought_to(state)
+    bench.sends_sun = bench.sends_time = False
+    for _ in range(60):
+        bench.run(1)
+        assert bench.fed

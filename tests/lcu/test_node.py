@@ -177,15 +177,15 @@ def test_flash_that_fails_latches_a_fault_and_the_beam_still_goes() -> None:
 def test_what_flash_does_not_hold_is_not_acknowledged() -> None:
     bench = standing_by()
     flash = frail(bench)
-    assert bench.order("SET_BIAS", 0.01, 0.02) == DONE
+    assert bench.order("SET_DEFOCUS", 0.21, 0.22) == DONE
     flash.worn = True
-    assert bench.order("SET_BIAS", 0.02, 0.02) == NOT_STORED
+    assert bench.order("SET_DEFOCUS", 0.22, 0.22) == NOT_STORED
     assert bench.controller.fault == controller.JOURNAL
     assert bench.state == "FAULT"
     # The old values lie in the other slot.
     kept = Journal(flash)
     kept.load()
-    assert kept.numbers("biases") == pytest.approx((0.01, 0.02))
+    assert kept.numbers("defocus") == pytest.approx((0.21, 0.22))
 
 
 def test_the_supply_falls_amid_a_motion() -> None:
@@ -216,6 +216,29 @@ def test_steps_that_the_timer_still_held_are_not_counted_when_the_supply_falls()
     kept = Journal(bench.flash)
     kept.load()
     assert [kept.primary, kept.secondary] == bench.made
+
+
+def test_the_last_record_of_a_falling_supply_leaves_out_steps_that_were_not_made() -> None:
+    # The supply dies right after that record: no other one corrects it.
+    bench = tracking()
+    bench.order("STOW")
+    bench.run(6)
+    flash = frail(bench)
+    bench.motors.undone = 37, -11
+    brown_out = bench.journal.brown_out
+
+    def last(primary: int, secondary: int) -> bool:
+        kept = brown_out(primary, secondary)
+        flash.worn = True
+        return kept
+
+    bench.journal.brown_out = last  # type: ignore[method-assign]
+    assert bench.node.on_supply_failing(bench.now)
+    kept = Journal(flash)
+    kept.load()
+    assert [kept.primary, kept.secondary] == bench.made
+    assert kept.rest
+    assert kept.doubt == 0
 
 
 def test_a_minute_without_trouble_is_healthy() -> None:

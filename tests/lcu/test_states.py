@@ -91,6 +91,13 @@ def test_what_needs_the_sun_is_left_when_it_lapses() -> None:
     assert step == (states.STOWING, "stow_directly")
 
 
+@pytest.mark.parametrize("state", [states.LOCKED, states.UNCONFIGURED, states.FAULT])
+def test_a_latched_mirror_goes_when_the_cluster_falls_silent(state: int) -> None:
+    """Invariant 13: the latch stays, the beam goes."""
+    assert states.transition(state, "LAPSED") == (state, "defocus")
+    assert states.transition(state, "SILENT") == (state, "stow_directly")
+
+
 def test_fault_and_lock_are_left_by_their_own_commands_alone() -> None:
     for state, word in ((states.FAULT, "CLEAR_FAULT"), (states.LOCKED, "UNLOCK")):
         for start, event, new, _ in TRANSITIONS:

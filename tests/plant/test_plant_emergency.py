@@ -1,5 +1,6 @@
 """Emergencies of the plant: order, proof, repetition, causes, hysteresis, release."""
 
+import re
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -17,12 +18,13 @@ from heliotrope.plant.audit import read
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.emergency import carried_out
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import Act, adjusted, conditions
+from heliotrope.safety import FLUX_READING, Act, FluxProof, adjusted, conditions
 from heliotrope.twin.wind import Wind
-from support.plant_bench import ENGINEER, OPERATOR, VIEWER, Bench, running
+from support.plant_bench import ENGINEER, LEADS, OPERATOR, VIEWER, Bench, running
 
 Play = Callable[[Bench], Awaitable[None]]
-WINDY = PlantSettings(sensors=frozenset({"wind_gust", "receiver_flux"}))
+WINDY = PlantSettings(sensors=frozenset({"wind_gust", "receiver_flux", FLUX_READING}))
+MEASURED = PlantSettings(sensors=frozenset({FLUX_READING}))
 
 
 def play(folder: Path, scene: Play, seed: int = 0, **options: Any) -> Bench:
@@ -63,15 +65,15 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
         assert bench.count(states.DEFOCUSED) == 17
         early = order.report(plant.now())
         assert (early.unacknowledged, early.not_done) == (("P3B",), ("P3B",))
-        assert early.flux_proven is None
-        plant.put_flux(0.04)
-        assert order.report(plant.now()).flux_proven
+        assert early.flux is FluxProof.AWAITED
+        plant.put(FLUX_READING, 0.04)
+        assert order.report(plant.now()).flux is FluxProof.BELOW
         await bench.wait(1.0)
         assert order.report(plant.now()).late == ("P3B",)
         assert "1 not acknowledged: P3B" in order.report(plant.now()).text
         bench.cluster_of("P3B").deaf.clear()
         await bench.wait(1.5)
-        plant.put_flux(0.04)
+        plant.put(FLUX_READING, 0.04)
         assert order.report(plant.now()).complete
         assert order.report(plant.now()).text.startswith(
             "every heliostat has acknowledged and is done"
@@ -84,7 +86,7 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
         assert plant.emergency.act is Act.STOW
         assert plant.emergency.report(plant.now()).not_done == ()
 
-    bench = play(tmp_path, scene)
+    bench = play(tmp_path, scene, settings=MEASURED)
     assert orders(bench) == [("DEFOCUS", ()), ("STOW", ())]
     # It was repeated to the one that was silent, and to no other.
     repeated = orders(bench, "pod-3")
@@ -92,6 +94,53 @@ def test_an_order_is_proven_or_the_nodes_are_named(tmp_path: Path) -> None:
     assert set(repeated[1:-1]) == {("DEFOCUS", ("P3B",))}
     records, _ = read(bench.audit.path)
     assert (records[0].who, records[0].what, records[0].note) == ("a visitor", "DEFOCUS", "smoke")
+
+
+def test_where_nobody_measures_the_flux_the_proof_rests_on_the_mirrors(tmp_path: Path) -> None:
+    """No row about a value that nobody measures trips or latches."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        assert "flux_after_emergency" in plant.unwatched
+        order = plant.raise_emergency("Olga", Act.STOW)
+        early = order.report(plant.now())
+        assert (early.flux, early.complete) == (FluxProof.NOT_MEASURED, False)
+        await bench.wait(45.0)
+        report = order.report(plant.now())
+        assert report.complete
+        assert report.text == (
+            "every heliostat has acknowledged and is done; flux on the receiver not measured"
+        )
+        assert plant.emergency is order
+        told = {alarm.condition for alarm in plant.alarms}
+        assert told == {"operator_emergency", "authority_lost"}
+        with pytest.raises(UnknownNameError, match="sensor"):
+            plant.put(FLUX_READING, 0.0)
+        plant.withdraw_emergency(OPERATOR)
+        await bench.wait(4.0)
+        plant.acknowledge(OPERATOR, "operator_emergency")
+        token = await bench.commanded()
+        assert not plant.emergency_on
+        assert plant.command(OPERATOR, token, "APPROACH", ("P2B",))
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("share", [0.3, None], ids=["light", "a silent sensor"])
+def test_a_sensor_of_the_flux_counts_also_when_it_is_silent(
+    tmp_path: Path, share: float | None
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        assert "flux_after_emergency" not in plant.unwatched
+        order = plant.raise_emergency("Olga", Act.STOW)
+        await feed(bench, 33, **({} if share is None else {FLUX_READING: share}))
+        assert order.report(plant.now()).flux is FluxProof.NOT_BELOW
+        (alarm,) = [a for a in plant.alarms if a.condition == "flux_after_emergency"]
+        assert ("30 %" if share else "100 %") in alarm.text
+        assert not [a for a in plant.alarms if a.condition == "unknown_reading"]
+
+    play(tmp_path, scene, settings=MEASURED)
 
 
 def test_it_holds_until_withdrawn_and_acknowledged_and_then_nothing_moves(tmp_path: Path) -> None:
@@ -150,7 +199,7 @@ def test_wind_defocuses_and_stows_with_hysteresis(tmp_path: Path) -> None:
         assert bench.count(states.TRACKING) == 18
         await feed(bench, 3, wind_gust=16.0, receiver_flux=0.0)
         assert bench.count(states.DEFOCUSED) == 18
-        plant.put_flux(0.0)
+        plant.put(FLUX_READING, 0.0)
         # Between its limits it stays as it is, however long.
         await feed(bench, 30, wind_gust=13.0, receiver_flux=0.0)
         assert plant.emergency_on
@@ -336,3 +385,37 @@ def test_done_is_judged_by_state_and_by_axes() -> None:
     for act in (Act.STOW, Act.DEFOCUS):
         assert not judged(act, states.IDLE, 0.0, flags=stowed)
     assert judged(Act.STOW, states.STOWED, 0.0)
+
+
+@pytest.mark.parametrize("act", [Act.DEFOCUS, Act.STOW])
+@pytest.mark.parametrize("seen", [True, False])
+def test_unknown_step_counts_are_never_done(act: Act, seen: bool, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P3B")
+        row = cluster.names.index("P3B")
+        if seen:
+            plant.aims[plant.field.place("P3B")] = (1.0, 0.0, 15.0)
+            cluster.set(states.TRACKING, "P3B")
+            await bench.wait(2.0)
+        # A reset has made its counts unreadable; the cluster reports all it is asked for as done.
+        cluster.rows["flags"][row] = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
+        cluster.set(states.FAULT, "P3B")
+        await bench.wait(2.0)
+        if not seen:
+            plant.field.posed_at[plant.field.place("P3B")] = -np.inf
+        order = plant.raise_emergency("a visitor", act)
+        await bench.wait(10.0)
+        report = order.report(plant.now())
+        assert report.not_done == ("P3B",)
+        assert not report.complete
+        text = r"P3B: step counts unknown, so it is not proven to be off; "
+        last = r"1\d s ago it was TRACKING with its beam at \(1.0, 0.0, 15.0\) m"
+        assert re.search(text + (last if seen else "nothing is known of its beam"), report.text)
+        cluster.rows["flags"][row] = 0
+        cluster.set(LEADS[act.name], "P3B")
+        await bench.wait(2.0)
+        report = order.report(plant.now())
+        assert report.not_done == ()
+        assert "unknown" not in report.text
+
+    play(tmp_path, scene)

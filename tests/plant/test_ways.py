@@ -9,14 +9,18 @@ import pytest
 
 from heliotrope.field.example import prototype
 from heliotrope.field.volumes import Sphere
-from heliotrope.lcu import states
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import names, states
 from heliotrope.links.clock import VirtualClock, run_virtual
 from heliotrope.links.messages import Emergency
+from heliotrope.mechanism.machine import AxisLimits, Machine
 from heliotrope.mechanism.tracking import track
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import rest_on
 from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.leaving import turned_away, way_out
+from heliotrope.safety import Act
 from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 #: South of the tower; P5A stands due south of it and shines to the tower.
@@ -178,43 +182,172 @@ def test_by_night_and_without_volumes_nothing_is_in_the_way() -> None:
         assert check.around(rows, aim, 0.3, np.array(sun)) == {}
 
 
+def reports(bench: Bench, name: str, state: int, at: list[int], end: list[int]) -> None:
+    """Let a heliostat report that it goes from counts to others."""
+    cluster = bench.cluster_of(name)
+    cluster.set(state, name)
+    row = cluster.names.index(name)
+    for axis, what in enumerate(("primary", "secondary")):
+        cluster.rows[what][row] = at[axis]
+        cluster.rows[f"{what}_goal"][row] = end[axis]
+
+
+def alarmed(plant: PlantController) -> set[str]:
+    """The heliostats whose alarm has not ended."""
+    last = {a.subject: a.active for a in plant.alarms if a.condition == "keep_out_predicted"}
+    return {name for name, active in last.items() if active}
+
+
 @pytest.mark.parametrize("commanded", [True, False])
-def test_who_goes_into_a_volume_is_held(commanded: bool, tmp_path: Path) -> None:
+def test_a_beam_in_a_volume_or_heading_for_one_is_sent_off(commanded: bool, tmp_path: Path) -> None:
     async def scene(bench: Bench) -> None:
         plant = bench.plant
         assert "keep_out_predicted" not in plant.unwatched
         if commanded:
             await bench.commanded()
-        west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
         inside = counts(plant, "P5B", (0.0, -12.0, 8.0))
-        cluster = bench.cluster_of("P5A")
         # P5C goes to stow across it, which is never held up; the beam of P5B stands in it.
-        for name, state, begin, end in (
-            ("P5A", states.IDLE, west, east),
-            ("P5B", states.TRACKING, inside, inside),
-            ("P5C", states.STOWING, counts(plant, "P5C", WEST), counts(plant, "P5C", EAST)),
-        ):
-            cluster.set(state, name)
-            row = cluster.names.index(name)
-            for axis, what in enumerate(("primary", "secondary")):
-                cluster.rows[what][row] = begin[axis]
-                cluster.rows[f"{what}_goal"][row] = end[axis]
+        west, east = counts(plant, "P5A", WEST), counts(plant, "P5A", EAST)
+        reports(bench, "P5A", states.IDLE, west, east)
+        reports(bench, "P5B", states.TRACKING, inside, inside)
+        begin, end = counts(plant, "P5C", WEST), counts(plant, "P5C", EAST)
+        reports(bench, "P5C", states.STOWING, begin, end)
         await bench.wait(6.0)
-        told = [a for a in plant.alarms if a.condition == "keep_out_predicted" and a.active]
-        assert {a.subject for a in told} == {"P5A", "P5B"}
-        # They are held, so that nothing moves into it any more.
-        await bench.wait(8.0)
-        over = [a for a in plant.alarms if a.condition == "keep_out_predicted" and not a.active]
-        assert {a.subject for a in over} == {"P5A", "P5B"}
+        told = {a.subject for a in plant.alarms if a.condition == "keep_out_predicted"}
+        assert told == {"P5A", "P5B"}
+        # P5A is defocused and does not go on; P5B has obeyed too, but its beam is where it was.
+        reports(bench, "P5A", states.DEFOCUSED, west, west)
+        await bench.wait(60.0)
+        assert alarmed(plant) == {"P5B"}
+        sent = [m.name for m in bench.cluster_of("P5A").of(Emergency) if "P5B" in m.heliostats]
+        assert sent[0] == "DEFOCUS"
+        assert sent[1:].count("STOW") >= 2
+        await stands(bench, "P5B", states.STOWED, counts(plant, "P5B", EAST))
+        await bench.wait(6.0)
+        assert alarmed(plant) == set()
+        sent = bench.cluster_of("P5A").of(Emergency)
+        await bench.wait(70.0)
+        assert bench.cluster_of("P5A").of(Emergency) == sent
 
     bench = play(tmp_path, scene)
     cluster = bench.cluster_of("P5A")
-    if commanded:
-        assert {m.heliostats for m in cluster.commands("LOCK")} == {("P5A",), ("P5B",)}
-        assert not cluster.of(Emergency)
-    else:
-        assert {m.heliostats for m in cluster.of(Emergency)} == {("P5A",), ("P5B",)}
-        assert not cluster.commands("LOCK")
+    assert {name for m in cluster.of(Emergency) for name in m.heliostats} == {"P5A", "P5B"}
+    assert not cluster.commands("LOCK")
+
+
+@pytest.mark.parametrize("state", range(len(states.STATES)), ids=states.STATES)
+def test_a_beam_in_a_volume_is_seen_in_every_state(state: int, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        inside = counts(bench.plant, "P5A", (0.0, -12.0, 8.0))
+        bench.cluster_of("P5A").deaf.add("P5A")
+        reports(bench, "P5A", state, inside, inside)
+        await bench.wait(6.0)
+        assert alarmed(bench.plant) == {"P5A"}
+        await bench.wait(40.0)
+        assert alarmed(bench.plant) == {"P5A"}
+
+    sent = play(tmp_path, scene).cluster_of("P5A").of(Emergency)
+    assert len({m.identity.split(".")[0] for m in sent}) > 2
+    assert {m.heliostats for m in sent} == {("P5A",)}
+    assert sent[-1].name == "STOW"
+
+
+@pytest.mark.parametrize("state", [states.DEFOCUSED, states.LOCKED, states.FAULT])
+def test_a_way_off_that_would_end_in_a_volume_is_seen_before_it_ends(
+    state: int, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        inside = counts(bench.plant, "P5A", (0.0, -12.0, 8.0))
+        reports(bench, "P5A", state, counts(bench.plant, "P5A", WEST), inside)
+        await bench.wait(6.0)
+        assert alarmed(bench.plant) == {"P5A"}
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize("lost", ["counts", "heliostat"])
+def test_a_beam_in_a_volume_stays_known_when_its_heliostat_is_lost(
+    lost: str, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of("P5A")
+        inside = counts(plant, "P5A", (0.0, -12.0, 8.0))
+        await stands(bench, "P5A", states.TRACKING, inside)
+        row = cluster.names.index("P5A")
+        if lost == "counts":
+            cluster.rows["flags"][row] = 1 << names.FLAGS.index("COUNTS_UNKNOWN")
+            await stands(bench, "P5A", states.FAULT, [0, 0])
+        else:
+            cluster.age_ms[row] = 20_000
+        await bench.wait(30.0)
+        assert alarmed(plant) == {"P5A"}
+        cluster.age_ms[row] = cluster.rows["flags"][row] = 0
+        await stands(bench, "P5A", states.STOWED, counts(plant, "P5A", EAST))
+        await bench.wait(6.0)
+        assert alarmed(plant) == set()
+
+    play(tmp_path, scene)
+
+
+def test_an_approach_is_known_to_turn_azimuth_first(tmp_path: Path) -> None:
+    """One way turns in the volume, the other passes beside it; both join the same two places."""
+
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        group, row = DESIGN.find("P5A")
+        found = track(group.mechanism[row], plant.sun_vector(), WALKWAY.center)
+        inside, drives = found.chosen(found.angles), group.mechanism[row].drives
+
+        def steps(angles: FloatArray) -> list[int]:
+            return [round(float(x)) for x in drives.counts(angles)]
+
+        # Elevation alone, then azimuth alone, leads through it.
+        begin, end = inside - np.array([0.0, 0.4]), inside + np.array([0.4, 0.0])
+        for first, last, seen in ((begin, end, False), (end, begin, True)):
+            reports(bench, "P5A", states.APPROACHING, steps(first), steps(last))
+            before = len(plant.alarms)
+            await bench.wait(5.0)
+            told = [a for a in list(plant.alarms)[before:] if a.condition == "keep_out_predicted"]
+            assert bool(told) == seen
+
+    play(tmp_path, scene)
+
+
+def test_the_way_out_is_the_one_that_ends_outside_and_is_inside_for_less() -> None:
+    sun = np.array([0.3, -0.4, 0.866])
+    sun /= np.linalg.norm(sun)
+    row = DESIGN.names.index("P5A")
+    group, place = DESIGN.find("P5A")
+    drives = group.mechanism[place].drives
+    found = track(group.mechanism[place], sun, WALKWAY.center)
+    begin, here = found.chosen(found.angles), found.chosen(found.counts)
+    limits = (AxisLimits(-(1 << 28), 1 << 28, 1000, 1000, 0),) * 2
+    far = tuple(round(x) for x in drives.counts(begin + np.array([0.8, 0.3])))
+    machine = Machine(limits, (far[0], far[1]), (0.1, 0.1))
+    check = BeamCheck(DESIGN, DESIGN.names)
+    assert way_out(check, machine, row, here, sun) is Act.DEFOCUS
+    assert way_out(check, None, row, here, sun) is Act.DEFOCUS
+    # Where the defocus ends, another volume begins.
+    end = group.mechanism[place].armature.pose(turned_away(begin, machine, drives))
+    normal, vertex = end[0], end[1]
+    ball = Sphere("ball", vertex + 20.0 * (2.0 * (sun @ normal) * normal - sun), 1.0)
+    check = BeamCheck(DESIGN, DESIGN.names, [WALKWAY, ball])
+    assert way_out(check, machine, row, here, sun) is Act.STOW
+    assert check.inside(row, begin[None], np.array([0.0, 0.6, -0.8])).tolist() == [False]
+
+
+def test_a_defocus_turns_the_other_way_before_a_stop() -> None:
+    group, place = DESIGN.find("P5A")
+    drives = group.mechanism[place].drives
+    low, high = drives.counts(np.array([0.0, 0.0])), drives.counts(np.array([1.0, 1.0]))
+    ends = np.sort(np.stack([low, high]), axis=0)
+    limits = tuple(AxisLimits(int(ends[0, i]), int(ends[1, i]), 1000, 1000, 0) for i in (0, 1))
+    stow = (int(ends[0, 0]), int(ends[0, 1]))
+    machine = Machine((limits[0], limits[1]), stow, (0.1, 0.1))
+    narrow = Machine((limits[0], limits[1]), stow, (0.9, 0.9))
+    for at, wide, expected in ((0.5, False, 0.6), (0.95, False, 0.85), (0.4, True, 1.0)):
+        found = turned_away(np.array([at, at]), narrow if wide else machine, drives)
+        assert np.allclose(found, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("field", [False, True])

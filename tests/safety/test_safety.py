@@ -18,6 +18,7 @@ from heliotrope.safety import (
     Act,
     Action,
     Condition,
+    FluxProof,
     JoinLimiter,
     Proof,
     Reading,
@@ -57,7 +58,17 @@ TRIPS = {
     "ups_on_battery": (1.0, 0.0, Act.DEFOCUS, Scope.FIELD, "runs on battery: mains power is lost"),
     "ups_charge_low": (0.4, 1.0, Act.STOW, Scope.FIELD, r"UPS is 40 % \(limit 50 %\)"),
     "database_unwritable": (5.5, 0.0, Act.REFUSE_NEW, Scope.FIELD, "not confirmed a write for"),
-    "keep_out_predicted": (1.0, 0.0, Act.HOLD, Scope.HELIOSTAT, "in a keep-out volume or headin"),
+    "keep_out_predicted": (
+        1.0,
+        0.0,
+        Act.DEFOCUS,
+        Scope.HELIOSTAT,
+        "in a keep-out volume or headin",
+    ),
+    "pointing_disagrees": (5e-3, 0.0, Act.DEFOCUS, Scope.HELIOSTAT, r"beam 0.286° beside its aim"),
+    "pointing_disagrees_many": (120.0, 0.0, Act.DEFOCUS, Scope.FIELD, "counts of 120 heliostats"),
+    "cluster_time_differs": (5.0, 0.0, Act.DEFOCUS, Scope.CLUSTER, "differs from the .* by 5 s"),
+    "cluster_site_differs": (0.04, 0.0, Act.DEFOCUS, Scope.CLUSTER, "site is 2.29° off that of"),
     "node_faults": (0.03, 0.0, Act.REFUSE_NEW, Scope.FIELD, "3 % of the heliostats failed"),
     "node_faults_many": (0.2, 0.0, Act.DEFOCUS, Scope.FIELD, "20 % of the heliostats failed"),
 }
@@ -531,7 +542,7 @@ def test_proof_is_complete_only_with_every_node_and_the_flux() -> None:
     assert report.late == ()
     assert "the flux is below its limit" in report.text
     # The reading grows old, and proves nothing any more.
-    assert proof.report(40.0).flux_proven is False
+    assert proof.report(40.0).flux is FluxProof.NOT_BELOW
     assert "flux not proven to be below 10%" in proof.report(40.0).text
 
 
@@ -560,6 +571,19 @@ def test_reports_that_prove_nothing_are_counted_and_left_out() -> None:
         Proof.of("TRACK", (), 0.0)
     with pytest.raises(InputError, match="not a time"):
         Proof.of("STOW", (), math.nan)
+
+
+def test_a_proof_rests_on_the_mirrors_where_nobody_measures_the_flux() -> None:
+    proof = Proof.of("DEFOCUS", ("A1", "A2"), 0.0, flux_measured=False)
+    proof = proof.with_acknowledged("A1", 0.5).with_done("A1", 12.0)
+    report = proof.report(40.0)
+    assert not report.complete, "A2 is not known to be done"
+    assert "1 not done: A2; flux on the receiver not measured" in report.text
+    assert safety.proof_readings(proof, 40.0)["flux_after_emergency", ""].value == 0.0
+    report = proof.with_done("A2", 41.0).report(50.0)
+    assert report.complete
+    assert report.flux is FluxProof.NOT_MEASURED
+    assert report.text.endswith("is done; flux on the receiver not measured")
 
 
 @pytest.mark.parametrize(("share", "trips"), [(0.05, False), (0.12, True), (None, True)])
@@ -659,5 +683,5 @@ def test_a_row_about_heliostats_is_evaluated_for_those_with_a_reading() -> None:
         readings[row.reading, ""] = Reading(0.0, now)
         state, actions = safety.evaluate(readings, state, now)
         assert {a.subject for a in actions} == tripped
-        assert {a.act for a in actions} <= {Act.HOLD}
+        assert {a.act for a in actions} <= {Act.DEFOCUS}
     assert set(safety.narrowed(state, row.name, ()).tracks) == {(row.name, "")}

@@ -6,7 +6,7 @@ import copy
 import functools
 import struct
 from collections.abc import AsyncIterator, Callable, Coroutine
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any, TypeVar
 
 from heliotrope.cluster.config import ClusterConfig, Member
@@ -272,12 +272,12 @@ class Field:
         return all(board.node.controller.sun.fresh() for board in self.boards if board.on)
 
 
-#: When fields begin whose boards come from another.
+#: When fields of new boards begin.
 LATER = datetime(2026, 6, 21, 10, 15, tzinfo=UTC)
 
 
 @functools.cache
-def _saved() -> dict[str, list[Board]]:
+def _saved() -> dict[str, tuple[list[Board], datetime]]:
     found = {}
 
     async def main(clock: VirtualClock) -> None:
@@ -286,19 +286,23 @@ def _saved() -> dict[str, list[Board]]:
             await field.order("aim", "AIM", *AIM)
             await field.order("approach", "APPROACH")
             await field.until(lambda: set(field.states()) == {"IDLE"}, 300.0)
-            found["IDLE"] = copy.deepcopy(field.boards)
+            found["IDLE"] = copy.deepcopy(field.boards), clock.utc()
             await field.order("track", "TRACK")
             await field.until(lambda: set(field.states()) == {"TRACKING"}, 10.0)
             await asyncio.sleep(20.0)
-            found["TRACKING"] = copy.deepcopy(field.boards)
+            found["TRACKING"] = copy.deepcopy(field.boards), clock.utc()
 
     run_virtual(main)
     return found
 
 
-def boards_in(state: str) -> list[Board]:
-    """Two boards that are in IDLE, or TRACKING; for a field that begins at `LATER`."""
-    return copy.deepcopy(_saved()[state])
+def boards_in(state: str) -> tuple[list[Board], datetime]:
+    """Two boards in IDLE or TRACKING, and when their field is to begin.
+
+    They refuse a sun that cannot follow from the last one that they took.
+    """
+    boards, at = _saved()[state]
+    return copy.deepcopy(boards), at.replace(microsecond=0) + timedelta(seconds=4)
 
 
 def run(
@@ -308,7 +312,7 @@ def run(
     **settings: Any,
 ) -> Field:
     """Run a test in virtual time, on two boards of a state or on new ones, and return its field."""
-    boards = boards_in(state) if state else settings.pop("boards", None)
+    boards, start = boards_in(state) if state else (settings.pop("boards", None), LATER)
 
     async def live(clock: VirtualClock) -> Field:
         field = Field(clock, boards=boards, seed=seed, **settings)
@@ -316,7 +320,7 @@ def run(
             await main(field)
         return field
 
-    return run_virtual(live, seed, start=LATER)
+    return run_virtual(live, seed, start=start)
 
 
 class SlotBus(TwinBus):

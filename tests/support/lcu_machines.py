@@ -298,7 +298,7 @@ class Bench:
     def check(self) -> None:
         """What must hold after every event."""
         own = self.controller
-        if own.motion.stepper is not None:
+        if own.motion.stepper is not None and own.motion.known:
             assert [axis.count for axis in own.motion.stepper.axes] == self.made
         if own.state in states.NEED_SUN:
             assert own.sun.fresh()

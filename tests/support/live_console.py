@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
+from nicegui import core
+
 from heliotrope.console import _secrets
 from heliotrope.console.serve import ConsoleServer
 from heliotrope.console.settings import ConsoleSettings
@@ -89,6 +91,8 @@ class LiveConsole:
         )
         async with self.live.running():
             settings = ConsoleSettings(port=0, page=page)
+            # NiceGUI's application is one for the process, and the tests open several consoles.
+            core.app.middleware_stack = None
             self.server = ConsoleServer(self.live.operations, self.keeper.people, settings)
             async with running(self.server):
                 self.address = await self.server.address()

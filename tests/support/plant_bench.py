@@ -2,12 +2,14 @@
 
 import asyncio
 import contextlib
+import functools
 import struct
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from heliotrope.field.example import prototype
 from heliotrope.field.plant import Plant
@@ -39,6 +41,7 @@ from heliotrope.plant.settings import PlantSettings
 OPERATOR = Person("Olga", Role.OPERATOR)
 ENGINEER = Person("Egon", Role.ENGINEER)
 VIEWER = Person("Vera", Role.VIEWER)
+_STEPS = ("primary", "secondary", "primary_goal", "secondary_goal")
 #: State to which a command leads at once.
 LEADS = {
     "APPROACH": states.IDLE,
@@ -50,6 +53,9 @@ LEADS = {
     "STOW": states.STOWED,
     "SEARCH": states.SEARCHING,
 }
+
+
+Rows = npt.NDArray[Any]
 
 
 class ScriptedCluster:
@@ -67,6 +73,10 @@ class ScriptedCluster:
         Its status, and the age of each row.
     stored
         Items of each heliostat's journal.
+    poses
+        Completes the rows with the step counts of heliostats that track.
+    late, site
+        Error of its time, s, and the site that it reports.
     """
 
     def __init__(self, name: str, names: tuple[str, ...], link: Link, clock: VirtualClock) -> None:
@@ -82,6 +92,9 @@ class ScriptedCluster:
         self.stored: dict[str, dict[str, bytes]] = {name: {} for name in names}
         self.token = 0
         self.first = True
+        self.poses: Callable[[Rows], Rows] = lambda rows: rows
+        self.late = 0.0
+        self.site: tuple[float, ...] = ()
 
     def of(self, kind: type[Any]) -> list[Any]:
         """The messages of a kind."""
@@ -111,19 +124,20 @@ class ScriptedCluster:
         while True:
             due += 1.0
             if self.link.connected and not self.mute:
-                rows = self.rows.copy()
+                rows = self.poses(self.rows.copy())
                 rows["heard_ms"] = np.where(self.age_ms < 0, NEVER, np.maximum(self.age_ms, 0))
                 rows["steps_ms"] = rows["heard_ms"]
                 greet = self.first and self.greets
                 status = ClusterStatus(
                     self.name,
                     len(rows),
-                    self.clock.utc().timestamp(),
+                    self.clock.utc().timestamp() - self.late,
                     "gps",
                     1e-3,
                     3.0,
                     0.2,
                     names=self.names if greet else (),
+                    site=self.site,
                     block=rows.tobytes(),
                 )
                 await self.send(status)
@@ -218,6 +232,21 @@ class Bench:
             entropy=lambda n: (next(counter) * 7919).to_bytes(n, "little"),
             **{"settings": PlantSettings(), **options},
         )
+        for cluster in self.clusters.values():
+            cluster.poses = functools.partial(self._tracking, cluster)
+
+    def _tracking(self, cluster: ScriptedCluster, rows: Rows) -> Rows:
+        """Put heliostats that track, and of which the test says nothing, on their aims."""
+        plant = self.plant
+        places = np.array([plant.field.place(n) for n in cluster.names], dtype=np.intp)
+        silent = ~np.any([rows[n] for n in _STEPS], axis=0) & (rows["state"] == states.TRACKING)
+        mine = np.flatnonzero(silent & np.isfinite(plant.aims[places]).all(axis=-1))
+        if len(mine):
+            found = plant.beams.poses(places[mine], plant.aims[places[mine]], plant.sun_vector())
+            counts = np.rint(found.chosen(found.counts)).astype(np.int32)
+            for i, name in enumerate(_STEPS):
+                rows[name][mine] = counts[:, i % 2]
+        return rows
 
     def cluster_of(self, name: str) -> ScriptedCluster:
         """The cluster of a heliostat."""

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from heliotrope.links.messages import Stage
 from heliotrope.plant import authority, field_state
 from heliotrope.plant.audit import AuditError
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.emergency.order import EmergencyOrder
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import JoinLimiter
+from heliotrope.twin.invariants.plant_observer import PlantObserver
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -69,6 +73,38 @@ def broken_by_anybody(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(authority.Authority, "seize", lambda self, person, reason: self._give(person))
 
 
+def resumes_by_itself(patch: pytest.MonkeyPatch) -> None:
+    """Heliostats that are defocused, and not in an emergency, are sent back to the receiver."""
+    take, check = PlantController._take_status, PlantObserver.check
+
+    def resuming(self: Any, end: Any, status: Any, now: float) -> None:
+        take(self, end, status, now)
+        names = [n for n in end.members if self.field.of(n, now).state == "DEFOCUSED"]
+        if names and not self.emergency_on and not self.waiting:
+            ticket = Ticket("by itself", "REFOCUS", names, self.clock, 60.0)
+            self._join(ticket, "REFOCUS", (), names, self.authority.token)
+
+    def quiet(self: Any, number: int, *rest: Any) -> None:
+        """Leave the missing record to a defect of its own."""
+        if number != 11:
+            check(self, number, *rest)
+
+    patch.setattr(PlantController, "_take_status", resuming)
+    patch.setattr(PlantObserver, "check", quiet)
+
+
+def done_when_acknowledged(patch: pytest.MonkeyPatch) -> None:
+    """A heliostat that acknowledges an emergency counts as done."""
+    take_stage = EmergencyOrder.take_stage
+
+    def hasty(self: Any, heliostats: Any, stage: Stage, now: float) -> None:
+        take_stage(self, heliostats, stage, now)
+        if stage is Stage.ACKNOWLEDGED:
+            take_stage(self, heliostats, Stage.DONE, now)
+
+    patch.setattr(EmergencyOrder, "take_stage", hasty)
+
+
 #: Invariants that may find it, name, defect, faults to draw from, pause between them, and the seed
 #: that found it.
 ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...] = (
@@ -78,5 +114,6 @@ ROWS: tuple[tuple[tuple[int, ...], str, Plant, tuple[str, ...], float, int], ...
     ((11,), "orders to everybody are not recorded", safe_not_recorded, ("line_drop",), 60.0, 0),
     ((11,), "stale row shown as live", stale_as_live, ("power_cut", "cluster_crash"), 10.0, 1),
     ((4,), "command accepted without authority", authority_of_anybody, ("line_drop",), 60.0, 1),
+    ((15,), "done when it is acknowledged", done_when_acknowledged, ("line_drop",), 60.0, 0),
     ((4,), "authority broken by anybody", broken_by_anybody, ("line_drop",), 60.0, 2),
 )

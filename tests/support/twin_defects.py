@@ -20,7 +20,9 @@ from heliotrope.lcu import (
     wire,
 )
 from heliotrope.links.messages import Stage
+from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant import aims
+from heliotrope.twin.boards import outfit
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan
 from support import plant_defects
@@ -48,10 +50,11 @@ class Defect:
     faults: tuple[Fault, ...] | None = None
     first: int = 0
     slow: bool = False
+    worlds: tuple[str, ...] = ()
 
     def plan(self, seed: int) -> RunPlan:
         """Where it is looked for."""
-        return RunPlan(seed, self.seconds, 3, self.pause, self.only, self.faults)
+        return RunPlan(seed, self.seconds, 3, self.pause, self.only, self.faults, self.worlds)
 
 
 def _lease_by_any_frame(patch: pytest.MonkeyPatch) -> None:
@@ -216,6 +219,37 @@ def _questions_alike(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(_nodes, "SEQUENCES", 1)
 
 
+def _sun_turned(patch: pytest.MonkeyPatch) -> None:
+    """Every local controller points by a sun that is ten minutes further west."""
+    vector = lease.SunLease.vector
+
+    def turned(self: Any, ahead_ms: int) -> tuple[float, float, float]:
+        east, north, up = vector(self, ahead_ms)
+        return east - 0.04 * north, north + 0.04 * east, up
+
+    patch.setattr(lease.SunLease, "vector", turned)
+
+
+def _armature_exchanged(patch: pytest.MonkeyPatch) -> None:
+    """The items of a board are those of another mirror: one that leans by 30 mrad."""
+    patch.setattr(
+        outfit, "items_of", lambda mechanism, machine: items_of(_leaning(mechanism), machine)
+    )
+
+
+def _leaning(mechanism: Any) -> Any:
+    return mechanism.with_parameters(dict.fromkeys(outfit.CAUSES, 0.03))
+
+
+def _stays_after_boot(patch: pytest.MonkeyPatch) -> None:
+    line = "UNCONFIGURED BOOT_AWAY DEFOCUSED defocus"
+    assert line in states.TABLE
+    table = states.TABLE.replace(line, "UNCONFIGURED BOOT_AWAY DEFOCUSED hold")
+    assert "DEFOCUSED SILENT STOWING" in table
+    table = table.replace("DEFOCUSED SILENT STOWING", "DEFOCUSED SILENCE STOWING")
+    patch.setattr(states, "TABLE", table)
+
+
 def _lease_too_long(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lease.SunLease, "fresh", lambda self: True)
     patch.setattr(lease.SunLease, "look", lambda self, now, elapsed: True)
@@ -250,6 +284,16 @@ DEFECTS = (
     Defect((11,), "an acknowledgement makes a row young", _young_by_any_answer, ("bus_bad",), 5.0),
     Defect((11,), "a late answer passes for another", _questions_alike, ("bus_bad",), 5.0,
            first=3, slow=True),
+    Defect((12,), "a sun ten minutes ahead", _sun_turned, ("line_drop",), 60.0,
+           worlds=("calm",)),
+    Defect((12,), "the armature of another mirror", _armature_exchanged, ("line_drop",), 60.0,
+           worlds=("calm",)),
+    Defect((14,), "the field resumes by itself", plant_defects.resumes_by_itself, seconds=180.0,
+           faults=tuple(Fault("line_cut", at, 9.0, 0, 0.5) for at in (80.0, 120.0, 150.0)),
+           worlds=("calm",)),
+    Defect((13,), "a mirror stays where it was after a boot", _stays_after_boot,
+           faults=tuple(Fault("power_cut", 150.0, 2.0, i, 0.5) for i in range(3)), seconds=220.0,
+           worlds=("calm",)),
     *(Defect(numbers, name, defect, only, pause, first=first)
       for numbers, name, defect, only, pause, first in plant_defects.ROWS),
 )  # fmt: skip

@@ -31,6 +31,7 @@ from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.safety import FLUX_READING
 from heliotrope.sun import Site
 from heliotrope.twin.boards import outfit
 from heliotrope.twin.boards.board import Board
@@ -136,7 +137,7 @@ class WholePlant:
             self.audit,
             wanted=Wanted(wanted),
             entropy=chance.randbytes,
-            **{"settings": PlantSettings(), **options},
+            **{"settings": PlantSettings(sensors=frozenset({FLUX_READING})), **options},
         )
         self.token = 0
 
@@ -160,7 +161,7 @@ class WholePlant:
             grant = self.plant.authority.grant
             if grant is not None and grant.token == self.token:
                 self.plant.authority.keep(ENGINEER, self.token)
-            self.plant.put_flux(self.flux())
+            self.plant.put(FLUX_READING, self.flux())
 
     @contextlib.asynccontextmanager
     async def alive(self) -> AsyncIterator["WholePlant"]:

@@ -185,7 +185,7 @@ def test_a_calibration_cycle_with_rendered_photographs(tmp_path: Path) -> None:
         result = await cycle.run(ENGINEER, token, worst, "white")
         assert result.text.startswith("calibrated: beam error"), result.text
         assert result.rejected == ()
-        assert camera.taken == 4
+        assert camera.taken == 5  # the last one confirms the new parameters
         await whole.wait(20.0)
         assert whole.all_are("TRACKING")
         assert error(worst) < 0.5 * MRAD < 1.0 * MRAD < before

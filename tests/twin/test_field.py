@@ -174,6 +174,28 @@ def test_field_and_boards_make_the_same_steps() -> None:
     assert both.angles_apart() < 1e-9
 
 
+def test_a_lock_and_a_hold_end_with_the_cluster_as_on_the_boards() -> None:
+    both = Both()
+    both.run(2)
+    both.order("AIM", *RECEIVER)
+    both.order("APPROACH")
+    both.run(60)
+    both.order("TRACK", rows=(0, 1))
+    both.run(12)
+    both.order("LOCK")
+    both.run(3)
+    both.order("UNLOCK", rows=(1,))
+    both.order("DEFOCUS", rows=(2,))
+    both.run(4)
+    assert [states.STATES[s] for s in both.field.state] == ["LOCKED", "IDLE", "LOCKED"]
+    both.run(12, sun=False)
+    assert [states.STATES[s] for s in both.field.state] == ["LOCKED", "DEFOCUSED", "LOCKED"]
+    both.run(60, sun=False)
+    assert both.field.at_stow().all()
+    assert [states.STATES[s] for s in both.field.state] == ["LOCKED", "STOWED", "LOCKED"]
+    assert both.angles_apart() < 1e-9
+
+
 def test_gears_faults_locks_and_supplies_are_those_of_the_boards() -> None:
     wind = Wind(speed=7.0, towards=1.0, seed=3)
     both = Both(play=35.0, wind=wind)

@@ -25,6 +25,7 @@ from heliotrope.mechanism.board_items import items_of
 from heliotrope.plant.authority import Person, Role
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.visits.photographs import Shot
+from heliotrope.safety import FluxProof
 from heliotrope.store.keeper import Keeper
 from heliotrope.twin.cameras import (
     ExactCamera,
@@ -37,10 +38,12 @@ from heliotrope.twin.field import Field, FieldBus
 from heliotrope.twin.live import PacedLoop, WorldOptions, near_pair
 from heliotrope.twin.live.live import machine_of
 from heliotrope.twin.live.loop import LATE
+from heliotrope.twin.sensors import light_share
 from support.live import LiveOptions, LivePlant
 
 MRAD = 1e-3
 START = datetime(2026, 10, 21, 7, tzinfo=UTC)
+NIGHT = datetime(2026, 10, 21, 23, tzinfo=UTC)
 EXACT = LiveOptions(rendered=False, threads=0)
 
 
@@ -396,3 +399,46 @@ def test_what_a_live_plant_refuses() -> None:
             WorldOptions(threads=-1)
 
     run_virtual(main)
+
+
+@pytest.mark.parametrize("boards", [False, True], ids=["field", "boards"])
+def test_an_emergency_of_the_twin_is_proven_with_its_flux(boards: bool) -> None:
+    """No false alarm of flux; a mirror that stays on the receiver is a true one."""
+    two = lay_out("radial", 2)
+    idle = replace(EXACT, boards=boards, work=AutomaticSettings(wanted=True, calibrate=False))
+
+    async def work(live: LivePlant) -> None:
+        plant, sensor = live.plant, live.world.flux
+        assert sensor is not None
+        assert "flux_after_emergency" not in plant.unwatched
+        await asyncio.sleep(100.0)
+        assert plant.field.among((states.TRACKING,), plant.now()).all(), plant.field.counted()
+        assert sensor.share() > 0.9
+        order = plant.raise_emergency("Olga")
+        await asyncio.sleep(29.0)
+        assert sensor.share() == 0.0
+        report = order.report(plant.now())
+        assert report.flux is FluxProof.BELOW
+        assert report.complete
+        assert report.text.endswith("is done; the flux is below its limit")
+        await asyncio.sleep(10.0)
+        assert not [row for row in live.operations.alarms() if "flux" in row.condition]
+
+    live(work, two, idle)
+
+
+def test_the_flux_sensor_sees_a_mirror_that_stays() -> None:
+    field = LivePlant(lay_out("radial", 4), VirtualClock(start=START), EXACT).world
+    assert field.flux is not None
+    receiver = field.design.receivers[0].center
+    normal, vertex = field.field.stand()
+    light = field.sun()
+    onto = bisector(light, normalize(receiver - vertex))
+    for count in range(5):
+        normal[:count] = onto[:count]
+        assert light_share(normal, vertex, light, receiver, 1.0) == pytest.approx(
+            count / 4, abs=0.1
+        )
+    night = LivePlant(lay_out("radial", 4), VirtualClock(start=NIGHT), EXACT).world
+    assert night.flux is not None
+    assert night.flux.share() == 0.0

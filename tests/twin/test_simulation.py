@@ -13,6 +13,7 @@ from heliotrope.twin.invariants.invariants import TITLES
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
+from heliotrope.twin.world.worlds import WORLDS
 from support.twin_defects import DEFECTS, Defect
 
 #: Seeds that may be spent on a defect.
@@ -87,6 +88,20 @@ def test_a_seed_gives_the_same_run_again() -> None:
     assert run(RunPlan(6, 60.0, 2)).counts != first.counts
 
 
+@pytest.mark.parametrize("world", WORLDS)
+def test_a_world_is_the_same_for_the_same_seed(world: str) -> None:
+    first, second = (run(RunPlan(4, 20.0, 2, worlds=(world,))) for _ in range(2))
+    assert (first.text, first.checks, first.counts) == (second.text, second.checks, second.counts)
+    assert f" --world {world}" in first.command
+
+
+@pytest.mark.parametrize("worlds", [("calm",), ("calm", "swarm")])
+def test_no_invariant_is_broken_while_mirrors_track(worlds: tuple[str, ...]) -> None:
+    outcome = run(RunPlan(1, 120.0, 3, 60.0, worlds=worlds))
+    assert outcome.good, f"{outcome.text}; {outcome.command}"
+    assert outcome.checks[12] > 50
+
+
 def test_a_failing_seed_is_replayed_by_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
     defect = next(each for each in DEFECTS if each.name == "authority unchecked")
     defect.plant(monkeypatch)
@@ -123,6 +138,7 @@ def test_the_faults_of_a_failing_run_are_shrunk(monkeypatch: pytest.MonkeyPatch)
         ({"heliostats": 33}, "simulation of 33 heliostats; a cluster has 1 to 32"),
         ({"pause": 0.0}, "a pause of 0.0 s between faults; it must be above 0"),
         ({"only": ("quake",)}, "fault 'quake' is not known; known: line_cut"),
+        ({"worlds": ("flat",)}, "world 'flat' is not known; known: calm"),
     ],
 )
 def test_a_plan_that_cannot_be_run(arguments: dict[str, object], text: str) -> None:

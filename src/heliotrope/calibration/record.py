@@ -44,6 +44,8 @@ class CalibrationOutcome(StrEnum):
     IMPLAUSIBLE = "implausible"
     POOR_FIT = "poor_fit"
     NO_BETTER = "no_better"
+    #: A photograph did not confirm the new parameters; the old ones are back.
+    NOT_VERIFIED = "not_verified"
     REFUSED = "refused"
     ERROR = "error"
     #: Unchanged for a reason that was not kept.

@@ -124,6 +124,8 @@ def status(context: typer.Context, as_json: Json = False) -> None:
     print(f"{found['holder'] or 'nobody'} has the command authority")
     if found["emergency"]:
         print("EMERGENCY")
+    if found["resume"]:
+        print(f"automatic control waits for Resume: {found['resume']}")
 
 
 @app.command()
@@ -253,6 +255,39 @@ def calibration(
     with _client(context) as client:
         found = client.ask("PUT", "calibration", {"on": on})
     print(f"calibration {'on' if found['on'] else 'off'}; {found['done']} calibrated")
+
+
+@app.command("out-of-service")
+def out_of_service(
+    context: typer.Context,
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
+    reason: Annotated[str, typer.Option(help="Reason, shown to everybody.")],
+    hours: Annotated[
+        float | None, typer.Option(help="Hours until they are expected back.", show_default=False)
+    ] = None,
+) -> None:
+    """Take heliostats out of service: they go to stow, and nobody moves them."""
+    order = {"heliostats": heliostats, "reason": reason, "hours": hours}
+    with _client(context) as client:
+        print_json(client.ask("POST", "holds", order))
+
+
+@app.command("give-back")
+def give_back(
+    context: typer.Context,
+    heliostats: Annotated[list[str], typer.Argument(help="Heliostats.")],
+) -> None:
+    """Give heliostats back to service, each by its name; nothing moves."""
+    with _client(context) as client:
+        print_json(client.ask("POST", "holds/release", {"heliostats": heliostats}))
+
+
+@app.command()
+def resume(context: typer.Context) -> None:
+    """Let automatic control go on after a loss of many heliostats."""
+    with _client(context) as client:
+        client.ask("POST", "automatic/resume")
+    print("automatic control resumed")
 
 
 def _names(heliostats: list[str] | None, everybody: bool) -> list[str]:

@@ -16,6 +16,9 @@ def simulate(
     only: Annotated[
         list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
     ] = None,
+    world: Annotated[
+        list[str] | None, typer.Option(help="Add one of the harder worlds; may be repeated.")
+    ] = None,
     runs: Annotated[int, typer.Option(help="Number of runs, with consecutive seeds.")] = 1,
     processes: Annotated[int, typer.Option(help="Runs in parallel.")] = 1,
     minutes: Annotated[
@@ -31,7 +34,7 @@ def simulate(
 ) -> None:
     """Run the real plant, clusters and local controllers in virtual time, with random faults.
 
-    Eleven safety invariants are checked at every step; the exit code is 1 if one is broken.
+    Fifteen safety invariants are checked at every step; the exit code is 1 if one is broken.
     """
     from heliotrope.errors import InputError
     from heliotrope.twin.world.simulation import RunPlan
@@ -40,7 +43,15 @@ def simulate(
     if runs < 1 or (minutes is not None and not minutes > 0.0):
         raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
     plans = [
-        RunPlan(seed + i, 3600.0 * hours, heliostats, pause, tuple(only or ())) for i in range(runs)
+        RunPlan(
+            seed + i,
+            3600.0 * hours,
+            heliostats,
+            pause,
+            tuple(only or ()),
+            worlds=tuple(world or ()),
+        )
+        for i in range(runs)
     ]
     found = run_many(
         plans,

@@ -29,6 +29,7 @@ _ALL = frozenset(range(len(states.STATES)))
 BEAM_OUT = frozenset({APPROACHING, IDLE, TRACKING, SEARCHING})
 
 _MOVING = 1 << names.FLAGS.index("MOVING")
+_UNKNOWN = 1 << names.FLAGS.index("COUNTS_UNKNOWN")
 _AT_STOW = 1 << names.FLAGS.index("AT_STOW")
 _DIAGNOSING = 1 << names.FLAGS.index("DIAGNOSING")
 
@@ -102,6 +103,8 @@ GOALS = {
         _ALL - BEAM_OUT - {states.DEFOCUSED}, clear=_MOVING, needed=_AT_STOW, limit=STOW_BUDGET
     ),
 }
+#: Commands that take a beam off, which only known step counts prove.
+_LEAVE = ("DEFOCUS", "STOW")
 assert STOWED in GOALS["STOW"].there
 assert STOWING in GOALS["STOW"].there
 
@@ -207,6 +210,8 @@ class Goals:
         """Return "" if it is done, a text if it has failed, None if neither."""
         if asked_at < watch.since + _SETTLE:
             return None
+        if watch.name in _LEAVE and node.flags & _UNKNOWN:
+            return "its step counts are unknown, so nothing shows where its beam is"
         goal = GOALS[watch.name]
         watch.sure = watch.sure or goal.shown(node.state, node.flags)
         counted = goal.near or (watch.shift is not None and not watch.sure)

@@ -27,6 +27,7 @@ from heliotrope.links.messages import (
     encode,
 )
 from heliotrope.safety import AcknowledgeRole, Alarm, alarms
+from heliotrope.sun import Site
 
 #: Life of a message to the plant, s.
 _NEWS_LIFE = 5.0
@@ -44,6 +45,8 @@ class PlantLink:
     ----------
     cluster
         Name of the cluster.
+    site
+        Site for which it computes the sun.
     link, clock, nodes, watch, work, reports
         Parts of the cluster.
     wake
@@ -53,6 +56,7 @@ class PlantLink:
     def __init__(
         self,
         cluster: str,
+        site: Site,
         link: Link,
         clock: Clock,
         nodes: Nodes,
@@ -63,6 +67,7 @@ class PlantLink:
     ) -> None:
         self._cluster, self._link, self._clock, self._nodes = cluster, link, clock, nodes
         self._watch, self._work, self._reports, self._wake = watch, work, reports, wake
+        self._site = site.numbers
         self._names = tuple(node.name for node in nodes)
         self._opened = -1
         self._was_connected = False
@@ -137,6 +142,7 @@ class PlantLink:
                 cycle_s=now - begin,
                 acts=self._watch.verdict.acts,
                 names=self._names if told else (),
+                site=self._site,
                 block=self._nodes.rows(now),
             )
         )

@@ -118,7 +118,15 @@ class Cluster:
         )
         self._wake = asyncio.Event()
         self._plant = PlantLink(
-            config.name, link, clock, self.nodes, self._watch, self._work, reports, self._wake.set
+            config.name,
+            config.site,
+            link,
+            clock,
+            self.nodes,
+            self._watch,
+            self._work,
+            reports,
+            self._wake.set,
         )
         # The first call loads libraries, which takes longer than a second may.
         broadcast_values(0, present.utc_s if present.usable else 0.0, config.site)

@@ -230,9 +230,9 @@ async def schedule(console: Here, request: Request, who: Anyone, limit: Limit = 
     return shared(console, request, f"schedule {limit}", lambda: console.operations.schedule(limit))
 
 
-@router.get("/holds", response_model=models.many(models.HeldHeliostat), tags=["calibration"])
+@router.get("/holds", response_model=models.many(models.Lockout), tags=["calibration"])
 async def holds(console: Here, who: Anyone) -> JSONResponse:
-    """Return the heliostats that are excluded from calibration."""
+    """Return the heliostats that are out of service."""
     del who
     return answer(console.operations.holds())
 

@@ -6,6 +6,7 @@ open to everybody who is signed in; everything else needs an operator.
 """
 
 import asyncio
+import math
 import time
 
 from fastapi import APIRouter, HTTPException
@@ -182,6 +183,12 @@ async def automatic(console: Here, who: Operator, order: models.SomeHeliostats) 
     console.operations.give_back(who.person, order.heliostats)
 
 
+@router.post("/automatic/resume", status_code=204, tags=["commands"])
+async def resume(console: Here, who: Operator) -> None:
+    """Let automatic control go on after a loss of many heliostats."""
+    console.operations.resume(who.person)
+
+
 @router.put("/calibration", response_model=models.CalibrationView, tags=["calibration"])
 async def switch(console: Here, who: Operator, to: models.Switch) -> JSONResponse:
     """Switch automatic calibration on or off."""
@@ -189,18 +196,16 @@ async def switch(console: Here, who: Operator, to: models.Switch) -> JSONRespons
     return answer(console.operations.calibration())
 
 
-@router.post("/holds", response_model=models.many(models.HeldHeliostat), tags=["calibration"])
+@router.post("/holds", response_model=models.many(models.Lockout), tags=["commands"])
 async def hold(console: Here, who: Operator, order: models.HoldOrder) -> JSONResponse:
-    """Exclude heliostats from calibration."""
-    console.operations.hold(who.person, order.heliostats, order.reason)
+    """Take heliostats out of service: they go to stow, and nobody moves them."""
+    hours = math.nan if order.hours is None else order.hours
+    console.operations.hold(who.person, order.heliostats, order.reason, hours)
     return answer(console.operations.holds())
 
 
-@router.post(
-    "/holds/release", response_model=models.many(models.HeldHeliostat), tags=["calibration"]
-)
-async def unhold(console: Here, who: Operator, order: models.SomeHeliostats) -> JSONResponse:
-    """Return heliostats to calibration."""
-    names = order.heliostats or [one.heliostat for one in console.operations.holds()]
-    console.operations.unhold(who.person, names)
+@router.post("/holds/release", response_model=models.many(models.Lockout), tags=["commands"])
+async def unhold(console: Here, who: Operator, order: models.GivenBack) -> JSONResponse:
+    """Give heliostats back to service by their names; nothing moves."""
+    console.operations.unhold(who.person, order.heliostats)
     return answer(console.operations.holds())

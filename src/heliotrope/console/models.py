@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from heliotrope.optics import flux
+from heliotrope.plant import lockouts
 from heliotrope.plant.operations import views
 
 _MADE: dict[type, type[BaseModel]] = {}
@@ -158,10 +159,17 @@ class Acknowledged(Strict):
 
 
 class HoldOrder(SomeHeliostats):
-    """Heliostats to exclude from calibration, and the reason."""
+    """Heliostats to take out of service, the reason, and the hours until they are expected back."""
 
     heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
     reason: Words
+    hours: Annotated[float, Field(gt=0.0, le=8760.0)] | None = None
+
+
+class GivenBack(Strict):
+    """Heliostats to give back to service, each by its name."""
+
+    heliostats: Annotated[list[Name], Field(min_length=1, max_length=200_000)]
 
 
 class Switch(Strict):
@@ -304,4 +312,4 @@ FluxView, HeliostatView = model_of(flux.FluxView), model_of(views.HeliostatView)
 ClusterRow, AlarmRow = model_of(views.ClusterRow), model_of(views.AlarmRow)
 EventRow, PacketRow = model_of(views.EventRow), model_of(views.PacketRow)
 CalibrationView, Planned = model_of(views.CalibrationView), model_of(views.Planned)
-HeldHeliostat, EmergencyView = model_of(views.HeldHeliostat), model_of(views.EmergencyView)
+Lockout, EmergencyView = model_of(lockouts.Lockout), model_of(views.EmergencyView)

@@ -27,7 +27,7 @@ _SCRIPTS = ("live", "dom", "palette", "orders", "map", "panels", "people", "cons
 _EMERGENCY = f"""
 <div id="emergency-box">
   <span id="emergency-said" role="status"></span>
-  <button id="emergency" type="button" title="Take all beams off the receiver now">
+  <button id="emergency" type="button" title="Take all beams off the receiver now (Alt+E)">
     EMERGENCY</button>
 </div>
 <script defer src="{KEPT}/emergency.js"></script>

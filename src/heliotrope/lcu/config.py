@@ -48,7 +48,7 @@ class Config:
         As in HERE.
     lease_ms, stow_wait_ms, silence_ms
         Greatest age of the sun; time without it until a defocused mirror goes to stow; time
-        without any valid message until an idle one is defocused.
+        without any valid message until a mirror that holds a position is defocused.
     slot_ms, ahead_ms, stride
         Of the ``Stepper``, and of the ``Journal``: no rate may make more steps than the stride in
         the time that segments are emitted ahead.
@@ -67,7 +67,7 @@ class Config:
         self.path: list[tuple[float, float, float]] = []
         self.azimuth_axis = 0
         self.serial, self.firmware, self.address = 0, 0, 0
-        self.lease_ms, self.stow_wait_ms, self.silence_ms = 6000, 30_000, 20_000
+        self.lease_ms, self.stow_wait_ms, self.silence_ms = 6000, 30_000, 6000
         self.slot_ms, self.ahead_ms, self.stride = 50, 100, STRIDE
         self._numbers: list[tuple[Any, ...] | None] = [None, None]
 

@@ -23,7 +23,19 @@ from . import messages, states, ticks
 from .config import Config, is_place
 from .journal import ITEMS, items_of
 from .lease import Clock, SunLease
-from .motion import APPROACH, DIAGNOSE, HOLD, MOVE, RETURN, ROUGH_STEPS, STANDBY, STOW, Motion
+from .motion import (
+    APPROACH,
+    DIAGNOSE,
+    HOLD,
+    MOVE,
+    RETURN,
+    ROUGH_STEPS,
+    SEARCH,
+    STANDBY,
+    STOW,
+    TRACK,
+    Motion,
+)
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such modules
@@ -49,8 +61,9 @@ if TYPE_CHECKING:  # for the type checker only: a microcontroller has no such mo
     LATCHED,
 ) = range(11)
 
-#: States in which settings may change: those of the calibration, and those of the machine.
-CALIBRATION = (
+#: States in which settings may change: those that move nothing, those of the pose, those of the
+#: machine. The last two change at rest only.
+HARMLESS = (
     states.UNCONFIGURED,
     states.STOWED,
     states.LOCKED,
@@ -58,13 +71,20 @@ CALIBRATION = (
     states.IDLE,
     states.DEFOCUSED,
 )
-MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT, states.IDLE)
+POSE = (states.UNCONFIGURED, states.STOWED, states.LOCKED, states.FAULT)
+MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
 STATES_OF = {
-    "SET_ARMATURE": CALIBRATION, "SET_BIAS": CALIBRATION, "SET_POSITION": CALIBRATION,
-    "SET_DEFOCUS": CALIBRATION, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
-    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": CALIBRATION,
+    "SET_ARMATURE": POSE, "SET_BIAS": POSE, "SET_POSITION": HARMLESS,
+    "SET_DEFOCUS": HARMLESS, "SET_DRIVES": MACHINE, "SET_LIMITS": MACHINE,
+    "SET_STOW": MACHINE, "SET_WAY": MACHINE, "ZERO": MACHINE, "SET_ADDRESS": HARMLESS,
 }  # fmt: skip
 
+#: States that hold a position for as long as the cluster is heard.
+HELD = (states.LOCKED, states.UNCONFIGURED)
+
+#: Motions that need the sun. The watchdog resets a board that is in one of them, or in a state that
+#: needs it, for longer than this (ms) beyond the lease: its program no longer does what it should.
+FOLLOWS, LATE_MS = (STANDBY, TRACK, SEARCH, APPROACH, RETURN), 1000
 #: A clock that changes by more than this (ms) has jumped.
 CLOCK_JUMP_MS = 2000
 MOST_STEPS = 1 << 29
@@ -111,6 +131,7 @@ class Controller:
         self._dark, self._heard = ticks.Deadline(), ticks.Deadline()
         self._dark.start(now_ms, config.stow_wait_ms)
         self._heard.start(now_ms, config.silence_ms)
+        self._sunless_ms = 0  # since the last sun; counted without the lease that it checks
         self._present = 0
         self._doubtful = self._aim_locked = False
         self._clock_jumped = self._ticks_jumped = False
@@ -141,17 +162,23 @@ class Controller:
             if is_place(point):
                 motion.aim = point
         if not self.config.complete():
+            if motion.known:
+                motion.defocus()  # as far as the settings allow
             return self.out
         if looping or not motion.known:
             self.fault = BOOTS if looping else COUNTS
         elif state == states.FAULT:
             self.fault = LATCHED
+        if looping or state in (states.STOWED, states.FAULT):
+            motion.blind = 0  # it was not on the receiver, or has turned away before
         if state == states.LOCKED:
             self._event("BOOT_LOCKED")
         elif self.fault != NO_FAULT:
             self._event("BOOT_FAULT")
         else:
             self._event("BOOT_STOWED" if motion.at_stow() else "BOOT_AWAY")
+        if state in (states.STOWED, states.FAULT) and not looping:
+            motion.blind = 1
         return self.out
 
     # Time.
@@ -174,7 +201,8 @@ class Controller:
         fresh = self.sun.look(now_ms, elapsed)
         silent = self._heard.over(now_ms)
         goes_on = self.motion.following() and self.state != states.FAULT
-        if fresh and (goes_on or self.state in states.NEED_SUN):
+        held = self.state in HELD and self.motion.kind == HOLD and not silent
+        if held or (fresh and (goes_on or self.state in states.NEED_SUN)):
             self._dark.start(now_ms, self.config.stow_wait_ms)
         dark = self._dark.over(now_ms)
         self._lapses(fresh, silent, dark)
@@ -189,14 +217,30 @@ class Controller:
                 self._event("LAPSED")
         elif state == states.STOWING and kind == RETURN and not fresh:
             self._event("LAPSED")
-        elif (state == states.DEFOCUSED and dark) or (
-            state == states.FAULT
-            and dark
-            and kind != STOW
-            and self.motion.known
-            and not self.motion.at_stow()
-        ):
+        elif state == states.DEFOCUSED:
+            if dark:
+                self._event("SILENT")
+        elif state == states.FAULT or state in HELD:
+            self._latched_lapses(silent, dark)
+
+    def _latched_lapses(self, silent: bool, dark: bool) -> None:
+        """Leave without a cluster: the latch stays, the mirror goes.
+
+        While the cause of a fault is present, nothing moves before the stow delay is over: the
+        supply may be falling.
+        """
+        motion = self.motion
+        if motion.at_stow() or motion.kind == STOW:
+            return
+        if dark and motion.known and self.config.fits():
             self._event("SILENT")
+        elif (
+            silent
+            and motion.kind in (HOLD, MOVE)
+            and not self._present
+            and (motion.known or self.state != states.UNCONFIGURED)
+        ):
+            self._event("LAPSED")
 
     def on_tick(self, now_ms: int) -> "list[tuple[Any, ...]]":
         """Advance in time; to be called more often than every ``ahead_ms`` during a motion."""
@@ -223,7 +267,9 @@ class Controller:
                 # flash would wear it out in a year.
                 self._moving = False
                 self.out.append((AT_REST, one, two))
-        if self.state != states.TRACKING or self.sun.fresh():
+        self._sunless_ms = min(self._sunless_ms + elapsed, 1_000_000)
+        needs_sun = self.state in states.NEED_SUN or motion.kind in FOLLOWS
+        if not needs_sun or self._sunless_ms <= self.config.lease_ms + LATE_MS:
             self.out.append((FEED,))
         return self.out
 
@@ -371,8 +417,8 @@ class Controller:
         if name == "TIME":
             if abs(self.clock.set(values[0], values[1])) > CLOCK_JUMP_MS:
                 self._clock_jumped = True
-        elif name == "SUN":
-            self.sun.take(values, self.clock, now_ms)
+        elif name == "SUN" and self.sun.take(values, self.clock, now_ms):
+            self._sunless_ms = 0
 
     def _answer(self, name: str, values: "tuple[Any, ...]") -> None:
         motion = self.motion
@@ -430,6 +476,7 @@ class Controller:
                 self._ticks_jumped,
                 self._present != 0,
                 motion.kind == DIAGNOSE,
+                self.sun.leaps,
             )
         ):
             bits |= bool(value) << i
@@ -545,7 +592,7 @@ class Controller:
         if allowed is None or self.state not in allowed:
             return messages.REFUSED_STATE
         motion, config = self.motion, self.config
-        if allowed is MACHINE and (motion.kind not in (HOLD, MOVE, STOW) or not motion.still()):
+        if allowed is not HARMLESS and (motion.following() or not motion.still()):
             return messages.REFUSED_STATE
         if name == "ZERO":
             if max(abs(values[0]), abs(values[1])) > MOST_STEPS:
@@ -565,6 +612,8 @@ class Controller:
         for item in items:
             if item != "edition" and not config.take(item, items[item]):
                 return messages.BAD_VALUE
+        if allowed is not HARMLESS:
+            motion.hold()  # a defocused mirror does not go on with the sun from another pose
         if name != "SET_ADDRESS":
             motion.rebuild()
         self.out.append((STORE, items))

@@ -9,6 +9,10 @@ AHEAD_MS = 2000
 #: Below this height (2^-30) there is no sun to reflect.
 NIGHT = -UNIT // 50
 MODULO = 1 << 32
+#: No sun moves faster, rad/ms: 15.05 arcsec/s (a turn in 86,164 s), seen from the earth's axis.
+FASTEST = 7.3e-8
+#: Time that tells apart the vectors of a whole day, ms.
+LONGEST_MS = 1 << 29
 
 
 class Clock:
@@ -51,6 +55,17 @@ class SunLease:
 
     Only a vector for a later second than any before renews the lease; the time that it was under
     way is deducted. The lease ends early, never late, if ticks jump.
+
+    While the lease runs, a vector must follow from the last one: the sun cannot have gone further
+    than `FASTEST` allows in the ticks since, with a margin of one lease for the time under way.
+    After a lapse, and after a start, there is nothing to go by, and any vector is taken.
+
+    Attributes
+    ----------
+    bad
+        Vectors that were refused.
+    leaps
+        Vectors that did not follow from the last one, refused or, after a lapse, taken.
     """
 
     def __init__(self, span_ms: int) -> None:
@@ -59,8 +74,8 @@ class SunLease:
         self._second = -1
         self._sun = [0, 0, 0]
         self._rate = [0, 0, 0]
-        self._since_ms = 0
-        self.bad = 0
+        self._since_ms = self._passed_ms = 0
+        self.bad = self.leaps = 0
 
     def take(self, values: "tuple[int, ...]", clock: Clock, now: int) -> bool:
         """Take SUN; return False, and renew nothing, if it is stale, repeated or not a sun."""
@@ -77,16 +92,31 @@ class SunLease:
         if not (good and abs(size - 1.0) < 1e-3 and values[3] > NIGHT):
             self.bad += 1
             return False
+        if self._second >= 0 and not self._follows(values):
+            self.leaps += 1
+            if not lapsed:
+                self.bad += 1
+                return False
         self._second = second
         for i in (0, 1, 2):
             self._sun[i], self._rate[i] = values[1 + i], values[4 + i] * RATE_FACTOR
-        self._since_ms = delay
+        self._since_ms, self._passed_ms = delay, 0
         self._left.start(now, self.span_ms - max(0, delay))
         return True
+
+    def _follows(self, values: "tuple[int, ...]") -> bool:
+        """Whether the sun can have come from the last vector to this one."""
+        gap = 0.0
+        for i in (0, 1, 2):
+            part = (values[1 + i] - self._sun[i]) / UNIT
+            gap += part * part
+        reach = FASTEST * (self._passed_ms + self.span_ms)
+        return gap <= reach * reach
 
     def look(self, now: int, elapsed: int) -> bool:
         """Charge the time that has passed, and return whether the lease runs."""
         self._since_ms = min(self._since_ms + elapsed, 1_000_000)
+        self._passed_ms = min(self._passed_ms + elapsed, LONGEST_MS)
         return not self._left.over(now)
 
     def fresh(self) -> bool:

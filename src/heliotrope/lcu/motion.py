@@ -60,6 +60,8 @@ class Motion:
         Whether the standby point was reached by the safe way since stow was left.
     known
         Whether the step counts are known.
+    blind
+        Way (1, -1) in which a mirror with unknown counts may turn away; 0: it has done so.
     cut, unreachable
         Whether the last goals were beyond the limits, or the last aim beyond the axes.
     diagnosis
@@ -79,12 +81,14 @@ class Motion:
         self.aim: tuple[float, float, float] | None = None
         self.ready = self.known = self.cut = self.unreachable = False
         self.rough = 0
+        self.blind, self._turns = 1, 0
         self.diagnosis: tuple[Any, ...] = (0, 0, 0, 0.0, 0.0)
         self._stops = [[0.0, 0.0], [0.0, 0.0]]
         self._near = [0.0, 0.0]
         self._start, self._slope = [0.0, 0.0], [0.0, 0.0]
         self._knot_ms = self._renew_ms = self._since_ms = 0
         self._base = HOLD  # what a defocus turns away from
+        self._offset = config.defocus  # by how much: new angles count from the next defocus on
         self._path: list[tuple[float, float, float]] = []
         self._place = 0
         self._spiral: Spiral | None = None
@@ -117,7 +121,7 @@ class Motion:
     def declare(self, primary: int, secondary: int, known: bool) -> None:
         """Declare the present step counts; only at rest."""
         self.counts[0], self.counts[1] = primary, secondary
-        self.known = known
+        self.known, self.blind = known, 1
         if self.stepper is not None:
             for axis, count in zip(self.stepper.axes, self.counts):  # noqa: B905
                 axis.count = axis.goal = axis.leg = count
@@ -153,6 +157,9 @@ class Motion:
     def halted(self, primary: int, secondary: int) -> None:
         """After an emergency stop: take back these signed steps, emitted but not made."""
         self.kind = HOLD
+        if self._turns == 1 and not self.still():
+            self.blind = -1  # a limit switch has ended the blind turn: the other way is left
+        self._turns = 0
         if self.stepper is not None:
             self.stepper.undone(primary, secondary)
 
@@ -222,7 +229,7 @@ class Motion:
 
     def _away(self, i: int, angle: float) -> float:
         """Return an angle turned away by the defocus; the other way where a stop is near."""
-        offset = self.config.defocus[i]
+        offset = self._offset[i]
         low, high = self._stops[i]
         if low <= angle + offset <= high:
             return angle + offset
@@ -239,20 +246,35 @@ class Motion:
             self.stepper.stop()
 
     def defocus(self) -> None:
-        """Turn away from the present position."""
+        """Turn away from the present position; where the counts are unknown, once, by as much."""
         if self.kind in (DEFOCUS, STOW) or self.at_stow():
             return
-        if not self.known or self.stepper is None or None in self.config.drives:
+        if self.stepper is None or None in self.config.drives:
             self.hold()
             return
-        self._base = self.kind
+        sense = 1
+        if not self.known:
+            sense = self.blind
+            if sense == 0 or not self.still():
+                self.hold()
+                return
+            # The middle of the range stands for the unknown counts: the steps are of the right
+            # size for a rotary drive, about right for a jack.
+            first, second = self.stepper.axes
+            self.declare((first.low + first.high) // 2, (second.low + second.high) // 2, False)
+            self.blind, self._turns = 0, sense
+            self.kind = HOLD
+        self._base, self._offset = self.kind, self.config.defocus
         self.kind = DEFOCUS
         self._knot_ms = self._renew_ms = 0
         angles = [0.0, 0.0]
         for i in (0, 1):
             drive = self.config.drives[i]
             assert drive is not None
-            angles[i] = self._away(i, drive.angle(self.place(i)))
+            here = drive.angle(self.place(i))
+            away = self._away(i, here)
+            # The other way is twice as far: past the place where the first turn began.
+            angles[i] = away if sense > 0 else 3.0 * here - 2.0 * away
         self._go_angles(angles, BOTH)
 
     def stow(self) -> None:
@@ -283,7 +305,10 @@ class Motion:
         """Go to stow at once, azimuth last."""
         self.ready = False
         stow = self.config.stow
-        if self.stepper is None or stow is None or not (self.known and self.config.fits()):
+        if not self.known:
+            self.defocus()  # stow cannot be found, but the beam can go
+            return
+        if self.stepper is None or stow is None or not self.config.fits():
             self.hold()
             return
         self.kind = STOW

@@ -30,8 +30,8 @@ EVENTS = {
     "BOOT_FAULT": (INTERNAL, "started complete, a fault latched before the reset"),
     "ARRIVED": (INTERNAL, "the motion is at its end"),
     "SEARCHED": (INTERNAL, "the spiral is at its end"),
-    "LAPSED": (INTERNAL, "the sun is older than its lease"),
-    "SILENT": (INTERNAL, "no fresh sun for the stow delay beyond the lease"),
+    "LAPSED": (INTERNAL, "the sun, or for a mirror that holds, the last message, is too old"),
+    "SILENT": (INTERNAL, "nothing to stay for during the stow delay"),
     "UNREACHABLE": (INTERNAL, "no pose sends the beam to the aim"),
     "FAULTED": (INTERNAL, "a fault has been found"),
 }
@@ -65,7 +65,7 @@ def transitions() -> list[tuple[int, str, int, str]]:
 #: Bits of the flags.
 FLAGS = ("MOVING", "SUN_FRESH", "CLOCK_SET", "CONFIGURED", "READY", "AT_STOW", "AIM_LOCKED",
          "ROUGH", "COUNTS_DOUBTFUL", "COUNTS_UNKNOWN", "UNREACHABLE", "CUT", "CLOCK_JUMPED",
-         "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING")  # fmt: skip
+         "TICKS_JUMPED", "FAULT_PRESENT", "DIAGNOSING", "SUN_JUMPED")  # fmt: skip
 
 #: Faults.
 FAULTS = ("none", "primary drive stuck", "secondary drive stuck", "limit switch", "supply",

@@ -190,6 +190,7 @@ class ClusterStatus:
     ``names``, in the order of the rows, is sent in the first message of a connection and in
     every tenth after it, as each may be lost; otherwise it is ().
     ``utc_s`` is the cluster's own time (POSIX seconds), ``time_error_s`` the bound of its error.
+    ``site`` holds `Site.numbers`, for which it computes the sun; () from an older cluster.
     ``lease_left`` in s; below 0 the plant's lease is over. ``cycle_s`` is the last poll cycle.
     """
 
@@ -204,6 +205,7 @@ class ClusterStatus:
     acts: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     block: bytes = b""
+    site: tuple[float, ...] = ()
 
     def nodes(self) -> "npt.NDArray[Any]":
         """Return the rows, of dtype `NODE`, read only.

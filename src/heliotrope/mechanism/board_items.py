@@ -11,7 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from zlib import crc32
 
+import numpy as np
+
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.geometry import FloatArray
 from heliotrope.lcu import drives
 from heliotrope.lcu.config import Config
 from heliotrope.lcu.journal import CODES_OF, SIZE_OF
@@ -39,6 +42,8 @@ OWN = frozenset({"address", "key_id", "edition"})
 #: Items that a local controller accepts at stow, at standby and defocused too; the others only
 #: locked, at rest, in FAULT, or before it is configured.
 CALIBRATION_ITEMS = frozenset({"armature", "biases", "location", "defocus"})
+#: Items by which a local controller turns an aim into step counts.
+POSE_ITEMS = frozenset({"armature", "biases", "drive_primary", "drive_secondary"})
 
 
 def drive_numbers(drive: Drive) -> tuple[int, tuple[float, ...], float]:
@@ -93,6 +98,36 @@ def items_of(mechanism: Mechanism, machine: Machine | None = None) -> dict[str, 
     if machine is not None:
         numbers |= _machine_numbers(machine)
     return {name: packed(name, values) for name, values in numbers.items()}
+
+
+def tables_with(
+    items: Mapping[str, bytes], armature: FloatArray, table: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the armature (18,) and the drives (2, 19) of a mechanism once items are stored.
+
+    The inverse of `items_of`, as far as the pose is concerned.
+
+    Parameters
+    ----------
+    items
+        Bytes by name; items beside `POSE_ITEMS` change nothing here.
+    armature, table
+        The tables before, (18,) and (2, 19).
+    """
+    rows = table.copy()
+    biases = None if "biases" not in items else struct.unpack(CODES_OF["biases"], items["biases"])
+    for i, end in enumerate(_ENDS):
+        kind, numbers, bias = drive_numbers(Drive(rows[i]))
+        if data := items.get(f"drive_{end}"):
+            kind, *stored = struct.unpack(CODES_OF[f"drive_{end}"], data)
+            numbers = tuple(stored)
+        rows[i, slot.KIND] = slot.ROTARY if kind == drives.ROTARY else slot.LINEAR
+        rows[i, slot.SENSE] = -1.0 if kind == drives.JACK_FALLING else 1.0
+        rows[i, list(DRIVE_NUMBERS)] = numbers
+        rows[i, [slot.BIAS, slot.SAG_PHASE]] = bias if biases is None else biases[i], 0.0
+    if data := items.get("armature"):
+        armature = np.array(struct.unpack(CODES_OF["armature"], data))
+    return armature.copy(), rows
 
 
 def _machine_numbers(machine: Machine) -> dict[str, tuple[object, ...]]:
@@ -155,7 +190,8 @@ class Wanted:
     items
         Bytes by heliostat and item.
     missing
-        Names of items that differed in the last comparison, by heliostat.
+        Names of items that differed in the last comparison, or are wanted otherwise since, by
+        heliostat.
     """
 
     items: dict[str, dict[str, bytes]] = field(default_factory=dict)
@@ -179,9 +215,22 @@ class Wanted:
                 )
 
     def set(self, heliostat: str, items: Mapping[str, bytes]) -> None:
-        """Add to the wanted items of a heliostat; see `check`."""
+        """Add to the wanted items of a heliostat; see `check`.
+
+        Items that were wanted otherwise before count as missing until a comparison finds them.
+        """
         self.check(heliostat, items)
-        self.items[heliostat] = {**self.items.get(heliostat, {}), **items}
+        before = self.items.get(heliostat, {})
+        changed = {name for name, data in items.items() if before.get(name, data) != data}
+        self.items[heliostat] = {**before, **items}
+        if changed:
+            self.missing[heliostat] = tuple(sorted(changed.union(self.missing.get(heliostat, ()))))
+
+    def rest(self, heliostat: str, point: tuple[float, ...]) -> None:
+        """Want the standby point that a heliostat was given, if one is wanted at all."""
+        items = self.items.get(heliostat, {})
+        if "standby" in items:
+            items["standby"] = packed("standby", point)
 
     def compare(self, heliostat: str, stored: Mapping[str, int]) -> tuple[str, ...]:
         """Compare with the checksums that a heliostat reports; return the names that differ."""

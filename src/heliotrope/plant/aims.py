@@ -309,6 +309,18 @@ class BeamCheck:
             self._check_motion(found, rows, path, sun)
         return found
 
+    def inside(self, row: int, poses: FloatArray, sun: FloatArray) -> npt.NDArray[np.bool_]:
+        """Return in which poses, angles of the axes (K, 2), the beam of a heliostat is in a volume.
+
+        For ``sun`` see `problems`.
+        """
+        if not (self.volumes and sun[2] > 0.0):
+            return np.zeros(len(poses), dtype=np.bool_)
+        armature, mirrors = Armature(self.armature.table[row]), _rows_of(self.mirrors, [row])
+        still = np.repeat(poses[:, None], 2, axis=1)
+        motion = sweep(armature, still, sun, mirrors, self.volumes, reach=FAR)
+        return np.asarray(motion.entered.any(axis=-1))
+
     def _sweep(
         self,
         found: dict[str, str],
@@ -350,7 +362,7 @@ class BeamCheck:
             )
 
 
-def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp]) -> MirrorOptics:
+def _rows_of(mirrors: MirrorOptics, rows: npt.NDArray[np.intp] | list[int]) -> MirrorOptics:
     return MirrorOptics(**{name: values[rows] for name, values in vars(mirrors).items()})
 
 

@@ -170,9 +170,11 @@ class PlantAssembly:
 
     def _want(self) -> None:
         """Want every local controller to store the machine table and the last calibration."""
-        for name in self.names:
+        for name, point in zip(self.names, self.plant.standbys, strict=True):
             mechanism = self.plant.beliefs.present(name)[0]
             self.plant.wanted.set(name, items_of(mechanism, self.design.machine(name)))
+            if np.isfinite(point).all():
+                self.plant.wanted.rest(name, tuple(point))
 
     # -- running ---------------------------------------------------------------------------
 
@@ -205,7 +207,7 @@ class PlantAssembly:
     async def _sense(self, sensors: Sensors) -> None:
         """Hand readings of sensors to the safety table as they come."""
         while True:
-            news = await asyncio.to_thread(sensors.read)
+            news = await sensors.news()
             for name, value in news.values.items():
                 self.plant.put(name, value)
             for name, text in news.problems.items():

@@ -1,6 +1,6 @@
 """Beams stay out of keep-out volumes: commands are proven before they are sent, beams watched."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -9,12 +9,14 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import states
 from heliotrope.lcu.diagnosis import NUDGE
 from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.machine import Machine
 from heliotrope.mechanism.tracking import TrackingStatus
 from heliotrope.plant.aims import BeamCheck
 from heliotrope.plant.assigned import Points
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.leaving import way_out
 from heliotrope.plant.refusals import BEAM_REFUSED, RefusedError
-from heliotrope.safety import Reading
+from heliotrope.safety import Act, Reading
 
 Rows = npt.NDArray[np.intp]
 
@@ -22,8 +24,11 @@ Rows = npt.NDArray[np.intp]
 LOOK_PERIOD, TURNS = 1.0, 3
 #: A heliostat moves if its counts and goals differ by more steps than this.
 _MOVES = 200
-#: States in which a beam is out by command. Motions that lead to safety are never held up.
-_BEAM_OUT = (states.IDLE, states.TRACKING, states.SEARCHING)
+#: States whose motions were commanded: the whole way is looked at. Of every other state the present
+#: pose and the end of the motion are, as a way to safety is never held up.
+_COMMANDED = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
+#: An approach turns by more than this (rad) only when it leaves stow: azimuth first.
+_FROM_STOW = 0.15
 #: States from which IDLE moves a heliostat straight to its standby point.
 _TO_STANDBY = (states.TRACKING, states.SEARCHING, states.DEFOCUSED, states.IDLE)
 
@@ -50,8 +55,10 @@ class BeamWatch:
     """Proof that a command brings no beam into a keep-out volume, and watch over the beams.
 
     The watch sees errors that a proof cannot: false counts, changed parameters, a local controller
-    that disobeys. Heliostats that move are looked at each second, the others in turn. The way from
-    stow is the local controller's own.
+    that disobeys, the sun that carries the beam of a standing mirror on. Every heliostat is looked
+    at, whatever its state, as long as its step counts have been known: where they are unknown or it
+    is silent, it is taken to stand where it was last seen. Those that move are looked at each
+    second, the others in turn.
 
     Parameters
     ----------
@@ -63,6 +70,8 @@ class BeamWatch:
         Assigned aims and standby points.
     sun
         Returns the unit vector to the sun now, (3,).
+    machines
+        Limits and resting places of heliostats, by name, as far as they are known.
 
     Attributes
     ----------
@@ -71,9 +80,17 @@ class BeamWatch:
     """
 
     def __init__(
-        self, check: BeamCheck, field: FieldState, points: Points, sun: Callable[[], FloatArray]
+        self,
+        check: BeamCheck,
+        field: FieldState,
+        points: Points,
+        sun: Callable[[], FloatArray],
+        machines: Mapping[str, Machine],
     ) -> None:
         self._check, self._field, self.points, self._sun = check, field, points, sun
+        self._machines = machines
+        axes = [m.azimuth_axis if (m := machines.get(n)) else 0 for n in field.names]
+        self._azimuth = np.array(axes, dtype=np.intp)
         self._seen: frozenset[str] = frozenset()
         self._turn = 0
         self._at = -np.inf
@@ -131,6 +148,45 @@ class BeamWatch:
         if wrong and len(wrong) == len(heliostats):
             raise BeamError(name, wrong)
         return tuple(n for n in heliostats if n not in wrong), wrong
+
+    def rewriting(self, heliostat: str, armature: FloatArray, drives: FloatArray) -> str:
+        """Return why new parameters may not be written where a heliostat stands, "" if they may.
+
+        With the present parameters and with the new ones, its beam must be free where it stands
+        and on the way from there to its standby point.
+
+        Parameters
+        ----------
+        heliostat
+            Name of the heliostat, which is at rest.
+        armature, drives
+            The new tables, (18,) and (2, 19).
+        """
+        row = self._field.place(heliostat)
+        if not self._check.volumes or not np.isfinite(self._field.posed_at[row]):
+            return ""
+        present = self._check.armature.table[row].copy(), self._check.drives.table[row].copy()
+        try:
+            for tables in (present, (armature, drives)):
+                self._check.replace(row, *tables)
+                if wrong := self._from_here(np.array([row])):
+                    return wrong[heliostat].partition(";")[0]
+        finally:
+            self._check.replace(row, *present)
+        return ""
+
+    def _from_here(self, rows: Rows) -> dict[str, str]:
+        """Return which heliostats may not go from where they stand to standby, and why."""
+        light = self._sun()
+        here = self._angles(rows, self._field.posed[rows])
+        wrong = self._check.moving(rows, np.repeat(here[:, None], 2, axis=1), light)
+        known = rows[np.isfinite(self.points.standbys[rows]).all(axis=-1)]
+        good, path = self._to_standby(known, light)
+        wrong |= {
+            self._field.names[row]: "its standby point cannot be reached"
+            for row in np.setdiff1d(known, good)
+        }
+        return wrong | self._check.moving(good, path, light)
 
     def joining(
         self, name: str, values: Sequence[float], heliostats: tuple[str, ...]
@@ -199,16 +255,55 @@ class BeamWatch:
         found["keep_out_predicted", ""] = Reading(0.0, now)
         return found
 
+    def way_out(self, name: str, *, again: bool) -> Act:
+        """Return the order, DEFOCUS or STOW, that takes a heliostat out of a volume soonest.
+
+        Parameters
+        ----------
+        name
+            Name of the heliostat.
+        again
+            Whether it has been ordered off already, and its beam is still there.
+        """
+        row = self._field.place(name)
+        if name not in self._seen:
+            return Act.DEFOCUS
+        node = self._field.rows[row]
+        ends = self._field.goals(np.array([row]))[0]
+        stands = not (np.abs(ends - self._field.posed[row]) > _MOVES).any()
+        if node["state"] == states.STOWING or (again and stands):
+            return Act.STOW
+        machine = self._machines.get(name)
+        return way_out(self._check, machine, row, self._field.posed[row], self._sun())
+
     def _look(self, now: float) -> None:
         field = self._field
-        out = np.flatnonzero(field.among(_BEAM_OUT, now) & np.isfinite(field.counted_at))
         self._turn = (self._turn + 1) % TURNS
-        begin, end = field.counts(out), field.goals(out)
-        moves = (np.abs(end - begin) > _MOVES).any(axis=-1)
-        chosen = moves | (out % TURNS == self._turn)
-        rows = out[chosen]
-        path = np.stack([self._angles(rows, begin[chosen]), self._angles(rows, end[chosen])], -2)
-        wrong = self._check.moving(rows, path, self._sun())
+        every = np.flatnonzero(np.isfinite(field.posed_at))
+        state, begin = field.rows["state"][every], field.posed[every]
+        goes = field.sure(now)[every] & np.not_equal(state, states.STOWING)
+        end = np.where(goes[:, None], field.goals(every), begin)
+        moves = np.asarray((np.abs(end - begin) > _MOVES).any(axis=-1))
+        chosen = moves | (every % TURNS == self._turn)
+        rows, moves, state = every[chosen], moves[chosen], state[chosen]
+        first, last = self._angles(rows, begin[chosen]), self._angles(rows, end[chosen])
+        commanded = np.isin(state, _COMMANDED)
+        light = self._sun()
+        path = np.stack([first, self._corner(rows, state, first, last), last], axis=-2)
+        path[~commanded] = first[~commanded, None]
+        wrong = self._check.moving(rows, path, light)
+        ends = moves & ~commanded
+        wrong |= self._check.moving(rows[ends], np.repeat(last[ends, None], 2, axis=1), light)
         looked = {field.names[row] for row in rows}
-        still = {field.names[row] for row in out} - looked
-        self._seen = frozenset(wrong) | (self._seen & still)
+        self._seen = frozenset(wrong) | (self._seen - looked)
+
+    def _corner(
+        self, rows: Rows, state: npt.NDArray[np.integer], first: FloatArray, last: FloatArray
+    ) -> FloatArray:
+        """Return the corner of each way (K, 2): azimuth first where an approach leaves stow."""
+        far = (np.abs(last - first) > _FROM_STOW).any(axis=-1)
+        turns = np.equal(state, states.APPROACHING) & far
+        axis = self._azimuth[rows]
+        corner = first.copy()
+        corner[turns, axis[turns]] = last[turns, axis[turns]]
+        return corner

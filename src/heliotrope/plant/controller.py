@@ -14,7 +14,7 @@ import asyncio
 import math
 import secrets
 from collections import deque
-from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -39,20 +39,24 @@ from heliotrope.links.messages import (
     ProtocolError,
     Stage,
 )
-from heliotrope.mechanism.board_items import Wanted, items_of
+from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.mechanism.machine import Machine
 from heliotrope.plant import refusals
+from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.aims import BeamCheck, default_aims
 from heliotrope.plant.assigned import Assigned, Points, grouped, points_of
 from heliotrope.plant.audit import Audit, AuditError
 from heliotrope.plant.authority import Authority, Grant, Person, Role
-from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
+from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
-from heliotrope.plant.parameters import ParameterSync
+from heliotrope.plant.parameters import ParameterSync, Tables, change_of_beam
 from heliotrope.plant.settings import Counters, PlantSettings, clusters_of
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act, Alarm, Condition, conditions
@@ -60,6 +64,8 @@ from heliotrope.sun import fast_vector
 
 #: Commands that bring beams to the receiver or move them across it.
 JOINING = frozenset({"TRACK", "REFOCUS", "SEARCH"})
+#: Commands that move heliostats by their parameters.
+MOTIONS = JOINING | {"APPROACH", "IDLE", "JOG", "GOTO", "DIAGNOSE"}
 #: Commands that move nothing.
 SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 #: Commands that assign points; `PlantController.aim` and `standby` prove their beams.
@@ -110,6 +116,8 @@ class PlantController:
         Mirrors and keep-out volumes; see `BeamCheck`.
     alarms
         The last alarms, oldest first.
+    out_of_service
+        Heliostats that only EMERGENCY, DEFOCUS and STOW move, by name; see `Lockout`.
     aims, standbys
         Assigned points, ENU, m, (N, 3); NaN where there is none.
 
@@ -149,9 +157,13 @@ class PlantController:
         self.beams = BeamCheck(design, self.field.names, volumes, eyes)
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
+        self.out_of_service: dict[str, Lockout] = {}
         points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
-        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector)
+        self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
+        self._agreement = Agreement(
+            self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
+        )
         self._clusters = Clusters(members, links, clock, self.counters)
         self._orders = PlantOrders(
             clock,
@@ -166,7 +178,7 @@ class PlantController:
             self._joining, self._orders, self._ways, self.settings.join_life
         )
         self._sync = ParameterSync(
-            self.field, self.wanted, self._orders, self._clusters, self._tell
+            self.field, self.wanted, self._orders, self._clusters, self._tell, self._rewriting
         )
         rows = conditions(self.settings.autonomy) if table is None else table
         self._sentinel = self._guarded(rows)
@@ -177,7 +189,12 @@ class PlantController:
     def _guarded(self, rows: Iterable[Condition]) -> Sentinel:
         """Return the sentinel, with the plant's own readings of the safety table."""
         readings = PlantReadings(
-            self.field, self.authority, self._orders, self._ways, self.sun_vector
+            self.field,
+            self.authority,
+            self._orders,
+            self._ways,
+            self._agreement,
+            self.sun_vector,
         )
         return Sentinel(
             self.clock,
@@ -185,7 +202,7 @@ class PlantController:
             self.field,
             self._orders,
             self._joining,
-            self.authority,
+            self._ways,
             self.beams.drives,
             self.settings.repeat,
         )
@@ -244,6 +261,7 @@ class PlantController:
     def _take_status(self, end: ClusterEnd, status: ClusterStatus, now: float) -> None:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
+        self._agreement.take(end.name, status)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -315,19 +333,14 @@ class PlantController:
         return self._orders.open
 
     def put(self, name: str, value: float, subject: str = "") -> None:
-        """Take a sensor's reading for the safety table, made now.
+        """Take a sensor's reading, made now, for the safety table or the proof of an emergency.
 
         Raises
         ------
         UnknownNameError
             If it is not one of the settings' sensors.
         """
-        self._sentinel.table.put(name, value, self.now(), subject)
-
-    def put_flux(self, share: float) -> None:
-        """Take the flux on the receiver as a share of the nominal, measured now, as proof."""
-        if self._sentinel.order is not None:
-            self._sentinel.order.take_flux(share, self.now())
+        self._sentinel.put(name, value, self.now(), subject)
 
     # -- open to anybody -------------------------------------------------------------------
 
@@ -480,9 +493,11 @@ class PlantController:
             raise UnknownNameError("command (points are given by aim and standby)", name, known)
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self.field.names
-        clear, blocked = self._ways.clear(name, numbers, names, self.now())
+        out = self._locked_out(name, names)
+        able, wrong = self._able(name, tuple(n for n in names if n not in out))
+        clear, blocked = self._ways.clear(name, numbers, able, self.now())
         ticket = self._accept(person, token, name, numbers, names)
-        ticket.block(blocked)
+        ticket.block({**wrong, **blocked, **out})
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
@@ -554,9 +569,27 @@ class PlantController:
         return self._point(person, token, "STANDBY", points)
 
     def parameters(
-        self, person: Person, token: int, heliostat: str, items: Mapping[str, bytes]
+        self,
+        person: Person,
+        token: int,
+        heliostat: str,
+        items: Mapping[str, bytes],
+        confirmed: str = "",
     ) -> Ticket:
         """Push items of the journal (see `board_items`) to one heliostat, and keep them wanted.
+
+        Items that change its pose are accepted only where its beam is safe: at stow, or standing
+        still where its beam and its way to standby are free with the present parameters and with
+        the new ones.
+
+        Parameters
+        ----------
+        person, token
+            The person commanding, and the token of the command authority.
+        heliostat, items
+            Name, and bytes by item.
+        confirmed
+            Why a change above the limit of the settings is right; the audit keeps it.
 
         Raises
         ------
@@ -565,20 +598,76 @@ class PlantController:
         InputError
             Items that no plant pushes.
         """
-        self.field.place(heliostat)
+        row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
-        note = ", ".join(items)
+        before, after = self._tables(heliostat, items)
+        if POSE_ITEMS.intersection(items):
+            self.authority.check(person, token, "PARAMETERS")
+            self._sync.check(heliostat, items)
+            change, limit = change_of_beam(before, after, self._aimed(row)), self.settings
+            if not confirmed.strip() and change > limit.largest_change:
+                raise refusals.CHANGE_TOO_LARGE.error(
+                    heliostat=heliostat, change=1e3 * change, limit=1e3 * limit.largest_change
+                )
+        note = ", ".join(items) + (f"; confirmed: {confirmed}" if confirmed else "")
         ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
         self.wanted.set(heliostat, items)
+        self._use(row, *after)
+        self._joining.drop("its parameters are being written", frozenset([heliostat]))
         self._sync.push(ticket, heliostat, items, token)
         return ticket
 
+    def _use(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
+        """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
+        self.beams.replace(row, armature, drives)
+        self._agreement.believe(row, armature, drives)
+
+    def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
+        """Return the tables of a heliostat's mechanism now, and once items are stored."""
+        row = self.field.place(heliostat)
+        before = self.beams.armature.table[row].copy(), self.beams.drives.table[row].copy()
+        return before, tables_with(items, *before) if POSE_ITEMS.intersection(items) else before
+
+    def _rewriting(self, heliostat: str, items: Mapping[str, bytes]) -> str:
+        return self._ways.rewriting(heliostat, *self._tables(heliostat, items)[1])
+
+    def _aimed(self, row: int) -> FloatArray:
+        """Return the points at which a heliostat may aim, ENU, m, (K, 3)."""
+        own = np.stack([self.aims[row], self.standbys[row]])
+        centers = [receiver.center for receiver in self.design.receivers]
+        centers += [target.center for target in self.design.targets]
+        return np.array([*own[np.isfinite(own).all(axis=-1)], *centers])
+
+    def _able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be given a command, and why the others may not.
+
+        A motion needs the wanted parameters; joining, that no alarm bars the heliostat.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        wrong = self._sync.differing(names) if name in MOTIONS else {}
+        if name in JOINING:
+            wrong |= self._sentinel.barred(names)
+        if wrong and len(wrong) == len(names):
+            raise BeamError(name, wrong)
+        return tuple(n for n in names if n not in wrong), wrong
+
     def _believe(self, record: HeliostatCalibration) -> None:
         """Use a new calibration in the beam checks and in the wanted parameters."""
-        mechanism = self.beliefs.present(record.heliostat)[0]
-        row = self.field.place(record.heliostat)
-        self.beams.replace(row, mechanism.armature.table, mechanism.drives.table)
-        self.wanted.set(record.heliostat, items_of(mechanism))
+        self.want(record.heliostat, self.beliefs.present(record.heliostat)[0])
+
+    def want(self, heliostat: str, mechanism: Mechanism) -> None:
+        """Use a mechanism, batch shape (), in the beam checks and in the wanted parameters.
+
+        The local controller is compared, and written when its state allows it.
+        """
+        row = self.field.place(heliostat)
+        self._use(row, mechanism.armature.table, mechanism.drives.table)
+        self.wanted.set(heliostat, items_of(mechanism))
+        self._sync.compare(heliostat)
 
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
         """Return the checksums of the items that a local controller stores, by item.
@@ -594,17 +683,26 @@ class PlantController:
     def _point(
         self, person: Person, token: int, name: str, points: Mapping[str, npt.ArrayLike]
     ) -> Ticket:
+        out = self._locked_out(name, points)
+        points = {n: point for n, point in points.items() if n not in out}
         names = tuple(points)
         rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
         wanted = points_of(name, points)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
+        moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
+        if wrong := self._sync.differing([names[i] for i in np.flatnonzero(moves)]):
+            raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
         groups = grouped(names, wanted)
         values = next(iter(groups)) if len(groups) == 1 else ()
-        ticket = self._accept(person, token, name, values, names, f"{len(groups)} points")
+        ticket = self._accept(person, token, name, values, (*names, *out), f"{len(groups)} points")
+        ticket.block(out)
         if problem := self._ways.points.assign(name, rows, wanted):
             ticket.advance(names, Stage.FAILED, f"not sent, because it cannot be stored: {problem}")
             return ticket
+        if name == "STANDBY":
+            for each, place in zip(names, wanted, strict=True):
+                self.wanted.rest(each, tuple(place))
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)
         moving = {names[i] for i in np.flatnonzero(tracking)} if name == "AIM" else set()
         for point, members in groups.items():
@@ -625,6 +723,16 @@ class PlantController:
     ) -> None:
         until = self.now() + self.settings.join_wait
         self._joining.put(JoiningJob(ticket, name, values, token, deque(heliostats), until))
+
+    def _locked_out(self, name: str, heliostats: Collection[str]) -> dict[str, str]:
+        """Return which heliostats are out of service, and why; refuse if all of them are."""
+        out = locked_out(self.out_of_service, name, heliostats)
+        if out and len(out) == len(heliostats):
+            first, more = next(iter(out)), f" and {len(out) - 1} more" if len(out) > 1 else ""
+            raise refusals.OUT_OF_SERVICE.error(
+                what=name, heliostat=first, more=more, reason=out[first]
+            )
+        return out
 
     def _accept(
         self,
@@ -647,6 +755,16 @@ class PlantController:
             )
         except AuditError as error:
             raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+
+
+def _machines(design: Plant) -> dict[str, Machine]:
+    """Return the machines that the design knows, by heliostat."""
+    return {
+        name: machine
+        for group in design.groups.values()
+        if group.machines
+        for name, machine in zip(group.names, group.machines, strict=True)
+    }
 
 
 def _checked(

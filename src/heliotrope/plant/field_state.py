@@ -22,6 +22,8 @@ from heliotrope.links.messages import NEVER, NODE, ClusterStatus
 #: Age from which a row is stale, s: three missed polls.
 STALE = 3.0
 
+_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
+
 Mask = npt.NDArray[np.bool_]
 
 
@@ -87,6 +89,9 @@ class FieldState:
         Time at which each row was true, monotonic s, (N,); minus infinity if never heard.
     counted_at
         The same of its step counts and goals.
+    posed, posed_state, posed_at
+        Step counts when they were last known, (N, 2), the state then, and that time, (N,): a local
+        controller that has lost its counts goes on reporting numbers, which mean nothing.
 
     Raises
     ------
@@ -112,6 +117,9 @@ class FieldState:
         self.rows: npt.NDArray[Any] = np.zeros(len(pairs), NODE)
         self.heard = np.full(len(pairs), -np.inf)
         self.counted_at = np.full(len(pairs), -np.inf)
+        self.posed = np.zeros((len(pairs), 2))
+        self.posed_state = np.zeros(len(pairs), dtype=np.intp)
+        self.posed_at = np.full(len(pairs), -np.inf)
         self.failed_at = np.full(len(pairs), -np.inf)
         self.status_at = dict.fromkeys(self.clusters, -math.inf)
         self._places: dict[str, tuple[tuple[str, ...], npt.NDArray[np.intp]]] = {}
@@ -149,6 +157,10 @@ class FieldState:
         self.heard[mine] = at - 1e-3 * new["heard_ms"].astype(np.float64)
         steps = new["steps_ms"].astype(np.float64)
         self.counted_at[mine] = np.where(steps < NEVER, at - 1e-3 * steps, -np.inf)
+        known = (steps < NEVER) & (new["flags"] & _UNKNOWN == 0)
+        self.posed[mine[known]] = self.counts(mine[known])
+        self.posed_state[mine[known]] = new["state"][known]
+        self.posed_at[mine[known]] = self.counted_at[mine[known]]
         return problems
 
     def _rows_of(self, cluster: str, names: Sequence[str]) -> npt.NDArray[np.intp]:
@@ -217,6 +229,11 @@ class FieldState:
 
     def _pairs(self, rows: npt.NDArray[np.intp], *names: str) -> FloatArray:
         return np.stack([self.rows[name][rows] for name in names], axis=-1).astype(np.float64)
+
+    def sure(self, now: float) -> Mask:
+        """Return which heliostats are live and know their step counts, (N,)."""
+        known = (self.rows["flags"] & _UNKNOWN == 0) & np.isfinite(self.counted_at)
+        return np.asarray(self.live(now) & known)
 
     def among(self, wanted: Sequence[int], now: float) -> Mask:
         """Return which heliostats are live and in one of some states, (N,)."""

@@ -2,11 +2,18 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.geometry import FloatArray, angle_between, normalize, reflect
 from heliotrope.lcu import states
 from heliotrope.links.messages import Answer, ProtocolError
-from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, Wanted, checksums
+from heliotrope.mechanism.armature import Armature
+from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, POSE_ITEMS, Wanted, checksums
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.tracking import track
 from heliotrope.plant import refusals
 from heliotrope.plant.audit import AuditError
 from heliotrope.plant.clusters import Clusters
@@ -15,7 +22,8 @@ from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Alarm, alarms
 
-#: States in which a controller takes items of its calibration, and items of its machine.
+#: States in which a controller takes items of its calibration, and items of its machine. Items that
+#: change the pose are written only where it stands still: at stow too, beside those of the machine.
 TAKES_CALIBRATION = (
     states.UNCONFIGURED,
     states.STOWED,
@@ -25,8 +33,54 @@ TAKES_CALIBRATION = (
     states.DEFOCUSED,
 )
 TAKES_MACHINE = (states.UNCONFIGURED, states.LOCKED, states.FAULT)
+TAKES_POSE = (*TAKES_MACHINE, states.STOWED)
 #: Pause before another attempt, s.
 AGAIN = 30.0
+
+
+#: Suns for which a change of parameters is measured: azimuth and elevation, rad.
+_SUNS = tuple(
+    (math.radians(azimuth), math.radians(elevation))
+    for azimuth in range(0, 360, 60)
+    for elevation in (25, 50)
+)
+#: Armature (18,) and drives (2, 19) of one heliostat.
+Tables = tuple[FloatArray, FloatArray]
+
+
+def change_of_beam(before: Tables, after: Tables, aims: npt.ArrayLike) -> float:
+    """Return the largest angle by which new parameters turn a beam from its aim, rad.
+
+    The mirror is taken to be as the present parameters say, and its local controller to aim by the
+    new ones, for suns all around. Infinite if the new ones reach none of the poses, or an aim that
+    the present ones reach is out of reach.
+
+    Parameters
+    ----------
+    before, after
+        Armature and drives under the present and the new parameters.
+    aims
+        Aim points, ENU, m, (K, 3).
+    """
+    suns = np.array(
+        [(math.sin(a) * math.cos(e), math.cos(a) * math.cos(e), math.sin(e)) for a, e in _SUNS]
+    )
+    points = np.reshape(np.asarray(aims, dtype=np.float64), (-1, 3))
+    light, goals = np.repeat(suns, len(points), axis=0), np.tile(points, (len(suns), 1))
+
+    def many(table: FloatArray) -> FloatArray:
+        return np.repeat(table[None], len(light), axis=0)
+
+    solved = [
+        track(Armature(many(a)), light, goals, drives=Drive(many(d))) for a, d in (before, after)
+    ]
+    reached, again = (found.chosen(found.reachable) for found in solved)
+    if not reached.any() or (reached & ~again).any():
+        return math.inf
+    angles = Drive(many(before[1])).angles(solved[1].chosen(solved[1].counts))
+    normal, vertex = Armature(many(before[0])).pose(angles)
+    missed = angle_between(reflect(light, normal), normalize(goals - vertex))
+    return float(missed[reached].max())
 
 
 def stored_items(answer: Answer) -> dict[str, bytes]:
@@ -60,6 +114,8 @@ class ParameterSync:
         Of the plant.
     tell
         Called with each alarm.
+    proof
+        Returns why items may not be written where a heliostat stands, "" if they may.
     """
 
     def __init__(
@@ -69,9 +125,10 @@ class ParameterSync:
         orders: PlantOrders,
         clusters: Clusters,
         tell: Callable[[Alarm], None],
+        proof: Callable[[str, Mapping[str, bytes]], str],
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
-        self._clusters, self._tell = clusters, tell
+        self._clusters, self._tell, self._proof = clusters, tell, proof
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         self._tickets: dict[str, Ticket] = {}
@@ -81,6 +138,35 @@ class ParameterSync:
         """Compare a heliostat as soon as possible."""
         if heliostat in self._wanted.items:
             self._due[heliostat] = -math.inf
+
+    def differing(self, heliostats: Sequence[str]) -> dict[str, str]:
+        """Return which heliostats may not move, because their parameters differ, and why."""
+        found = {}
+        for name in heliostats:
+            ticket = self._tickets.get(name)
+            items = self._wanted.missing.get(name, ())
+            if items or (ticket is not None and not ticket.finished):
+                listed = ", ".join(items) or "being written"
+                found[name] = refusals.PARAMETERS_DIFFER.text.format(items=listed)
+        return found
+
+    def check(self, heliostat: str, items: Mapping[str, bytes]) -> None:
+        """Check that the beam of a heliostat is safe if items are written now.
+
+        Raises
+        ------
+        RefusedError
+            If they change its pose where it does not stand still, or where its beam is not free.
+        """
+        state = int(self._field.rows["state"][self._field.place(heliostat)])
+        moving = ", ".join(sorted(POSE_ITEMS.intersection(items)))
+        reason = ""
+        if moving and state not in TAKES_POSE:
+            reason = f"it is {states.STATES[state]}, and {moving} would move its beam"
+        elif moving and state != states.STOWED:
+            reason = self._proof(heliostat, items)
+        if reason:
+            raise refusals.PARAMETERS_NOT_HERE.error(heliostat=heliostat, reason=reason)
 
     def push(self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int) -> None:
         """Send items of an accepted ticket; compare the heliostat when the ticket has ended."""
@@ -112,7 +198,9 @@ class ParameterSync:
         if not items:
             problem = answer.data.get("error", "nothing is stored")
             raise refusals.NO_ANSWER.error(heliostat=heliostat, problem=problem)
-        return checksums(items)
+        sums = checksums(items)
+        self._wanted.compare(heliostat, sums)
+        return sums
 
     def beat(self, now: float, token: int, allowed: bool) -> None:
         """Ask for and push what is due; nothing is pushed unless ``allowed``."""
@@ -127,7 +215,8 @@ class ParameterSync:
                 self._ask(name)
         if token and allowed:
             for name, missing in list(self._wanted.missing.items()):
-                if live[self._field.index[name]] and name not in self._tickets:
+                busy = name in self._tickets or name in self._due
+                if live[self._field.index[name]] and not busy:
                     self._push(name, missing, token, now)
 
     def _ask(self, name: str) -> None:
@@ -144,15 +233,15 @@ class ParameterSync:
 
     def _push(self, name: str, missing: tuple[str, ...], token: int, now: float) -> None:
         state = int(self._field.rows["state"][self._field.index[name]])
-        able = [
-            item
-            for item in missing
-            if state in TAKES_MACHINE or (state in TAKES_CALIBRATION and item in CALIBRATION_ITEMS)
-        ]
+        able = [item for item in missing if state in _takes(item)]
         if not able or now - self._tried.get(name, -math.inf) < AGAIN:
             return
         self._tried[name] = now
         items = {item: self._wanted.items[name][item] for item in able}
+        try:
+            self.check(name, items)
+        except refusals.RefusedError:
+            return  # it is written at stow
         try:
             ticket = self._orders.accept(
                 ("plant", "plant", "PARAMETERS"), (), (name,), ", ".join(able)
@@ -160,3 +249,10 @@ class ParameterSync:
         except AuditError:
             return  # nothing is sent without its record; the safety table reports the disk
         self.push(ticket, name, items, token)
+
+
+def _takes(item: str) -> tuple[int, ...]:
+    """Return the states in which an item is written."""
+    if item not in CALIBRATION_ITEMS:
+        return TAKES_MACHINE
+    return TAKES_POSE if item in POSE_ITEMS else TAKES_CALIBRATION

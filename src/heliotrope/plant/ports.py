@@ -69,8 +69,8 @@ class Sensors(Protocol):
         """Readings that they feed."""
         ...
 
-    def read(self) -> Readings:
-        """Return the changes since the last call; it may block, and runs in a thread."""
+    async def news(self) -> Readings:
+        """Return the changes since the last call; it must not hold up the loop."""
         ...
 
 

@@ -99,6 +99,18 @@ BEAM_REFUSED = Refusal(
     "{what} {heliostat}{more}: {reason}",
     "Choose another point, or leave out the heliostat that the text names.",
 )
+OUT_OF_SERVICE = Refusal(
+    "out of service",
+    "The heliostat is out of service, and the command would move it.",
+    "{what} {heliostat}{more}: {reason}",
+    "Make sure that nobody is at the mirror, then give it back by name. DEFOCUS and STOW pass.",
+)
+NOT_OWNER = Refusal(
+    "not the owner",
+    "A heliostat that another person took out of service is given back or taken out again.",
+    "{what}: {heliostat} is out of service: {text}; its owner or an engineer gives it back",
+    "Ask the owner or an engineer.",
+)
 NOT_ACKNOWLEDGED = Refusal(
     "not acknowledged",
     "The row is not tripped, its cause has not gone, or it needs another role.",
@@ -110,6 +122,26 @@ ONE_HELIOSTAT = Refusal(
     "A command whose values are true of one heliostat only is given to several.",
     "{what}: {count} heliostats; step counts differ from one to the next, give one heliostat",
     "Repeat the command for each heliostat.",
+)
+PARAMETERS_DIFFER = Refusal(
+    "parameters differ",
+    "A motion is given to a heliostat that stores parameters other than the wanted ones.",
+    "it stores parameters that differ from the wanted ones ({items})",
+    "Stow the heliostat: the wanted ones are written there. Lock it at stow if the text names more "
+    "than armature, biases, location and defocus.",
+)
+PARAMETERS_NOT_HERE = Refusal(
+    "parameters not here",
+    "Parameters that change a pose are given where the beam would move or is not proven free.",
+    "PARAMETERS {heliostat}: {reason}; stow it first",
+    "Stow the heliostat, or lock it at standby, then give the parameters again.",
+)
+CHANGE_TOO_LARGE = Refusal(
+    "change too large",
+    "Parameters would move the beam by more than the limit, and the change is not confirmed.",
+    "PARAMETERS {heliostat}: they would move its beam by {change:.1f} mrad, and {limit:.1f} are "
+    "allowed; are they its own? Confirm with a reason",
+    "Check that they belong to this heliostat. If so, confirm the change with a reason.",
 )
 NO_ANSWER = Refusal(
     "no answer",

@@ -5,16 +5,18 @@ another name, then renamed). A file that is not replaced gives no new reading: a
 its row counts the worst case, as if the sensor were gone. See `safety.conditions`.
 """
 
+import asyncio
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from heliotrope.plant.emergency import OWN_READINGS
-from heliotrope.safety import CONDITIONS, Watcher, watched_by
+from heliotrope.safety import CONDITIONS, FLUX_READING, Watcher, watched_by
 
 #: Readings that must come from outside.
 FED = frozenset(row.reading for row in watched_by(CONDITIONS, Watcher.PLANT)) - OWN_READINGS
+FED |= {FLUX_READING}
 #: Longest text of a number, bytes.
 _LONGEST = 64
 
@@ -54,6 +56,10 @@ class SensorFiles:
         self.names = frozenset(files)
         self._written: dict[str, int] = {}
         self._problems: dict[str, str] = {}
+
+    async def news(self) -> Readings:
+        """Read all files in a thread; return the changes."""
+        return await asyncio.to_thread(self.read)
 
     def read(self) -> Readings:
         """Read all files; return the changes."""

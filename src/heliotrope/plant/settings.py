@@ -38,6 +38,8 @@ class PlantSettings:
     repeat
         Pause between repetitions of an emergency order to heliostats that have not acknowledged
         it, s.
+    largest_change
+        Largest change of a heliostat's beam by pushed parameters that nobody has confirmed, rad.
     """
 
     lease: float = 3.0
@@ -54,6 +56,7 @@ class PlantSettings:
     authority: float = 15.0
     sensors: frozenset[str] = frozenset()
     repeat: float = 1.0
+    largest_change: float = 5e-3
 
     def __post_init__(self) -> None:
         if not 0.0 < 2.0 * self.period <= self.lease < math.inf:

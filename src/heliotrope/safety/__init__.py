@@ -33,8 +33,10 @@ from heliotrope.safety.evaluation import (
 from heliotrope.safety.joining import JoinLimiter
 from heliotrope.safety.proof import (
     DEFOCUS_BUDGET,
+    FLUX_READING,
     ORDER_BUDGET,
     STOW_BUDGET,
+    FluxProof,
     Proof,
     ProofReport,
     proof_readings,
@@ -43,6 +45,7 @@ from heliotrope.safety.proof import (
 __all__ = [
     "CONDITIONS",
     "DEFOCUS_BUDGET",
+    "FLUX_READING",
     "ORDER_BUDGET",
     "STOW_BUDGET",
     "AcknowledgeRole",
@@ -51,6 +54,7 @@ __all__ = [
     "Alarm",
     "AlarmKind",
     "Condition",
+    "FluxProof",
     "JoinLimiter",
     "Proof",
     "ProofReport",

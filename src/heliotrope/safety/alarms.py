@@ -113,8 +113,10 @@ PARAMETERS_DIFFER = AlarmKind(
     Severity.WARNING,
     "A local controller stores parameters that differ from the wanted ones.",
     "{subject}: stored parameters differ from the wanted ones: {items}",
-    "They are pushed as soon as there is a command authority and the heliostat's state allows it.",
-    "Nothing to do; if it returns, replace the controller's flash memory.",
+    "No motion but DEFOCUS and STOW is accepted; they are written as soon as there is a command "
+    "authority and the heliostat stands where its beam is safe.",
+    "Stow it; lock it at stow if more than armature, biases, location and defocus differ. If it "
+    "returns, replace the controller's flash memory.",
 )
 RECORDS = AlarmKind(
     "records",
@@ -126,6 +128,16 @@ RECORDS = AlarmKind(
     "Check the disk or the database.",
     over="records are stored again",
 )
+RECORD_REFUSED = AlarmKind(
+    "record_refused",
+    _PLANT,
+    Severity.WARNING,
+    "The store refuses a record for its content; the disk and the database are well.",
+    "a record was refused: {problem}",
+    "This record is lost; all others are stored.",
+    "Report the text.",
+    over="a record was refused: {problem}; the records after it are stored",
+)
 WORK = AlarmKind(
     "work",
     _PLANT,
@@ -135,6 +147,16 @@ WORK = AlarmKind(
     "It is tried again after 5 s.",
     "Report the text; without this part, command the field by hand.",
     over="automatic control, part {subject}, works again",
+)
+RESUME_NEEDED = AlarmKind(
+    "resume_needed",
+    _PLANT,
+    Severity.ALARM,
+    "More heliostats than the setting `losses` left the receiver within 30 s without an order.",
+    "{count} heliostats left the receiver without an order, seen at {since} UTC",
+    "They have turned away by themselves; automatic control waits and raises nothing.",
+    "Find the cause, make sure that nobody is in the field, then press Resume.",
+    over="automatic control was resumed",
 )
 BEAM_BLOCKED = AlarmKind(
     "beam_blocked",

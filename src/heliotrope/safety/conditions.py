@@ -10,7 +10,7 @@ from heliotrope.errors import InputError
 from heliotrope.safety.condition import AcknowledgeRole, Act, Condition, Scope, Severity, Watcher
 
 _PLANT, _CLUSTER, _NODE = Watcher.PLANT, Watcher.CLUSTER, Watcher.NODE
-_ALARM, _REFUSE, _HOLD, _DEFOCUS, _STOW = Act
+_ALARM, _REFUSE, _, _DEFOCUS, _STOW = Act
 _HELIOSTAT, _BUS, _FIELD = Scope
 _INFO, _WARNING, _SERIOUS, _EMERGENCY = Severity
 _OPERATOR, _SUPERVISOR = AcknowledgeRole
@@ -214,6 +214,23 @@ def _links(autonomy: float) -> tuple[Condition, ...]:
 def _time() -> tuple[Condition, ...]:
     return (
         Condition(
+            "cluster_time_differs", _PLANT, "cluster_time_off", "s",
+            "difference between the cluster's time and the plant's",
+            "the cluster's time differs from the plant's by {value}",
+            2.0, 1.0, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
+            clear_for=10.0, release="the two times agree again",
+            remedy="Check the clocks of both machines; if every cluster differs, the plant's is"
+            " wrong.",
+        ),
+        Condition(
+            "cluster_site_differs", _PLANT, "cluster_sun_off", "rad",
+            "angle between the suns of the cluster's site and of the plant's",
+            "the sun of the cluster's site is {value} off that of the plant's",
+            1e-3, 5e-4, _DEFOCUS, _BUS, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0,
+            clear_for=10.0, release="the two sites have the same sun",
+            remedy="Correct the table [site] of the cluster file, or the site in the plant file.",
+        ),
+        Condition(
             "clock_jump", _CLUSTER, "clock_step", "s",
             "step of the cluster's time against its monotonic clock",
             "the cluster's time stepped by {value}",
@@ -268,9 +285,27 @@ def _mirrors() -> tuple[Condition, ...]:
         Condition(
             "keep_out_predicted", _PLANT, "keep_out_predicted", "yes/no",
             "beam in or heading for a keep-out volume",
-            "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _HOLD, _HELIOSTAT,
-            _SERIOUS, 10.0, release="the beam and its way are clear",
-            remedy="Give it another aim point, or stow it.",
+            "its beam is in a keep-out volume or heading for one", 0.5, 0.4, _DEFOCUS, _HELIOSTAT,
+            _SERIOUS, 30.0, then_stow=_PATIENCE, release="the beam and its way are clear",
+            remedy="Keep people out of the volume until the alarm is over; then give it another aim"
+            " point.",
+        ),
+        Condition(
+            "pointing_disagrees", _PLANT, "pointing_error", "rad",
+            "angle between its beam, by its step counts, and its aim",
+            "its step counts send its beam {value} beside its aim", 3e-3, 2e-3, _DEFOCUS,
+            _HELIOSTAT, _SERIOUS, 30.0, delay=3.0, role=_OPERATOR,
+            release="its step counts agree with its aim, or its beam is off",
+            remedy="Check the parameters and the address of its local controller, and the time and"
+            " the site of its cluster; then acknowledge.",
+        ),
+        Condition(
+            "pointing_disagrees_many", _PLANT, "pointing_errors", "count",
+            "number of heliostats whose step counts disagree with their aims",
+            "the step counts of {value} heliostats or more disagree with their aims", 100.0, 20.0,
+            _DEFOCUS, _FIELD, _SERIOUS, 30.0, then_stow=_PATIENCE, delay=3.0, role=_OPERATOR,
+            release="few heliostats disagree",
+            remedy="Check the clock of the plant's machine and its site first, then the clusters.",
         ),
         Condition(
             "node_faults", _PLANT, "node_fault_share", "share",

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 from heliotrope.errors import InputError
 from heliotrope.safety.condition import Reading
@@ -14,6 +15,21 @@ ORDER_BUDGET, DEFOCUS_BUDGET, STOW_BUDGET = 1.0, 30.0, 300.0
 FLUX_LIMIT = 0.10
 #: A flux reading older than this (s) proves nothing.
 FLUX_AGE = 5.0
+#: Sensor of the flux on the receiver, as a share of its nominal value.
+FLUX_READING = "receiver_flux_nominal"
+
+
+class FluxProof(Enum):
+    """What a proof says about the flux on the receiver; the value is its text."""
+
+    #: No sensor feeds it: the proof rests on what is known of each heliostat.
+    NOT_MEASURED = "flux on the receiver not measured"
+    #: There is still time for a reading.
+    AWAITED = "flux not proven yet"
+    #: A fresh reading, taken after the order, shows it below its limit.
+    BELOW = "the flux is below its limit"
+    #: No such reading came in time.
+    NOT_BELOW = f"flux not proven to be below {FLUX_LIMIT:.0%}"
 
 
 @dataclass(frozen=True)
@@ -26,33 +42,35 @@ class ProofReport:
         Heliostats that have not acknowledged the order, and that have not carried it out; sorted.
     late
         Heliostats that missed the deadline for either, sorted.
-    flux_proven
-        Whether a fresh reading, taken after the order, shows the flux below its limit; None while
-        there is still time for that.
+    flux
+        Whether the flux is proven to be below its limit.
     complete
-        Whether every heliostat has acknowledged and is done, and the flux is proven.
+        Whether every heliostat has acknowledged and is done, and the flux is proven or is not
+        measured.
+    unknown
+        What is known of each heliostat of which nothing can show that it is done.
     """
 
     unacknowledged: tuple[str, ...]
     not_done: tuple[str, ...]
     late: tuple[str, ...]
-    flux_proven: bool | None
+    flux: FluxProof
     complete: bool
+    unknown: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
         """One line for the operator."""
         if self.complete:
-            return "every heliostat has acknowledged and is done; the flux is below its limit"
+            return f"every heliostat has acknowledged and is done; {self.flux.value}"
         parts = []
         for names, what in ((self.unacknowledged, "not acknowledged"), (self.not_done, "not done")):
             if names:
                 shown = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
                 parts.append(f"{len(names)} {what}: {shown}")
-        if self.flux_proven is None:
-            parts.append("flux not proven yet")
-        elif not self.flux_proven:
-            parts.append(f"flux not proven to be below {FLUX_LIMIT:.0%}")
+        parts += self.unknown[:8]
+        if self.flux is not FluxProof.BELOW:
+            parts.append(self.flux.value)
         return "; ".join(parts)
 
 
@@ -72,6 +90,8 @@ class Proof:
         Time at which each of them acknowledged the order and carried it out, s.
     flux
         Last reading of the flux after the order, as a share of the nominal.
+    flux_measured
+        Whether a sensor feeds the flux.
     refused
         Number of reports that prove nothing: from other heliostats, or from before the order.
     """
@@ -82,6 +102,7 @@ class Proof:
     acknowledged: Mapping[str, float] = field(default_factory=dict)
     done: Mapping[str, float] = field(default_factory=dict)
     flux: Reading | None = None
+    flux_measured: bool = True
     refused: int = 0
 
     def __post_init__(self) -> None:
@@ -91,9 +112,11 @@ class Proof:
             raise InputError(f"proof of {self.order}: ordered at {self.ordered_at} s, not a time")
 
     @classmethod
-    def of(cls, order: str, nodes: Iterable[str], now: float) -> "Proof":
+    def of(
+        cls, order: str, nodes: Iterable[str], now: float, *, flux_measured: bool = True
+    ) -> "Proof":
         """Return the proof of an order given to ``nodes`` at ``now``; nothing is proven yet."""
-        return cls(order, now, frozenset(nodes))
+        return cls(order, now, frozenset(nodes), flux_measured=flux_measured)
 
     @property
     def budget(self) -> float:
@@ -153,14 +176,17 @@ class Proof:
             tuple(sorted(open_)),
             tuple(sorted(late)),
             flux,
-            complete=not silent and not open_ and flux is True,
+            complete=not silent and not open_ and flux in (FluxProof.BELOW, FluxProof.NOT_MEASURED),
         )
 
-    def _flux_proven(self, now: float) -> bool | None:
+    def _flux_proven(self, now: float) -> FluxProof:
+        if not self.flux_measured:
+            return FluxProof.NOT_MEASURED
         known = self.flux is not None and 0.0 <= now - self.flux.at <= FLUX_AGE
         if known and self.flux is not None and self.flux.value < FLUX_LIMIT:
-            return True
-        return None if now - self.ordered_at <= DEFOCUS_BUDGET else False
+            return FluxProof.BELOW
+        early = now - self.ordered_at <= DEFOCUS_BUDGET
+        return FluxProof.AWAITED if early else FluxProof.NOT_BELOW
 
 
 def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Reading]:
@@ -168,14 +194,15 @@ def proof_readings(proof: Proof | None, now: float) -> dict[tuple[str, str], Rea
 
     ``nodes_unacknowledged`` is 0 until the deadline of the acknowledgements, then the number of
     heliostats that have not acknowledged. ``flux_after_emergency`` is 0 until the deadline of the
-    defocus, then the flux as a share of the nominal, or 1 if it is not known.
+    defocus, then the flux as a share of the nominal, or 1 if its sensor is silent; it stays 0
+    where no sensor feeds it.
     """
     silent, flux = 0.0, 0.0
     if proof is not None:
         report = proof.report(now)
         if not now - proof.ordered_at <= ORDER_BUDGET:
             silent = float(len(report.unacknowledged))
-        if report.flux_proven is False:
+        if report.flux is FluxProof.NOT_BELOW:
             fresh = proof.flux is not None and 0.0 <= now - proof.flux.at <= FLUX_AGE
             flux = proof.flux.value if fresh and proof.flux is not None else 1.0
     return {

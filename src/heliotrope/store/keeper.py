@@ -17,6 +17,7 @@ from sqlalchemy import Connection, Select, Table, and_, delete, func, select, up
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.errors import InputError, UnknownNameError
+from heliotrope.safety import Severity
 from heliotrope.store import _rows as rows
 from heliotrope.store import tables
 from heliotrope.store.database import Database
@@ -84,12 +85,17 @@ class Keeper:
     @property
     def problem(self) -> str:
         """Why records cannot be written now, "" if they can."""
-        return self.writer.problem
+        return self.writer.problem or self.writer.crowded
 
     @property
     def refused(self) -> str:
         """The last record that the database refused for its content, "" if none."""
         return self.writer.refused
+
+    @property
+    def refused_count(self) -> int:
+        """Number of records that the database refused for their content."""
+        return self.writer.refused_count
 
     @property
     def backlog(self) -> int:
@@ -299,10 +305,20 @@ class Keeper:
         self.writer.put(lambda c: rows.insert(c, tables.event, [row]))
 
     def record_alarm(
-        self, condition: str, subject: str, severity: str, text: str, at: float, *, active: bool
+        self,
+        condition: str,
+        subject: str,
+        severity: Severity,
+        text: str,
+        at: float,
+        *,
+        active: bool,
     ) -> None:
-        """Record that an alarm stands, or (not active) that it is over."""
-        _check_severity(severity)
+        """Record that an alarm stands, or (not active) that it is over.
+
+        A severity that is not known counts as an alarm: none is lost because of its severity.
+        """
+        severity = Severity.read(severity)
         number = self._take_numbers(tables.alarm)
         entry = AlarmEntry(condition, subject, severity, text, at, number=number)
         row = rows.row_of(tables.alarm, entry)
@@ -325,7 +341,12 @@ class Keeper:
         self.writer.put(lambda c: c.execute(update(tables.alarm).where(which).values(change)))
 
     def events(
-        self, limit: int = 100, *, heliostat: str = "", severity: str = "info", before: int = 0
+        self,
+        limit: int = 100,
+        *,
+        heliostat: str = "",
+        severity: Severity = Severity.INFO,
+        before: int = 0,
     ) -> list[Event]:
         """Return events of at least a severity, the latest first; before a number if given."""
         _check_severity(severity)

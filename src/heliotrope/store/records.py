@@ -87,7 +87,7 @@ class Event:
     at: float
     source: str
     text: str
-    severity: str = "info"
+    severity: Severity = Severity.INFO
     heliostat: str = ""
     values: Mapping[str, float] = field(default_factory=dict)
     number: int = 0
@@ -113,7 +113,7 @@ class AlarmEntry:
 
     condition: str
     subject: str
-    severity: str
+    severity: Severity
     text: str
     raised: float
     cleared: float | None = None
@@ -271,6 +271,16 @@ class Records(Protocol):
         ...
 
     @property
+    def refused(self) -> str:
+        """The last record that was refused for its content, "" if none."""
+        ...
+
+    @property
+    def refused_count(self) -> int:
+        """Number of records that were refused for their content."""
+        ...
+
+    @property
     def backlog(self) -> int:
         """Number of records that wait to be written."""
         ...
@@ -308,9 +318,19 @@ class Records(Protocol):
         ...
 
     def record_alarm(
-        self, condition: str, subject: str, severity: str, text: str, at: float, *, active: bool
+        self,
+        condition: str,
+        subject: str,
+        severity: Severity,
+        text: str,
+        at: float,
+        *,
+        active: bool,
     ) -> None:
-        """Record that an alarm stands, or (not active) that it is over."""
+        """Record that an alarm stands, or (not active) that it is over.
+
+        A severity that is not known counts as an alarm: none is lost because of its severity.
+        """
         ...
 
     def record_acknowledgement(self, condition: str, subject: str, person: str, at: float) -> None:
@@ -380,7 +400,12 @@ class Records(Protocol):
         ...
 
     def events(
-        self, limit: int = 100, *, heliostat: str = "", severity: str = "info", before: int = 0
+        self,
+        limit: int = 100,
+        *,
+        heliostat: str = "",
+        severity: Severity = Severity.INFO,
+        before: int = 0,
     ) -> list[Event]:
         """Return events of at least a severity, the latest first; before a number if given."""
         ...

@@ -338,7 +338,7 @@ alarm = Table(
     _number(),
     _text("condition"),
     _text("subject"),
-    _text("severity"),
+    Column("severity", Name(Severity), nullable=False),
     _text("text"),
     _real("raised", needed=True),
     _real("cleared"),

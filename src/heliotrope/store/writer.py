@@ -82,6 +82,16 @@ class Writer:
         """Number of pieces of work that wait."""
         return len(self._queue)
 
+    @property
+    def crowded(self) -> str:
+        """Why no more work is accepted, "" if there is room."""
+        if len(self._queue) < self._limit:
+            return ""
+        return (
+            f"store {self._database.name}: {len(self._queue)} records are waiting to be written, "
+            f"and no more are accepted ({self.problem or 'the disk is too slow'}); see to its disk"
+        )
+
     def put(self, work: Work[Any]) -> None:
         """Queue work, to be done whenever that is possible.
 
@@ -90,12 +100,8 @@ class Writer:
         StoreError
             If too much waits already, or the writer is closed.
         """
-        if len(self._queue) >= self._limit:
-            raise StoreError(
-                f"store {self._database.name}: {len(self._queue)} records are waiting to be "
-                f"written, and no more are accepted "
-                f"({self.problem or 'the disk is too slow'}); see to its disk"
-            )
+        if crowded := self.crowded:
+            raise StoreError(crowded)
         self._add(_Entry(work, None, kept=True))
 
     def do(self, work: Work[T], timeout: float = 5.0) -> T:

@@ -107,6 +107,12 @@ class Site:
 
         return float(alt2pres(self.height))
 
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """Latitude and longitude, °; height, m; pressure, Pa (−1: from the height); air, °C."""
+        pressure = -1.0 if self.pressure is None else self.pressure
+        return (self.latitude_deg, self.longitude_deg, self.height, pressure, self.temperature_c)
+
 
 _SITE_LIMITS = (
     ("latitude_deg", -90.0, 90.0, "°", "north is positive"),

@@ -4,8 +4,8 @@ import { FieldMap } from "./map.js";
 import { VIEWS } from "./palette.js";
 import * as panels from "./panels.js";
 import * as people from "./people.js";
-import { bar, say, whoCommands } from "./orders.js";
-import { count, degrees, h, span } from "./dom.js";
+import { act, bar, say, whoCommands } from "./orders.js";
+import { ask, count, degrees, h, span } from "./dom.js";
 
 const ready = store.begun.catch((error) => say(`no data from the plant: ${error.message}`, true));
 
@@ -54,14 +54,21 @@ function badge(box) {
 }
 
 function alert(box) {
-  const text = h("span"), back = h("button", { className: "hx-button", onclick: async () => {
+  const text = h("span"), viewer = me.role === "viewer";
+  const back = h("button", { className: "hx-button", onclick: async () => {
+    if (!await ask("Withdraw the emergency order? Nothing moves because of it; alarms that remain must be acknowledged.", [], "Withdraw")) return;
     try { await api("DELETE", "emergency"); say("emergency withdrawn; acknowledge the alarms that remain"); } catch (error) { say(error.message, true); }
   } }, "Withdraw");
-  box.append(text, me.role === "viewer" ? "" : back);
+  const resume = h("button", { className: "hx-button", onclick: async () => {
+    if (await ask("Resume automatic control? It raises the heliostats that it has lost.", [], "Resume")) await act(() => api("POST", "automatic/resume"), "Resume");
+  } }, "Resume");
+  box.append(text, viewer ? "" : back, viewer ? "" : resume);
   new ResizeObserver(() => document.body.style.setProperty("--alert", `${box.offsetHeight}px`)).observe(box);
   return store.on("frame", (now) => {
-    box.classList.toggle("on", now.emergency);
-    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)}` : "";
+    box.classList.toggle("on", now.emergency || Boolean(now.resume));
+    box.classList.toggle("waits", !now.emergency);
+    back.hidden = !now.emergency; resume.hidden = !now.resume;
+    text.textContent = now.emergency ? `EMERGENCY ${now.order.act} by ${now.order.who || "the safety table"} · acknowledged ${count(now.order.acknowledged)} of ${count(now.order.heliostats)} · done ${count(now.order.done)}` : now.resume;
   });
 }
 

@@ -54,6 +54,24 @@ export function refreshed(load, { key = () => "", every = Infinity } = {}) {
   return () => { over = true; off(); };
 }
 
+// Opens a dialog over the page. A modal of the browser would lie over EMERGENCY and disable it; here the rest of the
+// page is made inert, so that only the dialog and EMERGENCY can be reached.
+export function lay(dialog) {
+  const before = document.activeElement;
+  const rest = [...document.body.children].filter((part) => part.id !== "emergency-box" && !part.inert);
+  rest.forEach((part) => { part.inert = true; });
+  const hear = (event) => { if (event.key === "Escape" && dialog === [...document.querySelectorAll("dialog")].at(-1)) { event.stopPropagation(); dialog.close(""); } };
+  dialog.addEventListener("close", () => {
+    document.removeEventListener("keydown", hear, true);
+    dialog.remove();
+    rest.forEach((part) => { part.inert = false; });
+    before?.focus?.();
+  });
+  document.addEventListener("keydown", hear, true);
+  document.body.append(dialog);
+  dialog.show();
+}
+
 export function ask(title, fields, confirm) {
   return new Promise((resolve) => {
     const inputs = fields.map((field) => {
@@ -67,11 +85,9 @@ export function ask(title, fields, confirm) {
         h("button", { type: "submit", value: "yes", className: "hx-button main" }, confirm))));
     dialog.addEventListener("close", () => {
       const values = Object.fromEntries(fields.map((field, i) => [field.name, inputs[i].value]));
-      dialog.remove();
       resolve(dialog.returnValue === "yes" ? values : null);
     });
-    document.body.append(dialog);
-    dialog.showModal();
+    lay(dialog);
   });
 }
 

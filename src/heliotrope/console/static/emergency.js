@@ -1,4 +1,4 @@
-// EMERGENCY: a script of its own, so that it works when everything else is slow or broken. One click or key press.
+// EMERGENCY: a script of its own, so that it works when everything else is slow or broken. One click, one touch, or Alt+E.
 (() => {
   const button = document.getElementById("emergency");
   const say = document.getElementById("emergency-said");
@@ -13,6 +13,7 @@
 
   async function call(again) {
     button.classList.add("sent");
+    say.classList.remove("failed");
     say.textContent = "sending …";
     try {
       if (!csrf) await session();
@@ -33,5 +34,15 @@
     }
   }
 
-  button.addEventListener("click", () => call(true));
+  let touched = -Infinity;
+  // An open menu swallows the click of the touch that closes it, but not the touch itself.
+  button.addEventListener("pointerup", (event) => { if (event.pointerType !== "mouse") { touched = event.timeStamp; call(true); } });
+  button.addEventListener("click", (event) => { if (event.timeStamp - touched > 1000) call(true); });
+  // Before anything else on the page hears the key; AltGr, which reports Ctrl too, is for writing.
+  window.addEventListener("keydown", (event) => {
+    if (!event.altKey || event.ctrlKey || event.metaKey || event.repeat || event.code !== "KeyE") return;
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    call(true);
+  }, true);
 })();

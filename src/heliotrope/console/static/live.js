@@ -36,6 +36,7 @@ class Store extends EventTarget {
     this.fault = new Uint8Array(n);
     this.flags = new Uint16Array(n);
     this.aim = new Uint8Array(n).fill(STALE);
+    this.out = new Uint8Array(n); // of service
     this.sightings = new Uint16Array(n);
     this.calibrated = new Uint32Array(n);
     this.error = new Float32Array(n).fill(NaN);
@@ -84,6 +85,7 @@ class Store extends EventTarget {
       this.state[row] = view.getUint8(at + 20);
       this.fault[row] = view.getUint8(at + 21);
       this.aim[row] = view.getUint8(at + 22);
+      this.out[row] = view.getUint8(at + 23);
     }
     this.watch();
     this.emit("frame", this.head);
@@ -138,6 +140,7 @@ const FIELDS = {
   sightings: (row) => store.sightings[row],
   fault: (row) => store.fault[row],
   on: (row) => (store.head?.surfaces?.[store.aim[row]] ?? "").toUpperCase(),
+  service: (row) => (store.out[row] ? "OUT" : "IN"),
   east: (row) => store.field.positions[row][0],
   north: (row) => store.field.positions[row][1],
 };

@@ -205,6 +205,13 @@ export class FieldMap {
       c.strokeStyle = colourOf("FAULT");
       c.beginPath(); c.moveTo(px - r, py - r); c.lineTo(px + r, py + r); c.moveTo(px + r, py - r); c.lineTo(px - r, py + r); c.stroke();
     }
+    // Out of service: a ring with a bar, drawn even where the state is unknown.
+    c.strokeStyle = night ? "#ff5cc8" : "#a8006d"; c.lineWidth = 2;
+    for (let row = 0; row < n; row++) {
+      if (!store.out[row]) continue;
+      const [px, py] = this.toScreen(this.x[row], this.y[row]), r = Math.max(6, half + 3);
+      c.beginPath(); c.arc(px, py, r, 0, 2 * Math.PI); c.moveTo(px - r, py); c.lineTo(px + r, py); c.stroke();
+    }
     if (half > 3) {
       c.fillStyle = night ? "#12161b" : "#f4f5f6";
       for (let row = 0; row < n; row++) {
@@ -278,6 +285,7 @@ export class FieldMap {
   showLegend() {
     const view = VIEWS[this.view], box = this.legend;
     if (!this.x) return;
+    const out = store.out.reduce((sum, one) => sum + one, 0);
     box.replaceChildren(Object.assign(document.createElement("b"), { textContent: view.title }));
     if (view.scale) {
       const bar = document.createElement("canvas");
@@ -297,6 +305,7 @@ export class FieldMap {
       line.append(patch, count === undefined ? name : `${name} ${count.toLocaleString("en")}`);
       box.append(line);
     }
+    if (out) box.append(Object.assign(document.createElement("div"), { className: "hx-out", textContent: `⊖ out of service ${out.toLocaleString("en")}` }));
   }
 
   nearest(px, py) {
@@ -382,7 +391,7 @@ export class FieldMap {
     if (row < 0) { tip.style.display = "none"; return; }
     const error = 1e3 * store.error[row];
     tip.textContent = `${store.field.names[row]} · ${store.stateName(row)}` +
-      (Number.isNaN(error) ? " · not calibrated" : ` · ±${error.toFixed(2)} mrad`);
+      (Number.isNaN(error) ? " · not calibrated" : ` · ±${error.toFixed(2)} mrad`) + (store.out[row] ? " · OUT OF SERVICE" : "");
     tip.style.display = "block";
     tip.style.left = `${Math.min(px + 14, this.width - 190)}px`;
     tip.style.top = `${py + 14}px`;

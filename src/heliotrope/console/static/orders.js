@@ -37,11 +37,13 @@ function recipients() {
   return { names, text: names.length === 1 ? names[0] : `${count(names.length)} heliostats` };
 }
 
+// EMERGENCY, DEFOCUS and STOW never ask; an order to the whole field asks once.
 async function order(name, title, make, fields, sure) {
   let to;
   try { to = recipients(); } catch (error) { say(`${title}: ${error.message}`, true); return; }
   let values = {};
-  if (fields || (sure && to.names.length !== 1)) {
+  const safe = name === "STOW" || name === "DEFOCUS";
+  if (fields || (!safe && (scope === "field" || (sure && to.names.length !== 1)))) {
     values = await ask(`${title}: ${to.text}`, fields ?? [], title);
     if (!values) return;
   }
@@ -61,8 +63,8 @@ async function zero() {
 
 const plainly = (name) => (heliostats) => api("POST", "commands", { command: name, heliostats });
 const ORDERS = [
-  ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats }), null, scope === "field"), "safe"],
-  ["Defocus", "D", () => order("DEFOCUS", "Defocus", (heliostats) => api("POST", "defocus", { heliostats }), null, scope === "field"), "safe"],
+  ["Stow", "S", (f) => order("STOW", "Stow", (heliostats) => api("POST", "stow", { heliostats })), "safe"],
+  ["Defocus", "D", () => order("DEFOCUS", "Defocus", (heliostats) => api("POST", "defocus", { heliostats })), "safe"],
   ["Approach", "", () => order("APPROACH", "Approach", plainly("APPROACH"), null, true)],
   ["Track", "", () => order("TRACK", "Track", plainly("TRACK"), null, true)],
   ["Standby", "", () => order("IDLE", "Standby", plainly("IDLE"))],
@@ -77,8 +79,8 @@ const ORDERS = [
     [{ name: "pitch", label: "Pitch (mrad)", type: "number", value: "5" }, { name: "radius", label: "Radius (mrad)", type: "number", value: "30" }])],
   ["Clear fault", "", () => order("CLEAR_FAULT", "Clear fault", plainly("CLEAR_FAULT")), "engineer"],
   ["Zero…", "", zero, "engineer"],
-  ["Hold…", "", () => order("HOLD", "Exclude from calibration", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason }),
-    [{ name: "reason", label: "Reason" }]), "free"],
+  ["Out of service…", "", () => order("HOLD", "Out of service", (heliostats, v) => api("POST", "holds", { heliostats: heliostats.length ? heliostats : store.field.names, reason: v.reason, hours: Number(v.hours) || null }),
+    [{ name: "reason", label: "Reason: it goes to stow, and nobody moves it until it is given back by name" }, { name: "hours", label: "Expected back in (hours)", type: "number", value: "4", required: false }]), "free"],
   ["Automatic", "", () => order("AUTO", "Give to automatic control", (heliostats) => api("POST", "automatic", { heliostats }), null, true), "free"],
 ];
 
@@ -102,7 +104,9 @@ export function bar(box) {
       }
     };
     box.append(h("div", { className: "hx-orders" }, h("label", { className: "hx-to" }, "Scope ", to), buttons.map(([button]) => button)), said);
-    store.on("selection", mark); store.on("authority", mark);
+    // The whole field, or whole clusters, must be chosen anew after each selection.
+    store.on("selection", () => { if (store.selection.size) scope = to.value = "selection"; mark(); });
+    store.on("authority", mark);
     document.addEventListener("keydown", (event) => {
       const found = event.altKey && ORDERS.find(([, key]) => key && event.code === `Key${key}`);
       if (found) { event.preventDefault(); found[2](); }

@@ -1,8 +1,8 @@
 // The tabs of the page.
 import { api, me, store } from "./live.js";
 import { cividis, colourOf, dark } from "./palette.js";
-import { chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
-import { act, say } from "./orders.js";
+import { ask, chart, clock, count, degrees, facts, h, mrad, number, refreshed, span, table } from "./dom.js";
+import { act } from "./orders.js";
 
 const look = (name) => { const row = store.index.get(name); if (row !== undefined) store.select([row], row); };
 const canCommand = () => me.role !== "viewer";
@@ -28,7 +28,7 @@ export function plant(box) {
       ["Median error", `${mrad(head.calibration.quality?.median)} mrad`]]));
     light.replaceChildren(facts([["Azimuth", `${degrees(head.sun.azimuth, 1)}°`], ["Elevation", `${degrees(head.sun.elevation, 1)}°`],
       ["Shadow of the tower", head.sun.elevation > 0.02 ? `${number(store.field.tower[2] / Math.tan(head.sun.elevation), 0)} m to ${degrees((head.sun.azimuth + Math.PI) % (2 * Math.PI), 0)}°` : "none: the sun is down"]]));
-    proof.replaceChildren(...(head.order.act ? [h("p", { className: head.order.on ? "hx-said bad" : "hx-said" },
+    proof.replaceChildren(...(head.order.on ? [h("p", { className: "hx-said bad" },
       `${head.order.act} of the field, ordered by ${head.order.who}: ${head.order.acknowledged} of ${head.order.heliostats} acknowledged, ${head.order.done} done. ${head.order.text}`)] : []));
   };
   const draw = () => { if (seen) drawFlux(flux, seen); };
@@ -101,7 +101,7 @@ function heliostatView(one) {
       one.truth_error !== null ? ["True error (twin)", `${mrad(one.truth_error)} mrad`] : null,
       ["Supply voltage", one.supply === null ? "–" : `${number(one.supply, 1)} V`], ["Temperature", one.temperature === null ? "–" : `${number(one.temperature, 0)} °C`],
       ["Next measurement", one.planned ? `${clock(one.planned.at)} on ${one.planned.target}` : "not planned"],
-      one.hold ? ["On hold", one.hold, "warn"] : null]),
+      one.hold ? ["Out of service", `${one.hold}; ${one.state === "STOWED" ? "in stow" : "NOT IN STOW"}`, "warn"] : null]),
     h("h3", {}, "Drives"),
     one.drives.length ? table([["Axis", (d) => d.axis], ["Count", (d) => count(d.count), "num"], ["Goal", (d) => count(d.goal), "num"],
       ["Angle (°)", (d) => degrees(d.angle, 3), "num"], ["Goal (°)", (d) => degrees(d.goal_angle, 3), "num"]],
@@ -186,7 +186,11 @@ export function alarms(box) {
   return refreshed(async () => {
     const rows = await api("GET", "alarms");
     const open = rows.filter((r) => !r.acknowledged_by);
-    const all = async () => { for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => say(error.message, true)); };
+    const all = async () => {
+      const refused = [];
+      for (const r of open) await api("POST", "alarms/acknowledge", { condition: r.condition, subject: r.subject }).catch((error) => refused.push(error.message));
+      if (refused.length) throw new Error(`${refused.length} of ${open.length} refused: ${refused[0]}`);
+    };
     body.replaceChildren(h("div", { className: "hx-row" }, h("b", {}, `${open.length} not acknowledged, ${rows.filter((r) => r.active).length} active`),
       canCommand() && open.length ? h("button", { className: "hx-button", onclick: () => act(all, "acknowledge all") }, "Acknowledge all") : ""),
     rows.length ? table([["", (r) => h("span", { className: r.active ? (severe[r.severity] ?? "warn") : "" }, r.active ? (severe[r.severity] === "bad" ? "✕" : "▲") : "○")],
@@ -217,6 +221,13 @@ export function logs(box) {
   return refreshed(load, { key: () => store.head?.events, every: 3 });
 }
 
+const minute = (at) => (at ? new Date(1e3 * at).toISOString().slice(5, 16).replace("T", " ") : "–");
+const stateOf = (name) => h("span", { className: store.stateName(store.index.get(name)) === "STOWED" ? "good" : "bad" }, store.stateName(store.index.get(name)));
+async function giveBack(one) {
+  const sure = await ask(`Give ${one.heliostat} back to service? ${one.who} took it out: ${one.reason}. Make sure that nobody is at the mirror.`, [], "Give back");
+  if (sure) await act(() => api("POST", "holds/release", { heliostats: [one.heliostat] }), `give back ${one.heliostat}`);
+}
+
 export function schedule(box) {
   const body = h("div");
   box.append(body);
@@ -225,9 +236,10 @@ export function schedule(box) {
     body.replaceChildren(h("h3", {}, "Next measurements"),
       plan.length ? table([["Time", (r) => clock(r.at)], ["Heliostat", (r) => r.heliostat], ["Target", (r) => r.target], ["Gain (mrad)", (r) => mrad(r.gain), "num"], ["Why", (r) => r.reason]], plan, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "No measurement is planned."),
-      h("h3", {}, "Excluded from calibration"),
-      holds.length ? table([["Heliostat", (r) => r.heliostat], ["By", (r) => r.who], ["Since", (r) => clock(r.since)], ["Why", (r) => r.reason],
-        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => act(() => api("POST", "holds/release", { heliostats: [r.heliostat] }), "release") }, "Release") : "")]], holds)
+      h("h3", {}, "Out of service"),
+      holds.length ? table([["Heliostat", (r) => r.heliostat], ["State", (r) => stateOf(r.heliostat)], ["Owner", (r) => r.who], ["Since", (r) => minute(r.since)],
+        ["Expected back", (r) => h("span", { className: r.until && r.until < store.head.utc ? "warn" : "" }, r.until ? minute(r.until) : "–", r.until && r.until < store.head.utc ? " overdue" : "")], ["Why", (r) => r.reason],
+        ["", (r) => (canCommand() ? h("button", { className: "hx-button", onclick: () => giveBack(r) }, "Give back…") : "")]], holds, (r) => look(r.heliostat))
         : h("p", { className: "hx-hint" }, "None."));
   }, { every: 5 });
 }

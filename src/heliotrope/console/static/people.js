@@ -1,6 +1,6 @@
 // Accounts and tokens: in windows over the page, since they are rarely needed. Everything goes through the API.
 import { api, me } from "./live.js";
-import { ask, h, table } from "./dom.js";
+import { ask, h, lay, table } from "./dom.js";
 import { say } from "./orders.js";
 
 const day = (at) => (at ? new Date(1e3 * at).toISOString().slice(0, 10) : "never");
@@ -11,7 +11,6 @@ function open(title, fill) {
   const body = h("div"), told = h("p", { className: "hx-told", role: "status" });
   const dialog = h("dialog", { className: "hx-dialog wide" }, h("h2", {}, title), body, told,
     h("div", { className: "hx-row" }, button("Close", () => dialog.close())));
-  dialog.addEventListener("close", () => dialog.remove());
   const show = async () => body.replaceChildren(...await fill(done));
   const fail = (error) => { told.textContent = error.message; told.classList.add("bad"); };
   async function done(work) {
@@ -19,8 +18,7 @@ function open(title, fill) {
     told.textContent = "";
     try { told.replaceChildren(...[await work()].flat().filter(Boolean)); await show(); } catch (error) { fail(error); }
   }
-  document.body.append(dialog);
-  dialog.showModal();
+  lay(dialog);
   show().catch(fail);
 }
 

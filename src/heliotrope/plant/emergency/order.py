@@ -3,8 +3,10 @@
 A heliostat has acknowledged the order when its local controller says so, or when a state heard
 after the order shows it. A heliostat is done by its state *and* by its axes: its beam is off the
 receiver when the axes are within `NEAR` of the goals of the defocus, whatever the state is called.
+A heliostat with unknown step counts is never done: the report says where its beam was last.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,8 @@ NEAR = 5e-3
 LEAVING = 5.0
 #: States in which a beam is on the receiver or the standby point, or on its way there.
 ON_BEAM = (states.TRACKING, states.SEARCHING, states.APPROACHING, states.IDLE)
+#: Flag of a heliostat whose step counts mean nothing.
+COUNTS_UNKNOWN = 1 << meanings.FLAGS.index("COUNTS_UNKNOWN")
 _AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 Mask = npt.NDArray[np.bool_]
@@ -41,12 +45,24 @@ class EmergencyOrder:
         Monotonic s.
     ticket
         Ticket with the stage of each heliostat.
+    unknown
+        Where each heliostat with unknown step counts was last, by name: none of them is done.
     """
 
-    def __init__(self, act: Act, who: str, reason: str, at: float, ticket: Ticket) -> None:
+    def __init__(
+        self,
+        act: Act,
+        who: str,
+        reason: str,
+        at: float,
+        ticket: Ticket,
+        *,
+        flux_measured: bool = True,
+    ) -> None:
         self.act, self.who, self.reason, self.at, self.ticket = act, who, reason, at, ticket
-        self._proof = Proof.of(act.name, ticket.heliostats, at)
+        self._proof = Proof.of(act.name, ticket.heliostats, at, flux_measured=flux_measured)
         # A proof is a value, so reports of a whole field are added to it together.
+        self.unknown: dict[str, str] = {}
         self._told: dict[str, float] = {}
         self._ready: dict[str, float] = {}
 
@@ -76,7 +92,7 @@ class EmergencyOrder:
 
     def report(self, now: float) -> ProofReport:
         """Return how far the order has been carried out."""
-        return self.proof.report(now)
+        return replace(self.proof.report(now), unknown=tuple(self.unknown.values()))
 
     def unacknowledged(self, heliostats: tuple[str, ...]) -> tuple[str, ...]:
         """Return which of some heliostats have not acknowledged the order."""
@@ -124,7 +140,8 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     """
     # A heliostat that stands at stow and is IDLE has not obeyed: it may go on to track.
     off = ~np.isin(rows["state"], ON_BEAM)
-    stowed = off & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
+    known = rows["flags"] & COUNTS_UNKNOWN == 0
+    stowed = off & known & ((rows["state"] == states.STOWED) | (rows["flags"] & _AT_STOW != 0))
     if act is Act.STOW:
         return np.asarray(stowed)
     counts = np.stack([rows["primary"], rows["secondary"]], axis=-1).astype(np.float64)
@@ -132,4 +149,4 @@ def carried_out(act: Act, rows: npt.NDArray[Any], drives: Drive, settled: Mask) 
     left = np.abs((goals - counts) * drives.radians_per_count(counts)).max(axis=-1)
     # On the way to stow the goal is far away, although the beam has left.
     leaving = rows["state"] == states.STOWING
-    return np.asarray(stowed | (off & np.where(leaving, settled, left < NEAR)))
+    return np.asarray(stowed | (off & known & np.where(leaving, settled, left < NEAR)))

@@ -10,20 +10,23 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from heliotrope.lcu import states
 from heliotrope.links.clock import Clock
-from heliotrope.links.messages import Progress
+from heliotrope.links.messages import Progress, Stage
 from heliotrope.mechanism.drives import Drive
-from heliotrope.plant.authority import Authority
-from heliotrope.plant.emergency.order import EmergencyOrder
+from heliotrope.plant.beam_watch import BeamWatch
+from heliotrope.plant.emergency.order import COUNTS_UNKNOWN, ON_BEAM, EmergencyOrder
 from heliotrope.plant.emergency.table import TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinQueue
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import Act, Alarm
+from heliotrope.safety import FLUX_READING, Act, Alarm
 
 #: A heliostat that was sent off the receiver shows it within this time, s.
 OFF_SHOWS = 10.0
+#: Longest pause between two orders to one heliostat that does not show them, s.
+LONGEST_PAUSE = 60.0
 #: Name and role of the safety table in a record.
 _TABLE = ("safety table", "plant")
 
@@ -37,7 +40,7 @@ class Sentinel:
         Clock of the plant.
     table
         The plant's rows of the safety table.
-    field, orders, joining, authority
+    field, orders, joining, ways
         Of the plant.
     drives
         Of the heliostats, (N, 2), for the proof.
@@ -61,7 +64,7 @@ class Sentinel:
         field: FieldState,
         orders: PlantOrders,
         joining: JoinQueue,
-        authority: Authority,
+        ways: BeamWatch,
         drives: Drive,
         repeat: float,
     ) -> None:
@@ -69,11 +72,13 @@ class Sentinel:
         self.on = False
         self._called = False
         self._clock, self.table, self._field = clock, table, field
-        self._orders, self._joining, self._authority = orders, joining, authority
+        self._orders, self._joining, self._ways = orders, joining, ways
         self._drives, self._repeat = drives, repeat
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
+        #: Orders to single heliostats while their rows hold: number, and time of the next.
+        self._tries: dict[str, tuple[int, float]] = {}
         self._repeated_at = -math.inf
 
     # -- the table -------------------------------------------------------------------------
@@ -117,22 +122,29 @@ class Sentinel:
                 self.send_safe(_TABLE, act, members, text)
 
     def _obey_heliostats(self, now: float) -> None:
-        """Hold heliostats where they are; without a command authority, defocus them instead.
+        """Send heliostats off, and send them again until their rows release.
 
-        A heliostat that has been sent off the receiver is not stopped, even if its state does not
-        show the order yet.
+        A heliostat that has just been sent off has the time to show it.
         """
-        token = self._authority.token
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
-        for name, text in self.table.held().items():
-            if self.on or name in self._sent_off:
+        wanted = self.table.off()
+        self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
+        order = self.order if self.on else None
+        sent: dict[Act, dict[str, str]] = {}
+        for name, (act, text) in wanted.items():
+            tries, due = self._tries.get(name, (0, -math.inf))
+            whole = order is not None and now - order.at < OFF_SHOWS
+            if name in self._sent_off or now < due or whole:
                 continue
-            self._joining.drop(text, frozenset([name]))
-            if token:
-                ticket = self._orders.accept((*_TABLE, "LOCK"), (), (name,), text, late=True)
-                self._orders.command(ticket, "LOCK", (), (name,), token)
-            else:
-                self.send_safe(_TABLE, Act.DEFOCUS, (name,), text)
+            self._tries[name] = tries + 1, now + min(OFF_SHOWS * 2**tries, LONGEST_PAUSE)
+            best = self._ways.way_out(name, again=tries > 0)
+            if order is not None:
+                best = max(best, order.act)
+            sent.setdefault(max(act, best), {})[name] = text
+        for act, texts in sent.items():
+            why = "; ".join([*texts.values()][:3])
+            self._joining.drop(why, frozenset(texts))
+            self.send_safe(_TABLE, act, tuple(texts), why)
 
     # -- orders ----------------------------------------------------------------------------
 
@@ -140,7 +152,8 @@ class Sentinel:
         """Order DEFOCUS or STOW of the whole field."""
         now, names = self._clock.monotonic(), self._field.names
         ticket = self._orders.accept((*giver, act.name), (), names, reason, late=True)
-        self.order = EmergencyOrder(act, giver[0], reason, now, ticket)
+        measured = self.table.flux_measured
+        self.order = EmergencyOrder(act, giver[0], reason, now, ticket, flux_measured=measured)
         self.on, self._repeated_at = True, now
         self._orders.emergency(ticket, act, names)
         self._joining.drop(f"{act.name} of the field: {reason}")
@@ -186,11 +199,22 @@ class Sentinel:
 
     # -- proof -----------------------------------------------------------------------------
 
+    def put(self, name: str, value: float, at: float, subject: str = "") -> None:
+        """Take a reading of a sensor for the table, or for the proof; see `TableWatch.put`."""
+        self.table.put(name, value, at, subject)
+        if name == FLUX_READING and self.order is not None:
+            self.order.take_flux(value, at)
+
     def take_progress(
         self, ticket: Ticket, heliostats: tuple[str, ...], progress: Progress
     ) -> None:
         """Take a cluster's report on a ticket, if it is the order's ticket."""
         if self.order is not None and ticket is self.order.ticket:
+            if progress.stage is Stage.DONE:
+                flags = self._field.rows["flags"]
+                heliostats = tuple(
+                    n for n in heliostats if not flags[self._field.index[n]] & COUNTS_UNKNOWN
+                )
             self.order.take_stage(heliostats, progress.stage, self._clock.monotonic())
 
     def take_rows(self, cluster: str, now: float) -> None:
@@ -209,6 +233,30 @@ class Sentinel:
                 Drive(self._drives.table[index]),
                 now,
             )
+        for row in rows:
+            name = self._field.names[row]
+            if int(self._field.rows["flags"][row]) & COUNTS_UNKNOWN:
+                order.unknown[name] = self._last_of(row, now)
+            else:
+                order.unknown.pop(name, None)
+
+    def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
+        """Return which heliostats may not join their aims, and why."""
+        barred = self.table.barred()
+        return {name: barred[name] for name in heliostats if name in barred}
+
+    def _last_of(self, row: int, now: float) -> str:
+        """Return, in words, where a heliostat with unknown step counts was last."""
+        field, points = self._field, self._ways.points
+        text = f"{field.names[row]}: step counts unknown, so it is not proven to be off; "
+        if not math.isfinite(field.posed_at[row]):
+            return text + "nothing is known of its beam"
+        state = int(field.posed_state[row])
+        on_aim = state in (states.TRACKING, states.SEARCHING)
+        place = (points.aims if on_aim else points.standbys)[row]
+        out = state in ON_BEAM and np.isfinite(place).all()
+        beam = f" with its beam at ({', '.join(f'{x:.1f}' for x in place)}) m" if out else ""
+        return text + f"{now - field.posed_at[row]:.0f} s ago it was {states.STATES[state]}{beam}"
 
     def refusal(self, clusters: Iterable[str]) -> str:
         """Return why no new motion may begin in some clusters, "" if it may."""

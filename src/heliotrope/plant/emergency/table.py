@@ -7,11 +7,13 @@ import numpy as np
 
 from heliotrope.errors import InputError, UnknownNameError
 from heliotrope.geometry import FloatArray
+from heliotrope.plant.agreement import Agreement
 from heliotrope.plant.authority import Authority
 from heliotrope.plant.beam_watch import BeamWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.orders import PlantOrders
 from heliotrope.safety import (
+    FLUX_READING,
     AcknowledgeRole,
     Act,
     Action,
@@ -40,10 +42,16 @@ OWN_READINGS = frozenset(
         "sun_elevation",
         "audit_silence",
         "node_fault_share",
+        "cluster_time_off",
+        "cluster_sun_off",
+        "pointing_error",
+        "pointing_errors",
     }
 )
 #: Rows that follow from an emergency; by themselves they keep none going.
 CONSEQUENCES = frozenset({"nodes_unacknowledged", "flux_after_emergency"})
+#: Readings that the plant makes of a sensor's, and the sensor.
+DERIVED = {"flux_after_emergency": FLUX_READING}
 #: Pause between two computations of the sun's elevation, s.
 SUN_PERIOD = 5.0
 
@@ -53,7 +61,7 @@ class PlantReadings:
 
     Parameters
     ----------
-    field, authority, orders, beams
+    field, authority, orders, beams, agreement
         Of the plant.
     sun
         Returns the unit vector to the sun now, (3,).
@@ -70,10 +78,11 @@ class PlantReadings:
         authority: Authority,
         orders: PlantOrders,
         beams: BeamWatch,
+        agreement: Agreement,
         sun: Callable[[], FloatArray],
     ) -> None:
         self._field, self._authority, self._orders = field, authority, orders
-        self._beams, self._sun = beams, sun
+        self._beams, self._agreement, self._sun = beams, agreement, sun
         self._sun_at = -math.inf
         self._elevation = -0.5 * np.pi
         self.names = OWN_READINGS | ({"keep_out_predicted"} if beams.watches else set())
@@ -103,6 +112,7 @@ class PlantReadings:
             ("sun_elevation", ""): Reading(self._elevation, now),
             ("node_fault_share", ""): Reading(self._field.failed_share(now), now),
             **self._beams.readings(now),
+            **self._agreement.readings(now),
         }
         for name, at in self._field.status_at.items():
             if math.isfinite(at):
@@ -152,13 +162,14 @@ class TableWatch:
     ) -> None:
         table = watched_by(rows, Watcher.PLANT)
         self._sensors = frozenset(sensors)
-        known = {row.reading for row in table} - OWN_READINGS
+        known = {row.reading for row in table} - OWN_READINGS | set(DERIVED.values())
         for name in sorted(self._sensors - known):
             raise InputError(
                 f"sensor {name}: no row of the safety table that the plant watches takes it from a "
                 f"sensor; known: {', '.join(sorted(known))}"
             )
-        able = tuple(row for row in table if row.reading in self._sensors | readings.names)
+        self._fed = {n for n in readings.names if DERIVED.get(n) in self._sensors | {None}}
+        able = tuple(row for row in table if row.reading in self._sensors | self._fed)
         self.unwatched = tuple(row.name for row in table if row not in able)
         self.actions: list[Action] = []
         self.rows = frozenset(row.name for row in able)
@@ -168,6 +179,11 @@ class TableWatch:
         self._own = readings
         self._put: dict[tuple[str, str], Reading] = {}
         self._told: dict[tuple[str, str], Alarm] = {}
+
+    @property
+    def flux_measured(self) -> bool:
+        """Whether a sensor feeds the flux on the receiver, for the proof of an emergency."""
+        return FLUX_READING in self._sensors
 
     def put(self, name: str, value: float, at: float, subject: str = "") -> None:
         """Take a reading of a sensor, made at ``at`` (monotonic s).
@@ -179,14 +195,16 @@ class TableWatch:
         """
         if name not in self._sensors:
             raise UnknownNameError("sensor of the plant", name, self._sensors)
-        self._put[name, subject] = Reading(value, at)
+        if name not in DERIVED.values():
+            self._put[name, subject] = Reading(value, at)
 
     def evaluate(self, proof: Proof | None, *, called: bool, now: float) -> list[Alarm]:
         """Evaluate all rows; return the alarms raised and ended since the last time.
 
         For ``proof`` and ``called`` see `PlantReadings.take`.
         """
-        readings = {**self._put, **self._own.take(proof, called=called, now=now)}
+        own = self._own.take(proof, called=called, now=now)
+        readings = self._put | {key: each for key, each in own.items() if key[0] in self._fed}
         for row in self._single:
             subjects = [name for reading, name in readings if reading == row.reading and name]
             self._state = narrowed(self._state, row.name, subjects)
@@ -219,12 +237,20 @@ class TableWatch:
         acts = (a.act for a in self.actions if a.scope is scope and a.subject == cluster)
         return max(acts, default=None)
 
-    def held(self) -> dict[str, str]:
-        """Return the heliostats to be held from now on, and why."""
+    def off(self) -> dict[str, tuple[Act, str]]:
+        """Return the heliostats that must leave, by name: by which act, and why."""
+        return {
+            a.subject: (a.act, a.text)
+            for a in reversed(self.actions)
+            if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject and not a.waits
+        }
+
+    def barred(self) -> dict[str, str]:
+        """Return the heliostats that may not join their aims, by name, and why."""
         return {
             a.subject: a.text
             for a in self.actions
-            if a.scope is Scope.HELIOSTAT and a.act is Act.HOLD and a.new and a.subject
+            if a.scope is Scope.HELIOSTAT and a.act >= Act.DEFOCUS and a.subject
         }
 
     def caused(self) -> bool:

@@ -2,7 +2,8 @@
 
 It commands under a name of its own. It takes the command authority while nobody else has it, and
 gives way at once. It moves only *wanted* heliostats. A heliostat that a person stows, defocuses or
-locks is not wanted until a person gives it back; after an emergency, none is.
+locks is not wanted until a person gives it back; after an emergency, none is. After a loss of many
+heliostats it waits for a person (`losses`).
 """
 
 import asyncio
@@ -23,8 +24,10 @@ from heliotrope.plant.operations.calibrating import Calibrating, Scheduling, Tru
 from heliotrope.plant.operations.calibration_book import CalibrationBook
 from heliotrope.plant.operations.keeping import Keeping
 from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.plant.operations.losses import Losses
 from heliotrope.plant.operations.raising import Raising
-from heliotrope.plant.operations.views import CalibrationView, HeldHeliostat, Planned
+from heliotrope.plant.operations.service import Service
+from heliotrope.plant.operations.views import CalibrationView, Planned
 from heliotrope.plant.visits.calibration_cycle import CalibrationCycle
 from heliotrope.safety import alarms
 from heliotrope.store.records import Records
@@ -61,6 +64,8 @@ class AutomaticSettings:
         Time before the same command is given again, s.
     margin
         Standard deviations by which an uncalibrated beam must miss the targets.
+    losses
+        Heliostats that may be lost within 30 s; after more, it waits for a person's Resume.
     events
         Age at which events, and alarms that are over and acknowledged, are removed, days.
     """
@@ -72,6 +77,7 @@ class AutomaticSettings:
     lowest: float = math.radians(8.0)
     patience: float = 60.0
     margin: float = 3.0
+    losses: int = 3
     events: float = 400.0
 
     def __post_init__(self) -> None:
@@ -80,6 +86,8 @@ class AutomaticSettings:
                 f"automatic control: {self.rate} heliostats a second, a beat of {self.beat} s, a "
                 f"margin of {self.margin}; give above 0 to 100, above 0 to 60 s, 0 or more"
             )
+        if self.losses < 0:
+            raise InputError(f"automatic control: {self.losses} losses; give 0 or more")
         if not self.events > 0.0:
             raise InputError(
                 f"automatic control: events are kept for {self.events} days; give above 0"
@@ -95,8 +103,8 @@ class AutomaticControl:
         Book of calibrations.
     truth
         True errors, known to a twin only.
-    holds
-        Heliostats that people keep out of calibration, by name.
+    service
+        Heliostats out of service.
     installed
         Tracking error that the priors allow an uncalibrated heliostat, rad.
     """
@@ -113,11 +121,13 @@ class AutomaticControl:
         settings: AutomaticSettings,
     ) -> None:
         self._plant, self._log, self._settings = plant, logbook, settings
+        self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
+        self._token, self._sun_at = 0, -math.inf
         self.truth = TrueErrors(plant, truth)
         self.book = CalibrationBook(plant, "malan8" if cycle is None else cycle.settings.model)
         self.installed = self.book.installed()
         self._keeping = Keeping(plant.field.names, plant.beliefs, records)
-        self.holds: dict[str, HeldHeliostat] = self._keeping.holds(self._utc())
+        self.service = Service(plant, self._keeping)
         self._raising = Raising(
             plant,
             logbook,
@@ -127,13 +137,12 @@ class AutomaticControl:
             clearance=settings.margin * self.installed,
             wanted=settings.wanted,
         )
+        self._losses = Losses(plant, logbook, settings.losses, records, self.give_way)
         self._calibrating: Calibrating | None = None
         if cycle is not None and scheduler is not None:
             self._calibrating = Calibrating(
                 plant, logbook, cycle, scheduler, self.book, self._keeping, self.truth
             )
-        self._on, self._day, self._gave_way_at = settings.calibrate, True, -math.inf
-        self._token, self._sun_at, self._troubled = 0, -math.inf, False
         self._stopped = False
         if cycle is not None:
             self._keeping.recall()
@@ -149,25 +158,18 @@ class AutomaticControl:
         """Switch calibration on or off."""
         self._on = on
 
-    def want(self, heliostats: Sequence[str], *, wanted: bool) -> None:
-        """Give heliostats to automatic control, or take them out of it."""
-        self._raising.want(heliostats, wanted=wanted)
+    def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
+        """Give heliostats to automatic control, or take them out of it; see `Raising.want`."""
+        self._raising.want(heliostats, wanted=wanted, by_person=by_person)
 
-    def hold(self, who: str, heliostats: Sequence[str], reason: str) -> None:
-        """Keep heliostats out of calibration."""
-        now = self._utc()
-        for name in heliostats:
-            self._plant.field.place(name)
-        for name in heliostats:
-            self.holds[name] = HeldHeliostat(name, who, reason, now)
-        self._keeping.hold(heliostats, reason, who, now)
+    @property
+    def waits(self) -> str:
+        """Why it waits for a person's Resume, "" if it does not."""
+        return self._losses.reason
 
-    def unhold(self, who: str, heliostats: Sequence[str]) -> None:
-        """Give heliostats back to calibration."""
-        for name in heliostats:
-            self._plant.field.place(name)
-            self.holds.pop(name, None)
-        self._keeping.unhold(heliostats, who, self._utc())
+    def resume(self) -> None:
+        """Go on after a loss of many heliostats."""
+        self._losses.resume()
 
     def stop(self) -> None:
         """Begin nothing more; to be called before `run` is cancelled."""
@@ -189,12 +191,6 @@ class AutomaticControl:
             self._plant.release_authority(AUTOMATIC, self._token)
 
     # -- views -----------------------------------------------------------------------------
-
-    def held_rows(self) -> npt.NDArray[np.bool_]:
-        """Return which heliostats are held, (N,)."""
-        held = np.zeros(len(self._plant.field), dtype=np.bool_)
-        held[[self._plant.field.place(name) for name in self.holds]] = True
-        return held
 
     def view(self) -> CalibrationView:
         """Return the progress of calibration."""
@@ -270,6 +266,8 @@ class AutomaticControl:
         """Return why nothing is moved now, "" if heliostats may be moved."""
         if self._plant.emergency_on:
             return "an emergency is active"
+        if self.waits:
+            return "automatic control waits for Resume"
         if not self._day:
             return "the sun is too low"
         if not self._has_authority():
@@ -302,6 +300,7 @@ class AutomaticControl:
             up = self._plant.field.among(_UP, now) & self._raising.wanted
             if up.any():
                 names = tuple(self._plant.field.names[row] for row in np.flatnonzero(up))
+                self._losses.ordered(np.flatnonzero(up))
                 self._plant.stow(AUTOMATIC.name, names)
             text = f"the sun is low: {int(up.sum())} heliostats go to stow"
             self._log.event("plant", AUTOMATIC.name, text)
@@ -312,8 +311,13 @@ class AutomaticControl:
     # -- parts of the work -----------------------------------------------------------------
 
     async def _raise(self) -> None:
+        self.service.park()
+        if self._plant.emergency_on:
+            self._raising.give_up()
+        self._raising.lose(self._losses.look(self._raising.wanted))
         if not self._why_idle():
-            await self._raising.step(self._token, self._visiting)
+            resting = self._losses.settling() | self.service.rows()
+            await self._raising.step(self._token, self._visiting, resting)
 
     def _visiting(self) -> frozenset[str]:
         if self._calibrating is None:
@@ -323,7 +327,7 @@ class AutomaticControl:
     def _ready(self) -> npt.NDArray[np.bool_]:
         """Return which heliostats may be calibrated now, (N,)."""
         ready = self._plant.field.among(_READY, self._plant.now()) & self._raising.wanted
-        ready &= ~self.held_rows()
+        ready &= ~self.service.rows()
         ready[[self._plant.field.place(name) for name in self._visiting()]] = False
         return ready
 
@@ -338,13 +342,9 @@ class AutomaticControl:
         return visit
 
     async def _look(self) -> None:
-        """Update predicted errors and the field's quality; raise or end the alarm of records."""
+        """Update predicted errors and the field's quality; check the records."""
         self.book.refresh()
         self.book.point(self._utc(), self.truth.all())
         self._keeping.forget(self._utc(), self._settings.events)
-        problem = self._keeping.problem
-        if problem or self._troubled:
-            kind = alarms.RECORDS
-            self._log.take_alarm(kind.raised(problem=problem) if problem else kind.ended())
-        self._troubled = bool(problem)
+        self._log.check_records(self._keeping.problem)
         await self._sleep(_LOOK_EVERY)

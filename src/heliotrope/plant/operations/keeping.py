@@ -1,4 +1,4 @@
-"""Records of automatic control that outlast a restart: sightings, calibrations, visits, holds."""
+"""Records that outlast a restart: sightings, calibrations, visits, heliostats out of service."""
 
 import functools
 from collections.abc import Sequence
@@ -9,7 +9,8 @@ import numpy as np
 from heliotrope.calibration.record import HeliostatCalibration, Identities
 from heliotrope.calibration.sightings import Sightings
 from heliotrope.plant.beliefs import Beliefs
-from heliotrope.plant.operations.views import CalibrationEntry, HeldHeliostat
+from heliotrope.plant.lockouts import Lockout
+from heliotrope.plant.operations.views import CalibrationEntry
 from heliotrope.store.records import Records, StoreError, VisitEntry
 
 #: Time between removals of old events, s.
@@ -123,25 +124,29 @@ class Keeping:
         except StoreError as error:
             self.lost = str(error)
 
-    # -- holds and events ------------------------------------------------------------------
+    # -- heliostats out of service, and events ---------------------------------------------
 
-    def holds(self, now: float) -> dict[str, HeldHeliostat]:
-        """Return the holds kept before; ``now`` in POSIX s."""
+    def lockouts(self) -> dict[str, Lockout]:
+        """Return the heliostats that are out of service, those past their time included."""
         if self._records is None:
             return {}
-        return {
-            name: HeldHeliostat(name, hold.person, hold.reason, hold.since)
-            for name, hold in self._records.holds(now).items()
-            if name in self._names
-        }
+        found = {}
+        for name, hold in self._records.holds(-np.inf).items():
+            if name in self._names:
+                until = np.nan if hold.until is None else hold.until
+                found[name] = Lockout(name, hold.person, hold.reason, hold.since, until)
+        return found
 
-    def hold(self, heliostats: Sequence[str], reason: str, who: str, at: float) -> None:
-        """Keep holds."""
+    def lock_out(
+        self, heliostats: Sequence[str], reason: str, who: str, at: float, until: float
+    ) -> None:
+        """Keep that heliostats are out of service; ``until`` is NaN without an end."""
         if self._records is not None:
-            self._records.hold(heliostats, reason, who, at)
+            end = until if np.isfinite(until) else None
+            self._records.hold(heliostats, reason, who, at, end)
 
-    def unhold(self, heliostats: Sequence[str], who: str, at: float) -> None:
-        """Keep the end of holds."""
+    def put_back(self, heliostats: Sequence[str], who: str, at: float) -> None:
+        """Keep that heliostats are in service again."""
         if self._records is not None:
             self._records.unhold(heliostats, who, at)
 

@@ -15,7 +15,7 @@ from heliotrope.links.tapped import TappedLink
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.operations.views import AlarmRow, ClusterRow, EventRow, PacketRow
 from heliotrope.safety import Alarm, alarms
-from heliotrope.store.records import Event, Records
+from heliotrope.store.records import Event, Records, StoreError
 
 #: Messages that come each second: only the last of each cluster is kept.
 _STEADY = ("lease", "status")
@@ -61,6 +61,8 @@ class Logbook:
         self._links: dict[str, Link] = {}
         self._statuses: dict[str, ClusterStatus] = {}
         self.refused: dict[str, int] = {}
+        #: The last record that was refused while its alarm stands, and the store's count of such.
+        self._refused, self._refused_count = "", 0
 
     def _now(self) -> float:
         return self._clock.utc().timestamp()
@@ -126,19 +128,39 @@ class Logbook:
             self._keep(self._records.record_event, Event(self._now(), kind, line))
 
     def _keep(self, keep: Any, *values: Any, **named: Any) -> None:
-        """Keep a record; a store that is full or gone raises an alarm and stops nothing."""
+        """Keep a record; one that cannot be kept raises an alarm and stops nothing."""
         try:
             keep(*values, **named)
+        except StoreError as error:
+            self.take_alarm(alarms.RECORDS.raised(problem=error))
         except HeliotropeError as error:
-            raised = alarms.RECORDS.raised(problem=error)
-            self._alarms["records", ""] = AlarmRow(
-                self._now(),
-                raised.condition,
-                raised.subject,
-                raised.severity,
-                raised.text,
-                active=True,
-            )
+            self._refuse(str(error))
+
+    def _refuse(self, problem: str) -> None:
+        """Raise the alarm about a record that was refused for its content."""
+        self._refused = problem
+        self.take_alarm(alarms.RECORD_REFUSED.raised(problem=problem))
+
+    def check_records(self, lost: str) -> None:
+        """Raise and end the alarms about the store; ``lost``: why another record was not kept."""
+        if self._records is None:
+            return
+        problem, kind = lost or self._records.problem, alarms.RECORDS
+        if problem:
+            self.take_alarm(kind.raised(problem=problem))
+        elif self._stands(kind):
+            self.take_alarm(kind.ended())
+        count = self._records.refused_count
+        if count > self._refused_count:
+            self._refused_count = count
+            self._refuse(self._records.refused)
+        elif self._refused:
+            self._refused, reason = "", self._refused
+            self.take_alarm(alarms.RECORD_REFUSED.ended(problem=reason))
+
+    def _stands(self, kind: alarms.AlarmKind) -> bool:
+        known = self._alarms.get((kind.name, ""))
+        return known is not None and known.active
 
     def acknowledge(self, who: str, condition: str, subject: str) -> None:
         """Note that a person acknowledged an alarm."""

@@ -6,10 +6,12 @@ calibrates it with every target's camera. A failure of one part of automatic con
 event or an alarm, and the rest goes on.
 
 People's commands go through here so that automatic control knows what they want: a heliostat that a
-person has stowed, defocused or locked stays so until a person gives it back.
+person has stowed, defocused or locked stays so until a person gives it back, and one that a person
+has raised and that was lost is left to people.
 """
 
 import asyncio
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -25,6 +27,7 @@ from heliotrope.plant import refusals
 from heliotrope.plant.authority import Grant, Person, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.emergency import EmergencyOrder
+from heliotrope.plant.lockouts import Lockout
 from heliotrope.plant.operations.automatic import AutomaticControl, AutomaticSettings
 from heliotrope.plant.operations.calibrating import Scheduling
 from heliotrope.plant.operations.logbook import Logbook
@@ -37,7 +40,6 @@ from heliotrope.plant.operations.views import (
     EmergencyView,
     EventRow,
     FieldFrame,
-    HeldHeliostat,
     HeliostatView,
     PacketRow,
     Planned,
@@ -50,7 +52,7 @@ from heliotrope.safety import Act
 from heliotrope.store.records import Records
 
 #: People's commands after which automatic control leaves heliostats alone, and those that give them
-#: back to it.
+#: to it until they are lost.
 _AWAY = frozenset({"STOW", "DEFOCUS", "LOCK", "JOG", "GOTO", "SEARCH", "DIAGNOSE", "IDLE"})
 _BACK = frozenset({"APPROACH", "TRACK", "REFOCUS"})
 #: Time between predictions of the flux, s.
@@ -212,6 +214,7 @@ class Operations:
             self.plant.waiting,
             self.logbook.open_alarms,
             self.plant.emergency_on,
+            self.automatic.waits,
             float(extra.pop("lag", 0.0)),
             extra,
         )
@@ -308,39 +311,50 @@ class Operations:
         """Return the plan of the next visits."""
         return self.automatic.plan(limit)
 
-    def holds(self) -> tuple[HeldHeliostat, ...]:
-        """Return the heliostats kept out of calibration."""
-        return tuple(self.automatic.holds.values())
+    def holds(self) -> tuple[Lockout, ...]:
+        """Return the heliostats out of service."""
+        return self.automatic.service.out
 
-    def hold(self, person: Person, heliostats: Sequence[str], reason: str) -> None:
-        """Keep heliostats out of calibration.
+    def hold(
+        self, person: Person, heliostats: Sequence[str], reason: str, hours: float = math.nan
+    ) -> None:
+        """Take heliostats out of service: they go to stow, and nobody moves them.
+
+        Parameters
+        ----------
+        person
+            Their owner until they are given back.
+        heliostats, reason
+            Names, and why.
+        hours
+            Time after which they are expected back; NaN if unknown. They stay out after it too.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer or gives no reason.
+            If the person is a viewer or gives no reason, or another person took one out.
         UnknownNameError
             If there is no such heliostat.
         """
-        _operator(person, "hold")
+        _operator(person, "out of service")
         if not reason.strip():
-            raise refusals.REASON_MISSING.error(what="hold")
-        self.automatic.hold(person.name, heliostats, reason)
-        self._tell(person, f"{len(heliostats)} heliostats held: {reason}")
+            raise refusals.REASON_MISSING.error(what="out of service")
+        self.automatic.service.take(person, heliostats, reason, hours)
+        self._tell(person, f"{_some(heliostats)} out of service: {reason}", "command")
 
     def unhold(self, person: Person, heliostats: Sequence[str]) -> None:
-        """Give heliostats back to calibration.
+        """Give heliostats back to service by their names; nothing moves.
 
         Raises
         ------
         RefusedError
-            If the person is a viewer.
+            If the person is a viewer, or neither the owner nor an engineer.
         UnknownNameError
             If there is no such heliostat.
         """
-        _operator(person, "unhold")
-        self.automatic.unhold(person.name, heliostats)
-        self._tell(person, f"{len(heliostats)} heliostats given back")
+        _operator(person, "give back")
+        self.automatic.service.give_back(person, heliostats)
+        self._tell(person, f"{_some(heliostats)} back in service", "command")
 
     # -- the authority ---------------------------------------------------------------------
 
@@ -508,21 +522,36 @@ class Operations:
         self.automatic.want(names, wanted=True)
         self._tell(person, f"{len(names)} heliostats given to automatic control", "command")
 
+    def resume(self, person: Person) -> None:
+        """Let automatic control go on after a loss of many heliostats.
+
+        Raises
+        ------
+        RefusedError
+            If the person is a viewer.
+        """
+        _operator(person, "resume")
+        self.automatic.resume()
+        self._tell(person, "automatic control resumed", "command")
+
     # -- notes -----------------------------------------------------------------------------
 
     def _meant(self, name: str, heliostats: Sequence[str]) -> None:
         if name in _AWAY:
             self.automatic.want(heliostats, wanted=False)
         elif name in _BACK:
-            self.automatic.want(heliostats, wanted=True)
+            self.automatic.want(heliostats, wanted=True, by_person=True)
 
     def _told(self, person: Person, ticket: Ticket) -> None:
-        some = ", ".join(ticket.heliostats[:3])
-        more = f" and {len(ticket.heliostats) - 3} more" if len(ticket.heliostats) > 3 else ""
-        self.logbook.event("command", person.name, f"{ticket.name} {some}{more}")
+        self.logbook.event("command", person.name, f"{ticket.name} {_some(ticket.heliostats)}")
 
     def _tell(self, person: Person, text: str, kind: str = "calibration") -> None:
         self.logbook.event(kind, person.name, text)
+
+
+def _some(heliostats: Sequence[str]) -> str:
+    more = f" and {len(heliostats) - 3} more" if len(heliostats) > 3 else ""
+    return ", ".join(heliostats[:3]) + more
 
 
 def _act(name: str) -> Act:

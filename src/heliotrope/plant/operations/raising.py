@@ -63,6 +63,7 @@ class Raising:
         self._most, self._patience = most, patience
         count = len(plant.field)
         self.wanted: Mask = np.full(count, wanted, dtype=np.bool_)
+        self._by_people: Mask = np.zeros(count, dtype=np.bool_)
         self._busy_until = np.full(count, -math.inf)
         self._told_in = np.full(count, -1, dtype=np.int16)
         self._blocked: set[str] = set()
@@ -70,11 +71,19 @@ class Raising:
         self._aims = plant.default_aims() if plant.design.receivers else {}
         self._clear = self._clear_of_targets(clearance)
 
-    def want(self, heliostats: Sequence[str], *, wanted: bool) -> None:
-        """Give heliostats to automatic control, or take them out of it."""
+    def want(self, heliostats: Sequence[str], *, wanted: bool, by_person: bool = False) -> None:
+        """Give heliostats to automatic control, or take them out of it.
+
+        With ``by_person`` a person raises them: once lost, they are left to people.
+        """
         rows = [self._plant.field.place(name) for name in heliostats]
+        self._by_people[rows] = by_person & (self._by_people[rows] | ~self.wanted[rows])
         self.wanted[rows] = wanted
         self._busy_until[rows] = -math.inf
+
+    def lose(self, lost: Mask) -> None:
+        """Leave lost heliostats (N,) that people had raised to people."""
+        self.wanted &= ~(lost & self._by_people)
 
     def give_up(self) -> None:
         """Take all heliostats out of automatic control."""
@@ -99,7 +108,7 @@ class Raising:
         # The beam is off by twice as much as the normal; that error is two-dimensional.
         return np.asarray(math.sqrt(2.0) * clearance * slant < room)
 
-    async def step(self, token: int, visiting: Callable[[], frozenset[str]]) -> None:
+    async def step(self, token: int, visiting: Callable[[], frozenset[str]], resting: Mask) -> None:
         """Give the commands that may be given now.
 
         Parameters
@@ -108,11 +117,13 @@ class Raising:
             Token of the command authority.
         visiting
             Returns the heliostats that visit targets now.
+        resting
+            Heliostats that are left where they are, (N,).
         """
         plant, now = self._plant, self._plant.now()
         self._look_at_blocked()
         busy = (self._busy_until >= now) & (self._told_in == plant.field.rows["state"])
-        free = self.wanted & ~busy
+        free = self.wanted & ~busy & ~resting
         free[[plant.field.place(name) for name in visiting()]] = False
         for state, name in ((states.STOWED, "APPROACH"), (states.DEFOCUSED, "IDLE")):
             rows = np.flatnonzero(free & plant.field.among((state,), now))[: self._most]

@@ -93,7 +93,7 @@ class Viewer:
             _fixed(book.sightings.copy()),
             _fixed(field.cluster.astype(np.int16)),
             _fixed(self._on(now)),
-            _fixed(self._automatic.held_rows()),
+            _fixed(self._automatic.service.rows()),
             None if truth is None else _fixed(truth.astype(np.float32)),
         )
 
@@ -128,7 +128,7 @@ class Viewer:
         shown = plant.field.of(name, plant.now())
         node = plant.field.rows[row]
         told = shown.live and int(node["supply_mv"]) != _UNTOLD
-        truth, hold = automatic.truth.all(), automatic.holds.get(name)
+        truth, hold = automatic.truth.all(), plant.out_of_service.get(name)
         width, height = self.sizes[row]
         return HeliostatView(
             name,
@@ -156,7 +156,7 @@ class Viewer:
             automatic.book.history(name),
             automatic.book.results_of(name),
             next((p for p in automatic.plan(50) if p.heliostat == name), None),
-            "" if hold is None else f"{hold.reason} ({hold.who})",
+            "" if hold is None else hold.text,
         )
 
     def _drives(self, row: int) -> tuple[DriveView, ...]:
@@ -192,9 +192,15 @@ class Viewer:
         plant, order = self._plant, self._plant.emergency
         if order is None:
             return EmergencyView(False, "", "", "", 0.0, 0, 0, 0, (), "no emergency so far")
+        if not plant.emergency_on:
+            over = f"over: {order.act.name} of the field, ordered by {order.who}"
+            ago = plant.now() - order.at
+            return EmergencyView(
+                False, order.act.name, order.who, order.reason, ago, 0, 0, 0, (), over
+            )
         report, count = order.report(plant.now()), len(order.ticket.heliostats)
         return EmergencyView(
-            plant.emergency_on,
+            True,
             order.act.name,
             order.who,
             order.reason,

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from heliotrope.calibration.record import CalibrationOutcome, HeliostatCalibration
 from heliotrope.geometry import FloatArray
+from heliotrope.safety import Severity
 
 #: State shown for a row older than its limit, whose other values do not count.
 STALE_STATE = 255
@@ -47,7 +48,7 @@ class FieldFrame:
     on
         Place in `Operations.aim_names` of the aim of each, uint8, (N,); 0: none.
     held
-        Whether a person keeps it out of calibration, bool, (N,).
+        Whether it is out of service, bool, (N,).
     truth_error
         True tracking error, known to a twin only, rad, float32, (N,); None for a real plant.
     """
@@ -168,7 +169,7 @@ class HeliostatView:
     planned
         Its next visit, if one is planned.
     hold
-        Why a person keeps it out of calibration, "" if nobody does.
+        Why it is out of service, who took it out, and when it is expected back; "" if it is not.
     """
 
     name: str
@@ -268,7 +269,7 @@ class AlarmRow:
     at: float
     condition: str
     subject: str
-    severity: str
+    severity: Severity
     text: str
     active: bool
     acknowledged_by: str = ""
@@ -438,16 +439,6 @@ class CameraView:
 
 
 @dataclass(frozen=True)
-class HeldHeliostat:
-    """A heliostat kept out of calibration: the person, the reason, and the time (POSIX s)."""
-
-    heliostat: str
-    who: str
-    reason: str
-    since: float
-
-
-@dataclass(frozen=True)
 class EmergencyView:
     """The last order to the whole field, with its proof.
 
@@ -503,6 +494,8 @@ class Summary:
         Number of alarms active or unacknowledged.
     emergency
         Whether an emergency is active.
+    resume
+        Why automatic control waits for a person's Resume, "" if it does not.
     lag
         Delay of the plant's time, s: 0 unless the machine is too slow for a twin's speed.
     extra
@@ -520,5 +513,6 @@ class Summary:
     waiting: int
     alarms: int
     emergency: bool
+    resume: str
     lag: float
     extra: Mapping[str, Any]

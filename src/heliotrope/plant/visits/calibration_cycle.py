@@ -5,9 +5,11 @@ those already known; all of them together are fitted once. A fit that is better 
 calibration is pushed to the local controller, read back, and taken as the heliostat's calibration.
 Nothing is pushed after too few sightings, a fit that did not converge, values far from what an
 installation can be, or a fit that misses by more than before: the heliostat then keeps what it has.
+A first calibration and a large change are confirmed by one more photograph before they are taken;
+if it contradicts them, the old parameters are pushed back.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import timedelta
 
 import numpy as np
@@ -21,9 +23,9 @@ from heliotrope.calibration.record import (
     root_mean_square,
 )
 from heliotrope.calibration.sightings import Sightings, camera_target, join
-from heliotrope.geometry import FloatArray
+from heliotrope.geometry import FloatArray, angle_between
 from heliotrope.lcu import states
-from heliotrope.mechanism.board_items import CALIBRATION_ITEMS, differing, items_of
+from heliotrope.mechanism.board_items import differing, items_of
 from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.authority import Person, RefusedError
 from heliotrope.plant.controller import PlantController
@@ -37,6 +39,7 @@ from heliotrope.plant.visits.photographs import (
     Tell,
 )
 from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.verification import Verification
 from heliotrope.plant.visits.visit import Visit
 
 
@@ -126,6 +129,9 @@ class CalibrationCycle:
             if centring is None
             else Centred(camera, self.settings, centring)
         )
+        self._verification = Verification(
+            camera, self.settings, centring or Centring(), self._sighting
+        )
 
     async def run(
         self, person: Person, token: int, heliostat: str, target: str, tell: Tell | None = None
@@ -159,7 +165,7 @@ class CalibrationCycle:
         async with visit:
             await visit.go(self.settings.arrival)
             taken = await self._photographing.take(visit, tell or _nobody)
-        result = await self._learn(visit, taken)
+        result = await self._learn(visit, taken, tell or _nobody)
         if tracked and np.isfinite(aim).all():
             await visit.aim(aim)
             await visit.command("TRACK")
@@ -178,8 +184,8 @@ class CalibrationCycle:
             centroid_covariance=np.asarray(shot.covariance, dtype=np.float64),
         )
 
-    async def _learn(self, visit: Visit, taken: Photographs) -> CycleResult:
-        """Fit all sightings once; push and take a better fit."""
+    async def _learn(self, visit: Visit, taken: Photographs, tell: Tell) -> CycleResult:
+        """Fit all sightings once; push, verify and take a better fit."""
         name, beliefs = visit.heliostat, self._plant.beliefs
         new = [self._sighting(shot, counts) for shot, counts in taken.used]
         known, rejected = beliefs.seen(name), tuple(taken.rejected)
@@ -204,14 +210,18 @@ class CalibrationCycle:
                 measured,
             )
         found = self._fit(name, every)
-        if found.problem and not old:
-            # No earlier sighting supports these, and their own fit makes no sense: drop them.
+        pushed: tuple[str, ...] = ()
+        if not found.problem:
+            found, pushed = await self._try(visit, found, every, taken, tell)
+        if found.problem and (not old or found.outcome is CalibrationOutcome.NOT_VERIFIED):
+            # No earlier sighting supports these, or a later photograph contradicts them: drop them.
             text = f"unchanged: {found.problem}"
+            count = 0 if known is None else len(known)
             return CycleResult(
-                name, found.outcome, text, rejected, 0, 0, np.nan, found.before, found.after
+                name, found.outcome, text, rejected, count, 0, np.nan, found.before, found.after
             )
         beliefs.note(name, visit.target.name, here)
-        record = None if found.problem else await self._take(visit, found, every)
+        record = None if found.problem else self._take(visit, found, every, pushed)
         better = f"beam error {1e3 * found.before:.2f} to {1e3 * found.after:.2f} mrad RMS"
         return CycleResult(
             name,
@@ -264,10 +274,38 @@ class CalibrationCycle:
             )
         return CalibrationOutcome.CALIBRATED, ""
 
-    async def _take(self, visit: Visit, found: _Fit, every: Sightings) -> HeliostatCalibration:
-        """Push a fit, make its record, and let the plant believe it."""
+    async def _try(
+        self, visit: Visit, found: _Fit, every: Sightings, taken: Photographs, tell: Tell
+    ) -> tuple[_Fit, tuple[str, ...]]:
+        """Push a fit and verify it; return it, with why it was withdrawn, and the items pushed."""
         name, plant = visit.heliostat, self._plant
-        pushed = await self._push(visit, found.mechanism[0])
+        present, new = plant.beliefs.present(name), found.mechanism
+        large = _moved(present, new, every) > self.settings.large
+        try:
+            pushed = await self._push(visit, new[0], f"fit of {len(every)} sightings")
+            if not (large or plant.beliefs.record(name) is None):
+                return found, pushed
+            plant.want(name, new[0])
+            shots = [shot for shot, _ in taken.used]
+            problem = await self._verification.problem(
+                visit, found.fitted, found.nominal, shots, tell
+            )
+            if not problem:
+                return found, pushed
+            await self._push(visit, present[0], "the new ones were not verified")
+        except BaseException:
+            # The local controller gets the old parameters as soon as its state allows it.
+            plant.want(name, present[0])
+            raise
+        plant.want(name, present[0])
+        said = f"{problem}; the old parameters are back"
+        return replace(found, outcome=CalibrationOutcome.NOT_VERIFIED, problem=said), ()
+
+    def _take(
+        self, visit: Visit, found: _Fit, every: Sightings, pushed: tuple[str, ...]
+    ) -> HeliostatCalibration:
+        """Make the record of a fit that is stored, and let the plant believe it."""
+        name, plant = visit.heliostat, self._plant
         known, last = plant.beliefs.seen(name), plant.beliefs.record(name)
         assert known is not None
         record = HeliostatCalibration.from_fit(
@@ -285,28 +323,32 @@ class CalibrationCycle:
         plant.beliefs.take(record)
         return record
 
-    async def _push(self, visit: Visit, mechanism: Mechanism) -> tuple[str, ...]:
-        """Write the items that differ, and read them back."""
+    async def _push(self, visit: Visit, mechanism: Mechanism, why: str) -> tuple[str, ...]:
+        """Write the items that differ, and read them back; ``why`` is for the audit."""
         plant, name = self._plant, visit.heliostat
         wanted = items_of(mechanism)
         missing = differing(wanted, await plant.stored(name))
         if not missing:
             return ()
-        locked = not CALIBRATION_ITEMS.issuperset(missing)
-        if locked:
-            # Drives are only exchanged while nothing can move.
-            await visit.command("LOCK")
+        # Parameters are only exchanged while nothing can move.
+        await visit.command("LOCK")
         items = {item: wanted[item] for item in missing}
-        await visit.obey(plant.parameters(visit.person, visit.token, name, items), 60.0)
+        ticket = plant.parameters(visit.person, visit.token, name, items, confirmed=why)
+        await visit.obey(ticket, 60.0)
         left = differing(wanted, await plant.stored(name))
         if left:
             raise RefusedError(
                 f"{name}: {', '.join(left)} differ when read back; check its flash memory"
             )
-        if locked:
-            await visit.command("UNLOCK")
-            await visit.command("IDLE")
+        await visit.command("UNLOCK")
+        await visit.command("IDLE")
         return missing
+
+
+def _moved(present: Mechanism, new: Mechanism, made: Sightings) -> float:
+    """Return the largest change of the beam by new parameters at the counts of sightings, rad."""
+    normals = [m[made.heliostat].pose(made.counts).normal for m in (present, new)]
+    return 2.0 * float(angle_between(*normals).max())
 
 
 def _nobody(stage: str) -> None:

@@ -101,7 +101,7 @@ class Plain:
         for k in range(self._settings.shots):
             tell(f"photograph {k + 1}")
             due = plant.now() + self._settings.interval
-            shot = await _photograph(self._camera, visit)
+            shot = await photographed(self._camera, visit)
             if shot.reasons:
                 taken.rejected.append(f"photograph {k + 1}: {'; '.join(shot.reasons)}")
             else:
@@ -147,7 +147,7 @@ class Centred:
             tell(f"search {k}" if k else "first look")
             await self._go(visit, aim, before)
             before = aim
-            light = seen(target, await _photograph(self._camera, visit))
+            light = seen(target, await photographed(self._camera, visit))
             if light is not None:
                 return await self._centre(visit, aim, light, tell)
         return None
@@ -168,11 +168,11 @@ class Centred:
     async def _series(self, visit: Visit, light: "_Light", taken: Photographs, tell: Tell) -> None:
         """Take the photographs of the beam that was found; end at once if it is another's."""
         plant, settings = visit.plant, self._settings
-        aim, room = light.aim, self._room(visit)
+        aim, room = light.aim, room_of(visit, self._centring)
         for k in range(settings.shots + _SPARE):
             tell(f"photograph {k + 1}")
             due = plant.now() + settings.interval
-            shot = await _photograph(self._camera, visit)
+            shot = await photographed(self._camera, visit)
             astray = self._astray(visit.target, shot, aim, light)
             good = not astray and not shot.reasons
             if good:
@@ -200,15 +200,6 @@ class Centred:
             return ""
         return f"light {away:.1f} m from the expected place: another heliostat's beam"
 
-    def _room(self, visit: Visit) -> float:
-        """Return how far the beam may be moved off the middle, right and up, m."""
-        target, plant, row = visit.target, visit.plant, visit.row
-        group, place = plant.design.find(visit.heliostat)
-        mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
-        slant = float(np.linalg.norm(plant.beams.armature.origin_1[row] - target.center))
-        free = 0.5 * min(target.width, target.height) - mirror - self._centring.slope * slant
-        return self._centring.spread * max(0.0, free)
-
     async def _go(self, visit: Visit, aim: FloatArray, before: FloatArray) -> None:
         if np.linalg.norm(aim - before) > _SAME:
             await visit.aim(aim)
@@ -224,7 +215,24 @@ class _Light:
     place: FloatArray
 
 
-async def _photograph(camera: TargetCamera, visit: Visit) -> Shot:
+def room_of(visit: Visit, centring: Centring) -> float:
+    """Return how far the beam may be moved off the middle of the target, right and up, m."""
+    target, plant, row = visit.target, visit.plant, visit.row
+    group, place = plant.design.find(visit.heliostat)
+    mirror = 0.5 * math.hypot(float(group.width[place]), float(group.height[place]))
+    slant = float(np.linalg.norm(plant.beams.armature.origin_1[row] - target.center))
+    free = 0.5 * min(target.width, target.height) - mirror - centring.slope * slant
+    return centring.spread * max(0.0, free)
+
+
+async def photographed(camera: TargetCamera, visit: Visit) -> Shot:
+    """Return a photograph of a heliostat that tracks its aim.
+
+    Raises
+    ------
+    RefusedError
+        If it left its aim meanwhile.
+    """
     shot = await camera.photograph(visit.target, visit.heliostat)
     if visit.state != states.TRACKING:
         raise RefusedError(f"{visit.heliostat}: it left its aim while it was photographed")

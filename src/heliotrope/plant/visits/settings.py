@@ -28,6 +28,12 @@ class CycleSettings:
         sightings).
     left
         Largest accepted beam error after the fit, rad RMS: a robust fit settles on nonsense too.
+    large
+        Change of the beam by new parameters, rad, above which a photograph must confirm them. A
+        first calibration is always confirmed.
+    agreement
+        Largest distance of the beam from its predicted place in that photograph, in standard
+        deviations of the distance.
     """
 
     shots: int = 3
@@ -39,6 +45,8 @@ class CycleSettings:
     most: float = 6.0
     gain: float = 1.0
     left: float = 3e-3
+    large: float = 3e-3
+    agreement: float = 4.0
 
     def __post_init__(self) -> None:
         if self.shots < 1 or self.least < 1 or not self.interval >= 0.0:

@@ -96,8 +96,15 @@ class Visit:
         """Give the heliostat an aim and wait until it has taken it; see `obey`."""
         await self.obey(self.plant.aim(self.person, self.token, {self.heliostat: point}), limit)
 
-    async def go(self, limit: float) -> None:
+    async def go(self, limit: float, point: FloatArray | None = None) -> None:
         """Send the heliostat to the target and wait until it is there.
+
+        Parameters
+        ----------
+        limit
+            Longest time, s.
+        point
+            Aim on the target, ENU, m, (3,); None: its centre.
 
         Raises
         ------
@@ -111,7 +118,7 @@ class Visit:
                 f"{self.heliostat} is {states.STATES[state]}; bring it to standby (APPROACH) first"
             )
         self.away = True
-        await self.aim(self.target.center)
+        await self.aim(np.asarray(self.target.center) if point is None else point)
         if self.state != states.TRACKING:
             await self.command("TRACK")
         await self.arrived(limit)

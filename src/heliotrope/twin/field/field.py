@@ -37,6 +37,7 @@ from heliotrope.twin.field._among import among
 from heliotrope.twin.field._drives import Drives
 from heliotrope.twin.field._ways import pieces
 from heliotrope.twin.field.journals import Journals
+from heliotrope.twin.sensors import light_share
 from heliotrope.twin.wind import Wind
 
 Rows = npt.NDArray[np.intp]
@@ -151,6 +152,7 @@ class Field:
         self._target = np.full((count, 3), np.nan)
         self._ready = np.zeros(count, dtype=np.bool_)
         self._lease = np.zeros(count, dtype=np.int64)
+        self._heard = np.full(count, LEASE_MS, dtype=np.int64)
         self._dark = np.zeros(count, dtype=np.int64)
         self._knot, self._renew, self._since = np.zeros((3, count), dtype=np.int64)
         self._start, self._slope = np.zeros((2, count, 2))
@@ -315,6 +317,11 @@ class Field:
         self._sun_ms = delay_ms
         heard = np.arange(len(self)) if rows is None else rows
         self._lease[heard[self.state[heard] >= 0]] = LEASE_MS - max(0, delay_ms)
+        self.hear(heard)
+
+    def hear(self, rows: Rows) -> None:
+        """Note that heliostats hear their cluster; a position is held only while they do."""
+        self._heard[rows] = LEASE_MS
 
     def order(self, name: str, rows: Rows | None = None, aim: npt.ArrayLike | None = None) -> Bools:
         """Give a command; return which heliostats take it, (N,).
@@ -337,6 +344,8 @@ class Field:
         chosen = chosen[self.state[chosen] >= 0]
         self.edition += 1
         state, taken = self.state[chosen], np.zeros(len(self), dtype=np.bool_)
+        if name not in ("DEFOCUS", "STOW"):
+            self.hear(chosen)
         if name == "DEFOCUS":
             self._defocus_now(chosen)
         elif name == "STOW":
@@ -484,6 +493,7 @@ class Field:
         before = self._kept[rows]
         locked, faulty = before == states.LOCKED, before == states.FAULT
         self.fault[rows] = np.where(faulty, LATCHED, NO_FAULT)
+        self._heard[rows], self._dark[rows] = LEASE_MS, STOW_WAIT_MS
         home = self.at_stow(rows) & ~locked & ~faulty
         self._enter(rows[locked], states.LOCKED)
         self._enter(rows[home], states.STOWED)
@@ -510,32 +520,40 @@ class Field:
         self.edition += 1
         self.now_ms += TICK_MS
         self._sun_ms += TICK_MS
-        np.maximum(self._lease - TICK_MS, 0, out=self._lease)
-        fresh = self._lease > 0
+        for left in (self._lease, self._heard):
+            np.maximum(left - TICK_MS, 0, out=left)
+        fresh, silent = self._lease > 0, self._heard == 0
         follows = among(self.kind, STANDBY, TRACK) | (
             (self.kind == DEFOCUS) & among(self._base, STANDBY, TRACK)
         )
         needs = among(self.state, states.APPROACHING, states.TRACKING)
         renewed = fresh & ((follows & (self.state != states.FAULT)) | needs)
+        renewed |= (self.state == states.LOCKED) & (self.kind == HOLD) & ~silent
         self._dark = np.where(renewed, STOW_WAIT_MS, np.maximum(self._dark - TICK_MS, 0))
-        stands = (self.state == states.IDLE) & (self.kind == STANDBY)
-        comes = (self.state == states.STOWING) & (self.kind == RETURN)
-        lapsed = np.flatnonzero(~fresh & (needs | stands | comes))
-        if len(lapsed):
-            self._defocus_now(lapsed)
-        silent = np.flatnonzero((self.state == states.DEFOCUSED) & (self._dark == 0))
-        if len(silent):
-            self._stow_directly(silent)
-            self.state[silent] = states.STOWING
-        faulty = np.flatnonzero(
-            (self.state == states.FAULT) & (self._dark == 0) & (self.kind != STOW)
-        )
-        if len(faulty):
-            self._stow_directly(faulty[~self.at_stow(faulty)])
+        self._lapses(fresh, silent, needs)
         self._move()
         kernels.advance_rows(
             self.axes, self._order, self._queued, self.drives.next(), TICK_MS, SLOT_MS, AHEAD_MS
         )
+
+    def _lapses(self, fresh: Bools, silent: Bools, needs: Bools) -> None:
+        """`Controller._lapses`; ``needs``: in a state that needs the sun."""
+        dark, latched = self._dark == 0, among(self.state, states.LOCKED, states.FAULT)
+        idle = self.state == states.IDLE
+        comes = (self.state == states.STOWING) & (self.kind == RETURN)
+        held = latched & (self.kind == HOLD) & ~self._present & ~dark
+        lapsed = ~fresh & (needs | comes | (idle & (self.kind == STANDBY)))
+        if silent.any():
+            lapsed |= silent & (idle | (held & ~self.at_stow()))
+        if lapsed.any():
+            self._defocus_now(np.flatnonzero(lapsed))
+        alone = np.flatnonzero((self.state == states.DEFOCUSED) & dark)
+        if len(alone):
+            self._stow_directly(alone)
+            self.state[alone] = states.STOWING
+        left = np.flatnonzero(latched & dark & (self.kind != STOW))
+        if len(left):
+            self._stow_directly(left[~self.at_stow(left)])
 
     def _move(self) -> None:
         """`Motion.tick`."""
@@ -629,29 +647,8 @@ class Field:
         return np.where(good, np.arcsin(np.clip(off, 0.0, 1.0)), np.nan)
 
     def flux(self, sun: npt.ArrayLike, receiver: npt.ArrayLike, radius: float) -> float:
-        """Return the share of the field's light that passes a receiver, 0 to 1.
-
-        Parameters
-        ----------
-        sun
-            Direction to the sun, (3,).
-        receiver
-            Its middle, (3,), m.
-        radius
-            Beams whose axis passes nearer than this count as on it, m. Each is weighted by the
-            cosine of its incidence, relative to all beams aimed at the middle.
-        """
-        s, point = np.asarray(sun, dtype=np.float64), np.asarray(receiver, dtype=np.float64)
-        normal, vertex = self.stand()
-        cosine = normal @ s
-        rays = 2.0 * cosine[:, None] * normal - s
-        way = point - vertex
-        along = np.einsum("ij,ij->i", way, rays)
-        off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
-        unit = way / np.linalg.norm(way, axis=1)[:, None]
-        nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
-        on = (along > 0.0) & (off <= radius)
-        return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())
+        """Return the share of the field's light that passes a receiver; see `light_share`."""
+        return light_share(*self.stand(), sun, receiver, radius)
 
 
 def _limit(rows: npt.NDArray[np.void], axis: AxisLimits) -> None:

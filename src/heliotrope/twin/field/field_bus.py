@@ -38,9 +38,15 @@ _KEY_HEAD = struct.calcsize("<" + messages.HEADS[messages.KEY][0])
 _EDITION = slice(_KEY_HEAD - 4, _KEY_HEAD)
 _ITEMS = tuple(row[0] for row in journal.ITEMS)
 #: Messages of calibration with the states that accept them, and the states that accept the others.
-_CALIBRATION = frozenset({"SET_ARMATURE", "SET_BIAS", "SET_POSITION", "SET_DEFOCUS"})
-_TAKES = (states.STOWED, states.LOCKED, states.FAULT, states.IDLE, states.DEFOCUSED)
 _TAKES_ALL = (states.LOCKED, states.FAULT)
+_TAKES_POSE = (*_TAKES_ALL, states.STOWED)
+_TAKES_HARMLESS = (*_TAKES_POSE, states.IDLE, states.DEFOCUSED)
+_TAKES = {
+    "SET_ARMATURE": _TAKES_POSE,
+    "SET_BIAS": _TAKES_POSE,
+    "SET_POSITION": _TAKES_HARMLESS,
+    "SET_DEFOCUS": _TAKES_HARMLESS,
+}
 #: Commands that the field knows.
 KNOWN = frozenset(
     {
@@ -175,6 +181,8 @@ class FieldBus:
         elif name in ("DEFOCUS", "STOW"):
             self._field.order(name, self._all)
             self._tell(name, self._rows)
+        else:
+            self._field.hear(self._all)
 
     def _tell(self, name: str, rows: range) -> None:
         if self._took is not None:
@@ -238,7 +246,7 @@ class FieldBus:
             self._field.store(row, {"standby": payload[8:20]})
             return messages.DONE
         state = int(self._field.state[row])
-        if state not in (_TAKES if name in _CALIBRATION else _TAKES_ALL):
+        if state not in _TAKES.get(name, _TAKES_ALL):
             return messages.REFUSED_STATE
         body = payload[: len(payload) - wire.MAC_SIZE]
         targets = journal.TARGETS.get(name, ())

@@ -1,10 +1,11 @@
 """The observers that check the safety invariants.
 
-`Observer` watches one cluster with its boards, `PlantObserver` the plant; `TITLES` names the
-invariants.
+`Observer` watches one cluster with its boards, `PlantObserver` the plant, `BeamObserver` the true
+beams; `TITLES` names the invariants.
 """
 
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import TITLES, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 
-__all__ = ["TITLES", "InvariantError", "Observer", "PlantObserver", "Violation"]
+__all__ = ["TITLES", "BeamObserver", "InvariantError", "Observer", "PlantObserver", "Violation"]

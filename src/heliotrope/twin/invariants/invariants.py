@@ -1,4 +1,4 @@
-"""The eleven safety invariants, checked by an independent observer.
+"""The fifteen safety invariants, and an independent observer of the first eleven.
 
 The observer sees the frames on the bus, the actions of each board, and the messages to and from the
 plant. It keeps its own accounts in true time and trusts no report: the age of a sun counts from
@@ -23,7 +23,14 @@ number    check
 10        Azimuth moves first from stow and last to stow; no beam crosses the receiver on the way.
 11        Every command on the bus was accepted and reported once; no value is reported younger
           or other than it is.
+12        A beam in a state that lights anything is where it was sent; otherwise an alarm names
+          it within 10 s and it is off within 30 s.
+13        In no state does a beam stay on the receiver unsent, or in a keep-out volume, for 30 s.
+14        After a loss that took every mirror off, only a person's command brings one back.
+15        A mirror proven to be done is off the receiver, or at stow.
 ========  ============================================================================
+
+`twin.invariants.beams` checks 12 to 15.
 """
 
 from collections import Counter, deque
@@ -63,6 +70,10 @@ TITLES = {
     9: "no jump of time extends a lease",
     10: "beams travel safely",
     11: "every command once, every value true",
+    12: "a beam is where it was sent",
+    13: "no state is exempt",
+    14: "only a person resumes the field",
+    15: "a proof counts only what is known",
 }
 
 #: Local lease, and how late a board may notice its end, s.
@@ -139,7 +150,7 @@ class Violation:
     Attributes
     ----------
     number
-        1 to 11.
+        1 to 15.
     at
         Time since the start, s.
     subject
@@ -547,6 +558,8 @@ class Observer:
         board = account.board
         assert board.node is not None
         motion = board.node.controller.motion
+        if not motion.known:
+            return  # it turns away by steps that it counts from anywhere
         for i in (0, 1):
             ordered = board.axes[i].emitted - board.slip[i]
             counted = motion.place(i)
@@ -559,7 +572,7 @@ class Observer:
         account.served(now, leased)
         assert board.node is not None
         motion = board.node.controller.motion
-        if board.state in (states.LOCKED, states.UNCONFIGURED) or not motion.known:
+        if board.state == states.UNCONFIGURED or not motion.known:
             return
         on_way = board.state in (states.APPROACHING, states.IDLE) and account.from_stow
         for why, begin in account.deadlines(now):

@@ -49,6 +49,7 @@ from heliotrope.twin.field.field import Field
 from heliotrope.twin.field.field_bus import FieldBus
 from heliotrope.twin.live.boards import BoardField, key_of
 from heliotrope.twin.live.near_link import NearLink, near_pair
+from heliotrope.twin.sensors import FluxSensor
 
 #: Tick of the field, and period at which the true sun is computed, s.
 _TICK, _SUN_EVERY = 0.05, 5.0
@@ -143,6 +144,8 @@ class World:
         Bus of each cluster.
     cameras
         Cameras of the targets.
+    flux
+        Sensor of the flux on the receivers; None without a receiver.
     beats
         Ticks left out because the machine was too slow.
 
@@ -187,6 +190,8 @@ class World:
         aims = default_aims(design, self.names, design.position, None)
         self._aims = np.stack([aims[name] for name in self.names])
         self.cameras = self._new_cameras()
+        receivers = design.receivers
+        self.flux = FluxSensor(receivers, clock, self.field.stand, self.sun) if receivers else None
 
     # -- assembly --------------------------------------------------------------------------
 
@@ -246,6 +251,7 @@ class World:
             self.clock,
             audit or Forgetful(),
             self.cameras,
+            self.flux,
             records=records,
             assigned=assigned,
             beside=self.running,

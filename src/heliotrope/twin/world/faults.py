@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from heliotrope.errors import InputError
 from heliotrope.lcu import ticks
+from heliotrope.twin.world.worlds import pause_of, weights_of
 
 #: Everything that can go wrong: kind, weight in the draw, meaning.
 KINDS = {
@@ -75,7 +76,13 @@ class Fault:
 
 
 def drawn(
-    seed: int, seconds: float, heliostats: int, *, pause: float = 12.0, only: Sequence[str] = ()
+    seed: int,
+    seconds: float,
+    heliostats: int,
+    *,
+    pause: float = 12.0,
+    only: Sequence[str] = (),
+    worlds: Sequence[str] = (),
 ) -> list[Fault]:
     """Return the faults of a run, sorted by time.
 
@@ -91,6 +98,8 @@ def drawn(
         Mean time between faults, s.
     only
         Kinds to draw from; () for all.
+    worlds
+        Names of `worlds.WORLDS`; "swarm" draws the weights and the pause of this run.
 
     Raises
     ------
@@ -104,7 +113,9 @@ def drawn(
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
     kinds = list(only or KINDS)
-    weights = [KINDS[kind][0] for kind in kinds]
+    weighed = weights_of(worlds, seed, {kind: KINDS[kind][0] for kind in kinds})
+    weights = [weighed[kind] for kind in kinds]
+    pause = pause_of(worlds, seed, pause)
     found: list[Fault] = []
     at = chance.expovariate(1.0 / pause)
     while at < seconds:

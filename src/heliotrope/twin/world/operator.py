@@ -14,22 +14,25 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import LinkClosedError
 from heliotrope.links.messages import Command, encode
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.parameters import TAKES_POSE
 from heliotrope.plant.tickets import Ticket
-from heliotrope.safety import Act
+from heliotrope.safety import FLUX_READING, Act
 from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
+from heliotrope.twin.world.worlds import Habits
 
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)
 VIEWER = Person("viewer", Role.VIEWER)
-#: Mean time between two actions, s.
-PAUSE = 2.0
 #: Command that leads on from each state.
 ONWARDS = {
     "": ("APPROACH",), "STOWED": ("APPROACH",),
@@ -50,9 +53,9 @@ class Operator:
     ----------
     clock
         True time.
-    seed
-        Seed of their actions.
-    observer
+    seed, habits
+        Seed of their actions, and how often they take each.
+    observer, beams
         Told of each accepted command.
     names
         Names of the heliostats.
@@ -75,7 +78,9 @@ class Operator:
         self,
         clock: Clock,
         seed: int,
+        habits: Habits,
         observer: PlantObserver,
+        beams: BeamObserver,
         names: Sequence[str],
         pods: Sequence[Pod],
         flux: Callable[[], float],
@@ -84,6 +89,7 @@ class Operator:
         self.away = False
         self.counts: Counter[str] = Counter()
         self._clock, self._observer, self._flux = clock, observer, flux
+        self._beams, self._habits = beams, habits
         self._chance = random.Random(f"operator {seed}")
         self._names, self._pods = sorted(names), pods
         self._duty = ENGINEER
@@ -105,7 +111,7 @@ class Operator:
             due = self._clock.monotonic() + 1.0
             plant = self.plant
             if plant is not None and not self.away:
-                plant.put_flux(self._flux())
+                plant.put(FLUX_READING, self._flux())
                 if plant.authority.grant is None:
                     self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
                 token = self._tokens.get(self._duty.name, 0)
@@ -155,7 +161,7 @@ class Operator:
     async def work(self) -> None:
         """Command without end."""
         while True:
-            await asyncio.sleep(self._chance.expovariate(1 / PAUSE))
+            await asyncio.sleep(self._chance.expovariate(1 / self._habits.pause))
             plant = self.plant
             if plant is None or self.away or self._clock.monotonic() < self._rest_until:
                 continue
@@ -173,7 +179,7 @@ class Operator:
                     self._change,
                     self._astray,
                 ],
-                [60, 14, 8, 4, 2, 3, 5, 4, 4],
+                self._habits.weights,
             )[0]
             does(plant)
             if self._chance.random() < 0.06:
@@ -206,7 +212,9 @@ class Operator:
 
     def _accepted(self, who: Person, token: int, ticket: Ticket, what: str) -> None:
         self.counts["accepted"] += 1
-        self._observer.accepted(who, token, ticket, what, self._clock.monotonic())
+        now = self._clock.monotonic()
+        self._observer.accepted(who, token, ticket, what, now)
+        self._beams.resumed(ticket.heliostats, what, now)
 
     def _astray(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
@@ -264,7 +272,8 @@ class Operator:
                 ("DIAGNOSE",),
             ]
         ):
-            self._give(plant, what)
+            if what != "IDLE" or self._habits.idle:
+                self._give(plant, what)
 
     def _lock(self, plant: PlantController) -> None:
         self._give(plant, "LOCK", (self._chance.choice(self._names),))
@@ -281,7 +290,7 @@ class Operator:
         self._give(plant, what, (name,), who, token)
 
     def _parameters(self, plant: PlantController) -> None:
-        """Push two calibration items to one heliostat."""
+        """Push two calibration items to one heliostat, mostly to one whose beam is safe."""
         self.counts["parameters"] += 1
         chance, who = self._chance, self._duty
         items = {
@@ -289,8 +298,10 @@ class Operator:
             "defocus": struct.pack("<ff", chance.uniform(0.08, 0.12), chance.uniform(0.05, 0.06)),
         }
         token = self._tokens.get(who.name, 0)
+        safe = np.flatnonzero(plant.field.among(TAKES_POSE, plant.now()))
+        names = [plant.field.names[row] for row in safe] if chance.random() < 0.8 else self._names
         try:
-            ticket = plant.parameters(who, token, chance.choice(self._names), items)
+            ticket = plant.parameters(who, token, chance.choice(names or self._names), items)
         except RefusedError:
             self.counts["refused"] += 1
             return
@@ -351,7 +362,7 @@ class Operator:
         whom = (self._chance.choice(pod.boards).outfit.name,)
         what = self._chance.choice(["TRACK", "APPROACH", "REFOCUS", "IDLE"])
         command = Command(f"rogue-{self._number}", what, (), whom, token, 5.0)
-        ear = PlantEar(pod, self._observer)
+        ear = PlantEar(pod, self._observer, self._beams)
         pod.observer.ordered(ear.order(command, now, known=False))
         with contextlib.suppress(LinkClosedError):
             await tap.inner.send(encode(command), expires=now + 5.0)

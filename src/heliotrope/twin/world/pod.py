@@ -29,10 +29,12 @@ from heliotrope.sun import Site
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.bus import TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import Observer
 from heliotrope.twin.invariants.ledger import PlantCommand
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.world.intruder import Intruder
+from heliotrope.twin.world.worlds import PodErrors
 
 #: A cluster counts a command's lifetime from its arrival, so the command may be this much older, s.
 UNDER_WAY = 0.8
@@ -57,6 +59,8 @@ class Pod:
         Site of the plant.
     chance
         Draws clocks and seeds.
+    errors
+        What is wrong with the cluster from the start.
 
     Attributes
     ----------
@@ -81,12 +85,14 @@ class Pod:
         start: datetime,
         site: Site,
         chance: random.Random,
+        errors: PodErrors,
     ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
+        self._errors = errors
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
-        self._true, self._site, self._chance = clock, site, chance
+        self._true, self._site, self._chance = clock, errors.site(site), chance
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
-        self.clock = DriftingClock(clock.monotonic, start, drift)
+        self.clock = DriftingClock(clock.monotonic, errors.start(start), drift)
         self.time = SimulatedTime(self.clock) if chance.random() < 0.5 else None
         self._kept = Kept(None)  # the cluster's disk survives its crashes
         self.line = MemoryLine(clock, seed=chance.getrandbits(31))
@@ -117,7 +123,11 @@ class Pod:
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
         keeper = self.time or SystemTime(self.clock)
         fits = [board.outfit for board in self.boards]
-        members = tuple(Member(o.name, o.address, o.serial, o.key) for o in fits)
+        addresses = self._errors.addresses([o.address for o in fits])
+        members = tuple(
+            Member(o.name, address, o.serial, o.key)
+            for o, address in zip(fits, addresses, strict=True)
+        )
         config = ClusterConfig(self.name, self._site, members)
         cluster = Cluster(config, self.bus, link, self.clock, keeper, self._kept)
         self._running = [group.create_task(link.run()), group.create_task(cluster.run())]
@@ -175,10 +185,12 @@ class PlantEar:
         Cluster of the line.
     plant
         Observer of the plant.
+    beams
+        Observer of the beams.
     """
 
-    def __init__(self, pod: Pod, plant: PlantObserver) -> None:
-        self._pod, self._plant = pod, plant
+    def __init__(self, pod: Pod, plant: PlantObserver, beams: BeamObserver) -> None:
+        self._pod, self._plant, self._beams = pod, plant, beams
         self._addresses = {b.outfit.name: b.outfit.address for b in pod.boards}
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
@@ -208,8 +220,11 @@ class PlantEar:
         elif isinstance(message, Emergency):
             whom = message.heliostats or tuple(self._addresses)
             observer.emergency(message.name, now, carried=self._pod.carried(now), heliostats=whom)
+            self._beams.ordered_off(whom, now)
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
+            if isinstance(message, Command):
+                self._beams.sent(message, message.heliostats or tuple(self._addresses), now)
 
     def order(self, message: Command | Parameters, now: float, *, known: bool) -> PlantCommand:
         """Return an order for the ledger; ``known``: its token was once issued."""
@@ -233,5 +248,6 @@ class PlantEar:
         elif isinstance(message, Progress):
             counts[f"progress {message.stage.value}"] += 1
             observer.progress(message, now)
+            self._beams.progress(message)
         elif isinstance(message, Alarm):
             counts["alarms"] += 1

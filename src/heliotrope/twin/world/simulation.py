@@ -29,7 +29,7 @@ from heliotrope.links.tapped import TappedLink
 from heliotrope.mechanism.board_items import Wanted
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import conditions
+from heliotrope.safety import FLUX_READING, conditions
 from heliotrope.sun import Site, vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
@@ -42,6 +42,7 @@ from heliotrope.twin.boards.outfit import (
     mechanisms,
     outfits,
 )
+from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
@@ -50,6 +51,7 @@ from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
+from heliotrope.twin.world.worlds import Habits, PodErrors, checked
 
 SITE = Site(37.4, -6.0, 100.0, name="simulation")
 START = datetime(2026, 6, 21, 9, tzinfo=UTC)
@@ -60,7 +62,7 @@ _SUN_EVERY = 30.0
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: With this few mirrors they join one at a time.
-SETTINGS = PlantSettings(join_rate=0.5, join_burst=1)
+SETTINGS = PlantSettings(join_rate=0.5, join_burst=1, sensors=frozenset({FLUX_READING}))
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
 
@@ -108,11 +110,13 @@ class RunPlan:
         Kinds of faults to draw from, () for all.
     faults
         Faults of the run; None: drawn from the seed.
+    worlds
+        Names of `WORLDS` that this run adds to the usual one.
 
     Raises
     ------
     InputError
-        A length or a number of heliostats that cannot be simulated.
+        An unknown world, or a length or a number of heliostats that cannot be simulated.
     """
 
     seed: int
@@ -121,8 +125,10 @@ class RunPlan:
     pause: float = 12.0
     only: tuple[str, ...] = ()
     faults: tuple[Fault, ...] | None = None
+    worlds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        checked(self.worlds)
         if not 0.0 < self.seconds <= 3600.0 * MOST_HOURS:
             raise InputError(
                 f"simulation of {self.seconds / 3600.0:g} h; give above 0 and at most "
@@ -144,7 +150,14 @@ class RunPlan:
         if self.faults is not None:
             return self.faults
         return tuple(
-            kinds.drawn(self.seed, self.seconds, self.heliostats, pause=self.pause, only=self.only)
+            kinds.drawn(
+                self.seed,
+                self.seconds,
+                self.heliostats,
+                pause=self.pause,
+                only=self.only,
+                worlds=self.worlds,
+            )
         )
 
 
@@ -194,6 +207,7 @@ class RunResult:
             f"heliotrope simulate --seed {plan.seed} --hours {plan.seconds / 3600.0!r} "
             f"--heliostats {plan.heliostats} --pause {plan.pause!r}"
             + "".join(f" --only {kind}" for kind in plan.only)
+            + "".join(f" --world {name}" for name in plan.worlds)
         )
 
     @property
@@ -240,6 +254,12 @@ class Simulation:
         fits = outfits(plan.heliostats, plan.seed)
         self.boards = [self._board(each) for each in fits]
         self.pods = self._new_pods()
+        self.beams = BeamObserver(
+            self.begin,
+            {pod.name: pod.boards for pod in self.pods},
+            self.sun,
+            held="held" in plan.worlds,
+        )
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
         self._design, self._homes = design_of(fits, homes, SITE), homes
         # The boards' wanted items and assigned points survive the plant's program.
@@ -250,7 +270,14 @@ class Simulation:
         self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
         names = [each.name for each in fits]
         self.operator = Operator(
-            self._clock, plan.seed, self.observer, names, self.pods, self._flux
+            self._clock,
+            plan.seed,
+            Habits.of(plan.worlds, plan.seed),
+            self.observer,
+            self.beams,
+            names,
+            self.pods,
+            self._flux,
         )
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
@@ -273,7 +300,8 @@ class Simulation:
         for i in range(count):
             part = self.boards[i * cut : (i + 1) * cut]
             observer = Observer(part, self.begin, self.sun)
-            pods.append(Pod(f"C{i + 1}", part, observer, self._clock, START, SITE, self._chance))
+            name, errors = f"C{i + 1}", PodErrors(self.plan.worlds, self.plan.seed, i)
+            pods.append(Pod(name, part, observer, self._clock, START, SITE, self._chance, errors))
         return pods
 
     def sun(self, now: float) -> FloatArray:
@@ -308,7 +336,7 @@ class Simulation:
         for pod in self.pods:
             seed = self._chance.getrandbits(31)
             link = pod.line.end(0, pod.name, self._clock, seed=seed)
-            pod.ear = PlantEar(pod, self.observer)
+            pod.ear = PlantEar(pod, self.observer, self.beams)
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
@@ -323,6 +351,7 @@ class Simulation:
             assigned=self._assigned,
             table=TABLE,
             entropy=self._chance.randbytes,
+            on_alarm=lambda alarm: self.beams.alarmed(alarm, self._clock.monotonic()),
         )
         self.operator.begins(plant)
         self._program = [group.create_task(link.run()) for link in links.values()]
@@ -335,6 +364,7 @@ class Simulation:
         self._program, self.plant = [], None
         self.operator.begins(None)
         self.observer.ended(now)
+        self.beams.ended()
         for pod in self.pods:
             pod.tap = pod.ear = None
             pod.line.drop()
@@ -389,6 +419,8 @@ class Simulation:
                 for pod in self.pods:
                     pod.observer.look(now)
                 self.observer.look(self.plant, now)
+                carried = {pod.name for pod in self.pods if pod.carried(now)}
+                self.beams.look(self.plant, carried, now)
                 judged = now + JUDGE
             times = [board.due(now) for board in self.boards]
             due = min(*times, damage.next, now + LOOK, end)
@@ -412,7 +444,8 @@ def run(plan: RunPlan) -> RunResult:
             _blame(error, outcome)
             outcome.seconds = loop.time() - begin
     outcome.checks = sum(
-        (pod.observer.checks for pod in simulation.pods), Counter(simulation.observer.checks)
+        (pod.observer.checks for pod in simulation.pods),
+        simulation.observer.checks + simulation.beams.checks,
     )
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)

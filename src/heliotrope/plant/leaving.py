@@ -1,0 +1,77 @@
+"""The shorter of the two ways on which a beam leaves a keep-out volume: DEFOCUS or STOW.
+
+Both orders are open to anybody and never refused by a local controller, so no command authority is
+needed. The ways are those of a mirror that has no sun: by the angles of the defocus, or straight to
+stow, azimuth last.
+"""
+
+import numpy as np
+
+from heliotrope.geometry import FloatArray, as_float
+from heliotrope.lcu.config import Config
+from heliotrope.mechanism.drives import Drive
+from heliotrope.mechanism.machine import Machine
+from heliotrope.plant.aims import BeamCheck
+from heliotrope.safety import Act
+
+#: Turn of the axes between two poses that are looked at, rad.
+_PIECE = 0.02
+
+
+def way_out(
+    check: BeamCheck, machine: Machine | None, row: int, counts: FloatArray, sun: FloatArray
+) -> Act:
+    """Return DEFOCUS or STOW: the one whose way ends outside, and is inside for the smaller turn.
+
+    Parameters
+    ----------
+    check
+        Mirrors and keep-out volumes.
+    machine
+        Limits and resting places; None: STOW is not known, and the defocus is the usual one.
+    row, counts
+        Row of the heliostat, and where its axes stand, steps, (2,).
+    sun
+        Unit vector to the sun, (3,).
+    """
+    if machine is None:
+        return Act.DEFOCUS
+    drives = Drive(check.drives.table[row])
+    begin = as_float(drives.angles(counts))
+    end = as_float(drives.angles(np.asarray(machine.stow, dtype=np.float64)))
+    corner = end.copy()
+    corner[machine.azimuth_axis] = begin[machine.azimuth_axis]
+    ways = {
+        Act.DEFOCUS: np.stack([begin, turned_away(begin, machine, drives)]),
+        Act.STOW: np.stack([begin, corner, end]),
+    }
+    costs = {act: _cost(check, row, path, sun) for act, path in ways.items()}
+    return min(ways, key=lambda act: (costs[act], act))
+
+
+def turned_away(begin: FloatArray, machine: Machine | None, drives: Drive) -> FloatArray:
+    """Return the angles (2,) of the defocus from some angles, as a local controller chooses them.
+
+    The angle is turned the other way where a stop is near, as in `lcu.motion`.
+    """
+    offsets = Config().defocus if machine is None else machine.defocus
+    found = begin + as_float(offsets)
+    if machine is None:
+        return found
+    limits = np.array([(axis.low, axis.high) for axis in machine.axes], dtype=np.float64)
+    stops = np.sort(np.stack([drives.angles(limits[:, k]) for k in (0, 1)], axis=-1), axis=-1)
+    for i, (low, high) in enumerate(stops):
+        if not low <= found[i] <= high:
+            found[i] = begin[i] - offsets[i]
+        if not low <= found[i] <= high:
+            found[i] = low if begin[i] - low > high - begin[i] else high
+    return found
+
+
+def _cost(check: BeamCheck, row: int, path: FloatArray, sun: FloatArray) -> tuple[bool, float]:
+    """Return whether a path (K, 2) ends inside a volume, and the turn made inside, rad."""
+    turns = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(path, axis=0)).max(axis=-1))])
+    at = np.linspace(0.0, turns[-1], 2 + int(turns[-1] / _PIECE))
+    poses = np.stack([np.interp(at, turns, path[:, i]) for i in (0, 1)], axis=-1)
+    inside = check.inside(row, poses, sun)
+    return bool(inside[-1]), float(np.mean(inside) * turns[-1])

@@ -1,0 +1,118 @@
+"""Losses: heliostats that left the receiver or its standby point without an order.
+
+A heliostat that lost its cluster, its sun or its supply turns away by itself. Automatic control may
+raise a few such heliostats again. After a loss of many it waits for a person: nobody knows what has
+happened in the field.
+"""
+
+import math
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.errors import HeliotropeError
+from heliotrope.lcu import states
+from heliotrope.plant.controller import PlantController
+from heliotrope.plant.operations.logbook import Logbook
+from heliotrope.safety import alarms
+from heliotrope.store.records import Records
+
+#: Losses within this span count together; until it is over, none is raised again, s.
+SPAN = 30.0
+#: States in which a beam is at the receiver or at its standby point, or on its way there.
+_UP = (states.APPROACHING, states.IDLE, states.TRACKING, states.SEARCHING)
+#: States that show at the first sight that a heliostat was lost before.
+_LEAVING = (states.DEFOCUSED, states.STOWING)
+
+Mask = npt.NDArray[np.bool_]
+
+
+class Losses:
+    """Losses of wanted heliostats, and the wait for a person after many.
+
+    Parameters
+    ----------
+    plant, log
+        The controller, and the logbook for the alarm.
+    most
+        Heliostats that may be lost within `SPAN` without a person.
+    records
+        Store of alarms: a wait outlasts a restart; None: it does not.
+    stop
+        Called when a wait begins.
+
+    Attributes
+    ----------
+    reason
+        Why automatic control waits for a person, "" if it does not.
+    """
+
+    def __init__(
+        self,
+        plant: PlantController,
+        log: Logbook,
+        most: int,
+        records: Records | None,
+        stop: Callable[[], None],
+    ) -> None:
+        self._plant, self._log, self._most, self._stop = plant, log, most, stop
+        count = len(plant.field)
+        self._up: Mask = np.zeros(count, dtype=np.bool_)
+        self._seen: Mask = np.zeros(count, dtype=np.bool_)
+        self._lost_at = np.full(count, -math.inf)
+        self.reason = ""
+        for alarm in _standing(records):
+            self._wait(alarm)
+
+    def look(self, wanted: Mask) -> Mask:
+        """Return which of the wanted heliostats (N,) were lost since the last look, (N,)."""
+        field, now = self._plant.field, self._plant.now()
+        live, up = field.live(now), field.among(_UP, now)
+        lost = live & ~up & self._up
+        lost |= ~self._seen & field.among(_LEAVING, now)
+        lost &= wanted
+        # A heliostat that is not heard keeps what was seen of it last.
+        self._up = np.where(live, up, self._up)
+        self._seen |= live
+        self._lost_at[lost] = now
+        together = int((self.settling() & wanted).sum())
+        if together > self._most:
+            since = datetime.fromtimestamp(self._plant.clock.utc().timestamp(), UTC)
+            self._wait(alarms.RESUME_NEEDED.line(count=together, since=f"{since:%H:%M:%S}"))
+        return lost
+
+    def settling(self) -> Mask:
+        """Return which heliostats were lost a moment ago and are not raised yet, (N,)."""
+        return np.asarray(self._plant.now() - self._lost_at < SPAN)
+
+    def ordered(self, rows: npt.NDArray[np.intp]) -> None:
+        """Note that automatic control itself takes heliostats down: they are not lost."""
+        self._up[rows] = False
+
+    def resume(self) -> None:
+        """End the wait: a person has looked into the field."""
+        self._lost_at[:] = -math.inf
+        if self.reason:
+            self.reason = ""
+            self._log.take_alarm(alarms.RESUME_NEEDED.ended())
+
+    def _wait(self, text: str) -> None:
+        if not self.reason:
+            self._stop()
+            self.reason = text
+            kind = alarms.RESUME_NEEDED
+            self._log.take_alarm(alarms.Alarm(kind.name, "", kind.severity, text))
+
+
+def _standing(records: Records | None) -> list[str]:
+    """Return the text of the wait that stood when the plant ended."""
+    if records is None:
+        return []
+    try:
+        known = records.alarms(standing=True)
+    except HeliotropeError:
+        return []  # the logbook names a store that fails
+    name = alarms.RESUME_NEEDED.name
+    return [alarm.text for alarm in known if alarm.condition == name and alarm.cleared is None][:1]

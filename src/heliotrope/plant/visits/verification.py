@@ -1,0 +1,169 @@
+"""Verification of new parameters: one photograph of the beam where they send it.
+
+A fit explains whatever the photographs show, a false light as well as the beam. So the heliostat
+goes back to the target with its new parameters, to a place away from all earlier photographs, and
+its beam must be where they predict it.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.calibration.evaluation import beam_errors
+from heliotrope.calibration.fit.estimator import FieldFit
+from heliotrope.calibration.fit.residuals import linearise
+from heliotrope.calibration.sightings import Sightings
+from heliotrope.field.target import Target
+from heliotrope.geometry import FloatArray
+from heliotrope.mechanism.chain import Mechanism
+from heliotrope.plant.visits.photographs import (
+    CORNERS,
+    Shot,
+    TargetCamera,
+    Tell,
+    photographed,
+    room_of,
+    seen,
+)
+from heliotrope.plant.visits.settings import Centring, CycleSettings
+from heliotrope.plant.visits.visit import Visit
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The distance of a beam from the place that a fit predicts.
+
+    Attributes
+    ----------
+    miss
+        Distance, rad of beam.
+    reach
+        Standard deviation of the distance in the direction of the miss, rad.
+    deviations
+        Distance in standard deviations (Mahalanobis).
+    slant
+        Distance of the target from the mirror, m.
+    """
+
+    miss: float
+    reach: float
+    deviations: float
+    slant: float
+
+    @classmethod
+    def of(cls, mechanism: Mechanism, fitted: FieldFit, made: Sightings) -> "Prediction":
+        """Return the distance of one sighting from what a fit predicts.
+
+        Parameters
+        ----------
+        mechanism
+            With the fitted parameters, batch shape (1,).
+        fitted
+            The fit, of batch shape (1,).
+        made
+            One sighting that the fit did not use, heliostat row 0.
+        """
+        line = linearise(mechanism, made, tuple(fitted.names))
+        slope = line.jacobian[0]
+        # The whitened residual has unit noise of its own, beside that of the parameters.
+        spread = np.eye(2) + slope @ fitted.covariance[0] @ slope.T
+        residual = line.residual[0]
+        deviations = float(np.sqrt(residual @ np.linalg.solve(spread, residual)))
+        miss = float(beam_errors(mechanism, made).beam[0])
+        vertex = mechanism.pose(made.counts).vertex[0]
+        slant = float(np.linalg.norm(made.destination[0] - vertex))
+        return cls(miss, miss / max(deviations, 1e-9), deviations, slant)
+
+
+class Verification:
+    """The photograph that confirms new parameters.
+
+    Parameters
+    ----------
+    camera
+        Camera of the targets.
+    settings, centring
+        See their classes.
+    sighting
+        Makes a sighting of a shot and the step counts at its exposure.
+    """
+
+    def __init__(
+        self,
+        camera: TargetCamera,
+        settings: CycleSettings,
+        centring: Centring,
+        sighting: Callable[[Shot, FloatArray], Sightings],
+    ) -> None:
+        self._camera, self._settings, self._centring = camera, settings, centring
+        self._sighting = sighting
+
+    async def problem(
+        self, visit: Visit, fitted: FieldFit, nominal: Mechanism, used: list[Shot], tell: Tell
+    ) -> str:
+        """Return why the new parameters are not confirmed, "" if they are.
+
+        The heliostat stores them already. It stands at standby before and after.
+
+        Parameters
+        ----------
+        visit
+            Of the heliostat.
+        fitted, nominal
+            The fit of batch shape (1,), and the mechanism that it starts from.
+        used
+            The photographs that the fit used in this visit.
+        tell
+            Called with the name of each step.
+
+        Raises
+        ------
+        RefusedError
+            If a command is refused, or the heliostat does not carry it out.
+        """
+        point = apart(visit.target, [shot.point for shot in used], room_of(visit, self._centring))
+        why = ""
+        async with visit:
+            tell("verification")
+            await visit.go(self._settings.arrival, point)
+            for _ in range(self._settings.shots):
+                shot = await photographed(self._camera, visit)
+                if not shot.reasons and seen(visit.target, shot) is not None:
+                    counts = await visit.counts_at(shot.at)
+                    return self._judge(nominal, fitted, self._sighting(shot, counts))
+                why = "; ".join(shot.reasons) or "no light on the target"
+        return f"with the new parameters no photograph could be used: {why}"
+
+    def _judge(self, nominal: Mechanism, fitted: FieldFit, made: Sightings) -> str:
+        mechanism = nominal.with_parameters(fitted.parameters)
+        found, most = Prediction.of(mechanism, fitted, made), self._settings.agreement
+        if found.deviations <= most and found.miss <= self._settings.left:
+            return ""
+        allowed = min(most * found.reach, self._settings.left)
+        return (
+            f"with the new parameters the beam is {found.slant * found.miss:.2f} m from its "
+            f"predicted place, and {found.slant * allowed:.2f} m are allowed; look at the "
+            "photographs: is it this heliostat's beam?"
+        )
+
+
+def apart(target: Target, points: list[FloatArray], room: float) -> FloatArray:
+    """Return the aim on a target that is farthest from points already photographed, (3,).
+
+    A false light that stands still cannot be where the beam is predicted there.
+
+    Parameters
+    ----------
+    target
+        The target.
+    points
+        Places of the photographs, ENU, m, each (3,).
+    room
+        How far the beam may be moved off the middle, right and up, m.
+    """
+    places = room * np.array([(0.0, 0.0), *CORNERS])
+    before = target.plane_coordinates(np.reshape(points, (-1, 3)))
+    away: npt.NDArray[np.float64] = np.linalg.norm(places[:, None] - before, axis=-1).min(axis=-1)
+    return np.asarray(target.point(places[int(np.argmax(away))]))

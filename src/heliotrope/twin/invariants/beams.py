@@ -1,0 +1,336 @@
+"""The observer of beams: the true beam of each mirror beside the place where it was sent.
+
+It knows the true mirror (mechanism, joints, sun) and the orders that left the plant, each for a
+heliostat by its name. It reads the name of a board's state and nothing else of the code under test,
+so a wrong clock, site, armature or address, and false step counts, show as a beam beside its place.
+It checks invariants 12 to 15.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import states
+from heliotrope.links.messages import Command, Progress, Stage
+from heliotrope.plant.controller import PlantController
+from heliotrope.safety import Act, Alarm
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, STOW
+from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
+
+Point = tuple[float, ...]
+
+#: A beam this far from where it was sent is astray, m: play of the gears, rough steps, pushed
+#: biases and drifting clocks stay below it at 130 m.
+ASTRAY = 1.5
+#: Time for a mirror to get where it was sent after an order or a change of state, s.
+SETTLE = 10.0
+#: An astray beam is named by an alarm, and is off, within these times, s.
+NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
+#: A mirror that is done is off the receiver or at stow this long after the proof, s.
+DONE_WITHIN = 5.0
+#: True position of a mirror at stow, to within this many steps.
+NEAR_STOW = 5000
+#: Mirrors that leave within this time leave together, s; orders this old explain it.
+TOGETHER = 10.0
+#: Half angle of the largest search of the simulated persons, rad.
+_SEARCH = 8e-3
+#: States in which a beam is sent to a point.
+_LIT = {states.TRACKING: "aims", states.SEARCHING: "aims", states.IDLE: "standbys"}
+_ON = (states.TRACKING, states.SEARCHING)
+#: States in which a mirror stands where a person has left it.
+_HELD = (states.LOCKED, states.UNCONFIGURED)
+#: Commands that leave an idle mirror elsewhere than at its standby point.
+_ELSEWHERE = ("JOG", "GOTO", "DIAGNOSE", "UNLOCK", "CLEAR_FAULT", "LOCK", "ZERO")
+#: Commands that take a mirror off the receiver, and that resume.
+_TAKES_OFF = ("IDLE", "LOCK")
+_RESUMES = ("TRACK", "REFOCUS", "SEARCH")
+
+
+@dataclass
+class _Mirror:
+    """One mirror as the observer knows it.
+
+    Attributes
+    ----------
+    aims, standbys
+        Identities of orders and points: the last point that was reported as done, and all later.
+    state, settled_at
+        State last seen; when it must be where it was sent, s.
+    elsewhere, approached
+        Whether its last motion led to step counts, not to its standby point; whether it has come to
+        its standby point by the way from stow since it last had power or was at stow.
+    astray_since, lit_since, inside_since
+        Since when its beam is beside its place, on the receiver unsent, inside a volume, s.
+    named_at
+        When an alarm last named it, s.
+    ordered_at, off_at, resumed_at
+        When the plant last sent it an order, and one that takes it off the receiver; when a person
+        last sent it there, s.
+    """
+
+    board: Board
+    cluster: str
+    aims: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
+    standbys: deque[tuple[str, Point]] = field(default_factory=lambda: deque(maxlen=40))
+    state: int = -1
+    settled_at: float = float("-inf")
+    elsewhere: bool = False
+    approached: bool = False
+    astray_since: float | None = None
+    lit_since: float | None = None
+    inside_since: float | None = None
+    named_at: float = float("-inf")
+    ordered_at: float = float("-inf")
+    off_at: float = float("-inf")
+    resumed_at: float = float("-inf")
+
+    @property
+    def name(self) -> str:
+        """Name of the heliostat."""
+        return self.board.outfit.name
+
+    @property
+    def left(self) -> bool:
+        """Whether it is IDLE and holds still, wherever that is."""
+        return self.state == states.IDLE and (self.elsewhere or not self.approached)
+
+
+def _since(holds: bool, before: float | None, now: float) -> float | None:
+    return None if not holds else now if before is None else before
+
+
+class BeamObserver:
+    """Observes beams, alarms and proofs.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        Boards by name of the cluster.
+    sun
+        Returns the true direction to the sun, (3,), at a time in s.
+    held
+        Whether mirrors that are locked or unconfigured, that a person left elsewhere than at
+        standby, or whose counts are unknown are judged too.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    losses
+        Number of losses that took every mirror off the receiver.
+    """
+
+    def __init__(
+        self,
+        start: float,
+        boards: Mapping[str, Sequence[Board]],
+        sun: Callable[[float], FloatArray],
+        *,
+        held: bool,
+    ) -> None:
+        self.checks: Counter[int] = Counter()
+        self.losses = 0
+        self._start, self._sun, self._held = start, sun, held
+        self._mirrors = {
+            board.outfit.name: _Mirror(board, cluster)
+            for cluster, some in boards.items()
+            for board in some
+        }
+        for mirror in self._mirrors.values():
+            mirror.standbys.append(("", STANDBY))
+        self._alarms: dict[tuple[str, str], tuple[float, bool]] = {}
+        self._left: deque[tuple[float, str]] = deque(maxlen=64)
+        self._lost_at = float("-inf")
+        self._proved: dict[tuple[str, str], float] = {}
+
+    def _check(self, number: int, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[number] += 1
+        if not good:
+            raise InvariantError(Violation(number, now - self._start, subject, saw))
+
+    # -- orders, reports and alarms ----------------------------------------------------------
+
+    def sent(self, message: Command, heliostats: Iterable[str], now: float) -> None:
+        """Note a command that has left the plant."""
+        for name in heliostats:
+            mirror = self._mirrors[name]
+            mirror.ordered_at = now
+            if message.name in _TAKES_OFF:
+                mirror.off_at = now
+            if message.name in ("AIM", "STANDBY"):
+                mirror.settled_at = max(mirror.settled_at, now + SETTLE)
+            if message.name == "AIM":
+                mirror.aims.append((message.identity, message.values))
+            elif message.name == "STANDBY":
+                mirror.standbys.append((message.identity, message.values))
+            elif message.name in _ELSEWHERE:
+                mirror.elsewhere = True
+
+    def ordered_off(self, heliostats: Iterable[str], now: float) -> None:
+        """Note DEFOCUS or STOW from the plant."""
+        for name in heliostats or self._mirrors:
+            self._mirrors[name].ordered_at = self._mirrors[name].off_at = now
+
+    def resumed(self, heliostats: Iterable[str], what: str, now: float) -> None:
+        """Note a command of a person that the plant has accepted."""
+        if what in _RESUMES:
+            for name in heliostats:
+                self._mirrors[name].resumed_at = now
+
+    def progress(self, message: Progress) -> None:
+        """Forget the points before the one that is reported as done."""
+        if message.stage is not Stage.DONE:
+            return
+        for name in message.heliostats:
+            mirror = self._mirrors.get(name)
+            for points in () if mirror is None else (mirror.aims, mirror.standbys):
+                if any(identity == message.identity for identity, _ in points):
+                    while points[0][0] != message.identity:
+                        points.popleft()
+
+    def alarmed(self, alarm: Alarm, now: float) -> None:
+        """Note an alarm of the plant."""
+        self._alarms[alarm.condition, alarm.subject] = (now, alarm.active)
+
+    def ended(self) -> None:
+        """Note that the plant's program has ended, and its alarms with it."""
+        self._alarms.clear()
+        self._proved.clear()
+
+    # -- judgement ---------------------------------------------------------------------------
+
+    def look(self, plant: PlantController | None, carried: Set[str], now: float) -> None:
+        """Judge all beams.
+
+        Parameters
+        ----------
+        plant
+            None: it does not run.
+        carried
+            Clusters that the plant reaches.
+        now
+            s.
+        """
+        sun = self._sun(now)
+        named = {subject for (_, subject), (_, active) in self._alarms.items() if active}
+        on = 0
+        for mirror in self._mirrors.values():
+            if mirror.cluster not in carried or named & {mirror.name, mirror.cluster}:
+                mirror.named_at = now
+            self._enters(mirror, mirror.board.state, now)
+            on += mirror.state in _ON
+            if mirror.state < 0:
+                mirror.astray_since = mirror.lit_since = mirror.inside_since = None
+                continue
+            self._placed(mirror, sun, now)
+            self._dark(mirror, sun, now)
+        self._loss(on, now)
+        if plant is not None:
+            self._proofs(plant, sun, now)
+
+    def _enters(self, mirror: _Mirror, state: int, now: float) -> None:
+        """Note a new state; after a loss it must not be TRACKING unless a person said so."""
+        before, mirror.state = mirror.state, state
+        if state == before:
+            return
+        mirror.settled_at = max(mirror.settled_at, now + SETTLE)
+        if (before, state) == (states.APPROACHING, states.IDLE):
+            mirror.approached = True
+        elif state in (-1, states.STOWED, states.STOWING):
+            mirror.approached = False
+        if state not in (states.IDLE, states.FAULT, *_HELD):
+            mirror.elsewhere = False
+        if before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
+            self._left.append((now, mirror.name))
+        if state in _ON and before not in _ON:
+            saw = (
+                f"{states.STATES[state]} {now - self._lost_at:.1f} s after a loss that took every "
+                "mirror off, without a person's command since"
+            )
+            good = mirror.resumed_at >= self._lost_at
+            self._check(14, good, now, mirror.name, saw)
+
+    def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
+        """Check that a beam that was sent to a point is there."""
+        sent = _LIT.get(mirror.state)
+        if sent is None or mirror.left:
+            mirror.astray_since = None
+            return
+        points = [point for _, point in getattr(mirror, sent)]
+        slack = ASTRAY
+        if mirror.state == states.SEARCHING:
+            slack += _SEARCH * 150.0
+        miss = min(
+            (mirror.board.miss(sun, (p[0], p[1], p[2])) for p in points), default=float("inf")
+        )
+        astray = miss > slack and now >= mirror.settled_at
+        mirror.astray_since = _since(astray, mirror.astray_since, now)
+        state, since = states.STATES[mirror.state], mirror.astray_since
+        passed = 0.0 if since is None else now - since
+        beside = f"{state}, its beam {miss:.1f} m beside where it was sent for {passed:.1f} s"
+        unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
+        saw = f"{beside}, and no alarm names it"
+        self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)
+        self._check(12, passed <= OFF_WITHIN, now, mirror.name, beside)
+
+    def _dark(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
+        """Check that a beam that nobody sent to the receiver, or into a volume, leaves."""
+        board, node = mirror.board, mirror.board.node
+        assert node is not None
+        left = mirror.state in _HELD or mirror.left
+        if not self._held and (left or not node.controller.motion.known):
+            mirror.lit_since = mirror.inside_since = None
+            return
+        sent = mirror.state in _ON
+        lit = not sent and board.miss(sun, RECEIVER) <= OFF
+        mirror.lit_since = _since(lit, mirror.lit_since, now)
+        inside = board.miss(sun, KEEP_OUT) <= KEEP_OUT_RADIUS
+        mirror.inside_since = _since(inside, mirror.inside_since, now)
+        state = states.STATES[mirror.state]
+        for since, where in (
+            (mirror.lit_since, "on the receiver, where nobody sent it"),
+            (mirror.inside_since, "inside a keep-out volume"),
+        ):
+            passed = 0.0 if since is None else now - since
+            saw = f"{state}, its beam {where} for {passed:.1f} s"
+            self._check(13, passed <= OFF_WITHIN, now, mirror.name, saw)
+
+    def _loss(self, on: int, now: float) -> None:
+        """Note a loss that took every mirror off the receiver, two at least."""
+        while self._left and now - self._left[0][0] > TOGETHER:
+            self._left.popleft()
+        if on == 0 and len({name for _, name in self._left}) >= 2:
+            self._left.clear()
+            self._lost_at = now
+            self.losses += 1
+
+    def _proofs(self, plant: PlantController, sun: FloatArray, now: float) -> None:
+        """Check that a mirror proven to be done is off the receiver, or at stow, in truth."""
+        order = plant.emergency
+        if order is None:
+            return
+        for mirror in self._mirrors.values():
+            key = (order.ticket.identity, mirror.name)
+            if key not in self._proved:
+                if not order.is_done(mirror.name):
+                    continue
+                self._proved[key] = now
+            begin, board = self._proved[key], mirror.board
+            if begin == float("inf"):
+                continue
+            away = mirror.state < 0 or mirror.ordered_at > order.at + 1.0
+            if order.act is Act.STOW:
+                off = max(abs(a.turned - s) for a, s in zip(board.axes, STOW, strict=True))
+                saw, good = f"{off} steps from stow", off <= NEAR_STOW
+            else:
+                miss = board.miss(sun, RECEIVER)
+                saw, good = f"{miss:.1f} m from the middle of the receiver", miss > OFF
+            if good or away:
+                self._proved[key] = float("inf")
+                good = True
+            saw = f"{order.act.name} is proven for it, and its beam or mirror is {saw}"
+            self._check(15, good or now - begin <= DONE_WITHIN, now, mirror.name, saw)

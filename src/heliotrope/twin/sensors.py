@@ -1,0 +1,96 @@
+"""Sensors of a simulated plant."""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from heliotrope.field.target import Receiver
+from heliotrope.geometry import FloatArray
+from heliotrope.links.clock import Clock
+from heliotrope.plant.sensors import Readings
+from heliotrope.safety import FLUX_READING
+
+#: Time between two readings, s.
+_EVERY = 1.0
+
+
+class FluxSensor:
+    """The flux on the receivers, computed from the true mirrors; a `plant.ports.Sensors`.
+
+    Parameters
+    ----------
+    receivers
+        Of the plant, at least one.
+    clock
+        Clock of the loop.
+    stand
+        Returns true normals and vertices, (N, 3).
+    sun
+        Returns the true direction to the sun, (3,).
+
+    Attributes
+    ----------
+    names
+        The one reading.
+    """
+
+    def __init__(
+        self,
+        receivers: Sequence[Receiver],
+        clock: Clock,
+        stand: Callable[[], tuple[FloatArray, FloatArray]],
+        sun: Callable[[], FloatArray],
+    ) -> None:
+        self.names = frozenset({FLUX_READING})
+        self._apertures = [
+            (each.center, 0.5 * math.hypot(each.width, each.height)) for each in receivers
+        ]
+        self._clock, self._stand, self._sun = clock, stand, sun
+        self._read_at = -math.inf
+
+    def share(self) -> float:
+        """Return the flux now, as a share of the field's if every mirror were on a receiver."""
+        light = self._sun()
+        if light[2] <= 0.0:
+            return 0.0
+        stand = self._stand()
+        return sum(light_share(*stand, light, *aperture) for aperture in self._apertures)
+
+    async def news(self) -> Readings:
+        """Return a reading each second."""
+        now = self._clock.monotonic()
+        if now - self._read_at < _EVERY:
+            return Readings()
+        self._read_at = now
+        return Readings({FLUX_READING: self.share()})
+
+
+def light_share(
+    normal: FloatArray, vertex: FloatArray, sun: npt.ArrayLike, middle: npt.ArrayLike, radius: float
+) -> float:
+    """Return the share of a field's light that passes a receiver, 0 to 1.
+
+    Parameters
+    ----------
+    normal, vertex
+        Of the mirrors, (N, 3).
+    sun
+        Direction to the sun, (3,).
+    middle
+        Middle of the receiver, (3,), m.
+    radius
+        Beams whose axis passes nearer than this count as on it, m. Each is weighted by the cosine
+        of its incidence, relative to all beams aimed at the middle.
+    """
+    s, point = np.asarray(sun, dtype=np.float64), np.asarray(middle, dtype=np.float64)
+    cosine = normal @ s
+    rays = 2.0 * cosine[:, None] * normal - s
+    way = point - vertex
+    along = np.einsum("ij,ij->i", way, rays)
+    off = np.sqrt(np.maximum(0.0, np.einsum("ij,ij->i", way, way) - along**2))
+    unit = way / np.linalg.norm(way, axis=1)[:, None]
+    nominal = np.sqrt(np.maximum(0.0, 0.5 * (1.0 + unit @ s)))
+    on = (along > 0.0) & (off <= radius)
+    return float(np.maximum(cosine, 0.0)[on].sum() / nominal.sum())

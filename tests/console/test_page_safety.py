@@ -1,0 +1,287 @@
+"""The operator page in a browser: what people's safety rests on."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from support.live_console import LiveConsole
+from support.pages import NEEDS_BROWSER, browsers, entering, menu, said
+
+pytestmark = NEEDS_BROWSER
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveConsole]:
+    """Sixty-four heliostats with the page, at four times the speed of real time."""
+    made = LiveConsole(tmp_path_factory.mktemp("safety"), 64, speed=4.0)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser for this module alone."""
+    yield from browsers()
+
+
+@pytest.fixture
+def enter(field: LiveConsole, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in as somebody of a role."""
+    yield from entering(field.address, browser)
+
+
+# -- EMERGENCY above everything ----------------------------------------------------------------
+
+
+def _counted(page: Any) -> list[str]:
+    """Answer calls of an emergency in place of the plant; return the list of them."""
+    calls: list[str] = []
+
+    def take(route: Any) -> None:
+        calls.append(route.request.method)
+        route.fulfill(json={"act": "DEFOCUS", "heliostats": 64})
+
+    page.route("**/api/v1/emergency", take)
+    return calls
+
+
+def _open_order(page: Any) -> None:
+    page.evaluate("heliotrope.store.select([3], 3)")
+    page.click(".hx-orders >> text=Out of service")
+    page.wait_for_selector("dialog[open]")
+
+
+def _open_people(page: Any) -> None:
+    menu(page, "People")
+    page.click("dialog >> text=Add…")
+    page.wait_for_selector("dialog[open] >> nth=1")
+
+
+def _open_menu(page: Any) -> None:
+    page.click("header >> text=/engineer/")
+    page.wait_for_selector(".q-menu")
+
+
+def _by_mouse(page: Any) -> None:
+    page.click("#emergency", timeout=3000)
+
+
+def _by_touch(page: Any) -> None:
+    page.tap("#emergency", timeout=3000)
+
+
+def _by_key(page: Any) -> None:
+    page.keyboard.press("Alt+e")
+
+
+@pytest.mark.parametrize("width", [1600, 800])
+@pytest.mark.parametrize("give", [_by_mouse, _by_touch, _by_key])
+@pytest.mark.parametrize("lay_over", [_open_order, _open_people, _open_menu])
+def test_emergency_works_above_everything(
+    enter: Callable[..., Any],
+    lay_over: Callable[[Any], None],
+    give: Callable[[Any], None],
+    width: int,
+) -> None:
+    page = enter("engineer", viewport={"width": width, "height": 700}, has_touch=True)
+    calls = _counted(page)
+    lay_over(page)
+    give(page)
+    page.wait_for_selector("#emergency-said:has-text('ordered')", timeout=5000)
+    assert calls == ["POST"]
+
+
+def test_emergency_is_reached_by_tab_from_a_dialog(enter: Callable[..., Any]) -> None:
+    """The rest of the page cannot be reached while a dialog is open; EMERGENCY can."""
+    page = enter("engineer")
+    calls = _counted(page)
+    _open_order(page)
+    reached = set()
+    for _ in range(12):
+        page.keyboard.press("Tab")
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.tagName"))
+        if "emergency" in reached:
+            break
+    assert "emergency" in reached, reached
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#emergency-said:has-text('ordered')")
+    assert calls == ["POST"]
+    # Nothing behind the dialog can be clicked, and the dialog is still there.
+    assert page.locator(".hx-orders button").first.evaluate("b => Boolean(b.closest('[inert]'))")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("dialog", state="detached")
+    assert not page.locator("[inert]").count()
+
+
+def test_every_layer_of_the_page_lies_below_emergency(enter: Callable[..., Any]) -> None:
+    page = enter("engineer")
+    page.evaluate(
+        """() => { const veil = document.createElement('div'); veil.id = 'veil';
+        veil.style = 'position:fixed;inset:0;z-index:2147483646'; document.body.append(veil); }"""
+    )
+    calls = _counted(page)
+    _by_mouse(page)
+    page.wait_for_selector("#emergency-said:has-text('ordered')")
+    assert calls == ["POST"]
+
+
+# -- after a loss, and after an emergency ------------------------------------------------------
+
+
+def test_after_a_loss_of_many_a_person_presses_resume(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, viewer = enter("operator"), enter("viewer")
+    live = field.live
+
+    def up() -> bool:
+        found = live.operations.summary().states
+        return found.get("IDLE", 0) + found.get("TRACKING", 0) > 40
+
+    field.until(up, 90.0)
+    link = live.links[live.operations.clusters[0]]
+    field.call(lambda: setattr(link, "plugged", False))
+    page.wait_for_function("heliotrope.store.state.filter(s => s === 255).length === 32")
+    page.wait_for_timeout(3000)
+    field.call(lambda: setattr(link, "plugged", True))
+    page.wait_for_selector(".hx-alert.on:has-text('left the receiver without an order')")
+    viewer.wait_for_selector(".hx-alert.on:has-text('left the receiver')")
+    assert not viewer.locator(".hx-alert button").count()
+    page.click(".hx-alert button >> text=Resume")
+    page.click("dialog >> text=Cancel")
+    page.wait_for_timeout(1500)
+    assert field.call(lambda: live.operations.summary().resume)
+    page.click(".hx-alert button >> text=Resume")
+    page.click("dialog >> text='Resume'")
+    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    assert not field.call(lambda: live.operations.summary().resume)
+
+
+def test_an_emergency_is_withdrawn_after_one_question_and_its_text_ends(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page = enter("operator")
+    page.click("#emergency")
+    page.wait_for_selector(".hx-plant p:has-text('ordered by operator')")
+    page.click(".hx-alert button >> text=Withdraw")
+    page.wait_for_selector("dialog[open] h2:has-text('Withdraw')")
+    page.click("dialog >> text=Cancel")
+    page.wait_for_timeout(1000)
+    assert field.call(lambda: field.live.plant.emergency_on)
+    page.click(".hx-alert button >> text=Withdraw")
+    page.click("dialog >> text='Withdraw'")
+    field.calm()
+    page.wait_for_function("!document.querySelector('.hx-alert.on')")
+    page.wait_for_selector(".hx-plant p:has-text('ordered by')", state="detached")
+
+
+def test_a_refused_acknowledgement_is_not_shown_as_done(enter: Callable[..., Any]) -> None:
+    page = enter("operator")
+    row = {"at": 1.0, "condition": "wind_gust_stow", "subject": "", "severity": "alarm"}
+    row |= {"text": "gusts", "active": True, "acknowledged_by": "", "count": 1}
+    page.route("**/api/v1/alarms", lambda route: route.fulfill(json=[row]))
+    refusal = {"detail": "wind_gust_stow: its cause has not gone"}
+    page.route(
+        "**/api/v1/alarms/acknowledge", lambda route: route.fulfill(status=409, json=refusal)
+    )
+    page.click(".hx-tabs >> text=Alarms")
+    page.click(".hx-alarms >> text=Acknowledge all")
+    said(page, "1 of 1 refused: wind_gust_stow: its cause has not gone")
+
+
+# -- out of service ----------------------------------------------------------------------------
+
+
+def test_a_heliostat_out_of_service_is_shown_and_given_back_by_name(
+    field: LiveConsole, enter: Callable[..., Any]
+) -> None:
+    page, viewer = enter("operator"), enter("viewer")
+    name = field.live.names[3]
+    page.evaluate("heliotrope.store.select([3], 3)")
+    page.click(".hx-orders >> text=Out of service")
+    page.fill("dialog [name=reason]", "washing")
+    page.fill("dialog [name=hours]", "2")
+    page.click("dialog >> text='Out of service'")
+    for each in (page, viewer):
+        each.wait_for_selector(".hx-legend .hx-out:has-text('out of service 1')")
+        assert each.evaluate("[...heliotrope.store.out].indexOf(1)") == 3
+    field.until(lambda: field.live.operations.heliostat(name).state == "STOWED", 60.0)
+    page.click(".hx-tabs >> text=Heliostat")
+    page.wait_for_selector(".hx-heliostat dd:has-text('washing (operator, since')")
+    page.wait_for_selector(".hx-heliostat dd:has-text('expected back'):has-text('in stow')")
+    # The whole field is given to automatic control: it stays where it is.
+    page.select_option(".hx-to select", "field")
+    page.click(".hx-orders >> text=Automatic")
+    page.click("dialog >> text='Give to automatic control'")
+    page.wait_for_timeout(5000)
+    assert field.call(lambda: field.live.operations.heliostat(name).state) == "STOWED"
+    page.click(".hx-tabs >> text=Schedule")
+    row = page.locator(f".hx-schedule tr:has-text('{name}'):has-text('washing')")
+    assert "STOWED" in row.inner_text()
+    row.locator("text=Give back").click()
+    page.click("dialog >> text='Give back'")
+    page.wait_for_function("heliotrope.store.out.every((one) => !one)")
+    page.wait_for_function("!document.querySelector('.hx-legend .hx-out')")
+
+
+# -- scope -------------------------------------------------------------------------------------
+
+
+def _take_command(page: Any) -> None:
+    page.click(".hx-authority >> text=Take command")
+    page.wait_for_selector(".hx-authority:has-text('You have command')")
+
+
+def _sent(page: Any, *paths: str) -> list[Any]:
+    """Answer some requests in place of the plant; return the list of them."""
+    bodies: list[Any] = []
+
+    def take(route: Any) -> None:
+        bodies.append(route.request.post_data_json)
+        route.fulfill(status=204)
+
+    for path in paths:
+        page.route(f"**/api/v1/{path}", take)
+    return bodies
+
+
+def test_the_scope_follows_the_selection(field: LiveConsole, enter: Callable[..., Any]) -> None:
+    page, name = enter("engineer"), field.live.names[5]
+    sent = _sent(page, "commands", "aim")
+    _take_command(page)
+    scope = page.locator(".hx-to select")
+    for wide in ("field", "cluster"):
+        for button in ("Aim…", "Search…", "Jog…"):
+            page.evaluate("heliotrope.store.select([1, 2], -1)")
+            scope.select_option(wide)
+            page.evaluate("heliotrope.store.select([5], 5)")
+            assert scope.input_value() == "selection"
+            page.click(f".hx-orders >> text={button}")
+            page.wait_for_selector(f"dialog h2:has-text('{name}')")
+            page.click(f"dialog button >> text={button[:-1] if wide == 'field' else 'Cancel'}")
+            page.wait_for_selector("dialog", state="detached")
+    page.wait_for_timeout(500)
+    assert [one["heliostats"] for one in sent] == [[name]] * 3
+    page.click(".hx-authority >> text=Release")
+
+
+def test_motion_of_the_whole_field_asks_once_and_safe_orders_never(
+    enter: Callable[..., Any],
+) -> None:
+    page = enter("engineer")
+    sent = _sent(page, "commands", "stow", "defocus", "automatic")
+    _take_command(page)
+    page.select_option(".hx-to select", "field")
+    for button in ("Approach", "Track", "Standby", "Refocus", "Unlock", "Clear fault", "Automatic"):
+        page.locator(".hx-orders button", has_text=button).first.click()
+        page.wait_for_selector("dialog h2:has-text('all 64 heliostats')")
+        page.keyboard.press("Escape")
+        page.wait_for_selector("dialog", state="detached")
+    assert not sent
+    for button in ("Stow", "Defocus"):
+        page.click(f".hx-orders >> text={button}")
+        page.wait_for_timeout(300)
+        assert not page.locator("dialog").count()
+    assert sent == [{"heliostats": []}] * 2
+    page.click(".hx-authority >> text=Release")

@@ -1,0 +1,211 @@
+"""A wrong clock, site, sun or parameter shows, although every tier below the plant is content."""
+
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+from zlib import crc32
+
+import numpy as np
+import pytest
+
+from heliotrope.field.example import prototype
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Emergency
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.authority import RefusedError
+from heliotrope.safety import Act
+from heliotrope.sun import fast_vector
+from support.plant_bench import OPERATOR, Bench, running
+
+DESIGN = prototype()
+AIM = (2.0, 0.0, 15.0)
+NAME = "P5A"
+
+
+def play(folder: Path, scene: Callable[[Bench], Awaitable[None]]) -> Bench:
+    """Run a scene in virtual time."""
+    made: list[Bench] = []
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, folder)
+        made.append(bench)
+        async with running(bench):
+            await scene(bench)
+
+    run_virtual(main)
+    return made[0]
+
+
+def alarmed(bench: Bench, condition: str) -> set[str]:
+    """The subjects of an alarm that has not ended."""
+    last = {a.subject: a.active for a in bench.plant.alarms if a.condition == condition}
+    return {name for name, active in last.items() if active}
+
+
+async def tracking(bench: Bench) -> int:
+    """Bring a heliostat to its aim; return the token."""
+    token = await bench.commanded()
+    assert await bench.plant.aim(OPERATOR, token, {NAME: AIM}).end(5.0)
+    bench.cluster_of(NAME).set(states.IDLE, NAME)
+    await bench.wait(2.0)
+    assert await bench.plant.command(OPERATOR, token, "TRACK", (NAME,)).end(30.0)
+    return token
+
+
+def steps_at(bench: Bench, late: float, east: float = 0.0) -> list[int]:
+    """The step counts of a heliostat whose sun is late, or that of a place further east."""
+    plant = bench.plant
+    site = replace(DESIGN.site, longitude_deg=DESIGN.site.longitude_deg + east)
+    sun = fast_vector(bench.clock.utc().timestamp() - late, site)
+    group, row = DESIGN.find(NAME)
+    found = track(group.mechanism[row], sun, plant.aims[plant.field.place(NAME)])
+    return [round(float(x)) for x in found.chosen(found.counts)]
+
+
+async def go(bench: Bench, seconds: int, late: float, east: float = 0.0) -> None:
+    """Let the heliostat follow a wrong sun for some seconds."""
+    cluster = bench.cluster_of(NAME)
+    row = cluster.names.index(NAME)
+    for _ in range(seconds):
+        for axis, value in zip(("primary", "secondary"), steps_at(bench, late, east), strict=True):
+            cluster.rows[axis][row] = cluster.rows[f"{axis}_goal"][row] = value
+        bench.plant.authority.keep(OPERATOR, bench.plant.authority.token)
+        await bench.wait(1.0)
+
+
+@pytest.mark.parametrize("late", [-600.0, 5.0, 3600.0])
+def test_a_cluster_with_a_wrong_clock_is_named_and_defocused(late: float, tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of(NAME)
+        assert not alarmed(bench, "cluster_time_differs")
+        cluster.late = late
+        took = await bench.until(lambda: bool(cluster.of(Emergency)), 10.0)
+        assert took < 7.0
+        assert alarmed(bench, "cluster_time_differs") == {cluster.name}
+        token = await bench.commanded()
+        with pytest.raises(RefusedError, match=r"differs from the plant's by"):
+            bench.plant.command(OPERATOR, token, "APPROACH", (NAME,))
+        cluster.late = 0.2
+        await bench.wait(15.0)
+        assert not alarmed(bench, "cluster_time_differs")
+
+    bench = play(tmp_path, scene)
+    sent = [(c.name, m.name) for c in bench.clusters.values() for m in c.of(Emergency)]
+    assert set(sent) == {(bench.cluster_of(NAME).name, "DEFOCUS")}
+
+
+@pytest.mark.parametrize(
+    ("site", "wrong"),
+    [
+        (DESIGN.site, False),
+        (replace(DESIGN.site, longitude_deg=DESIGN.site.longitude_deg + 1e-3), False),
+        (replace(DESIGN.site, longitude_deg=DESIGN.site.longitude_deg + 2.5), True),
+        (replace(DESIGN.site, latitude_deg=-DESIGN.site.latitude_deg), True),
+        (None, True),
+    ],
+)
+def test_a_cluster_with_a_wrong_site_is_named_and_defocused(
+    site: object, wrong: bool, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of(NAME)
+        cluster.site = (1.0, 2.0) if site is None else site.numbers  # type: ignore[attr-defined]
+        await bench.wait(8.0)
+        assert alarmed(bench, "cluster_site_differs") == ({cluster.name} if wrong else set())
+        assert bool(cluster.of(Emergency)) == wrong
+
+    play(tmp_path, scene)
+
+
+@pytest.mark.parametrize(("late", "east"), [(600.0, 0.0), (-90.0, 0.0), (0.0, 2.5)])
+def test_a_heliostat_that_follows_a_wrong_sun_is_named_and_defocused(
+    late: float, east: float, tmp_path: Path
+) -> None:
+    async def scene(bench: Bench) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        token = await tracking(bench)
+        await go(bench, 6, 0.0)
+        assert not alarmed(bench, "pointing_disagrees")
+        await go(bench, 8, late, east)
+        assert alarmed(bench, "pointing_disagrees") == {NAME}
+        assert [m.heliostats for m in cluster.of(Emergency)] == [(NAME,)]
+        # It may not join again before somebody has looked.
+        await bench.wait(5.0)
+        cluster.set(states.IDLE, NAME)
+        await bench.wait(1.0)
+        with pytest.raises(RefusedError, match=r"TRACK P5A: pointing_disagrees .*acknowledge"):
+            plant.command(OPERATOR, token, "TRACK", (NAME,))
+        assert plant.command(OPERATOR, token, "TRACK", (NAME, "P5B")).blocked.keys() == {NAME}
+        plant.acknowledge(OPERATOR, "pointing_disagrees", NAME)
+        assert plant.command(OPERATOR, token, "TRACK", (NAME,))
+
+    play(tmp_path, scene)
+
+
+def test_a_heliostat_on_its_way_is_left_in_peace_and_one_that_stands_is_not(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        cluster = bench.cluster_of(NAME)
+        row = cluster.names.index(NAME)
+        await tracking(bench)
+
+        async def approach(first: int, last: int) -> None:
+            for k in range(first, last):
+                goal = steps_at(bench, 0.0)
+                for axis, value in zip(("primary", "secondary"), goal, strict=True):
+                    cluster.rows[f"{axis}_goal"][row] = value
+                    cluster.rows[axis][row] = value - 200_000 + 10_000 * k
+                await bench.wait(1.0)
+
+        await approach(0, 12)
+        assert not alarmed(bench, "pointing_disagrees")
+        for _ in range(10):
+            await approach(12, 13)
+        assert alarmed(bench, "pointing_disagrees") == {NAME}
+
+    play(tmp_path, scene)
+
+
+def test_a_new_aim_that_waits_for_its_turn_is_no_disagreement(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        await tracking(bench)
+        await go(bench, 5, 0.0)
+        still = steps_at(bench, 0.0)
+        cluster = bench.cluster_of(NAME)
+        row = cluster.names.index(NAME)
+        bench.plant.aims[bench.plant.field.place(NAME)] = (-2.0, 0.0, 15.0)
+        for axis, value in zip(("primary", "secondary"), still, strict=True):
+            cluster.rows[axis][row] = cluster.rows[f"{axis}_goal"][row] = value
+        await bench.wait(8.0)
+        assert not alarmed(bench, "pointing_disagrees")
+
+    play(tmp_path, scene)
+
+
+def test_a_new_calibration_counts_once_the_local_controller_has_it(tmp_path: Path) -> None:
+    bench = Bench(VirtualClock(), tmp_path)
+    plant, row = bench.plant, bench.plant.field.place(NAME)
+    other, agreement = DESIGN.heliostat("P5B"), plant._agreement
+    before = agreement._armature[row].copy()
+    agreement.believe(row, other.armature.table, other.drives.table)
+    agreement._look(1.0)
+    assert np.array_equal(agreement._armature[row], before)
+    plant.field.rows["armature_crc"][row] = crc32(items_of(other)["armature"])
+    agreement._look(2.0)
+    assert np.array_equal(agreement._armature[row], other.armature.table)
+    assert np.array_equal(agreement._drives[row], other.drives.table)
+
+
+def test_many_that_disagree_defocus_the_field(tmp_path: Path) -> None:
+    async def scene(bench: Bench) -> None:
+        plant = bench.plant
+        plant._agreement._wrong = {f"H{i}": 0.1 for i in range(120)}
+        plant._agreement._at = np.inf
+        await bench.wait(5.0)
+        assert alarmed(bench, "pointing_disagrees_many") == {""}
+        assert plant.emergency_on
+        assert plant.emergency is not None
+        assert plant.emergency.act is Act.DEFOCUS
+
+    play(tmp_path, scene)

@@ -1,0 +1,162 @@
+"""Parameters pass the same proofs as motions: where, how far, and never beside what is wanted."""
+
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliotrope.field.example import prototype
+from heliotrope.field.volumes import Sphere
+from heliotrope.geometry import reflect
+from heliotrope.lcu import states
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.messages import Parameters
+from heliotrope.mechanism.board_items import Wanted, items_of, tables_with
+from heliotrope.mechanism.tracking import track
+from heliotrope.plant.audit import read
+from heliotrope.plant.authority import RefusedError
+from heliotrope.plant.beam_watch import BeamError
+from support.plant_bench import ENGINEER, Bench, running
+
+NAME, OTHER = "P1A", "P2A"
+Scene = Callable[[Bench, int], Awaitable[None]]
+
+
+def play(folder: Path, scene: Scene, **options: Any) -> Bench:
+    made: list[Bench] = []
+
+    async def main(clock: VirtualClock) -> None:
+        bench = Bench(clock, folder, **options)
+        made.append(bench)
+        async with running(bench):
+            await scene(bench, await bench.commanded(ENGINEER))
+
+    run_virtual(main)
+    return made[0]
+
+
+def items(name: str, **error: float) -> dict[str, bytes]:
+    """What a heliostat should store if it is off by ``error`` from nominal."""
+    return items_of(prototype().heliostat(name).with_parameters(error))
+
+
+@pytest.mark.parametrize("state", [states.IDLE, states.TRACKING, states.DEFOCUSED])
+def test_no_pose_is_changed_while_the_beam_is_out(tmp_path: Path, state: int) -> None:
+    async def scene(bench: Bench, token: int) -> None:
+        bench.cluster_of(NAME).set(state, NAME)
+        await bench.wait(2.0)
+        with pytest.raises(RefusedError, match=f"P1A: it is {states.STATES[state]}, and armature"):
+            bench.plant.parameters(ENGINEER, token, NAME, {"armature": items(OTHER)["armature"]})
+        with pytest.raises(RefusedError, match="and biases would move its beam; stow it first"):
+            bench.plant.parameters(ENGINEER, token, NAME, {"biases": bytes(8)})
+        assert NAME not in bench.plant.wanted.items
+        assert not bench.cluster_of(NAME).of(Parameters)
+
+    play(tmp_path, scene)
+
+
+def test_another_mirrors_parameters_are_refused_unless_confirmed(tmp_path: Path) -> None:
+    async def scene(bench: Bench, token: int) -> None:
+        plant = bench.plant
+        before = plant.beams.armature.table[plant.field.place(NAME)].copy()
+        foreign = items(OTHER)
+        with pytest.raises(
+            RefusedError, match=r"would move its beam by \d+\.\d mrad, and 5\.0 are"
+        ):
+            plant.parameters(ENGINEER, token, NAME, foreign, confirmed=" ")
+        assert (plant.beams.armature.table[plant.field.place(NAME)] == before).all()
+        assert not bench.cluster_of(NAME).of(Parameters)
+        # A small change needs no confirmation.
+        assert await plant.parameters(ENGINEER, token, NAME, items(NAME, azimuth_bias=1e-3)).end(
+            5.0
+        )
+        # A large one has it in the audit, and the proofs use it from then on.
+        reason = "boards of P1A and P2A exchanged"
+        assert await plant.parameters(ENGINEER, token, NAME, foreign, confirmed=reason).end(5.0)
+        after = plant.beams.armature.table[plant.field.place(NAME)]
+        assert (after == np.frombuffer(foreign["armature"])).all()
+
+    bench = play(tmp_path, scene)
+    notes = [record.note for record in read(bench.audit.path)[0] if record.what == "PARAMETERS"]
+    assert len(notes) == 2
+    assert "confirmed" not in notes[0]
+    assert notes[1].endswith("; confirmed: boards of P1A and P2A exchanged")
+
+
+def test_nothing_moves_beside_what_is_wanted(tmp_path: Path) -> None:
+    wanted = Wanted({name: items(name) for name in (NAME, OTHER)})
+
+    async def scene(bench: Bench, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        assert NAME in plant.wanted.missing
+        said = r"it stores parameters that differ from the wanted ones \(drive_primary"
+        for command in ("TRACK", "APPROACH", "IDLE", "REFOCUS"):
+            with pytest.raises(BeamError, match=f"{command} P1A: {said}"):
+                plant.command(ENGINEER, token, command, (NAME,))
+        # Of several, the others go; what leads to safety is never refused.
+        some = plant.command(ENGINEER, token, "IDLE", (NAME, "P1B"))
+        assert set(some.blocked) == {NAME}
+        await bench.wait(1.0)
+        assert cluster.commands("IDLE")[-1].heliostats == ("P1B",)
+        for safe in (plant.stow, plant.defocus):
+            assert await safe("anybody", (NAME,)).end(5.0)
+        # It stands on its aim with a difference: no other aim either.
+        cluster.set(states.TRACKING, NAME)
+        await bench.wait(2.0)
+        with pytest.raises(BeamError, match="AIM P1A: it stores"):
+            plant.aim(ENGINEER, token, {NAME: (0.0, 0.0, 13.0)})
+        # Locked, the wanted ones are written, and it may move again.
+        cluster.set(states.LOCKED, NAME)
+        for _ in range(40):
+            plant.authority.keep(ENGINEER, token)
+            await bench.wait(1.0)
+        assert NAME not in plant.wanted.missing
+        assert await plant.command(ENGINEER, token, "IDLE", (NAME,)).end(5.0)
+        # From the moment that other ones are wanted, nothing moves until they are stored.
+        plant.want(NAME, prototype().heliostat(NAME).with_parameters({"azimuth_bias": 1e-3}))
+        with pytest.raises(BeamError, match="TRACK P1A: it stores"):
+            plant.command(ENGINEER, token, "TRACK", (NAME,))
+
+    play(tmp_path, scene, wanted=wanted)
+
+
+def test_a_locked_mirror_takes_only_parameters_with_a_clear_way_to_standby(tmp_path: Path) -> None:
+    rest = np.array([0.0, 0.0, 20.0])
+    new = {"azimuth_bias": 0.1}
+
+    async def scene(bench: Bench, token: int) -> None:
+        plant, cluster = bench.plant, bench.cluster_of(NAME)
+        mirror, sun = bench.design.heliostat(NAME), plant.sun_vector()
+        assert await plant.standby(ENGINEER, token, {NAME: rest}).end(5.0)
+        found = track(mirror, sun, rest)
+        counts, row = np.round(found.chosen(found.counts)), cluster.names.index(NAME)
+        for end, count in zip(("primary", "secondary"), counts, strict=True):
+            cluster.rows[end][row] = cluster.rows[f"{end}_goal"][row] = count
+        cluster.set(states.LOCKED, NAME)
+        await bench.wait(3.0)
+        # Under the new parameters, the beam of the same counts stands elsewhere.
+        pose = mirror.with_parameters(new).pose(counts)
+        there = pose.vertex + 20.0 * reflect(sun, pose.normal)
+        plant.beams.volumes = (Sphere("walkway", there, 0.5),)
+        with pytest.raises(
+            RefusedError, match=r"P1A: the beam enters walkway 18 m .* stow it first"
+        ):
+            plant.parameters(ENGINEER, token, NAME, items(NAME, **new), confirmed="a test")
+        plant.beams.volumes = ()
+        ticket = plant.parameters(ENGINEER, token, NAME, items(NAME, **new), confirmed="a test")
+        assert await ticket.end(5.0)
+
+    play(tmp_path, scene)
+
+
+def test_stored_items_give_the_pose_that_they_were_made_of() -> None:
+    error = {"azimuth_bias": 3e-3, "elevation_bias": -2e-3, "tilt_east": 4e-3, "sag": 1e-3}
+    before = prototype().heliostat(NAME)
+    after = before.with_parameters(error)
+    armature, drives = tables_with(items_of(after), before.armature.table, before.drives.table)
+    assert (armature == after.armature.table).all()
+    counts = np.array([12_345.0, -2_345.0])
+    made = type(before.drives)(drives).angles(counts)
+    assert made == pytest.approx(after.drives.angles(counts), abs=1e-6)

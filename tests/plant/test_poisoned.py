@@ -1,0 +1,64 @@
+"""A calibration from false photographs leaves no mirror beside the receiver."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from heliotrope.calibration.record import CalibrationOutcome
+from heliotrope.field.target import Target
+from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.mechanism.board_items import checksums
+from heliotrope.plant.visits import CalibrationCycle, CycleResult, CycleSettings
+from heliotrope.plant.visits.photographs import Shot
+from support.whole_plant import ENGINEER, WholePlant
+
+NAME = "H1"
+#: A light that is not the heliostat's beam, 3 m from the middle of the target.
+FALSE = np.array([2.1, 0.0, 42.1])
+
+
+class Liar:
+    """A camera whose first photographs show the same false light, the later ones the beam."""
+
+    def __init__(self, whole: WholePlant, lies: int) -> None:
+        self._whole, self._lies = whole, lies
+
+    async def photograph(self, target: Target, heliostat: str) -> Shot:
+        shot = await self._whole.photograph(target, heliostat)
+        self._lies -= 1
+        return Shot(FALSE, shot.at, 1e-4) if self._lies >= 0 else shot
+
+
+@pytest.mark.parametrize("lies", [3, 100])
+def test_the_same_false_light_on_a_first_visit_changes_nothing(tmp_path: Path, lies: int) -> None:
+    results: list[CycleResult] = []
+
+    async def main(clock: VirtualClock) -> None:
+        whole = WholePlant(clock, tmp_path, clusters=1)
+        async with whole.alive():
+            plant, token = whole.plant, whole.token
+            assert await plant.aim(ENGINEER, token, plant.default_aims()).end(20.0)
+            assert await plant.command(ENGINEER, token, "APPROACH").end(400.0)
+            assert await plant.command(ENGINEER, token, "TRACK").end(30.0)
+            await whole.wait(20.0)
+            before = whole.miss(NAME)
+            stored = await plant.stored(NAME)
+            cycle = CalibrationCycle(plant, Liar(whole, lies), CycleSettings(interval=5.0))
+            results.append(await cycle.run(ENGINEER, token, NAME, "white"))
+            await whole.wait(20.0)
+            assert whole.states()[NAME] == "TRACKING"
+            assert whole.miss(NAME) < before + 0.1
+            assert plant.beliefs.record(NAME) is None
+            assert plant.beliefs.seen(NAME) is None
+            again = await plant.stored(NAME)
+            assert {**again, "edition": 0} == {**stored, "edition": 0}
+            wanted = plant.wanted.items[NAME]
+            assert {item: stored[item] for item in wanted} == checksums(wanted)
+            assert NAME not in plant.wanted.missing
+
+    run_virtual(main, 1)
+    (result,) = results
+    assert result.outcome is CalibrationOutcome.NOT_VERIFIED, result.text
+    assert "the old parameters are back" in result.text
+    assert result.record is None

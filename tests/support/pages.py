@@ -1,0 +1,69 @@
+"""The operator page in a browser without a screen."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from support.live_console import PASSWORD
+
+CHROMIUM = shutil.which("chromium") or "/usr/bin/chromium"
+ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+#: Mark of modules that need the browser.
+NEEDS_BROWSER = pytest.mark.skipif(
+    not os.path.exists(CHROMIUM) and not os.environ.get("CI"),  # noqa: PTH110 - a word of skipif
+    reason=f"{CHROMIUM} is not there: the page is not tested",
+)
+
+
+def browsers() -> Iterator[Any]:
+    """Start a browser for one module: its loop would stand in others' way."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        made = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+        yield made
+        made.close()
+
+
+def entering(address: str, browser: Any) -> Iterator[Callable[..., Any]]:
+    """Sign in as somebody of a role; what goes wrong in the page fails the test.
+
+    The function takes the role, and options of the browser's context such as ``has_touch``.
+    """
+    opened, wrong = [], []
+
+    def go(role: str, **options: Any) -> Any:
+        context = browser.new_context(**{"viewport": {"width": 1600, "height": 900}, **options})
+        context.set_default_timeout(20_000)
+        opened.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.goto(address)
+        page.wait_for_url("**/login")
+        page.fill("[name=name]", role)
+        page.fill("[name=password]", PASSWORD)
+        page.click("button")
+        page.wait_for_selector(".hx-legend b")
+        page.wait_for_function("heliotrope.store.live")
+        return page
+
+    yield go
+    for context in opened:
+        context.close()
+    assert not wrong
+
+
+def said(page: Any, text: str) -> None:
+    """Wait until the command bar says a text."""
+    page.wait_for_function(
+        "text => document.querySelector('.hx-bar .hx-said').textContent.includes(text)", arg=text
+    )
+
+
+def menu(page: Any, title: str) -> None:
+    """Choose an item of the person's menu."""
+    page.click("header >> text=/engineer|operator|viewer/")
+    page.click(f".q-menu >> text={title}")
