@@ -9,8 +9,10 @@ from pathlib import Path
 
 from heliotrope.field.layouts import malan_plant
 from heliotrope.links.clock import SystemClock, VirtualClock
+from heliotrope.links.messages import Stage
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
+from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.store.keeper import Keeper
@@ -41,6 +43,7 @@ async def _run(place: Path, seed: int, tell: Callable[[str], object]) -> None:
             work=AutomaticSettings(wanted=not by_hand, calibrate=not by_hand),
         ),
         audit=KeptAudit(keeper, SystemClock(), clock.utc()),
+        disk=DiskThread(),
         assigned=KeptPoints(keeper),
         records=keeper,
     )
@@ -72,12 +75,12 @@ async def _command(
         await asyncio.sleep(chance.uniform(0.2, 4.0))
         try:
             token = token or one.take_authority(person).token
-            _one(one, person, token, chance, tell)
+            await _one(one, person, token, chance, tell)
         except RefusedError:
             token = 0
 
 
-def _one(
+async def _one(
     one: PlantController,
     person: Person,
     token: int,
@@ -90,11 +93,18 @@ def _one(
         # Beside the receiver, and never the same twice.
         places = {n: (25.0 + chance.random(), 0.0, 90.0) for n in names}
         ticket = one.standby(person, token, places)
-        tell(f"accepted {ticket.identity}")
+        await ticket.reached(Stage.SENT, 20.0)
+        if ticket.recorded:
+            tell(f"accepted {ticket.identity}")
         for name, place in places.items():
-            tell(f"point {name} {place[0]!r}")
+            if "not sent" not in ticket.refusals.get(name, ""):
+                tell(f"point {name} {place[0]!r}")
     elif what in ("STOW", "DEFOCUS"):
         ticket = (one.stow if what == "STOW" else one.defocus)(person.name, names)
         # Safety waits for no disk: its record is owed, and written within the next second.
     else:
-        tell(f"accepted {one.command(person, token, what, heliostats=names).identity}")
+        ticket = one.command(person, token, what, heliostats=names)
+        while not (ticket.recorded or ticket.finished):
+            await asyncio.sleep(0.05)
+        if ticket.recorded:
+            tell(f"accepted {ticket.identity}")

@@ -193,14 +193,20 @@ class TestPoints:
         import numpy as np
 
         points = Points(["A", "B"], KeptPoints(keeper))
-        assert points.assign("AIM", np.array([0]), np.array([[1.0, 2.0, 3.0]])) == ""
+
+        def assigned(rows: list[int], places: list[list[float]]) -> str:
+            told: list[str] = []
+            points.assign("AIM", np.array(rows), np.array(places), told.append)
+            return told[0]
+
+        assert assigned([0], [[1.0, 2.0, 3.0]]) == ""
         break_writing(keeper, monkeypatch)
-        why = points.assign("AIM", np.array([0, 1]), np.ones((2, 3)))
+        why = assigned([0, 1], [[1.0] * 3] * 2)
         assert "assigned points" in why
         assert "the disk is gone" in why
         np.testing.assert_array_equal(points.aims[0], [1.0, 2.0, 3.0])
         monkeypatch.undo()
-        assert points.assign("AIM", np.array([1]), np.ones((1, 3))) == ""
+        assert assigned([1], [[1.0] * 3]) == ""
         again = Points(["A", "B"], KeptPoints(keeper))
         np.testing.assert_array_equal(again.aims, [[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]])
 

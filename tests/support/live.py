@@ -12,6 +12,7 @@ from heliotrope.mechanism.chain import Mechanism
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
+from heliotrope.plant.disk import Disk
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.settings import PlantSettings
 from heliotrope.plant.visits.settings import CycleSettings
@@ -54,6 +55,7 @@ class LivePlant:
         options: LiveOptions | None = None,
         *,
         audit: Audit | None = None,
+        disk: Disk | None = None,
         records: Records | None = None,
         assigned: Assigned | None = None,
         extra: Callable[[], Mapping[str, Any]] = dict,
@@ -61,7 +63,9 @@ class LivePlant:
         chosen = options or LiveOptions()
         self.design, self.clock = design, clock
         self.world = World(design, clock, chosen.world())
-        ports = self.world.ports(audit=audit, records=records, assigned=assigned, facts=extra)
+        ports = self.world.ports(
+            audit=audit, disk=disk, records=records, assigned=assigned, facts=extra
+        )
         self.assembly = PlantAssembly(design, ports, chosen.settings())
         self.plant, self.operations = self.assembly.plant, self.assembly.operations
         self.names, self.cameras, self.field = (

@@ -120,6 +120,7 @@ class PlantAssembly:
             settings=replace(chosen.plant, sensors=chosen.plant.sensors | fed),
             assigned=ports.assigned,
             on_alarm=self.logbook.take_alarm,
+            disk=ports.disk,
         )
         cameras = ports.cameras if design.targets else None
         cycle = (
@@ -200,6 +201,8 @@ class PlantAssembly:
                 for task in tasks:
                     task.cancel()
         finally:
+            if self.ports.disk is not None:
+                self.ports.disk.close()
             self.ports.audit.close()
             if cameras is not None:
                 cameras.close()

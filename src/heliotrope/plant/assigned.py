@@ -9,7 +9,7 @@ file is always there.
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, HeliotropeError, InputError
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu.config import FAR
+from heliotrope.plant.disk import AtOnce, Disk, DiskBusyError
 
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]
@@ -125,6 +126,8 @@ class Points:
         Names of the heliostats.
     store
         Store of the points; None: they do not outlive the plant.
+    disk
+        Does the work of the store.
 
     Attributes
     ----------
@@ -132,35 +135,57 @@ class Points:
         ENU, m, (N, 3); NaN where there is none.
     """
 
-    def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
+    def __init__(
+        self, names: Sequence[str], store: Assigned | None, disk: Disk | None = None
+    ) -> None:
         self.aims, self.standbys = (np.full((len(names), 3), np.nan) for _ in KINDS)
-        self._names, self._store = names, store
+        self._names, self._store, self._disk = names, store, disk or AtOnce()
         self._arrays = {"AIM": self.aims, "STANDBY": self.standbys}
+        #: The points in the store; only work of the disk changes them.
+        self._stored: dict[str, Places] = {kind: {} for kind in KINDS}
         index = {name: row for row, name in enumerate(names)}
         for kind, places in ({} if store is None else store.read()).items():
             for name, point in places.items():
                 if name in index:
                     self._arrays[kind][index[name]] = point
+                    self._stored[kind][name] = point
 
-    def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> str:
-        """Assign points (K, 3) to heliostats (K,); return why they cannot be stored, or "".
+    def assign(
+        self,
+        kind: str,
+        rows: npt.NDArray[np.intp],
+        points: FloatArray,
+        then: Callable[[str], None],
+    ) -> None:
+        """Assign points (K, 3) to heliostats (K,), once they are stored.
 
-        Points that cannot be stored are not assigned.
+        ``then`` is called with "", or with the reason why they cannot be stored; such points are
+        not assigned.
         """
-        array = self._arrays[kind]
-        before = array[rows]
-        array[rows] = points
-        if self._store is not None:
-            try:
-                self._store.keep({k: self._places(a) for k, a in self._arrays.items()})
-            except AssignedError as error:
-                array[rows] = before
-                return str(error)
-        return ""
+        store = self._store
+        if store is None:
+            self._arrays[kind][rows] = points
+            then("")
+            return
 
-    def _places(self, array: FloatArray) -> Places:
-        known = np.flatnonzero(np.isfinite(array).all(axis=-1))
-        return {self._names[int(i)]: tuple(array[i].tolist()) for i in known}
+        def keep() -> None:
+            places = {k: dict(known) for k, known in self._stored.items()}
+            for row, point in zip(rows, points, strict=True):
+                places[kind][self._names[int(row)]] = tuple(point.tolist())
+            store.keep(places)
+            self._stored = places
+
+        def kept(error: Exception | None) -> None:
+            if error is None:
+                self._arrays[kind][rows] = points
+            elif not isinstance(error, AssignedError):
+                raise error
+            then("" if error is None else str(error))
+
+        try:
+            self._disk.do(keep, kept)
+        except DiskBusyError as error:
+            then(str(error))
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:

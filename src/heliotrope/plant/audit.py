@@ -1,8 +1,9 @@
 """The audit: exactly one record of every accepted command, with who, what, when and the result.
 
 A record is begun before its command is sent; a command whose record cannot be begun is not
-accepted. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they
-are written. `Audit` is the protocol of a store, and `JsonLines` a store in one file.
+sent. DEFOCUS and STOW never wait: they are sent first, and their records are retried until they
+are written. `Audit` is the protocol of a store, and `JsonLines` a store in one file. Both wait for
+their disk: `disk.Disk` keeps that out of the loop.
 
 The file holds two lines for each record, "accepted" and "result", both appended and synced to the
 disk. `read` puts them together. A line torn by a loss of power is skipped and counted; a record

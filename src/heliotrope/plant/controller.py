@@ -51,6 +51,7 @@ from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
+from heliotrope.plant.disk import AtOnce, Disk
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
@@ -72,6 +73,8 @@ SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 POINTS = frozenset({"AIM", "STANDBY"})
 #: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
+#: Points that are not stored within this time of their command are not sent, s.
+_STORED_WITHIN = 5.0
 #: Pause between two passes over parameters and owed records, s.
 _SLOW_BEAT = 1.0
 #: A cluster is asked again for the names of its rows after this time, s.
@@ -107,6 +110,8 @@ class PlantController:
         Source of random bytes for tokens and identities.
     on_alarm
         Called with each alarm.
+    disk
+        Does what waits for a disk; None: it is done in the loop, as virtual time needs it.
 
     Attributes
     ----------
@@ -145,6 +150,7 @@ class PlantController:
         table: Iterable[Condition] | None = None,
         entropy: Callable[[int], bytes] = secrets.token_bytes,
         on_alarm: Callable[[Alarm], None] | None = None,
+        disk: Disk | None = None,
     ) -> None:
         members = _checked(design, links, clusters)
         self.design, self.settings = design, settings or PlantSettings()
@@ -158,7 +164,8 @@ class PlantController:
         self.beliefs = Beliefs(design)
         self.beliefs.subscribe(self._believe)
         self.out_of_service: dict[str, Lockout] = {}
-        points = Points(self.field.names, assigned)
+        place = disk or AtOnce()
+        points = Points(self.field.names, assigned, place)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
         self._agreement = Agreement(
@@ -168,6 +175,7 @@ class PlantController:
         self._orders = PlantOrders(
             clock,
             audit,
+            place,
             self._clusters,
             f"{clock.utc():%Y%m%dT%H%M%S}-{entropy(4).hex()}",
             self.settings.lifetime,
@@ -223,7 +231,7 @@ class PlantController:
                 await end.link.close()
             for task in tasks:
                 task.cancel()
-        self._orders.end(self.now())
+        await self._orders.end(self.now())
 
     async def close(self) -> None:
         """End the plant and its links; the clusters defocus when their leases are over."""
@@ -501,10 +509,10 @@ class PlantController:
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
-        if name in JOINING:
-            self._join(ticket, name, numbers, clear, token)
-        else:
-            self._orders.command(ticket, name, numbers, clear, token)
+        send = self._join if name in JOINING else self._orders.command
+        self._orders.when_recorded(
+            ticket, lambda: send(ticket, name, numbers, ticket.waiting(clear), token)
+        )
         return ticket
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
@@ -533,7 +541,12 @@ class PlantController:
         """
         numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
         ticket = self._accept(person, token, "ZERO", numbers, (heliostat,))
-        self._orders.command(ticket, "ZERO", numbers, (heliostat,), token)
+        self._orders.when_recorded(
+            ticket,
+            lambda: self._orders.command(
+                ticket, "ZERO", numbers, ticket.waiting((heliostat,)), token
+            ),
+        )
         return ticket
 
     def default_aims(
@@ -697,12 +710,34 @@ class PlantController:
         values = next(iter(groups)) if len(groups) == 1 else ()
         ticket = self._accept(person, token, name, values, (*names, *out), f"{len(groups)} points")
         ticket.block(out)
-        if problem := self._ways.points.assign(name, rows, wanted):
-            ticket.advance(names, Stage.FAILED, f"not sent, because it cannot be stored: {problem}")
-            return ticket
-        if name == "STANDBY":
-            for each, place in zip(names, wanted, strict=True):
-                self.wanted.rest(each, tuple(place))
+
+        def kept(problem: str) -> None:
+            if not problem and self.now() - ticket.accepted_at > _STORED_WITHIN:
+                problem = f"it took more than {_STORED_WITHIN:g} s"
+            if problem:
+                text = f"not sent, because it cannot be stored: {problem}"
+                ticket.advance(names, Stage.FAILED, text)
+            else:
+                if name == "STANDBY":
+                    for each, place in zip(names, wanted, strict=True):
+                        self.wanted.rest(each, tuple(place))
+                self._send_points(ticket, name, groups, token)
+
+        assign = self._ways.points.assign
+        self._orders.when_recorded(ticket, lambda: assign(name, rows, wanted, kept))
+        return ticket
+
+    def _send_points(
+        self,
+        ticket: Ticket,
+        name: str,
+        groups: Mapping[tuple[float, ...], Sequence[str]],
+        token: int,
+    ) -> None:
+        """Send points that are stored; heliostats that track join their new aim."""
+        names = [n for members in groups.values() for n in members]
+        rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
+        tracking = self.field.among(_ON_AIM, self.now())[rows]
         self._joining.drop(f"superseded by another {name}", frozenset(names), name)
         moving = {names[i] for i in np.flatnonzero(tracking)} if name == "AIM" else set()
         for point, members in groups.items():
@@ -711,7 +746,6 @@ class PlantController:
                 self._orders.command(ticket, name, point, still, token)
             if len(still) < len(members):
                 self._join(ticket, name, point, [n for n in members if n in moving], token)
-        return ticket
 
     def _join(
         self,

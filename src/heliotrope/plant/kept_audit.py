@@ -1,9 +1,8 @@
 """The audit and the assigned points in the plant's store.
 
-`KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both on a `store.Keeper`. A
-command's record is committed and synced before the command is sent. The commit stops the event loop
-for some milliseconds, at most for `PATIENCE` or `POINTS_PATIENCE`, which is within every lease.
-`KeptAudit.confirm` does not wait: it relies on the store's last answer.
+`KeptAudit` is an `audit.Audit`, `KeptPoints` an `assigned.Assigned`, both on a `store.Keeper`. They
+wait for the disk, so a plant uses them in the thread of its `disk.Disk`. `KeptAudit.confirm` does
+not wait: it relies on the store's last answer.
 """
 
 import math
@@ -25,10 +24,9 @@ from heliotrope.store.records import AuditEntry, StoreError
 
 T = TypeVar("T")
 
-#: Longest wait for the commit of a record, and of points, s. Those of a whole field (10,000
-#: points) take 0.1 s.
-PATIENCE = 1.0
-POINTS_PATIENCE = 2.0
+#: Longest wait for the commit of a record or of points, s. Those of a whole field (10,000 points)
+#: take 0.1 s.
+PATIENCE = 30.0
 #: A store that has confirmed nothing for this time cannot be relied on, s.
 SILENCE = 5.0
 #: Pause between two probes of the store, s.
@@ -174,7 +172,7 @@ class KeptPoints:
                 for kind, places in points.items()
             }
             gone = {kind: places.keys() - points.get(kind, {}) for kind, places in before.items()}
-            self._keeper.writer.do(lambda c: audit.change_points(c, new, gone), POINTS_PATIENCE)
+            self._keeper.writer.do(lambda c: audit.change_points(c, new, gone), PATIENCE)
         except StoreError as error:
             # The commit may have succeeded all the same, so the store is read before the next one.
             self._kept = None

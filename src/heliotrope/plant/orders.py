@@ -1,15 +1,19 @@
 """Accepted commands under way: their records, their messages, and their results."""
 
 import struct
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
 
 from heliotrope.errors import InputError
-from heliotrope.links.clock import Clock
+from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
 from heliotrope.plant.audit import Audit, AuditError, Record
 from heliotrope.plant.clusters import ClusterEnd, Clusters
+from heliotrope.plant.disk import Disk, DiskBusyError
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
@@ -21,6 +25,14 @@ FORGOTTEN = 60.0
 REPEAT = 1.0
 #: Time that a cluster may need beyond a command's life to report that it failed, s.
 GRACE = 3.0
+#: A command whose record is not on the disk within this time is not sent, s.
+RECORDING = 2.0
+#: Owed records that are written together.
+_BATCH = 256
+#: Commands that move nothing by themselves: an emergency does not overtake them.
+_STILL = frozenset({"AIM", "STANDBY", "PARAMETERS"})
+#: Time allowed at the end of the plant for the records that are owed, s.
+_LAST = 10.0
 
 
 @dataclass(frozen=True)
@@ -33,8 +45,23 @@ class _Under:
     at: float
 
 
+@dataclass
+class _Recording:
+    """A ticket whose record is on its way to the disk."""
+
+    ticket: Ticket
+    begin: Callable[[], None]
+    until: float
+    sends: list[Callable[[], None]] = field(default_factory=list)
+    error: Exception | None = None
+    given_up: bool = False
+
+
 class PlantOrders:
     """Accepted commands: their records, their messages and their tickets.
+
+    Nothing here waits for a disk. A command waits in the plant until its record is on the disk
+    (`when_recorded`); DEFOCUS and STOW do not, and overtake the commands that wait.
 
     Parameters
     ----------
@@ -42,6 +69,8 @@ class PlantOrders:
         Clock of the plant.
     audit
         Store of the records.
+    disk
+        Does the work of the audit.
     clusters
         Their links carry the messages.
     prefix
@@ -61,17 +90,20 @@ class PlantOrders:
         self,
         clock: Clock,
         audit: Audit,
+        disk: Disk,
         clusters: Clusters,
         prefix: str,
         lifetime: float,
         patience: float,
     ) -> None:
-        self._clock, self._audit, self._clusters = clock, audit, clusters
+        self._clock, self._audit, self._disk, self._clusters = clock, audit, disk, clusters
         self._prefix, self._lifetime, self._patience = prefix, lifetime, patience
         self._number = self._messages = 0
         self._open: dict[str, Ticket] = {}
         self._under: dict[str, _Under] = {}
-        self._owed: list[Callable[[], None]] = []
+        self._recording: dict[str, _Recording] = {}
+        self._owed: deque[Callable[[], None]] = deque()
+        self._paying = False
         self._sent_at: dict[str, float] = {}
         self._purged_at = clock.monotonic()
         self.confirmed_at = clock.monotonic()
@@ -96,7 +128,7 @@ class PlantOrders:
         *,
         late: bool = False,
     ) -> Ticket:
-        """Accept a command: its record is safe when this returns.
+        """Accept a command and give its record to the disk; see `when_recorded`.
 
         Parameters
         ----------
@@ -110,21 +142,68 @@ class PlantOrders:
         Raises
         ------
         AuditError
-            If the record could not be written and may not be ``late``.
+            If it is already known that the record cannot be written, and it may not be ``late``.
         """
         self._number += 1
         who, role, what = record
         identity = f"{self._prefix}-{self._number}"
         named = () if len(heliostats) == len(self._clusters) else tuple(heliostats)
         entry = Record(identity, who, role, what, self._utc(), tuple(values), named, note)
+        ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
         if late:
+            self._overtake(frozenset(heliostats), what)
             self._owed.append(lambda: self._audit.begin(entry))
         else:
-            self._audit.begin(entry)
-            self.confirmed_at = self._clock.monotonic()
-        ticket = Ticket(identity, what, heliostats, self._clock, self._patience)
+            self._record(ticket, entry)
         self._open[identity] = ticket
         return ticket
+
+    def _record(self, ticket: Ticket, entry: Record) -> None:
+        """Give the record of a ticket to the disk."""
+        begin = partial(self._audit.begin, entry)
+        recording = _Recording(ticket, begin, self._clock.monotonic() + RECORDING)
+        self._recording[ticket.identity] = recording
+        try:
+            self._disk.do(begin, partial(self._recorded, recording))
+        except DiskBusyError as error:
+            del self._recording[ticket.identity]
+            raise AuditError(f"audit: {error}") from None
+        if recording.error is not None:
+            raise recording.error
+
+    def _recorded(self, recording: _Recording, error: Exception | None) -> None:
+        """Send a command whose record is on the disk, or end it because that failed."""
+        ticket = recording.ticket
+        del self._recording[ticket.identity]
+        recording.error = error
+        if error is None:
+            self.confirmed_at, ticket.recorded = self._clock.monotonic(), not recording.given_up
+            for send in () if recording.given_up else recording.sends:
+                send()
+        elif ticket.identity in self._open:
+            text = f"not sent: its record could not be written: {error}"
+            ticket.advance(ticket.heliostats, Stage.FAILED, text)
+            # It was accepted, so it gets a record as soon as the disk takes one.
+            self._owed.append(recording.begin)
+
+    def when_recorded(self, ticket: Ticket, send: Callable[[], None]) -> None:
+        """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
+
+        Heliostats that have ended meanwhile (`Ticket.waiting`) must be left out.
+        """
+        recording = self._recording.get(ticket.identity)
+        if recording is None:
+            send()
+        else:
+            recording.sends.append(send)
+
+    def _overtake(self, heliostats: frozenset[str], what: str) -> None:
+        """Give up commands that wait for their records: none may follow DEFOCUS, STOW or LOCK."""
+        for recording in self._recording.values():
+            ticket = recording.ticket
+            if ticket.name not in _STILL:
+                names = [name for name in ticket.heliostats if name in heliostats]
+                ticket.advance(names, Stage.FAILED, f"not sent: overtaken by {what}")
 
     def note(self, who: str, role: str, what: str, note: str) -> None:
         """Record an action that is complete at once, such as a change of the command authority."""
@@ -133,15 +212,34 @@ class PlantOrders:
         self._owe_result(ticket.identity, "done")
 
     def pay(self) -> None:
-        """Write the records that are owed, in order, as far as the audit accepts them."""
-        try:
-            while self._owed:
-                self._owed[0]()
-                del self._owed[0]
+        """Give the oldest owed records to the disk, unless earlier ones are on their way."""
+        if self._paying:
+            return
+        batch, done = tuple(islice(self._owed, _BATCH)), [0]
+
+        def write() -> None:
+            for each in batch:
+                each()
+                done[0] += 1
             self._audit.confirm()
+
+        self._paying = True
+        try:
+            self._disk.do(write, lambda error: self._paid(done[0], error))
+        except DiskBusyError as error:
+            self._paying, self.problem = False, str(error)
+
+    def _paid(self, count: int, error: Exception | None) -> None:
+        self._paying = False
+        for _ in range(count):
+            self._owed.popleft()
+        if error is None:
             self.confirmed_at, self.problem = self._clock.monotonic(), ""
-        except AuditError as error:
+        elif isinstance(error, AuditError):
             self.problem = str(error)
+        else:
+            self.problem = str(error)
+            raise error
 
     # Sending.
 
@@ -239,10 +337,15 @@ class PlantOrders:
 
     def beat(self, now: float) -> None:
         """End commands that were not answered in time; record the results of ended tickets."""
+        for recording in self._recording.values():
+            if now >= recording.until and not recording.given_up:
+                recording.given_up = True
+                text = f"not sent: its record was not on the disk within {RECORDING:g} s"
+                recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
-            if ticket.finished:
+            if ticket.finished and identity not in self._recording:
                 ended.append(identity)
                 self._owe_result(identity, ticket.text)
         for identity in ended:
@@ -266,13 +369,28 @@ class PlantOrders:
                 self._sent_at[identity] = now
                 self.repeat(ticket, Act[ticket.name], ticket.unacknowledged())
 
-    def end(self, now: float) -> None:
+    async def end(self, now: float) -> None:
         """Record the state of every open ticket, at the end of the plant."""
+        until = now + _LAST
         self.beat(now)
+        await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():
-            self._owe_result(identity, f"{ticket.text}; then the plant was closed")
+            if identity not in self._recording:
+                self._owe_result(identity, f"{ticket.text}; then the plant was closed")
         self._open.clear()
+        self.problem = ""
         self.pay()
+        await self._until(self._settled, until)
+
+    def _settled(self) -> bool:
+        """Whether the owed records are written or cannot be; the next batch is on its way."""
+        if self.owing:
+            self.pay()
+        return not (self._paying or self.owing)
+
+    async def _until(self, what: Callable[[], bool], until: float) -> None:
+        while not what() and self._clock.monotonic() < until:
+            await sleep_until(self._clock, self._clock.monotonic() + 0.05)
 
     def _owe_result(self, identity: str, result: str) -> None:
         at = self._utc()

@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -170,7 +171,8 @@ class ParameterSync:
 
     def push(self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int) -> None:
         """Send items of an accepted ticket; compare the heliostat when the ticket has ended."""
-        self._orders.parameters(ticket, heliostat, items, token)
+        send = partial(self._orders.parameters, ticket, heliostat, items, token)
+        self._orders.when_recorded(ticket, send)
         self._tickets[heliostat] = ticket
 
     async def stored(self, heliostat: str, timeout: float) -> dict[str, int]:

@@ -16,6 +16,7 @@ from heliotrope.links.clock import Clock
 from heliotrope.links.link import Link
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit
+from heliotrope.plant.disk import Disk
 from heliotrope.plant.operations.views import CameraView
 from heliotrope.plant.sensors import Readings
 from heliotrope.plant.visits.photographs import Shot
@@ -90,6 +91,9 @@ class Ports:
         None: nothing is calibrated.
     sensors
         None: no reading comes from outside.
+    disk
+        Does the work of audit and assigned points; it is closed with the plant. None: they are
+        written in the loop, as virtual time needs it.
     records
         Store of sightings, events and holds; None: they end with the program.
     assigned
@@ -109,6 +113,7 @@ class Ports:
     audit: Audit
     cameras: Cameras | None = None
     sensors: Sensors | None = None
+    disk: Disk | None = field(default=None, kw_only=True)
     records: Records | None = field(default=None, kw_only=True)
     assigned: Assigned | None = field(default=None, kw_only=True)
     beside: Callable[[], AbstractAsyncContextManager[object]] = field(

@@ -37,6 +37,8 @@ class Ticket:
         Those of the reasons that are beams in keep-out volumes.
     accepted_at
         Monotonic s.
+    recorded
+        Whether its record was on the disk before it was sent; False for DEFOCUS and STOW.
     """
 
     def __init__(
@@ -45,7 +47,7 @@ class Ticket:
         self.identity, self.name, self.heliostats = identity, name, tuple(heliostats)
         self.refusals: dict[str, str] = {}
         self.blocked: dict[str, str] = {}
-        self.accepted_at = clock.monotonic()
+        self.accepted_at, self.recorded = clock.monotonic(), False
         self._clock = clock
         self._row = {name: i for i, name in enumerate(self.heliostats)}
         self._stage = np.full(len(self.heliostats), WAITING, dtype=np.int8)
@@ -96,6 +98,10 @@ class Ticket:
                 else "no answer before it expired"
             )
             self.advance([self.heliostats[i]], Stage.FAILED, text)
+
+    def waiting(self, heliostats: Iterable[str]) -> tuple[str, ...]:
+        """Return which of some heliostats have not ended."""
+        return tuple(name for name in heliostats if self._stage[self._row[name]] < FINAL)
 
     def unacknowledged(self) -> tuple[str, ...]:
         """Return the heliostats that have neither acknowledged nor ended."""

@@ -14,6 +14,7 @@ from heliotrope.links.clock import SystemClock
 from heliotrope.links.link import running
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
 from heliotrope.plant.cameras import RealCameras
+from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.plant.ports import Ports
@@ -96,6 +97,7 @@ class _Outside:
             KeptAudit(keeper, clock, clock.utc()),
             _cameras(design, choice, shown, clock),
             self.links.sensors,
+            disk=DiskThread(),
             records=keeper,
             assigned=KeptPoints(keeper),
             beside=self.running,

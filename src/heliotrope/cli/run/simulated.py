@@ -8,6 +8,7 @@ from heliotrope.cli.run._shared import Shown, at_work, begin, one_error, store
 from heliotrope.field.plant import Plant
 from heliotrope.links.clock import SystemClock, VirtualClock
 from heliotrope.plant.assembly import AssemblySettings, MachineTables, PlantAssembly
+from heliotrope.plant.disk import DiskThread
 from heliotrope.plant.kept_audit import KeptAudit, KeptPoints
 from heliotrope.plant.operations.automatic import AutomaticSettings
 from heliotrope.twin.live import CYCLE, PacedLoop, World, WorldOptions
@@ -45,6 +46,8 @@ async def _run(design: Plant, choice: SimulationOptions, shown: Shown) -> None:
     with store(shown) as keeper:
         ports = World(design, clock, options).ports(
             audit=KeptAudit(keeper, SystemClock(), clock.utc()),
+            # A record takes long in a time that runs faster, so there the loop waits for it.
+            disk=DiskThread() if choice.speed <= 1.0 else None,
             records=keeper,
             assigned=KeptPoints(keeper),
             facts=lambda: {"lag": loop.lag, "speed": loop.speed},

@@ -33,6 +33,7 @@ from heliotrope.mechanism.parameters import MODELS
 from heliotrope.plant.aims import default_aims
 from heliotrope.plant.assigned import Assigned
 from heliotrope.plant.audit import Audit, Record
+from heliotrope.plant.disk import Disk
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.settings import clusters_of
 from heliotrope.plant.visits.settings import CycleSettings
@@ -241,6 +242,7 @@ class World:
         self,
         *,
         audit: Audit | None = None,
+        disk: Disk | None = None,
         records: Records | None = None,
         assigned: Assigned | None = None,
         facts: Callable[[], Mapping[str, Any]] = dict,
@@ -252,6 +254,7 @@ class World:
             audit or Forgetful(),
             self.cameras,
             self.flux,
+            disk=disk,
             records=records,
             assigned=assigned,
             beside=self.running,

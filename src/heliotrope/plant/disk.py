@@ -1,0 +1,99 @@
+"""Work that waits for a disk, done outside the loop that renews leases and sends emergencies.
+
+A `Disk` does pieces of work in the order in which they were given, and tells their outcome to the
+loop. `DiskThread` does them in a thread of its own; `AtOnce` does them where they are given, as
+virtual time needs it.
+"""
+
+import asyncio
+import queue
+import threading
+from collections.abc import Callable
+from typing import Protocol
+
+from heliotrope.errors import HeliotropeError
+
+#: Largest number of pieces of work that may wait.
+MOST = 1000
+
+Work = Callable[[], object]
+Then = Callable[[Exception | None], None]
+
+
+class DiskBusyError(HeliotropeError):
+    """Too much work waits for the disk."""
+
+
+class Disk(Protocol):
+    """A place where work is done that waits for a disk."""
+
+    def do(self, work: Work, then: Then) -> None:
+        """Do work after all earlier work; call ``then`` in the loop with its error, or None.
+
+        Raises
+        ------
+        DiskBusyError
+            If too much work waits already.
+        """
+        ...
+
+    def close(self) -> None:
+        """Do the work that waits, if the disk allows it soon, and end."""
+        ...
+
+
+class AtOnce:
+    """Work is done where it is given."""
+
+    def do(self, work: Work, then: Then) -> None:
+        """Do work now; see `Disk.do`."""
+        then(_error_of(work))
+
+    def close(self) -> None:
+        """Do nothing: nothing waits."""
+
+
+class DiskThread:
+    """A thread that does the work.
+
+    Parameters
+    ----------
+    most
+        Largest number of pieces of work that may wait.
+    """
+
+    def __init__(self, most: int = MOST) -> None:
+        self._most = most
+        self._waiting: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="plant disk", daemon=True)
+        self._thread.start()
+
+    def do(self, work: Work, then: Then) -> None:
+        """Do work in the thread; see `Disk.do`."""
+        if (count := self._waiting.qsize()) >= self._most:
+            raise DiskBusyError(f"{count} records wait for the disk; see to it")
+        loop = asyncio.get_running_loop()
+
+        def run() -> None:
+            error = _error_of(work)
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(then, error)
+
+        self._waiting.put(run)
+
+    def close(self, timeout: float = 10.0) -> None:
+        """Do the work that waits, for ``timeout`` s at most, and end the thread."""
+        self._waiting.put(None)
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while (run := self._waiting.get()) is not None:
+            run()
+
+
+def _error_of(work: Work) -> Exception | None:
+    try:
+        work()
+    except Exception as error:  # noqa: BLE001 - it goes to the loop
+        return error
+    return None
