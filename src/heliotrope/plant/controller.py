@@ -54,6 +54,7 @@ from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
 from heliotrope.plant.disk import AtOnce, Disk
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
+from heliotrope.plant.identity import Identities
 from heliotrope.plant.joining import JoinDispatcher, JoiningJob, JoinQueue
 from heliotrope.plant.lockouts import Lockout, locked_out
 from heliotrope.plant.orders import PlantOrders, whole
@@ -168,6 +169,7 @@ class PlantController:
         points = Points(self.field.names, assigned, place)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
+        self._identities = Identities(self.field, self.wanted, self._tell)
         self._agreement = Agreement(
             self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
         )
@@ -186,7 +188,13 @@ class PlantController:
             self._joining, self._orders, self._ways, self.settings.join_life
         )
         self._sync = ParameterSync(
-            self.field, self.wanted, self._orders, self._clusters, self._tell, self._rewriting
+            self.field,
+            self.wanted,
+            self._orders,
+            self._clusters,
+            self._tell,
+            self._rewriting,
+            self._identities.strange.__contains__,
         )
         rows = conditions(self.settings.autonomy) if table is None else table
         self._sentinel = self._guarded(rows)
@@ -270,6 +278,7 @@ class PlantController:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
+        self._identities.look(end.name, now)
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -613,6 +622,8 @@ class PlantController:
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
+        if strange := self._identities.barred((heliostat,)):
+            raise BeamError("PARAMETERS", strange)
         before, after = self._tables(heliostat, items)
         if POSE_ITEMS.intersection(items):
             self.authority.check(person, token, "PARAMETERS")
@@ -661,7 +672,9 @@ class PlantController:
         BeamError
             If none may.
         """
-        wrong = self._sync.differing(names) if name in MOTIONS else {}
+        wrong = {}
+        if name in MOTIONS:
+            wrong = self._sync.differing(names) | self._identities.barred(names)
         if name in JOINING:
             wrong |= self._sentinel.barred(names)
         if wrong and len(wrong) == len(names):
@@ -680,6 +693,7 @@ class PlantController:
         row = self.field.place(heliostat)
         self._use(row, mechanism.armature.table, mechanism.drives.table)
         self.wanted.set(heliostat, items_of(mechanism))
+        self._identities.want(heliostat)
         self._sync.compare(heliostat)
 
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:

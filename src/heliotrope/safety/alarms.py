@@ -118,6 +118,16 @@ PARAMETERS_DIFFER = AlarmKind(
     "Stow it; lock it at stow if more than armature, biases, location and defocus differ. If it "
     "returns, replace the controller's flash memory.",
 )
+IDENTITY = AlarmKind(
+    "identity",
+    _PLANT,
+    Severity.ALARM,
+    "A local controller reports the armature of another heliostat.",
+    "{subject}: its address answers with the parameters of {other}",
+    "It is neither moved nor written; DEFOCUS and STOW still go to its address.",
+    "Order DEFOCUS for the whole cluster; then correct the addresses of both local controllers.",
+    over="{subject}: its own parameters answer again",
+)
 RECORDS = AlarmKind(
     "records",
     _PLANT,
