@@ -8,6 +8,7 @@ value: a record's field goes in and comes out as it is (see `_rows`).
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from enum import Enum
 from typing import Any
@@ -59,7 +60,7 @@ def _figure(value: float | None) -> float:
     return math.nan if value is None else value
 
 
-class _Converted(TypeDecorator[Any]):
+class _Converted(TypeDecorator[Any], ABC):
     """A type that converts each value as it is written and as it is read."""
 
     impl: Any = Text
@@ -72,11 +73,11 @@ class _Converted(TypeDecorator[Any]):
         """Return a value as a record has it."""
         return self._read(value)
 
-    def _written(self, value: Any) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _written(self, value: Any) -> Any: ...
 
-    def _read(self, value: Any) -> Any:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, value: Any) -> Any: ...
 
 
 class Figure(_Converted):
