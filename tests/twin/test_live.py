@@ -35,7 +35,7 @@ from heliotrope.twin.cameras import (
     mirrors_near,
 )
 from heliotrope.twin.field import Field, FieldBus
-from heliotrope.twin.live import PacedLoop, WorldOptions, near_pair
+from heliotrope.twin.live import CYCLE, PacedLoop, WorldOptions, near_pair
 from heliotrope.twin.live.live import machine_of
 from heliotrope.twin.live.loop import LATE
 from heliotrope.twin.sensors import light_share
@@ -209,11 +209,26 @@ def test_what_is_stored_is_what_the_mirror_then_does() -> None:
     assert errors[6:].min() > 1 * MRAD
 
 
+#: Photographs of a visit: one to find the beam, those of the fit, and one that confirms the new
+#: parameters.
+PHOTOGRAPHS = 1 + CYCLE.shots + 1
+#: A visit in the twin, s: a photograph every 5 s, and twice the way to the target and back, because
+#: the new parameters are written between the last photograph of the fit and the confirming one.
+VISIT = 5.0 * PHOTOGRAPHS + 2 * 12.0
+#: Time in which the field goes from stow to standby, s.
+RAISED = 35.0
+
+
 def test_a_small_plant_raises_itself_learns_and_is_stowed() -> None:
     async def work(plant: LivePlant) -> None:
         before = plant.errors()
-        await asyncio.sleep(210.0)
+        # Two targets serve three heliostats: on each, three visits one after another.
+        await asyncio.sleep(RAISED + 3 * VISIT)
+        # Further visits would go on without end; one that has begun is finished first.
+        plant.operations.switch_calibration(Person("operator", Role.OPERATOR), on=False)
+        await asyncio.sleep(VISIT)
         view = plant.operations.calibration()
+        assert not view.running
         seen = {(entry.heliostat, entry.target) for entry in view.results if entry.good}
         assert seen == {(name, target) for name in plant.names for target in ("left", "right")}
         assert plant.operations.summary().states == {"TRACKING": 3}
