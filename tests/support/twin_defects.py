@@ -288,6 +288,8 @@ DEFECTS = (
            worlds=("calm",)),
     Defect((12,), "the armature of another mirror", _armature_exchanged, ("line_drop",), 60.0,
            worlds=("calm",)),
+    Defect((12,), "identity never checked", plant_defects.identity_unchecked, ("line_drop",), 60.0,
+           worlds=("addresses", "calm")),
     Defect((14,), "the field resumes by itself", plant_defects.resumes_by_itself, seconds=180.0,
            faults=tuple(Fault("line_cut", at, 9.0, 0, 0.5) for at in (80.0, 120.0, 150.0)),
            worlds=("calm",)),

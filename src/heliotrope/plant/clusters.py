@@ -139,6 +139,10 @@ class Clusters:
         """Return the cluster of a heliostat."""
         return self._home[heliostat]
 
+    def connection(self, cluster: str) -> int:
+        """Return how often the link to a cluster has been opened."""
+        return self.ends[cluster].link.statistics.opened
+
     def parts(self, heliostats: Iterable[str]) -> list[tuple[ClusterEnd, tuple[str, ...]]]:
         """Return heliostats by their clusters."""
         found: dict[str, list[str]] = {}

@@ -169,11 +169,17 @@ class PlantController:
         points = Points(self.field.names, assigned, place)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
-        self._identities = Identities(self.field, self.wanted, self._tell)
         self._agreement = Agreement(
             self.field, points, self.beams, design.site, lambda: clock.utc().timestamp()
         )
         self._clusters = Clusters(members, links, clock, self.counters)
+        self._identities = Identities(
+            self.field,
+            self.beams.armature.table,
+            self.wanted.items,
+            self._clusters.connection,
+            self._tell,
+        )
         self._orders = PlantOrders(
             clock,
             audit,
@@ -194,7 +200,7 @@ class PlantController:
             self._clusters,
             self._tell,
             self._rewriting,
-            self._identities.strange.__contains__,
+            self._identities.barred,
         )
         rows = conditions(self.settings.autonomy) if table is None else table
         self._sentinel = self._guarded(rows)
@@ -221,6 +227,7 @@ class PlantController:
             self._ways,
             self.beams.drives,
             self.settings.repeat,
+            self._identities.off,
         )
 
     # -- running ---------------------------------------------------------------------------
@@ -278,7 +285,7 @@ class PlantController:
         self.counters.statuses += 1
         self.counters.problems.extend(self.field.take(end.name, status, now))
         self._agreement.take(end.name, status)
-        self._identities.look(end.name, now)
+        self._give_up(self._identities.look(end.name))
         if not self.field.knows_order(end.name) and now - self._named_at[end.name] >= _ASK_NAMES:
             # The message that names the rows was lost; the statistics come in the same order.
             self._named_at[end.name] = now
@@ -549,6 +556,8 @@ class PlantController:
             If there is no such heliostat.
         """
         numbers = whole(counts, wire.ROW_OF[wire.NUMBER_OF["ZERO"]][3], "ZERO")
+        if wrong := self._identities.barred((heliostat,)):
+            raise BeamError("ZERO", wrong)
         ticket = self._accept(person, token, "ZERO", numbers, (heliostat,))
         self._orders.when_recorded(
             ticket,
@@ -622,8 +631,8 @@ class PlantController:
         """
         row = self.field.place(heliostat)
         self.wanted.check(heliostat, items)
-        if strange := self._identities.barred((heliostat,)):
-            raise BeamError("PARAMETERS", strange)
+        if wrong := self._identities.barred((heliostat,)):
+            raise BeamError("PARAMETERS", wrong)
         before, after = self._tables(heliostat, items)
         if POSE_ITEMS.intersection(items):
             self.authority.check(person, token, "PARAMETERS")
@@ -645,6 +654,12 @@ class PlantController:
         """Use an armature (18,) and drives (2, 19) in proofs, and to compare the pointing."""
         self.beams.replace(row, armature, drives)
         self._agreement.believe(row, armature, drives)
+        self._give_up(self._identities.learn(row, armature))
+
+    def _give_up(self, heliostats: Mapping[str, str]) -> None:
+        """Let heliostats that are not what they seem wait no longer to join."""
+        if heliostats:
+            self._joining.drop(next(iter(heliostats.values())), frozenset(heliostats))
 
     def _tables(self, heliostat: str, items: Mapping[str, bytes]) -> tuple[Tables, Tables]:
         """Return the tables of a heliostat's mechanism now, and once items are stored."""
@@ -665,16 +680,17 @@ class PlantController:
     def _able(self, name: str, names: tuple[str, ...]) -> tuple[tuple[str, ...], dict[str, str]]:
         """Return the heliostats that may be given a command, and why the others may not.
 
-        A motion needs the wanted parameters; joining, that no alarm bars the heliostat.
+        Everything but LOCK needs a board that is the heliostat's; a motion, the wanted parameters;
+        joining, that no alarm bars the heliostat.
 
         Raises
         ------
         BeamError
             If none may.
         """
-        wrong = {}
+        wrong = {} if name == "LOCK" else self._identities.barred(names)
         if name in MOTIONS:
-            wrong = self._sync.differing(names) | self._identities.barred(names)
+            wrong = self._sync.differing(names) | wrong
         if name in JOINING:
             wrong |= self._sentinel.barred(names)
         if wrong and len(wrong) == len(names):
@@ -693,7 +709,6 @@ class PlantController:
         row = self.field.place(heliostat)
         self._use(row, mechanism.armature.table, mechanism.drives.table)
         self.wanted.set(heliostat, items_of(mechanism))
-        self._identities.want(heliostat)
         self._sync.compare(heliostat)
 
     async def stored(self, heliostat: str, timeout: float = 15.0) -> dict[str, int]:
@@ -717,7 +732,8 @@ class PlantController:
         wanted = points_of(name, points)
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
-        if wrong := self._sync.differing([names[i] for i in np.flatnonzero(moves)]):
+        moved = [names[i] for i in np.flatnonzero(moves)]
+        if wrong := self._sync.differing(moved) | self._identities.barred(moved):
             raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
         groups = grouped(names, wanted)

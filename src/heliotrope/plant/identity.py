@@ -1,22 +1,27 @@
 """Which board answers at an address: two exchanged addresses, or a board moved to another mirror.
 
 Every local controller reports the checksum of the armature that it stores. The armature holds the
-place of the mirror, so the checksum of another heliostat's armature shows the board of that other
-heliostat: a command to H1 would move H2.
+place of the mirror, so no two are equal, and the checksum of another heliostat's armature shows
+that other heliostat's board: a command to H1 would move H2. A checksum that the plant has never
+known says nothing about whose board it is.
 """
 
-import math
-from collections.abc import Callable, Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping
 from zlib import crc32
 
 import numpy as np
 
-from heliotrope.mechanism.board_items import Wanted
+from heliotrope.geometry import FloatArray
+from heliotrope.lcu import names as meanings
+from heliotrope.lcu import states
+from heliotrope.plant import refusals
 from heliotrope.plant.field_state import FieldState
-from heliotrope.safety import Alarm, alarms
+from heliotrope.safety import Act, Alarm, alarms
 
-#: Pauses between two gatherings of the wanted armatures: with new odd checksums, and without, s.
-_SOON, _AGAIN = 1.0, 10.0
+#: States in which a heliostat is off, or on its way there.
+_OFF = (states.STOWED, states.STOWING, states.DEFOCUSED)
+_AT_STOW = 1 << meanings.FLAGS.index("AT_STOW")
 
 
 class Identities:
@@ -24,65 +29,121 @@ class Identities:
 
     Parameters
     ----------
-    field, wanted
-        Of the plant.
+    field
+        State of the field.
+    armatures
+        Armatures of the plant's beliefs at its start, (N, 18).
+    wanted
+        Items that heliostats should store, by name and item.
+    connections
+        Returns how often the link to a cluster has been opened.
     tell
         Called with each alarm.
 
     Attributes
     ----------
     strange
-        Heliostats that answer with the armature of another, by name, each with that other's name.
+        Why a heliostat is not what its address says, by name.
     """
 
-    def __init__(self, field: FieldState, wanted: Wanted, tell: Callable[[Alarm], None]) -> None:
-        self._field, self._wanted, self._tell = field, wanted, tell
+    def __init__(
+        self,
+        field: FieldState,
+        armatures: FloatArray,
+        wanted: Mapping[str, Mapping[str, bytes]],
+        connections: Callable[[str], int],
+        tell: Callable[[Alarm], None],
+    ) -> None:
+        self._field, self._connections, self._tell = field, connections, tell
         self.strange: dict[str, str] = {}
-        #: Checksums that are not their heliostat's own, by its name.
-        self._odd: dict[str, int] = {}
-        self._seen = np.zeros(len(field), dtype=np.uint32)
-        self._owners: dict[int, str] = {}
-        self._built = -math.inf
+        #: Rows of the heliostats that have ever had an armature, by its checksum.
+        self._owners: defaultdict[int, set[int]] = defaultdict(set)
+        #: Checksums last reported, 0 before; whether they are the heliostat's own.
+        self._stored = np.zeros(len(field), dtype=np.uint32)
+        self._own = np.zeros(len(field), dtype=np.bool_)
+        #: Rows whose checksum is another's.
+        self._foreign: set[int] = set()
+        self._rows = {
+            name: np.array([field.index[n] for n in held], dtype=np.intp)
+            for name, held in field.members.items()
+        }
+        #: Connection in which each cluster last sent a status.
+        self._judged: dict[str, int] = {}
+        for row, armature in enumerate(armatures):
+            self._owners[crc32(armature.tobytes())].add(row)
+        for name, items in wanted.items():
+            if "armature" in items:
+                self._owners[crc32(items["armature"])].add(field.index[name])
 
-    def want(self, name: str) -> None:
-        """Judge a heliostat again, because the armature that it should store has changed."""
-        self._seen[self._field.index[name]] = 0
+    def learn(self, row: int, armature: FloatArray) -> dict[str, str]:
+        """Add an armature (18,) that a heliostat may store; return as `look`."""
+        crc = crc32(np.ascontiguousarray(armature).tobytes())
+        if row in self._owners[crc]:
+            return {}
+        self._owners[crc].add(row)
+        return self._judge(np.flatnonzero(self._stored == crc).tolist())
 
-    def look(self, cluster: str, now: float) -> None:
-        """Judge the heliostats of a cluster whose armature has changed since the last look."""
-        field = self._field
-        rows = np.array([field.index[n] for n in field.members[cluster]], np.intp)
-        stored = field.rows["armature_crc"][rows]
-        new = np.flatnonzero(stored != self._seen[rows])
-        for i in new:
-            self._seen[rows[i]] = stored[i]
-            self._odd[field.names[rows[i]]] = int(stored[i])
-        if self._odd and now - self._built >= (_SOON if len(new) else _AGAIN):
-            self._built = now
-            armatures = {n: items.get("armature") for n, items in self._wanted.items.items()}
-            self._owners = {crc32(a): n for n, a in armatures.items() if a is not None}
-            self._judge()
-        elif len(new):
-            self._judge()
+    def look(self, cluster: str) -> dict[str, str]:
+        """Judge the heliostats of a cluster by its status; return those newly found strange."""
+        self._judged[cluster] = self._connections(cluster)
+        rows = self._rows[cluster]
+        stored = self._field.rows["armature_crc"][rows]
+        changed = stored != self._stored[rows]
+        self._stored[rows] = stored
+        return self._judge(rows[changed].tolist())
 
-    def _judge(self) -> None:
-        for name, crc in list(self._odd.items()):
-            own = self._wanted.items.get(name, {}).get("armature")
-            good = own is not None and crc32(own) == crc
-            other = "" if good else self._owners.get(crc, "")
-            if good:
-                del self._odd[name]
-            if other and self.strange.get(name) != other:
-                self.strange[name] = other
-                self._tell(alarms.IDENTITY.raised(name, other=other))
-            elif not other and self.strange.pop(name, ""):
-                self._tell(alarms.IDENTITY.ended(name))
+    def _judge(self, changed: list[int]) -> dict[str, str]:
+        """Judge rows whose checksum, or its owners, have changed, and with them their pairs."""
+        for row in changed:
+            self._own[row] = row in self._of(row)
+            alien = not self._own[row] and bool(self._of(row))
+            (self._foreign.add if alien else self._foreign.discard)(row)
+        if not changed or not (self._foreign or self.strange):
+            return {}
+        names, found = self._field.names, dict[str, str]()
+        pairs = [(row, other) for row in sorted(self._foreign) for other in sorted(self._of(row))]
+        for row, other in pairs:
+            text = refusals.OTHER_PARAMETERS.text.format(other=names[other])
+            found.setdefault(names[row], text)
+        for row, other in pairs:
+            if not self._own[other]:
+                text = f"its parameters answer at the address of {names[row]}"
+                found.setdefault(names[other], text)
+        new = {name: text for name, text in found.items() if self.strange.get(name) != text}
+        for name, text in new.items():
+            self._tell(alarms.IDENTITY.raised(name, problem=text))
+        for name in self.strange.keys() - found.keys():
+            self._tell(alarms.IDENTITY.ended(name))
+        self.strange = found
+        return new
+
+    def _of(self, row: int) -> set[int]:
+        """Return the rows of the heliostats that have ever had the armature of a row."""
+        return self._owners.get(int(self._stored[row]), set())
 
     def barred(self, heliostats: Iterable[str]) -> dict[str, str]:
-        """Return which heliostats may not be moved, and why."""
+        """Return which heliostats may be neither moved nor written, and why."""
+        field, found = self._field, {}
+        for name in heliostats:
+            row = field.place(name)
+            cluster = field.clusters[field.cluster[row]]
+            if name in self.strange:
+                found[name] = self.strange[name]
+                continue
+            judged = self._judged.get(cluster, -1) == self._connections(cluster)
+            if not (judged and np.isfinite(field.heard[row])):
+                found[name] = refusals.NOT_HEARD.text
+        return found
+
+    def off(self, now: float) -> dict[str, tuple[Act, str]]:
+        """Return the strange heliostats that must leave, by name: by which act, and why."""
+        if not self.strange:
+            return {}
+        field = self._field
+        going = field.among(_OFF, now) | (field.rows["flags"] & _AT_STOW != 0)
+        needed = field.live(now) & ~going
         return {
-            name: f"its address answers with the parameters of {self.strange[name]}; correct the "
-            "addresses first"
-            for name in heliostats
-            if name in self.strange
+            name: (Act.DEFOCUS, f"{name}: {text}")
+            for name, text in self.strange.items()
+            if needed[field.index[name]]
         }

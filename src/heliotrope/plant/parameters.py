@@ -117,8 +117,8 @@ class ParameterSync:
         Called with each alarm.
     proof
         Returns why items may not be written where a heliostat stands, "" if they may.
-    strange
-        Returns whether the address of a heliostat answers as another one: nothing is pushed there.
+    barred
+        Returns which heliostats may not be written at all, and why.
     """
 
     def __init__(
@@ -129,11 +129,11 @@ class ParameterSync:
         clusters: Clusters,
         tell: Callable[[Alarm], None],
         proof: Callable[[str, Mapping[str, bytes]], str],
-        strange: Callable[[str], bool],
+        barred: Callable[[Sequence[str]], Mapping[str, str]],
     ) -> None:
         self._field, self._wanted, self._orders = field, wanted, orders
         self._clusters, self._tell, self._proof = clusters, tell, proof
-        self._strange = strange
+        self._barred = barred
         #: Heliostats to be compared, each with its time, monotonic s.
         self._due = dict.fromkeys(wanted.items, -math.inf)
         self._tickets: dict[str, Ticket] = {}
@@ -221,8 +221,8 @@ class ParameterSync:
                 self._ask(name)
         if token and allowed:
             for name, missing in list(self._wanted.missing.items()):
-                busy = name in self._tickets or name in self._due or self._strange(name)
-                if live[self._field.index[name]] and not busy:
+                busy = name in self._tickets or name in self._due
+                if live[self._field.index[name]] and not busy and not self._barred((name,)):
                     self._push(name, missing, token, now)
 
     def _ask(self, name: str) -> None:

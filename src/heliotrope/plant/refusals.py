@@ -130,6 +130,18 @@ PARAMETERS_DIFFER = Refusal(
     "Stow the heliostat: the wanted ones are written there. Lock it at stow if the text names more "
     "than armature, biases, location and defocus.",
 )
+OTHER_PARAMETERS = Refusal(
+    "other parameters",
+    "A heliostat is moved, unlocked or written, and its address answers as another heliostat.",
+    "its address answers with the parameters of {other}",
+    "Correct the addresses of both. LOCK, DEFOCUS and STOW are still sent.",
+)
+NOT_HEARD = Refusal(
+    "not heard",
+    "A heliostat is moved, unlocked or written before its board is known.",
+    "it has not been heard since its cluster connected, so its board is not known",
+    "Wait for its next status, a second at most. If none comes, see to its cluster or its supply.",
+)
 PARAMETERS_NOT_HERE = Refusal(
     "parameters not here",
     "Parameters that change a pose are given where the beam would move or is not proven free.",

@@ -122,10 +122,10 @@ IDENTITY = AlarmKind(
     "identity",
     _PLANT,
     Severity.ALARM,
-    "A local controller reports the armature of another heliostat.",
-    "{subject}: its address answers with the parameters of {other}",
-    "It is neither moved nor written; DEFOCUS and STOW still go to its address.",
-    "Order DEFOCUS for the whole cluster; then correct the addresses of both local controllers.",
+    "A local controller reports the armature of another heliostat, or another one reports its own.",
+    "{subject}: {problem}",
+    "It is defocused, and neither moved nor written; DEFOCUS and STOW still go to its address.",
+    "Stow both; then correct their addresses, or write the parameters of the mirror that is there.",
     over="{subject}: its own parameters answer again",
 )
 RECORDS = AlarmKind(

@@ -6,7 +6,7 @@ acknowledged, and a person's order is withdrawn.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -46,6 +46,8 @@ class Sentinel:
         Of the heliostats, (N, 2), for the proof.
     repeat
         Pause between two repetitions of an order, s.
+    astray
+        Returns the heliostats that must leave, beside those of the table, at a time.
 
     Attributes
     ----------
@@ -67,13 +69,14 @@ class Sentinel:
         ways: BeamWatch,
         drives: Drive,
         repeat: float,
+        astray: Callable[[float], Mapping[str, tuple[Act, str]]],
     ) -> None:
         self.order: EmergencyOrder | None = None
         self.on = False
         self._called = False
         self._clock, self.table, self._field = clock, table, field
         self._orders, self._joining, self._ways = orders, joining, ways
-        self._drives, self._repeat = drives, repeat
+        self._drives, self._repeat, self._astray = drives, repeat, astray
         #: The strongest act that each cluster was sent as a whole, while it holds.
         self._acts: dict[str, Act] = {}
         self._sent_off: dict[str, float] = {}
@@ -127,7 +130,7 @@ class Sentinel:
         A heliostat that has just been sent off has the time to show it.
         """
         self._sent_off = {n: at for n, at in self._sent_off.items() if now - at < OFF_SHOWS}
-        wanted = self.table.off()
+        wanted = {**self._astray(now), **self.table.off()}
         self._tries = {name: tried for name, tried in self._tries.items() if name in wanted}
         order = self.order if self.on else None
         sent: dict[Act, dict[str, str]] = {}

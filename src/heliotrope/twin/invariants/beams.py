@@ -46,6 +46,9 @@ _ELSEWHERE = ("JOG", "GOTO", "DIAGNOSE", "UNLOCK", "CLEAR_FAULT", "LOCK", "ZERO"
 #: Commands that take a mirror off the receiver, and that resume.
 _TAKES_OFF = ("IDLE", "LOCK")
 _RESUMES = ("TRACK", "REFOCUS", "SEARCH")
+#: Commands that send a beam to a point, and states from which IDLE needs one.
+_CALLS = ("APPROACH", "IDLE", *_RESUMES)
+_AWAY = (states.STOWED, states.DEFOCUSED)
 
 
 @dataclass
@@ -68,6 +71,8 @@ class _Mirror:
     ordered_at, off_at, resumed_at
         When the plant last sent it an order, and one that takes it off the receiver; when a person
         last sent it there, s.
+    called_at, uncalled
+        When the plant last sent its beam to a point, s; whether it went there without that.
     """
 
     board: Board
@@ -85,6 +90,8 @@ class _Mirror:
     ordered_at: float = float("-inf")
     off_at: float = float("-inf")
     resumed_at: float = float("-inf")
+    called_at: float = float("-inf")
+    uncalled: bool = False
 
     @property
     def name(self) -> str:
@@ -161,6 +168,8 @@ class BeamObserver:
             mirror.ordered_at = now
             if message.name in _TAKES_OFF:
                 mirror.off_at = now
+            if message.name in _CALLS:
+                mirror.called_at, mirror.uncalled = now, False
             if message.name in ("AIM", "STANDBY"):
                 mirror.settled_at = max(mirror.settled_at, now + SETTLE)
             if message.name == "AIM":
@@ -244,6 +253,10 @@ class BeamObserver:
             mirror.approached = False
         if state not in (states.IDLE, states.FAULT, *_HELD):
             mirror.elsewhere = False
+        if state not in (states.APPROACHING, *_LIT):
+            mirror.uncalled = False
+        elif state != states.IDLE or before in _AWAY:
+            mirror.uncalled = now - mirror.called_at > TOGETHER
         if before in _ON and state not in _ON and now - mirror.off_at > TOGETHER:
             self._left.append((now, mirror.name))
         if state in _ON and before not in _ON:
@@ -257,21 +270,22 @@ class BeamObserver:
     def _placed(self, mirror: _Mirror, sun: FloatArray, now: float) -> None:
         """Check that a beam that was sent to a point is there."""
         sent = _LIT.get(mirror.state)
-        if sent is None or mirror.left:
+        if sent is None or (mirror.left and not mirror.uncalled):
             mirror.astray_since = None
             return
-        points = [point for _, point in getattr(mirror, sent)]
+        points = [] if mirror.uncalled else [point for _, point in getattr(mirror, sent)]
         slack = ASTRAY
         if mirror.state == states.SEARCHING:
             slack += _SEARCH * 150.0
         miss = min(
             (mirror.board.miss(sun, (p[0], p[1], p[2])) for p in points), default=float("inf")
         )
-        astray = miss > slack and now >= mirror.settled_at
+        astray = mirror.uncalled or (miss > slack and now >= mirror.settled_at)
         mirror.astray_since = _since(astray, mirror.astray_since, now)
         state, since = states.STATES[mirror.state], mirror.astray_since
         passed = 0.0 if since is None else now - since
-        beside = f"{state}, its beam {miss:.1f} m beside where it was sent for {passed:.1f} s"
+        where = "where nobody sent it" if not points else f"{miss:.1f} m beside where it was sent"
+        beside = f"{state}, its beam {where} for {passed:.1f} s"
         unnamed = 0.0 if since is None else now - max(since, mirror.named_at)
         saw = f"{beside}, and no alarm names it"
         self._check(12, unnamed <= NAMED_WITHIN, now, mirror.name, saw)

@@ -34,7 +34,7 @@ number    check
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -218,6 +218,11 @@ class Observer:
         self.entered: Counter[int] = Counter()
         for account in self.accounts:
             account.board.witness = self
+
+    def call(self, names: Mapping[int, str]) -> None:
+        """Call each heliostat by the name that the cluster has for its address."""
+        for account in self.accounts:
+            account.name = names[account.address]
 
     # -- verdicts --------------------------------------------------------------------------
 

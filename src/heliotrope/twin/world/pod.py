@@ -68,6 +68,8 @@ class Pod:
         Those in use now.
     clock, time
         The cluster's own; ``time`` is None where it uses its system clock.
+    addresses
+        Address by which the cluster reaches each heliostat: exchanged, if errors say so.
     tap, ear
         The plant's end of the line and its listener; None while no plant runs.
     plant
@@ -88,7 +90,6 @@ class Pod:
         errors: PodErrors,
     ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
-        self._errors = errors
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
         self._true, self._site, self._chance = clock, errors.site(site), chance
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
@@ -103,7 +104,12 @@ class Pod:
         self.plant: PlantObserver | None = None
         self.counts: Counter[str] = Counter()
         self._running: list[asyncio.Task[None]] = []
-        self._names_of = {b.outfit.address: b.outfit.name for b in boards}
+        #: Address at which the cluster is configured to find each heliostat.
+        own = [b.outfit.address for b in boards]
+        names = [b.outfit.name for b in boards]
+        self.addresses = dict(zip(names, errors.addresses(own), strict=True))
+        self._names_of = {address: name for name, address in self.addresses.items()}
+        observer.call(self._names_of)
         self._whole_since = clock.monotonic()
 
     def _new_bus(self) -> TwinBus:
@@ -123,11 +129,7 @@ class Pod:
         link = self.link = self.line.end(1, "plant", self.clock, seed=seed)
         keeper = self.time or SystemTime(self.clock)
         fits = [board.outfit for board in self.boards]
-        addresses = self._errors.addresses([o.address for o in fits])
-        members = tuple(
-            Member(o.name, address, o.serial, o.key)
-            for o, address in zip(fits, addresses, strict=True)
-        )
+        members = tuple(Member(o.name, self.addresses[o.name], o.serial, o.key) for o in fits)
         config = ClusterConfig(self.name, self._site, members)
         cluster = Cluster(config, self.bus, link, self.clock, keeper, self._kept)
         self._running = [group.create_task(link.run()), group.create_task(cluster.run())]
@@ -191,7 +193,7 @@ class PlantEar:
 
     def __init__(self, pod: Pod, plant: PlantObserver, beams: BeamObserver) -> None:
         self._pod, self._plant, self._beams = pod, plant, beams
-        self._addresses = {b.outfit.name: b.outfit.address for b in pod.boards}
+        self._addresses = pod.addresses
         self._names: tuple[str, ...] = ()
         self._goes = asyncio.Event()
         self._goes.set()
