@@ -3,20 +3,25 @@
 import asyncio
 import errno
 import itertools
+import math
 import os
 import time
 from collections import deque
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from heliotrope.lcu import states
 from heliotrope.links.clock import SystemClock, VirtualClock, run_virtual, sleep_until
 from heliotrope.links.messages import Command, Emergency, Lease, Stage
+from heliotrope.mechanism.board_items import items_of
+from heliotrope.plant.assigned import AssignedFile
 from heliotrope.plant.audit import read
 from heliotrope.plant.disk import DiskBusyError, DiskThread, Then, Work
+from heliotrope.plant.lockouts import Lockout
 from heliotrope.safety import Act
-from support.plant_bench import OPERATOR, Bench, running
+from support.plant_bench import ENGINEER, OPERATOR, Bench, running
 
 AIM = {"P1A": (0.1, 0.2, 16.5)}
 
@@ -167,6 +172,86 @@ def test_a_silent_disk_refuses_new_motion_and_lets_leases_and_emergencies_go(
     records, _ = read(bench.audit.path)
     assert [r.what for r in records if r.who == "a visitor"] == ["DEFOCUS"]
     assert all(r.result for r in records)
+
+
+def test_commands_that_wait_for_their_records_do_not_overtake_each_other(tmp_path: Path) -> None:
+    async def scene(bench: Bench, disk: SlowDisk) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        await plant.aim(OPERATOR, token, dict.fromkeys(plant.field.names, AIM["P1A"])).end(10.0)
+        disk.delay = 0.2
+        track = plant.command(OPERATOR, token, "TRACK")
+        plant.command(OPERATOR, token, "LOCK")
+        disk.delay = 0.0
+        await bench.wait(5.0)
+        (locked, _), *_ = sent(bench, "LOCK")
+        assert not [at for at, _ in sent(bench, "TRACK") if at > locked]
+        assert "superseded by LOCK" in track.refusals.values()
+
+    play(tmp_path, scene)
+
+
+def test_what_was_proven_is_proven_again_after_the_wait(tmp_path: Path) -> None:
+    async def scene(bench: Bench, disk: SlowDisk) -> None:
+        plant = bench.plant
+        token = await bench.commanded()
+        disk.delay = 1.0
+        approach = plant.command(OPERATOR, token, "APPROACH", ("P1A", "P1B"))
+        aim = plant.aim(OPERATOR, token, AIM)
+        plant.out_of_service["P1A"] = Lockout("P1A", OPERATOR.name, "washing", 0.0, math.nan)
+        await bench.wait(1.2)
+        assert [m.heliostats for _, m in sent(bench, "APPROACH")] == [("P1B",)]
+        assert "washing" in approach.refusals["P1A"]
+        plant.raise_emergency("a visitor")
+        disk.delay = 0.0
+        await bench.wait(5.0)
+        assert "an emergency holds" in aim.text
+        assert not sent(bench, "AIM")
+
+    play(tmp_path, scene)
+
+
+def test_points_that_are_not_sent_are_neither_assigned_nor_stored(tmp_path: Path) -> None:
+    store = AssignedFile(tmp_path / "assigned.json")
+
+    async def main(clock: VirtualClock) -> None:
+        disk = SlowDisk(clock)
+        bench = Bench(clock, tmp_path, disk=disk, assigned=store)
+        for cluster in bench.clusters.values():
+            cluster.set(states.IDLE)
+        async with running(bench):
+            plant = bench.plant
+            token = await bench.commanded()
+            first = {**AIM, "P1B": AIM["P1A"]}
+            assert await plant.aim(OPERATOR, token, first).end(10.0)
+            moved = {"P1A": (0.3, 0.2, 16.5)}
+            disk.delay = 4.0
+            late = plant.aim(OPERATOR, token, moved)
+            disk.delay = 0.0
+            await bench.wait(8.0)
+            assert "not on the disk within 2 s" in late.text
+            np.testing.assert_allclose(plant.aims[plant.field.place("P1A")], AIM["P1A"])
+            assert len(sent(bench, "AIM")) == 1
+
+    run_virtual(main)
+    assert store.read()["AIM"] == {"P1A": AIM["P1A"], "P1B": AIM["P1A"]}
+
+
+def test_parameters_whose_record_fails_are_not_wanted(tmp_path: Path) -> None:
+    async def scene(bench: Bench, disk: SlowDisk) -> None:
+        plant = bench.plant
+        bench.cluster_of("P1A").set(states.STOWED)
+        await bench.wait(2.0)
+        token = await bench.commanded(ENGINEER)
+        disk.delay = 4.0
+        items = items_of(plant.beliefs.present("P1A")[0])
+        ticket = plant.parameters(ENGINEER, token, "P1A", items)
+        disk.delay = 0.0
+        await bench.wait(12.0)
+        assert "not on the disk within 2 s" in ticket.text
+        assert "P1A" not in plant.wanted.items
+
+    play(tmp_path, scene)
 
 
 # -- with a file and a thread --------------------------------------------------------------------

@@ -194,19 +194,18 @@ class TestPoints:
 
         points = Points(["A", "B"], KeptPoints(keeper))
 
-        def assigned(rows: list[int], places: list[list[float]]) -> str:
-            told: list[str] = []
-            points.assign("AIM", np.array(rows), np.array(places), told.append)
-            return told[0]
+        def assign(rows: list[int], places: list[list[float]]) -> None:
+            given = "AIM", np.array(rows), np.array(places)
+            points.storing(*given)[0]()
+            points.assign(*given)
 
-        assert assigned([0], [[1.0, 2.0, 3.0]]) == ""
+        assign([0], [[1.0, 2.0, 3.0]])
         break_writing(keeper, monkeypatch)
-        why = assigned([0, 1], [[1.0] * 3] * 2)
-        assert "assigned points" in why
-        assert "the disk is gone" in why
+        with pytest.raises(AssignedError, match=r"assigned points.*the disk is gone"):
+            assign([0, 1], [[1.0] * 3] * 2)
         np.testing.assert_array_equal(points.aims[0], [1.0, 2.0, 3.0])
         monkeypatch.undo()
-        assert assigned([1], [[1.0] * 3]) == ""
+        assign([1], [[1.0] * 3])
         again = Points(["A", "B"], KeptPoints(keeper))
         np.testing.assert_array_equal(again.aims, [[1.0, 2.0, 3.0], [1.0, 1.0, 1.0]])
 

@@ -15,9 +15,12 @@ from fastapi.responses import JSONResponse
 from heliotrope.console import models
 from heliotrope.console.api import REFUSALS, Named, answer
 from heliotrope.console.auth import Anyone, Caller, Console, Here, Operator, token_of
+from heliotrope.console.tickets import state_of
 from heliotrope.errors import InputError
 from heliotrope.plant.authority import OPERATOR_COMMANDS, Role
 from heliotrope.plant.operations.zero import zero
+from heliotrope.plant.orders import RECORDING
+from heliotrope.plant.tickets import Ticket
 
 router = APIRouter(prefix="/api/v1", responses=REFUSALS)
 
@@ -42,6 +45,16 @@ async def _told(console: Console) -> None:
     Until then the field would refuse commands.
     """
     await asyncio.sleep(1.5 * console.operations.plant.settings.period + 1.0)
+
+
+async def _recorded(console: Console, ticket: Ticket) -> models.TicketState:
+    """Return a command's progress once it is recorded, or once that has failed.
+
+    The next command of the same client then finds the points that this one has assigned.
+    """
+    console.tickets.put(ticket)
+    await ticket.written(RECORDING + 1.0)
+    return state_of(ticket)
 
 
 @router.post("/emergency", response_model=models.EmergencyView, tags=["safety"])
@@ -139,7 +152,7 @@ async def command(console: Here, who: Operator, order: models.CommandOrder) -> m
         here.logbook.event("command", who.person.name, f"ZERO {order.heliostats[0]}")
     else:
         ticket = here.command(who.person, token, name, order.heliostats, order.values)
-    return console.tickets.put(ticket)
+    return await _recorded(console, ticket)
 
 
 @router.get("/commands", response_model=list[models.TicketState], tags=["commands"])
@@ -166,7 +179,7 @@ async def aim(console: Here, who: Operator, order: models.AimOrder) -> models.Ti
         ticket = here.aim_at(who.person, token, order.heliostats, order.where)
     else:
         ticket = here.aim(who.person, token, dict(order.points))
-    return console.tickets.put(ticket)
+    return await _recorded(console, ticket)
 
 
 @router.post("/standby", response_model=models.TicketState, tags=["commands"])
@@ -174,7 +187,7 @@ async def standby(console: Here, who: Operator, order: models.StandbyOrder) -> m
     """Set standby points."""
     token = token_of(console, who.person)
     ticket = console.operations.standby(who.person, token, dict(order.points))
-    return console.tickets.put(ticket)
+    return await _recorded(console, ticket)
 
 
 @router.post("/automatic", status_code=204, tags=["commands"])

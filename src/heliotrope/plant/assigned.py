@@ -9,7 +9,7 @@ file is always there.
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +19,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, HeliotropeError, InputError
 from heliotrope.geometry import FloatArray, as_vectors
 from heliotrope.lcu.config import FAR
-from heliotrope.plant.disk import AtOnce, Disk, DiskBusyError
+from heliotrope.plant.disk import Work
 
 #: Points of one kind (AIM, STANDBY) by name of the heliostat, ENU, m.
 Places = dict[str, tuple[float, ...]]
@@ -126,8 +126,6 @@ class Points:
         Names of the heliostats.
     store
         Store of the points; None: they do not outlive the plant.
-    disk
-        Does the work of the store.
 
     Attributes
     ----------
@@ -135,11 +133,9 @@ class Points:
         ENU, m, (N, 3); NaN where there is none.
     """
 
-    def __init__(
-        self, names: Sequence[str], store: Assigned | None, disk: Disk | None = None
-    ) -> None:
+    def __init__(self, names: Sequence[str], store: Assigned | None) -> None:
         self.aims, self.standbys = (np.full((len(names), 3), np.nan) for _ in KINDS)
-        self._names, self._store, self._disk = names, store, disk or AtOnce()
+        self._names, self._store = names, store
         self._arrays = {"AIM": self.aims, "STANDBY": self.standbys}
         #: The points in the store; only work of the disk changes them.
         self._stored: dict[str, Places] = {kind: {} for kind in KINDS}
@@ -150,42 +146,39 @@ class Points:
                     self._arrays[kind][index[name]] = point
                     self._stored[kind][name] = point
 
-    def assign(
-        self,
-        kind: str,
-        rows: npt.NDArray[np.intp],
-        points: FloatArray,
-        then: Callable[[str], None],
-    ) -> None:
-        """Assign points (K, 3) to heliostats (K,), once they are stored.
+    def assign(self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray) -> None:
+        """Assign points (K, 3) to heliostats (K,); they must be stored (`storing`)."""
+        self._arrays[kind][rows] = points
 
-        ``then`` is called with "", or with the reason why they cannot be stored; such points are
-        not assigned.
+    def storing(
+        self, kind: str, rows: npt.NDArray[np.intp], points: FloatArray
+    ) -> tuple[Work, Work]:
+        """Return work of a disk that stores points (K, 3) of heliostats (K,), and its reverse.
+
+        Both raise `AssignedError` if they cannot be stored. The reverse leaves points alone that
+        were replaced meanwhile; it may be done again.
         """
-        store = self._store
-        if store is None:
-            self._arrays[kind][rows] = points
-            then("")
-            return
+        new = {self._names[i]: tuple(p) for i, p in zip(rows, points.tolist(), strict=True)}
+        old: dict[str, tuple[float, ...] | None] = {}
 
-        def keep() -> None:
-            places = {k: dict(known) for k, known in self._stored.items()}
-            for row, point in zip(rows, points, strict=True):
-                places[kind][self._names[int(row)]] = tuple(point.tolist())
-            store.keep(places)
-            self._stored = places
+        def store() -> None:
+            old.update({name: self._stored[kind].get(name) for name in new})
+            self._keep(kind, dict(new))
 
-        def kept(error: Exception | None) -> None:
-            if error is None:
-                self._arrays[kind][rows] = points
-            elif not isinstance(error, AssignedError):
-                raise error
-            then("" if error is None else str(error))
+        def take_back() -> None:
+            known = self._stored[kind]
+            self._keep(kind, {n: p for n, p in old.items() if known.get(n) == new[n]})
 
-        try:
-            self._disk.do(keep, kept)
-        except DiskBusyError as error:
-            then(str(error))
+        return store, take_back
+
+    def _keep(self, kind: str, changes: Mapping[str, tuple[float, ...] | None]) -> None:
+        """Store points by heliostat; None: it has none any more."""
+        changed = {**self._stored[kind], **changes}
+        places = {k: dict(known) for k, known in self._stored.items()}
+        places[kind] = {name: point for name, point in changed.items() if point is not None}
+        if self._store is not None:
+            self._store.keep(places)
+        self._stored = places
 
 
 def rest_on(standbys: FloatArray, point: tuple[float, float, float] | None) -> None:

@@ -16,6 +16,7 @@ import secrets
 from collections import deque
 from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,6 @@ from heliotrope.links.messages import (
     Lease,
     Progress,
     ProtocolError,
-    Stage,
 )
 from heliotrope.mechanism.board_items import POSE_ITEMS, Wanted, items_of, tables_with
 from heliotrope.mechanism.chain import Mechanism
@@ -51,7 +51,7 @@ from heliotrope.plant.authority import Authority, Grant, Person, Role
 from heliotrope.plant.beam_watch import BeamError, BeamWatch
 from heliotrope.plant.beliefs import Beliefs
 from heliotrope.plant.clusters import QUESTION_LIFE, ClusterEnd, Clusters
-from heliotrope.plant.disk import AtOnce, Disk
+from heliotrope.plant.disk import AtOnce, Disk, Work
 from heliotrope.plant.emergency import EmergencyOrder, PlantReadings, Sentinel, TableWatch
 from heliotrope.plant.field_state import FieldState
 from heliotrope.plant.identity import Identities
@@ -74,8 +74,6 @@ SETTINGS = frozenset({"LOCK_AIM", "ROUGH"})
 POINTS = frozenset({"AIM", "STANDBY"})
 #: States in which a beam is at its aim.
 _ON_AIM = (states.TRACKING, states.SEARCHING)
-#: Points that are not stored within this time of their command are not sent, s.
-_STORED_WITHIN = 5.0
 #: Pause between two passes over parameters and owed records, s.
 _SLOW_BEAT = 1.0
 #: A cluster is asked again for the names of its rows after this time, s.
@@ -166,7 +164,7 @@ class PlantController:
         self.beliefs.subscribe(self._believe)
         self.out_of_service: dict[str, Lockout] = {}
         place = disk or AtOnce()
-        points = Points(self.field.names, assigned, place)
+        points = Points(self.field.names, assigned)
         self.aims, self.standbys = points.aims, points.standbys
         self._ways = BeamWatch(self.beams, self.field, points, self.sun_vector, _machines(design))
         self._agreement = Agreement(
@@ -518,18 +516,56 @@ class PlantController:
         numbers = whole(values, row[3], name)
         names = tuple(dict.fromkeys(heliostats)) or self.field.names
         out = self._locked_out(name, names)
-        able, wrong = self._able(name, tuple(n for n in names if n not in out))
-        clear, blocked = self._ways.clear(name, numbers, able, self.now())
+        clear, wrong = self._examine(name, numbers, tuple(n for n in names if n not in out))
         ticket = self._accept(person, token, name, numbers, names)
-        ticket.block({**wrong, **blocked, **out})
+        ticket.block({**wrong, **out})
         if name not in SETTINGS:
             # A heliostat that still waits to join must not undo a later command.
             self._joining.drop(f"superseded by {name}", frozenset(names))
-        send = self._join if name in JOINING else self._orders.command
-        self._orders.when_recorded(
-            ticket, lambda: send(ticket, name, numbers, ticket.waiting(clear), token)
-        )
+        self._orders.when_recorded(ticket, partial(self._send, ticket, numbers, clear, token))
         return ticket
+
+    def _send(
+        self,
+        ticket: Ticket,
+        numbers: tuple[float, ...],
+        heliostats: tuple[str, ...],
+        token: int,
+        again: bool,
+    ) -> None:
+        """Send a recorded command; one that waited for its record (``again``) is examined again.
+
+        Raises
+        ------
+        RefusedError
+            If it may no longer be sent.
+        """
+        name, left = ticket.name, ticket.waiting(heliostats)
+        if again and left:
+            self._refuse_now(name, left)
+            out = locked_out(self.out_of_service, name, left)
+            left, wrong = self._examine(name, numbers, tuple(n for n in left if n not in out))
+            ticket.block({**wrong, **out})
+            if name not in SETTINGS:
+                # One that was given before it may have joined the queue after its acceptance.
+                self._joining.drop(f"superseded by {name}", frozenset(left))
+        if left:
+            send = self._join if name in JOINING else self._orders.command
+            send(ticket, name, numbers, left, token)
+
+    def _examine(
+        self, name: str, numbers: tuple[float, ...], names: tuple[str, ...]
+    ) -> tuple[tuple[str, ...], dict[str, str]]:
+        """Return the heliostats that may be sent a command now, and why the others may not.
+
+        Raises
+        ------
+        BeamError
+            If none may.
+        """
+        able, wrong = self._able(name, names)
+        clear, blocked = self._ways.clear(name, numbers, able, self.now())
+        return clear, wrong | blocked
 
     def zero(self, person: Person, token: int, heliostat: str, counts: Sequence[float]) -> Ticket:
         """Declare the step counts of the axes of one heliostat that is locked or has a fault.
@@ -561,7 +597,7 @@ class PlantController:
         ticket = self._accept(person, token, "ZERO", numbers, (heliostat,))
         self._orders.when_recorded(
             ticket,
-            lambda: self._orders.command(
+            lambda _: self._orders.command(
                 ticket, "ZERO", numbers, ticket.waiting((heliostat,)), token
             ),
         )
@@ -644,10 +680,13 @@ class PlantController:
                 )
         note = ", ".join(items) + (f"; confirmed: {confirmed}" if confirmed else "")
         ticket = self._accept(person, token, "PARAMETERS", (), (heliostat,), note)
-        self.wanted.set(heliostat, items)
-        self._use(row, *after)
-        self._joining.drop("its parameters are being written", frozenset([heliostat]))
-        self._sync.push(ticket, heliostat, items, token)
+
+        def use() -> None:
+            self.wanted.set(heliostat, items)
+            self._use(row, *self._tables(heliostat, items)[1])
+            self._joining.drop("its parameters are being written", frozenset([heliostat]))
+
+        self._sync.push(ticket, heliostat, items, token, use)
         return ticket
 
     def _use(self, row: int, armature: FloatArray, drives: FloatArray) -> None:
@@ -730,32 +769,43 @@ class PlantController:
         names = tuple(points)
         rows = np.array([self.field.place(n) for n in names], dtype=np.intp)
         wanted = points_of(name, points)
+        self._prove_points(name, names, rows, wanted)
+        groups, keep = grouped(names, wanted), self._ways.points
+        values = next(iter(groups)) if len(groups) == 1 else ()
+        all_names, note = (*names, *out), f"{len(groups)} points"
+        store = keep.storing(name, rows, wanted)
+        ticket = self._accept(person, token, name, values, all_names, note, store)
+        ticket.block(out)
+
+        def send(again: bool) -> None:
+            if again:
+                self._refuse_now(name, names)
+                self._prove_points(name, names, rows, wanted)
+            keep.assign(name, rows, wanted)
+            if name == "STANDBY":
+                for each, place in zip(names, wanted, strict=True):
+                    self.wanted.rest(each, tuple(place))
+            self._send_points(ticket, name, groups, token)
+
+        self._orders.when_recorded(ticket, send)
+        return ticket
+
+    def _prove_points(
+        self, name: str, names: tuple[str, ...], rows: npt.NDArray[np.intp], wanted: FloatArray
+    ) -> None:
+        """Prove that heliostats (K,) may be given points (K, 3) now.
+
+        Raises
+        ------
+        BeamError
+            If one of them may not.
+        """
         tracking = self.field.among(_ON_AIM, self.now())[rows]
         moves = tracking if name == "AIM" else self.field.among((states.IDLE,), self.now())[rows]
         moved = [names[i] for i in np.flatnonzero(moves)]
         if wrong := self._sync.differing(moved) | self._identities.barred(moved):
             raise BeamError(name, wrong)
         self._ways.check_points(name, rows, wanted, tracking)
-        groups = grouped(names, wanted)
-        values = next(iter(groups)) if len(groups) == 1 else ()
-        ticket = self._accept(person, token, name, values, (*names, *out), f"{len(groups)} points")
-        ticket.block(out)
-
-        def kept(problem: str) -> None:
-            if not problem and self.now() - ticket.accepted_at > _STORED_WITHIN:
-                problem = f"it took more than {_STORED_WITHIN:g} s"
-            if problem:
-                text = f"not sent, because it cannot be stored: {problem}"
-                ticket.advance(names, Stage.FAILED, text)
-            else:
-                if name == "STANDBY":
-                    for each, place in zip(names, wanted, strict=True):
-                        self.wanted.rest(each, tuple(place))
-                self._send_points(ticket, name, groups, token)
-
-        assign = self._ways.points.assign
-        self._orders.when_recorded(ticket, lambda: assign(name, rows, wanted, kept))
-        return ticket
 
     def _send_points(
         self,
@@ -806,19 +856,26 @@ class PlantController:
         values: tuple[float, ...],
         heliostats: Sequence[str],
         note: str = "",
+        store: tuple[Work, Work] | None = None,
     ) -> Ticket:
-        rows = [self.field.place(n) for n in heliostats]
+        for each in heliostats:
+            self.field.place(each)
         self.authority.check(person, token, name)
+        self._refuse_now(name, heliostats)
+        try:
+            return self._orders.accept(
+                (person.name, person.role.title, name), values, heliostats, note, store=store
+            )
+        except AuditError as error:
+            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
+
+    def _refuse_now(self, name: str, heliostats: Sequence[str]) -> None:
+        """Refuse a command where no new motion may begin now."""
+        rows = [self.field.place(n) for n in heliostats]
         clusters = {self.field.clusters[self.field.cluster[row]] for row in rows}
         reason = "" if name == "LOCK" else self._sentinel.refusal(clusters)
         if reason:
             raise refusals.NOT_NOW.error(what=name, reason=reason)
-        try:
-            return self._orders.accept(
-                (person.name, person.role.title, name), values, heliostats, note
-            )
-        except AuditError as error:
-            raise refusals.NOT_RECORDED.error(what=name, problem=error) from None
 
 
 def _machines(design: Plant) -> dict[str, Machine]:

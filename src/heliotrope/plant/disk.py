@@ -6,6 +6,7 @@ virtual time needs it.
 """
 
 import asyncio
+import contextlib
 import queue
 import threading
 from collections.abc import Callable
@@ -76,7 +77,7 @@ class DiskThread:
 
         def run() -> None:
             error = _error_of(work)
-            if not loop.is_closed():
+            with contextlib.suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(then, error)
 
         self._waiting.put(run)

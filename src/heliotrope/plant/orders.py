@@ -3,7 +3,7 @@
 import struct
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 
@@ -11,9 +11,11 @@ from heliotrope.errors import InputError
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import SendOutcome
 from heliotrope.links.messages import Command, Emergency, Parameters, Progress, Stage
+from heliotrope.plant.assigned import AssignedError
 from heliotrope.plant.audit import Audit, AuditError, Record
+from heliotrope.plant.authority import RefusedError
 from heliotrope.plant.clusters import ClusterEnd, Clusters
-from heliotrope.plant.disk import Disk, DiskBusyError
+from heliotrope.plant.disk import Disk, DiskBusyError, Work
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import Act
 
@@ -27,8 +29,9 @@ REPEAT = 1.0
 GRACE = 3.0
 #: A command whose record is not on the disk within this time is not sent, s.
 RECORDING = 2.0
-#: Owed records that are written together.
-_BATCH = 256
+#: Owed records that are written together, and the time after which the rest must wait: commands
+#: that are given meanwhile wait behind them, s.
+_BATCH, _TURN = 256, 0.5
 #: Commands that move nothing by themselves: an emergency does not overtake them.
 _STILL = frozenset({"AIM", "STANDBY", "PARAMETERS"})
 #: Time allowed at the end of the plant for the records that are owed, s.
@@ -50,11 +53,20 @@ class _Recording:
     """A ticket whose record is on its way to the disk."""
 
     ticket: Ticket
-    begin: Callable[[], None]
+    begin: Work
+    #: Stores what the command assigns, after its record, and takes that back.
+    store: tuple[Work, Work] | None
     until: float
-    sends: list[Callable[[], None]] = field(default_factory=list)
+    send: Callable[[bool], None] | None = None
+    begun: bool = False
     error: Exception | None = None
-    given_up: bool = False
+
+    def write(self) -> None:
+        """Write the record, then store what the command assigns."""
+        self.begin()
+        self.begun = True
+        if self.store is not None:
+            self.store[0]()
 
 
 class PlantOrders:
@@ -102,7 +114,7 @@ class PlantOrders:
         self._open: dict[str, Ticket] = {}
         self._under: dict[str, _Under] = {}
         self._recording: dict[str, _Recording] = {}
-        self._owed: deque[Callable[[], None]] = deque()
+        self._owed: deque[Work] = deque()
         self._paying = False
         self._sent_at: dict[str, float] = {}
         self._purged_at = clock.monotonic()
@@ -127,6 +139,7 @@ class PlantOrders:
         note: str = "",
         *,
         late: bool = False,
+        store: tuple[Work, Work] | None = None,
     ) -> Ticket:
         """Accept a command and give its record to the disk; see `when_recorded`.
 
@@ -138,6 +151,9 @@ class PlantOrders:
             For the record and the ticket.
         late
             Whether the record may be written later: DEFOCUS and STOW wait for nothing.
+        store
+            Work of the disk that stores what the command assigns, in one piece with its record, and
+            work that takes it back if the command is not sent in the end.
 
         Raises
         ------
@@ -154,48 +170,77 @@ class PlantOrders:
             self._overtake(frozenset(heliostats), what)
             self._owed.append(lambda: self._audit.begin(entry))
         else:
-            self._record(ticket, entry)
+            self._record(ticket, entry, store)
         self._open[identity] = ticket
         return ticket
 
-    def _record(self, ticket: Ticket, entry: Record) -> None:
+    def _record(self, ticket: Ticket, entry: Record, store: tuple[Work, Work] | None) -> None:
         """Give the record of a ticket to the disk."""
         begin = partial(self._audit.begin, entry)
-        recording = _Recording(ticket, begin, self._clock.monotonic() + RECORDING)
+        recording = _Recording(ticket, begin, store, self._clock.monotonic() + RECORDING)
         self._recording[ticket.identity] = recording
         try:
-            self._disk.do(begin, partial(self._recorded, recording))
+            self._disk.do(recording.write, partial(self._recorded, recording))
         except DiskBusyError as error:
             del self._recording[ticket.identity]
             raise AuditError(f"audit: {error}") from None
-        if recording.error is not None:
+        if recording.error is not None and not recording.begun:
             raise recording.error
 
     def _recorded(self, recording: _Recording, error: Exception | None) -> None:
         """Send a command whose record is on the disk, or end it because that failed."""
         ticket = recording.ticket
+        self._give_up_late(recording, self._clock.monotonic())
         del self._recording[ticket.identity]
         recording.error = error
+        if recording.begun:
+            self.confirmed_at = self._clock.monotonic()
         if error is None:
-            self.confirmed_at, ticket.recorded = self._clock.monotonic(), not recording.given_up
-            for send in () if recording.given_up else recording.sends:
-                send()
+            if not ticket.finished:
+                ticket.record()
+                if recording.send is not None:
+                    self._send_recorded(recording, recording.send)
+            elif recording.store is not None:
+                self._owed.append(recording.store[1])
+        elif recording.begun:
+            text = f"not sent, because it cannot be stored: {error}"
+            ticket.advance(ticket.heliostats, Stage.FAILED, text)
         elif ticket.identity in self._open:
             text = f"not sent: its record could not be written: {error}"
             ticket.advance(ticket.heliostats, Stage.FAILED, text)
             # It was accepted, so it gets a record as soon as the disk takes one.
             self._owed.append(recording.begin)
 
-    def when_recorded(self, ticket: Ticket, send: Callable[[], None]) -> None:
+    def _send_recorded(self, recording: _Recording, send: Callable[[bool], None]) -> None:
+        """Send a command that waited for its record, unless it may no longer be sent."""
+        try:
+            send(True)
+        except Exception as error:
+            ticket = recording.ticket
+            ticket.advance(ticket.heliostats, Stage.FAILED, f"not sent: {error}")
+            if recording.store is not None:
+                self._owed.append(recording.store[1])
+            if not isinstance(error, RefusedError):
+                raise
+
+    @staticmethod
+    def _give_up_late(recording: _Recording, now: float) -> None:
+        if now > recording.until:
+            text = f"not sent: its record was not on the disk within {RECORDING:g} s"
+            recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
+
+    def when_recorded(self, ticket: Ticket, send: Callable[[bool], None]) -> None:
         """Call ``send`` once the ticket's record is on the disk; never, if that takes too long.
 
-        Heliostats that have ended meanwhile (`Ticket.waiting`) must be left out.
+        ``send`` is called with whether the command had to wait: what was proven at its acceptance
+        must then be proven again, and heliostats that have ended meanwhile (`Ticket.waiting`) are
+        left out. It may raise `RefusedError`, which ends the ticket.
         """
         recording = self._recording.get(ticket.identity)
-        if recording is None:
-            send()
-        else:
-            recording.sends.append(send)
+        if recording is not None:
+            recording.send = send
+        elif ticket.recorded:
+            send(False)
 
     def _overtake(self, heliostats: frozenset[str], what: str) -> None:
         """Give up commands that wait for their records: none may follow DEFOCUS, STOW or LOCK."""
@@ -218,9 +263,16 @@ class PlantOrders:
         batch, done = tuple(islice(self._owed, _BATCH)), [0]
 
         def write() -> None:
+            until = self._clock.monotonic() + _TURN
             for each in batch:
-                each()
                 done[0] += 1
+                try:
+                    each()
+                except (AuditError, AssignedError):
+                    done[0] -= 1  # it is tried again; what is refused for its content is not
+                    raise
+                if self._clock.monotonic() >= until:
+                    break
             self._audit.confirm()
 
         self._paying = True
@@ -235,10 +287,9 @@ class PlantOrders:
             self._owed.popleft()
         if error is None:
             self.confirmed_at, self.problem = self._clock.monotonic(), ""
-        elif isinstance(error, AuditError):
-            self.problem = str(error)
-        else:
-            self.problem = str(error)
+            return
+        self.problem = str(error)
+        if not isinstance(error, AuditError | AssignedError):
             raise error
 
     # Sending.
@@ -338,10 +389,7 @@ class PlantOrders:
     def beat(self, now: float) -> None:
         """End commands that were not answered in time; record the results of ended tickets."""
         for recording in self._recording.values():
-            if now >= recording.until and not recording.given_up:
-                recording.given_up = True
-                text = f"not sent: its record was not on the disk within {RECORDING:g} s"
-                recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
+            self._give_up_late(recording, now)
         ended = []
         for identity, ticket in self._open.items():
             ticket.expire(now)
@@ -372,6 +420,9 @@ class PlantOrders:
     async def end(self, now: float) -> None:
         """Record the state of every open ticket, at the end of the plant."""
         until = now + _LAST
+        for recording in self._recording.values():
+            text = "not sent: the plant was closed"
+            recording.ticket.advance(recording.ticket.heliostats, Stage.FAILED, text)
         self.beat(now)
         await self._until(lambda: not self._recording, until)
         for identity, ticket in self._open.items():

@@ -3,7 +3,6 @@
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -173,11 +172,27 @@ class ParameterSync:
         if reason:
             raise refusals.PARAMETERS_NOT_HERE.error(heliostat=heliostat, reason=reason)
 
-    def push(self, ticket: Ticket, heliostat: str, items: Mapping[str, bytes], token: int) -> None:
-        """Send items of an accepted ticket; compare the heliostat when the ticket has ended."""
-        send = partial(self._orders.parameters, ticket, heliostat, items, token)
-        self._orders.when_recorded(ticket, send)
+    def push(
+        self,
+        ticket: Ticket,
+        heliostat: str,
+        items: Mapping[str, bytes],
+        token: int,
+        before: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Send items of an accepted ticket once it is recorded; call ``before`` just before.
+
+        The heliostat is compared when the ticket has ended.
+        """
+
+        def send(again: bool) -> None:
+            if again:
+                self.check(heliostat, items)
+            before()
+            self._orders.parameters(ticket, heliostat, items, token)
+
         self._tickets[heliostat] = ticket
+        self._orders.when_recorded(ticket, send)
 
     async def stored(self, heliostat: str, timeout: float) -> dict[str, int]:
         """Return the checksums of the items that a local controller stores, by item.

@@ -56,6 +56,11 @@ class Ticket:
         self._patience = patience
         self._news = asyncio.Event()
 
+    def record(self) -> None:
+        """Note that its record is on the disk."""
+        self.recorded = True
+        self._news.set()
+
     def __repr__(self) -> str:
         return f"<Ticket {self.identity} {self.text}>"
 
@@ -155,6 +160,18 @@ class Ticket:
             elif not await _within(self._clock, until, self._news):
                 return False
         return bool((self._stage <= FINAL).all())
+
+    async def written(self, timeout: float) -> bool:
+        """Wait until its record is on the disk, or it has ended without one; return which.
+
+        ``timeout`` is in s, by the plant's clock; False when it expires.
+        """
+        until = self._clock.monotonic() + timeout
+        while not (self.recorded or self.finished):
+            self._news.clear()
+            if not await _within(self._clock, until, self._news):
+                break
+        return self.recorded
 
     async def end(self, timeout: float = math.inf) -> bool:
         """Wait until every heliostat has ended; True if all are done."""
