@@ -36,6 +36,8 @@ from heliotrope.field.plant import Plant
 from heliotrope.field.target import Receiver
 from heliotrope.lcu.journal import CODES_OF, Journal
 from heliotrope.links.clock import SystemClock
+from heliotrope.links.messages import Emergency, Lease
+from heliotrope.links.tcp import tcp_link
 from heliotrope.mechanism import kinds
 from heliotrope.mechanism.board_items import items_of
 from heliotrope.mechanism.chain import Mechanism
@@ -46,14 +48,15 @@ from heliotrope.plant.audit import JsonLines
 from heliotrope.plant.links_file import LinksFile, read_links
 from heliotrope.plant.ports import Ports
 from heliotrope.plant.sensors import FED, SensorFiles
-from heliotrope.plant.settings import clusters_of
+from heliotrope.plant.settings import PlantSettings, clusters_of
 from heliotrope.sun import Site
 from heliotrope.twin.live import near_pair
 from support.broker import Mosquitto, mosquitto_for
 from support.cluster_process import Line
 from support.clusters import Board, key_of
+from support.plant_bench import ScriptedCluster
 
-MAIN = [sys.executable, "-c", "from heliotrope.cli import main; main()"]
+MAIN = "from heliotrope.cli import main; main()"
 PREFIX = "heliotrope/test"
 #: By which way each cluster of two heliostats is reached.
 WAYS = {"K1": "tcp", "K2": "mqtt", "K3": "K3.toml", "K4": "tcp"}
@@ -160,11 +163,14 @@ def free_port() -> int:
 class Process:
     """A program whose lines are read as they come."""
 
-    def __init__(self, *words: str) -> None:
+    def __init__(self, *words: str, main: str = MAIN) -> None:
         self.text = ""
         self._lines: queue.Queue[str] = queue.Queue()
         self._popen = subprocess.Popen(
-            [*MAIN, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            [sys.executable, "-c", main, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
         self._reader = threading.Thread(target=self._read)
         self._reader.start()
@@ -301,6 +307,105 @@ def _tracked_and_stowed(client: Client, lines: dict[str, Line]) -> None:
     assert {states(lines)[name] for name in names[2:]} == {"TRACKING"}
     missing = [a for a in client.get("alarms") if a["subject"] == "K4" and a["active"]]
     assert missing
+
+
+#: The program with a disk on which each transaction, a mere read too, and each sync takes some
+#: seconds while a file is there.
+SLOW = """
+import os, time
+from sqlalchemy import event
+from sqlalchemy.engine import Engine
+from heliotrope.cli import main
+
+sync, path = os.fsync, {path!r}
+def wait(*_):
+    if os.path.exists(path):
+        time.sleep({seconds})
+def slow(file):
+    wait()
+    sync(file)
+event.listen(Engine, "commit", wait)
+os.fsync = slow
+main()
+"""
+#: Time of one transaction on that disk, s.
+SLOWNESS = 3.0
+
+
+def test_a_slow_disk_holds_up_no_lease_and_no_emergency(tmp_path: Path) -> None:
+    port, slow = free_port(), tmp_path / "slow"
+    write_plant(design(), tmp_path / "plant.toml")
+    (tmp_path / "links.toml").write_text(
+        'format = "heliotrope-links"\nversion = 1\nkeys = "links.keys"\n'
+        f'[tcp]\nlisten = "127.0.0.1:{port}"\n[clusters]\n'
+        + "".join(f'{name} = "tcp"\n' for name in WAYS)
+    )
+    keys = "".join(f'{name} = "{KEYS[name].hex()}"\n' for name in WAYS)
+    private(tmp_path / "links.keys", f"[clusters]\n{keys}")
+    words = "run", "plant.toml", "--clusters", "links.toml", "--port", "0", "--data", "data"
+    places = {"plant.toml", "links.toml", "data"}
+    program = SLOW.format(path=str(slow), seconds=SLOWNESS)
+    with contextlib.ExitStack() as stack:
+        plant = Process(
+            *(str(tmp_path / word) if word in places else word for word in words),
+            *("--no-browser", "--idle", "--every", "1"),
+            main=program,
+        )
+        stack.callback(plant.end)
+        address = plant.says(r"console: (\S+)")[1]
+        password = plant.says(r"password (\S+)")[1]
+        near = Near(port)
+        stack.callback(near.end)
+        with Client(url=address, timeout=60.0) as client:
+            client.sign_in("engineer", password)
+            until(lambda: client.get("clusters")[0]["alive"], lambda: client.get("clusters"))
+            slow.touch()
+            begun = time.monotonic()
+            # The store is asked for the accounts, and for the session.
+            client.get("accounts")
+            client.get("accounts")
+            client.ask("POST", "defocus", {"heliostats": ["H1"]})
+            asked = time.monotonic()
+            client.ask("POST", "emergency", {})
+            until(lambda: near.times(Emergency)[-1:] > [asked], lambda: near.times(Emergency))
+            took = near.times(Emergency)[-1] - asked
+            time.sleep(3.0 * SLOWNESS)
+            ended = time.monotonic()
+            slow.unlink()
+        leases = [at for at in near.times(Lease) if begun - 2.0 < at < ended]
+        lease = PlantSettings().lease
+        assert max(np.diff([*leases, ended])) < lease
+        assert took < lease
+        code, text = plant.end(signal.SIGINT)
+    assert code == 0, text
+
+
+class Near:
+    """The cluster K1 in a thread of the test: it obeys, and notes when messages come."""
+
+    def __init__(self, port: int) -> None:
+        clock = SystemClock()
+        self._link = tcp_link("127.0.0.1", port, "K1", KEYS["K1"], clock)
+        members = clusters_of(design())["K1"]
+        self._cluster = ScriptedCluster("K1", members, self._link, clock)
+        self._ended = False
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()))
+        self._thread.start()
+
+    async def _run(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._cluster.run())
+            while not self._ended:
+                await asyncio.sleep(0.1)
+            await self._link.close()
+
+    def times(self, kind: type[Any]) -> list[float]:
+        """Return when messages of a kind came, monotonic s."""
+        return [at for at, message in self._cluster.taken if isinstance(message, kind)]
+
+    def end(self) -> None:
+        self._ended = True
+        self._thread.join()
 
 
 # -- the links file ------------------------------------------------------------------------

@@ -63,7 +63,7 @@ async def sign_in(
         samesite="strict",
         secure=console.settings.tls or console.settings.plain,
     )
-    account = await console.read(lambda: console.people.account(given.name))
+    account = await console.ask(lambda: console.people.account(given.name))
     role = account.role if account is not None else "viewer"
     return models.CallerState(
         name=given.name, role=role, by="session", expires=expires, csrf=_secrets.csrf_of(secret)
@@ -74,7 +74,7 @@ async def sign_in(
 async def sign_out(console: Here, who: Anyone, response: Response) -> None:
     """Sign out."""
     if who.by == "session":
-        await asyncio.to_thread(console.people.close_session, who.secret)
+        await console.ask(lambda: console.people.close_session(who.secret))
         console.known.clear()
         response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
 
@@ -107,7 +107,7 @@ async def reset_password(console: Here, who: Engineer, name: Named) -> models.Gi
     """Give a person a new password, shown once; all their sessions end."""
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
-    if await console.read(lambda: console.people.account(name)) is None:
+    if await console.ask(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     password = _secrets.new_password()
     await _set_password(console, name, password)
@@ -119,7 +119,7 @@ async def reset_password(console: Here, who: Engineer, name: Named) -> models.Gi
 async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
     """Return the accounts."""
     del who
-    return [_account(one) for one in await console.read(console.people.accounts)]
+    return [_account(one) for one in await console.ask(console.people.accounts)]
 
 
 @router.post("/accounts", response_model=models.AccountState, status_code=201, tags=["people"])
@@ -128,7 +128,9 @@ async def new_account(
 ) -> models.AccountState:
     """Create an account."""
     kept = await _hashed(console, given.password)
-    made = await asyncio.to_thread(console.people.add, given.name, kept, given.role, console.now())
+    made = await console.ask(
+        lambda: console.people.add(given.name, kept, given.role, console.now())
+    )
     console.operations.logbook.event(
         "people", who.person.name, f"account {given.name} created, {given.role}"
     )
@@ -142,16 +144,13 @@ async def change_account(
     """Change the role or password of an account, or disable it."""
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
-    if await console.read(lambda: console.people.account(name)) is None:
+    if await console.ask(lambda: console.people.account(name)) is None:
         raise HTTPException(404, f"there is no account {name}")
     kept = await _hashed(console, given.password) if given.password is not None else None
-    made = await asyncio.to_thread(
-        console.people.change,
-        name,
-        console.now(),
-        role=given.role,
-        password_hash=kept,
-        disabled=given.disabled,
+    made = await console.ask(
+        lambda: console.people.change(
+            name, console.now(), role=given.role, password_hash=kept, disabled=given.disabled
+        )
     )
     console.known.clear()
     console.operations.logbook.event("people", who.person.name, f"account {name} changed")
@@ -161,7 +160,7 @@ async def change_account(
 @router.get("/tokens", response_model=list[models.TokenState], tags=["people"])
 async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
     """Return the tokens: your own, or all of them for an engineer."""
-    found = await console.read(lambda: console.people.tokens(_whose(who)))
+    found = await console.ask(lambda: console.people.tokens(_whose(who)))
     return [models.TokenState(**asdict(one)) for one in found]
 
 
@@ -172,13 +171,11 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
         raise HTTPException(403, "a token cannot create tokens; sign in to do so")
     if ROLES[given.role] > who.person.role:
         raise HTTPException(403, f"token: role {given.role} is higher than your own")
-    made, secret = await asyncio.to_thread(
-        console.people.add_token,
-        who.person.name,
-        given.label,
-        given.role,
-        console.now(),
-        86_400.0 * given.days,
+    lifetime = 86_400.0 * given.days
+    made, secret = await console.ask(
+        lambda: console.people.add_token(
+            who.person.name, given.label, given.role, console.now(), lifetime
+        )
     )
     console.operations.logbook.event(
         "people", who.person.name, f"token {given.label} created, {given.role}"
@@ -189,10 +186,10 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
 @router.delete("/tokens/{key}", status_code=204, tags=["people"])
 async def revoke(console: Here, who: Anyone, key: Named) -> None:
     """Revoke a token: your own, or any as an engineer."""
-    found = await console.read(lambda: console.people.tokens(_whose(who)))
+    found = await console.ask(lambda: console.people.tokens(_whose(who)))
     if key not in {one.key for one in found}:
         raise HTTPException(404, f"there is no token {key}")
-    await asyncio.to_thread(console.people.revoke_token, key)
+    await console.ask(lambda: console.people.revoke_token(key))
     console.known.clear()
 
 
@@ -203,7 +200,7 @@ async def _hashed(console: Console, password: str) -> str:
 
 async def _set_password(console: Console, name: str, password: str) -> None:
     kept = await _hashed(console, password)
-    await asyncio.to_thread(console.people.change, name, console.now(), password_hash=kept)
+    await console.ask(lambda: console.people.change(name, console.now(), password_hash=kept))
     console.known.clear()
 
 

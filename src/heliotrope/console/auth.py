@@ -10,6 +10,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar, cast
 from urllib.parse import urlsplit
@@ -57,6 +58,11 @@ class Console:
     #: Concurrent password checks: each takes 50 ms of a core and 64 MiB.
     hashing: asyncio.Semaphore = field(default_factory=lambda: asyncio.Semaphore(2))
 
+    #: Threads that wait for the store.
+    threads: ThreadPoolExecutor = field(
+        default_factory=lambda: ThreadPoolExecutor(4, "console store")
+    )
+
     #: Recently authenticated callers, with the time, by kind and secret.
     known: dict[tuple[str, str], tuple[float, "Caller"]] = field(default_factory=dict)
 
@@ -99,13 +105,13 @@ class Console:
         if fixed is not None:
             self.shared[FIXED] = fixed
 
-    async def read(self, look: Callable[[], T]) -> T:
-        """Return an answer of the store.
+    async def ask(self, work: Callable[[], T]) -> T:
+        """Return the result of work of the store, done in a thread: its disk may be slow.
 
-        A file is read at once, in less than a millisecond; a thread beside a busy loop would take a
-        hundred. A database server, which may be slow or gone, must not hold the loop.
+        The threads are the console's own: those that hang must not take the place of others, such
+        as the one that reads the sensors.
         """
-        return look() if self.people.near else await asyncio.to_thread(look)
+        return await asyncio.get_running_loop().run_in_executor(self.threads, work)
 
     def now(self) -> float:
         """Return the machine's time, POSIX s: sessions end by it, whatever the plant's time."""
@@ -181,9 +187,9 @@ async def _look_up(console: Console, by: str, secret: str) -> tuple[float, Calle
     now = console.now()
     found: ApiToken | Session | None
     if by == "token":
-        found = await console.read(lambda: console.people.token(secret, now))
+        found = await console.ask(lambda: console.people.token(secret, now))
     else:
-        found = await console.read(lambda: console.people.session(secret, now))
+        found = await console.ask(lambda: console.people.session(secret, now))
     if found is None:
         console.known.pop((by, secret), None)
         return None
@@ -281,8 +287,8 @@ async def log_in(console: Console, name: str, password: str, address: str) -> tu
     """
     account = await checked(console, name, password, address)
     now, lifetime = console.now(), console.settings.session_s
-    secret = await asyncio.to_thread(
-        console.people.open_session, account.name, now, lifetime, address
+    secret = await console.ask(
+        lambda: console.people.open_session(account.name, now, lifetime, address)
     )
     return secret, now + lifetime
 
@@ -304,7 +310,7 @@ async def checked(console: Console, name: str, password: str, address: str) -> A
             {"Retry-After": str(seconds)},
         )
     console.attempts.begin(*keys)
-    account = await console.read(lambda: console.people.account(name))
+    account = await console.ask(lambda: console.people.account(name))
     kept = account.password_hash if account is not None and not account.disabled else None
     async with console.hashing:
         good = await asyncio.to_thread(_secrets.verify_password, kept, password)

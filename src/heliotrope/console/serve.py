@@ -53,6 +53,8 @@ class ConsoleServer:
             ssl_certfile=chosen.certificate,
             ssl_keyfile=chosen.key,
         )
+        # This reads modules and certificates from the disk, which no loop may wait for.
+        config.load()
         self._server = _Server(config)
 
     async def run(self) -> None:

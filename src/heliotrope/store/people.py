@@ -121,11 +121,6 @@ class People:
         self._database, self._writer, self._entropy = database, writer, entropy
         self._noted: dict[str, float] = {}
 
-    @property
-    def near(self) -> bool:
-        """Whether the database is a file on this machine, not a server that may be slow."""
-        return self._database.file is not None
-
     # -- accounts ------------------------------------------------------------------------
 
     def empty(self) -> bool:

@@ -20,6 +20,7 @@ from heliotrope.field.plant import Plant
 from heliotrope.geometry import as_float
 from heliotrope.lcu import states
 from heliotrope.plant.assembly import PlantAssembly
+from heliotrope.plant.disk import DiskBusyError, DiskThread
 from heliotrope.store.keeper import Keeper
 from heliotrope.store.telemetry import Look, Telemetry
 
@@ -189,48 +190,78 @@ async def archive(live: PlantAssembly, shown: Shown) -> AsyncIterator[None]:
         kept.close()
 
 
-def console_of(live: PlantAssembly, keeper: Keeper, shown: Shown) -> "ConsoleServer | None":
-    """Return the console of a plant that does not run yet; None without one.
+class Lines:
+    """The printed lines of a plant at work, printed by a thread.
 
-    Making it takes longer than a lease lasts, so it is made before the plant begins.
+    Their reader may be slow, as a full pipe or a busy disk is, and may have gone: lines are lost
+    then, and the plant goes on.
+    """
+
+    def __init__(self) -> None:
+        self._thread = DiskThread(most=100)
+
+    def print(self, text: str) -> None:
+        """Print a line soon."""
+        with contextlib.suppress(DiskBusyError):
+            self._thread.do(lambda: print(text, flush=True), lambda _: None)
+
+    def close(self) -> None:
+        """Print what waits, and end."""
+        self._thread.close(2.0)
+
+
+def console_of(
+    live: PlantAssembly, keeper: Keeper, shown: Shown
+) -> "tuple[ConsoleServer | None, str | None]":
+    """Return the console of a plant that does not run yet, and the password of a new first account.
+
+    None without a console. Making it takes longer than a lease lasts, and the account is written to
+    the store, so this comes before the plant begins.
     """
     if not shown.console:
-        return None
+        return None, None
+    from heliotrope.console.people import first_start
     from heliotrope.console.serve import ConsoleServer
 
-    return ConsoleServer(live.operations, keeper.people, shown.settings())
+    server = ConsoleServer(live.operations, keeper.people, shown.settings())
+    return server, first_start(keeper.people, live.clock.utc().timestamp())
 
 
 @contextlib.asynccontextmanager
 async def console(
     server: "ConsoleServer | None",
-    live: PlantAssembly,
-    keeper: Keeper,
+    password: str | None,
     shown: Shown,
+    lines: Lines,
     speed: float = 1.0,
 ) -> AsyncIterator[bool]:
     """Serve the console during a block and print its address; yield whether there is one."""
     if server is None:
         yield False
         return
-    from heliotrope.console.people import FIRST, first_start
+    from heliotrope.console.people import FIRST
 
-    password = first_start(keeper.people, live.clock.utc().timestamp())
     async with asyncio.TaskGroup() as group:
         serving = group.create_task(server.run())
         address = await server.address(60.0 * speed)
-        print(f"console: {address}", flush=True)
+        lines.print(f"console: {address}")
         if password is not None:
-            print(f"first account: {FIRST}, password {password} (shown only now)", flush=True)
+            lines.print(f"first account: {FIRST}, password {password} (shown only now)")
         if shown.browser and sys.stdout.isatty():
-            webbrowser.open(address)
+            await asyncio.to_thread(webbrowser.open, address)
         yield True
         await server.close()
         await serving
 
 
 async def watch(
-    live: PlantAssembly, shown: Shown, ending: asyncio.Event, *, seen: bool, speed: float = 1.0
+    live: PlantAssembly,
+    shown: Shown,
+    ending: asyncio.Event,
+    lines: Lines,
+    *,
+    seen: bool,
+    speed: float = 1.0,
 ) -> None:
     """Print a line at intervals until the end; ``seen``: a console is served."""
     loop = asyncio.get_running_loop()
@@ -241,12 +272,12 @@ async def watch(
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(max(left, 0.01)):
                 await ending.wait()
-        print(line(live), flush=True)
+        lines.print(line(live))
 
 
-async def stow(live: PlantAssembly, ending: asyncio.Event) -> bool:
+async def stow(live: PlantAssembly, ending: asyncio.Event, lines: Lines) -> bool:
     """Stow the field, or give up at a second signal; return whether all of it is stowed."""
-    print("stowing; Ctrl-C again ends at once", flush=True)
+    lines.print("stowing; Ctrl-C again ends at once")
     ending.clear()
     stowing = asyncio.ensure_future(live.stowed())
     waiting = asyncio.ensure_future(ending.wait())
@@ -258,7 +289,7 @@ async def stow(live: PlantAssembly, ending: asyncio.Event) -> bool:
         if isinstance(error, Exception):
             raise error
     good = list(done) == [True]
-    print("the field is stowed" if good else "not every heliostat is stowed", flush=True)
+    lines.print("the field is stowed" if good else "not every heliostat is stowed")
     return good
 
 
@@ -312,14 +343,16 @@ async def at_work(
     live: PlantAssembly, keeper: Keeper, shown: Shown, ending: asyncio.Event, speed: float = 1.0
 ) -> None:
     """Run a plant with console and archive until the end, then stow its field."""
-    server = console_of(live, keeper, shown)
-    async with (
-        live.running(),
-        archive(live, shown),
-        console(server, live, keeper, shown, speed) as seen,
-    ):
-        await watch(live, shown, ending, seen=seen, speed=speed)
-        if not await stow(live, ending):
-            print(live.left(), flush=True)
-        await live.end()
-    print("ended", flush=True)
+    server, password = console_of(live, keeper, shown)
+    with contextlib.closing(Lines()) as lines:
+        # The archive opens its folder before the plant begins, and is closed after its end.
+        async with (
+            archive(live, shown),
+            live.running(),
+            console(server, password, shown, lines, speed) as seen,
+        ):
+            await watch(live, shown, ending, lines, seen=seen, speed=speed)
+            if not await stow(live, ending, lines):
+                lines.print(live.left())
+            await live.end()
+        lines.print("ended")
