@@ -35,7 +35,7 @@ test: $(STAMP)  ## run the tests in parallel
 soak: $(STAMP)  ## run the slow tests too
 	@$(BIN)/python -m pytest -n $(JOBS) -q
 	@mkdir -p out
-	@$(BIN)/heliotrope simulate --seed 1 --hours 0.1 --runs $(RUNS) --processes $(shell nproc) \
+	@$(BIN)/heliotrope simulate --seed 1 --hours 0.1 --world any --runs $(RUNS) --processes $(shell nproc) \
 		--minutes 120 --progress out/soak.jsonl
 
 mutants: $(STAMP)  ## plant 500 small errors in the control code; what finds them (hours; goes on)

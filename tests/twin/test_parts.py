@@ -1,19 +1,26 @@
 """Parts of the twin: flash, motors, clocks, the bus and its faults, many runs."""
 
+import asyncio
+import math
 import random
+from contextvars import copy_context
 from pathlib import Path
 
 import pytest
 
 from heliotrope.errors import FormatError, InputError
 from heliotrope.lcu import ticks, wire
-from heliotrope.links.clock import VirtualClock, run_virtual
+from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of, run_virtual
 from heliotrope.links.link import LinkClosedError, SendOutcome
+from heliotrope.plant.audit import AuditError
+from heliotrope.sun import vector
 from heliotrope.twin.boards.bus import BusFaults, TwinBus
 from heliotrope.twin.boards.clocks import DriftingClock, SimulatedTime, TickCounter
 from heliotrope.twin.boards.flash import NorFlash, PowerCutError
 from heliotrope.twin.boards.motors import MotorAxis
-from heliotrope.twin.boards.outfit import outfits
+from heliotrope.twin.boards.outfit import RECEIVER, outfits
+from heliotrope.twin.records import RecordsDisk
+from heliotrope.twin.world.scene import USUAL, scene_of
 from heliotrope.twin.world.simulation import RunPlan
 from heliotrope.twin.world.soak import run_many
 
@@ -151,3 +158,80 @@ def test_a_soak_goes_on_where_it_stopped(tmp_path: Path) -> None:
 def test_a_bus_carries_no_more() -> None:
     with pytest.raises(InputError, match="33 heliostats on a bus; give 1 to 32"):
         outfits(33)
+
+
+def test_a_frozen_program_stands_still_and_catches_up() -> None:
+    async def main(clock: VirtualClock) -> None:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualLoop)
+        echo, ticks_of = Echo(), {"one": 0, "two": 0}
+        bus = TwinBus(clock, [echo])
+
+        async def tick(name: str) -> None:
+            while True:
+                await asyncio.sleep(1.0)
+                ticks_of[name] += 1
+
+        async def program(name: str) -> None:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(tick(name))
+                await bus.transmit(b"frame\0")
+
+        tasks = [loop.create_task(program(n), context=context_of(n)) for n in ticks_of]
+        await asyncio.sleep(1e-5)
+        loop.freeze("one")
+        await asyncio.sleep(10.5)
+        assert ticks_of == {"one": 0, "two": 10}
+        assert echo.heard == [b"frame\0"], "the port sends what was written to it"
+        loop.thaw("one")
+        await asyncio.sleep(1.5)
+        assert ticks_of["one"] == 2
+        loop.freeze("two")
+        for task in tasks:
+            task.cancel()
+        loop.thaw("two")
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+    run_virtual(main)
+
+
+def test_a_slow_disk_works_in_order_and_loses_what_waits() -> None:
+    async def main(clock: VirtualClock) -> None:
+        disk, done = RecordsDisk(), []
+        queue = disk.queue(clock, copy_context())
+
+        def work(name: str) -> None:
+            queue.do(lambda: done.append(name), done.append)
+
+        work("at once")
+        disk.set_slow(clock.monotonic(), 2.0)
+        work("first")
+        disk.set_slow(clock.monotonic(), 0.0)
+        work("second")
+        assert done == ["at once", None]
+        assert disk.busy(clock.monotonic())
+        await asyncio.sleep(2.1)
+        assert done == ["at once", None, "first", None, "second", None]
+        assert not disk.busy(clock.monotonic())
+        disk.set_full(clock.monotonic(), full=True)
+        queue.do(disk.check, lambda error: done.append(type(error)))
+        assert done[-1] is AuditError
+        disk.set_slow(clock.monotonic(), 2.0)
+        work("lost")
+        disk.lose()
+        await asyncio.sleep(5.0)
+        assert "lost" not in done
+
+    run_virtual(main)
+
+
+def test_a_drawn_scene_has_sun_and_free_mirrors() -> None:
+    assert scene_of(("calm",), 3, 60.0, 4) is USUAL
+    for seed in range(30):
+        scene = scene_of(("place",), seed, 600.0, 6)
+        assert scene == scene_of(("place",), seed, 600.0, 6)
+        for at in (0.0, 600.0):
+            assert vector(scene.start.timestamp() + at, scene.site)[2] > 0.13
+        for middle, radius in scene.keep_outs:
+            assert math.dist(middle, RECEIVER) > radius + 5.0
+            assert all(math.dist(middle, (*place, 2.0)) > radius + 5.0 for place in scene.places)

@@ -13,7 +13,7 @@ from heliotrope.twin.invariants.invariants import TITLES
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
 from heliotrope.twin.world.simulation import RunPlan, RunResult, run, shrink
-from heliotrope.twin.world.worlds import WORLDS
+from heliotrope.twin.world.worlds import MIX, WORLDS, mixed
 from support.twin_defects import DEFECTS, Defect
 
 #: Seeds that may be spent on a defect.
@@ -95,7 +95,17 @@ def test_a_world_is_the_same_for_the_same_seed(world: str) -> None:
     assert f" --world {world}" in first.command
 
 
-@pytest.mark.parametrize("worlds", [("calm",), ("calm", "swarm")])
+def test_each_run_of_any_draws_its_worlds_again() -> None:
+    drawn = [mixed(seed) for seed in range(40)]
+    assert drawn == [mixed(seed) for seed in range(40)]
+    assert () in drawn
+    assert {name for worlds in drawn for name in worlds} == set(MIX)
+    assert len(set(drawn)) > 15
+
+
+@pytest.mark.parametrize(
+    "worlds", [("calm",), ("calm", "swarm"), *(("calm", name) for name in MIX[3:])]
+)
 def test_no_invariant_is_broken_while_mirrors_track(worlds: tuple[str, ...]) -> None:
     outcome = run(RunPlan(1, 120.0, 3, 60.0, worlds=worlds))
     assert outcome.good, f"{outcome.text}; {outcome.command}"

@@ -17,7 +17,8 @@ def simulate(
         list[str] | None, typer.Option(help="Only faults of this kind; may be repeated.")
     ] = None,
     world: Annotated[
-        list[str] | None, typer.Option(help="Add one of the harder worlds; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Add a harder world; may be repeated. any: each run draws its own."),
     ] = None,
     runs: Annotated[int, typer.Option(help="Number of runs, with consecutive seeds.")] = 1,
     processes: Annotated[int, typer.Option(help="Runs in parallel.")] = 1,
@@ -39,6 +40,7 @@ def simulate(
     from heliotrope.errors import InputError
     from heliotrope.twin.world.simulation import RunPlan
     from heliotrope.twin.world.soak import run_many
+    from heliotrope.twin.world.worlds import ANY, mixed
 
     if runs < 1 or (minutes is not None and not minutes > 0.0):
         raise InputError(f"{runs} runs in {minutes} minutes; give at least 1, and above 0")
@@ -49,7 +51,7 @@ def simulate(
             heliostats,
             pause,
             tuple(only or ()),
-            worlds=tuple(world or ()),
+            worlds=mixed(seed + i) if world == [ANY] else tuple(world or ()),
         )
         for i in range(runs)
     ]

@@ -15,6 +15,7 @@ import selectors
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine
+from contextvars import Context, ContextVar, copy_context
 from datetime import UTC, datetime, timedelta
 from typing import Any, Protocol, TypeVar
 
@@ -224,17 +225,36 @@ def utc_of_week(week: int, time_of_week_ms: int, not_before: datetime) -> dateti
 # -- virtual time ----------------------------------------------------------------------
 
 
-class _Drawn(deque[asyncio.Handle]):
-    """Ready callbacks, taken in random order."""
+#: The simulated program that a task belongs to, "" if it belongs to none; see `VirtualLoop.freeze`.
+PROGRAM: ContextVar[str] = ContextVar("PROGRAM", default="")
 
-    def __init__(self, chance: random.Random) -> None:
+
+def context_of(program: str) -> Context:
+    """Return a context for the tasks of a simulated program; their own tasks inherit it."""
+    context = copy_context()
+    context.run(PROGRAM.set, program)
+    return context
+
+
+class _Drawn(deque[asyncio.Handle]):
+    """Ready callbacks, taken in random order; those of frozen programs wait."""
+
+    def __init__(self, chance: random.Random, nothing: asyncio.Handle) -> None:
         super().__init__()
-        self._chance = chance
+        self._chance, self._nothing = chance, nothing
+        self.held: dict[str, list[asyncio.Handle]] = {}
 
     def popleft(self) -> asyncio.Handle:
         if len(self) > 1:
             self.rotate(-self._chance.randrange(len(self)))
-        return super().popleft()
+        handle = super().popleft()
+        if self.held:
+            context: Context = handle._context  # type: ignore[attr-defined] # noqa: SLF001
+            held = self.held.get(context.get(PROGRAM, ""))
+            if held is not None:
+                held.append(handle)
+                return self._nothing
+        return handle
 
 
 class _NoWait(selectors.SelectSelector):
@@ -285,11 +305,25 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         super().__init__(self._no_wait)
         if seed is not None:
             # asyncio offers no public way to order callbacks; a test checks that this one works.
-            self._ready = _Drawn(random.Random(seed))
+            nothing = asyncio.Handle(lambda: None, (), self)
+            nothing.cancel()
+            self._ready: _Drawn = _Drawn(random.Random(seed), nothing)
 
     def time(self) -> float:
         """Return the virtual time in s."""
         return self._no_wait.now
+
+    def freeze(self, program: str) -> None:
+        """Stop a program, as a stopped process or a suspended machine does, until `thaw`.
+
+        Nothing of it runs, while time goes on. Its tasks are those of `context_of`; the loop needs
+        a seed.
+        """
+        self._ready.held.setdefault(program, [])
+
+    def thaw(self, program: str) -> None:
+        """Let a program go on: everything that has become due runs at once, in any order."""
+        self._ready.extend(self._ready.held.pop(program, ()))
 
     def run_in_executor(  # type: ignore[override]
         self, executor: Any, func: Callable[..., Any], *args: Any

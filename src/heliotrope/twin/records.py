@@ -1,11 +1,16 @@
 """Command records on a simulated disk, which may be full and which survives the plant."""
 
+import asyncio
+from collections import deque
 from collections.abc import Mapping
+from contextvars import Context
 from dataclasses import replace
 
 from heliotrope.errors import InputError
+from heliotrope.links.clock import Clock
 from heliotrope.plant.assigned import Places
 from heliotrope.plant.audit import STOPPED, AuditError, Record
+from heliotrope.plant.disk import Then, Work
 
 
 class RecordsDisk:
@@ -17,20 +22,45 @@ class RecordsDisk:
         Records by identity, in the order in which they began.
     full
         Whether nothing can be written.
+    delay
+        Time that each piece of work takes, s.
     well_since
-        Time since which the disk has had room, s.
+        Time since which the disk has had room and has kept up with the work, s.
     """
 
     def __init__(self) -> None:
         self.records: dict[str, Record] = {}
         self.full = False
+        self.delay = 0.0
         self.well_since = float("-inf")
+        self._queue: DiskQueue | None = None
 
     def set_full(self, now: float, *, full: bool) -> None:
         """Fill the disk, or make room."""
         if self.full and not full:
             self.well_since = now
         self.full = full
+
+    def set_slow(self, now: float, delay: float) -> None:
+        """Set the time that each piece of work takes, s."""
+        if self.delay and not delay:
+            self.well_since = now if self._queue is None else max(now, self._queue.free_at)
+        self.delay = delay
+
+    def queue(self, clock: Clock, context: Context) -> "DiskQueue":
+        """Return the queue of a run of the plant's program; see `DiskQueue`."""
+        self._queue = DiskQueue(self, clock, context)
+        return self._queue
+
+    def lose(self) -> None:
+        """Lose the work that waits: the plant's program has ended."""
+        if self._queue is not None:
+            self._queue.lose()
+            self._queue = None
+
+    def busy(self, now: float) -> bool:
+        """Whether a record may take its time."""
+        return self.delay > 0.0 or (self._queue is not None and self._queue.free_at > now)
 
     def check(self) -> None:
         """Check that the disk has room.
@@ -42,6 +72,59 @@ class RecordsDisk:
         """
         if self.full:
             raise AuditError("audit: no space left on the simulated disk; make room")
+
+
+class DiskQueue:
+    """The work that waits for a disk in virtual time; a `plant.disk.Disk`.
+
+    Parameters
+    ----------
+    disk
+        Its delay is that of each piece of work.
+    clock
+        True time.
+    context
+        Context of the program that the work belongs to.
+
+    Attributes
+    ----------
+    free_at
+        When the work given so far is done, s.
+    """
+
+    def __init__(self, disk: RecordsDisk, clock: Clock, context: Context) -> None:
+        self._disk, self._clock, self._context = disk, clock, context
+        self._waiting: deque[tuple[float, Work, Then]] = deque()
+        self.free_at = clock.monotonic()
+
+    def do(self, work: Work, then: Then) -> None:
+        """Do work when all earlier work is done and its own time has passed."""
+        now = self._clock.monotonic()
+        self.free_at = max(self.free_at, now) + self._disk.delay
+        self._waiting.append((self.free_at, work, then))
+        if self.free_at > now:
+            loop = asyncio.get_running_loop()
+            loop.call_later(self.free_at - now, self._work, context=self._context)
+        else:
+            self._work()
+
+    def _work(self) -> None:
+        # A timer may fire a rounding error too early.
+        while self._waiting and self._waiting[0][0] <= self._clock.monotonic() + 1e-6:
+            _, work, then = self._waiting.popleft()
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001 - it goes to the plant
+                then(error)
+            else:
+                then(None)
+
+    def lose(self) -> None:
+        """Lose the work that waits."""
+        self._waiting.clear()
+
+    def close(self) -> None:
+        """Do nothing: the work goes on by itself."""
 
 
 class SimulatedAudit:

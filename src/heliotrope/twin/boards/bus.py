@@ -8,12 +8,13 @@ any moment (`BusFaults`). Everything connected to the bus is a `Station`.
 import asyncio
 import random
 from collections.abc import Callable
+from contextvars import Context
 from dataclasses import dataclass
 from typing import Protocol
 
 from heliotrope.cluster.turns import Turns
 from heliotrope.errors import InputError
-from heliotrope.links.clock import Clock
+from heliotrope.links.clock import PROGRAM, Clock
 from heliotrope.links.link import LinkClosedError, SendOutcome
 
 #: Start, eight data bits, stop.
@@ -177,8 +178,7 @@ class TwinBus:
         async with self._turns.turn(urgent=urgent):
             outcome = self._may(expires)
             if outcome is SendOutcome.SENT:
-                await self._pause(len(frame))
-                self.carry(frame)
+                await self._carried(frame)
             return outcome
 
     async def transact(
@@ -204,8 +204,7 @@ class TwinBus:
         async with self._turns.turn(urgent=urgent):
             if self._may(expires) is not SendOutcome.SENT:
                 return b""
-            await self._pause(len(frame))
-            answer = self.carry(frame)
+            answer = await self._carried(frame)
             took = self._turn_around + self._per_byte * len(answer)
             if self._happens(self.faults.delay):
                 took = max(took, self._chance.uniform(took, timeout))
@@ -217,9 +216,25 @@ class TwinBus:
             await asyncio.sleep(took)
             return answer
 
-    async def _pause(self, size: int) -> None:
-        if self._per_byte:
-            await asyncio.sleep(self._per_byte * size)
+    async def _carried(self, frame: bytes) -> bytes:
+        """Carry a frame when its last byte is out; return the answers."""
+        if not PROGRAM.get():
+            if self._per_byte:
+                await asyncio.sleep(self._per_byte * len(frame))
+            return self.carry(frame)
+        # The port goes on sending when the program that wrote to it is frozen.
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[bytes] = loop.create_future()
+
+        def out() -> None:
+            if not done.done():
+                try:
+                    done.set_result(self.carry(frame))
+                except Exception as error:  # noqa: BLE001 - it is the sender's
+                    done.set_exception(error)
+
+        loop.call_later(self._per_byte * len(frame), out, context=Context())
+        return await done
 
     def _may(self, expires: float | None) -> SendOutcome:
         if self.closed:

@@ -35,6 +35,8 @@ MACHINE = Machine(
 )
 #: Centre and radius of a sphere that no beam may enter, m; no way leads there unless ordered.
 KEEP_OUT, KEEP_OUT_RADIUS = (-12.0, 0.0, 25.0), 2.0
+#: Centre and radius of a ball, ENU, m.
+Ball = tuple[tuple[float, float, float], float]
 #: Parameters whose imperfections are drawn.
 CAUSES = ("tilt_north", "tilt_east", "canting", "non_orthogonality")
 #: Most heliostats of a cluster.
@@ -73,7 +75,7 @@ def sha256(data: bytes) -> bytes:
     return hashlib.sha256(data).digest()
 
 
-def outfits(count: int, seed: int = 0) -> list[Outfit]:
+def outfits(count: int, seed: int = 0, places: Sequence[tuple[float, float]] = ()) -> list[Outfit]:
     """Return heliostats north of a tower at the origin, 60 to 130 m away.
 
     Parameters
@@ -82,6 +84,8 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
         1 to 32.
     seed
         Seed of places and imperfections.
+    places
+        East and north of each heliostat, m; (): drawn.
 
     Raises
     ------
@@ -95,8 +99,8 @@ def outfits(count: int, seed: int = 0) -> list[Outfit]:
     for i in range(count):
         bearing = math.radians(-35.0 + 70.0 * (i + chance.uniform(0.2, 0.8)) / count)
         away = chance.uniform(60.0, 130.0)
-        place = (away * math.sin(bearing), away * math.cos(bearing), 0.0)
-        perfect = _perfect(place)
+        drawn = (away * math.sin(bearing), away * math.cos(bearing))
+        perfect = _perfect((*(places[i] if places else drawn), 0.0))
         causes = {name: chance.gauss(0.0, 3e-3) for name in CAUSES}
         mechanism = perfect.with_parameters(causes)
         address = 11 + i

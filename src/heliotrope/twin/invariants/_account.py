@@ -72,6 +72,8 @@ class HeliostatAccount:
         Times (s) and values of the last STATUS answers that the cluster received.
     from_stow
         Whether it has left stow and has not tracked since.
+    stows
+        Stow positions that it was ever given, steps.
     """
 
     def __init__(self, board: Board, now: float) -> None:
@@ -88,6 +90,7 @@ class HeliostatAccount:
         self.good = 0
         self.told: deque[tuple[float, tuple[Any, ...]]] = deque(maxlen=64)
         self.from_stow = False
+        self.stows = {STOW}
         self._history: deque[tuple[float, int]] = deque([(now, self.state)], maxlen=64)
         self._items = board.node.journal.items if board.node is not None else board.outfit.items
         self._pending: dict[str, bytes] = {}
@@ -195,7 +198,7 @@ class HeliostatAccount:
         if self._stowing_since is not None and board.now - self._stowing_since > BRAKING:
             if axis == 1:
                 return ""
-            wrong = self.place()[1] != STOW[1]
+            wrong = self.place()[1] not in {elevation for _, elevation in self.stows}
             return f"azimuth moves to stow while elevation is at {self.place()[1]}" if wrong else ""
         if self._leg == 0 or board.state != states.APPROACHING:
             return None

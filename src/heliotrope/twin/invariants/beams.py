@@ -16,7 +16,7 @@ from heliotrope.links.messages import Command, Progress, Stage
 from heliotrope.plant.controller import PlantController
 from heliotrope.safety import Act, Alarm
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, STOW
+from heliotrope.twin.boards.outfit import RECEIVER, STANDBY, STOW, Ball
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Violation
 
 Point = tuple[float, ...]
@@ -119,6 +119,8 @@ class BeamObserver:
         Boards by name of the cluster.
     sun
         Returns the true direction to the sun, (3,), at a time in s.
+    keep_outs
+        Balls that no beam may enter.
     held
         Whether mirrors that are locked or unconfigured, that a person left elsewhere than at
         standby, or whose counts are unknown are judged too.
@@ -136,12 +138,14 @@ class BeamObserver:
         start: float,
         boards: Mapping[str, Sequence[Board]],
         sun: Callable[[float], FloatArray],
+        keep_outs: Sequence[Ball],
         *,
         held: bool,
     ) -> None:
         self.checks: Counter[int] = Counter()
         self.losses = 0
         self._start, self._sun, self._held = start, sun, held
+        self._keep_outs = tuple(keep_outs)
         self._mirrors = {
             board.outfit.name: _Mirror(board, cluster)
             for cluster, some in boards.items()
@@ -302,7 +306,7 @@ class BeamObserver:
         sent = mirror.state in _ON
         lit = not sent and board.miss(sun, RECEIVER) <= OFF
         mirror.lit_since = _since(lit, mirror.lit_since, now)
-        inside = board.miss(sun, KEEP_OUT) <= KEEP_OUT_RADIUS
+        inside = any(board.miss(sun, middle) <= radius for middle, radius in self._keep_outs)
         mirror.inside_since = _since(inside, mirror.inside_since, now)
         state = states.STATES[mirror.state]
         for since, where in (

@@ -43,14 +43,7 @@ from heliotrope.geometry import FloatArray
 from heliotrope.lcu import messages, states, wire
 from heliotrope.links.messages import NEVER, ClusterStatus, Progress, Stage
 from heliotrope.twin.boards.board import Board
-from heliotrope.twin.boards.outfit import (
-    KEEP_OUT,
-    KEEP_OUT_RADIUS,
-    LIMITS,
-    RANGES,
-    RECEIVER,
-    STOW,
-)
+from heliotrope.twin.boards.outfit import LIMITS, RANGES, RECEIVER, Ball
 from heliotrope.twin.invariants._account import HeliostatAccount, fingerprint
 from heliotrope.twin.invariants.ledger import FrameLedger, OrderLedger, PlantCommand, Sent
 
@@ -183,6 +176,8 @@ class Observer:
         Zero of the times that it reports, s.
     sun
         Returns the true direction to the sun, (3,), at a time in s.
+    keep_outs
+        Balls that no commanded beam may enter.
 
     Attributes
     ----------
@@ -202,7 +197,10 @@ class Observer:
         As given.
     """
 
-    def __init__(self, boards: Sequence[Board], start: float, sun: SunAt) -> None:
+    def __init__(
+        self, boards: Sequence[Board], start: float, sun: SunAt, keep_outs: Sequence[Ball] = ()
+    ) -> None:
+        self._keep_outs = tuple(keep_outs)
         self.checks: Counter[int] = Counter(dict.fromkeys(TITLES, 0))
         self.frames = FrameLedger()
         self.orders = OrderLedger()
@@ -264,6 +262,8 @@ class Observer:
         name = "PARAMETERS" if sent.who == messages.KEY else sent.name
         addresses = [a.address for a in self.accounts if sent.addresses(a.address)]
         orders = self.orders.covering(name, addresses, now)
+        if name == "STANDBY":  # a pushed standby point goes out as the command does
+            orders = [*orders, *self.orders.covering("PARAMETERS", addresses, now)]
         where = f"{sent.name} to {sent.to}"
         allowed = [order for order in orders if order.authorised]
         self.check(4, bool(allowed), now, "cluster", f"{where} without an order of the authority")
@@ -460,6 +460,12 @@ class Observer:
         """Note an order of the plant."""
         self.orders.note(order)
 
+    def given_stow(self, heliostat: str, stow: tuple[int, int]) -> None:
+        """Note a stow position, steps, that a heliostat was sent."""
+        for account in self.accounts:
+            if account.name == heliostat:
+                account.stows.add(stow)
+
     def emergency(
         self, name: str, now: float, *, carried: bool, heliostats: Iterable[str] = ()
     ) -> None:
@@ -594,15 +600,17 @@ class Observer:
                 )
                 self.check(2, crossing <= CROSSING, now, name, saw)
             if passed > STOW_WITHIN and account.must_stow(why):
-                saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {STOW}"
-                self.check(2, account.place() == STOW, now, name, saw)
+                stow = sorted(account.stows)
+                saw = f"{state} at {account.place()} {passed:.1f} s after {why}, stow is {stow}"
+                self.check(2, account.place() in account.stows, now, name, saw)
         if board.state in ON_THE_WAY:
-            miss = board.miss(sun, KEEP_OUT, believed=True)
-            saw = (
-                f"{states.STATES[board.state]}, its beam is {miss:.1f} m from the middle of a "
-                "keep-out volume"
-            )
-            self.check(10, miss > KEEP_OUT_RADIUS, now, name, saw)
+            for middle, radius in self._keep_outs:
+                miss = board.miss(sun, middle, believed=True)
+                saw = (
+                    f"{states.STATES[board.state]}, its beam is {miss:.1f} m from the middle of a "
+                    f"keep-out volume of {radius:.1f} m"
+                )
+                self.check(10, miss > radius, now, name, saw)
         if on_way:
             miss = board.miss(sun, RECEIVER, believed=True)
             saw = f"{states.STATES[board.state]}, its beam passes the receiver at {miss:.1f} m"

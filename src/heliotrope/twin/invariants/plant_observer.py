@@ -83,6 +83,7 @@ class PlantObserver:
         self._looked = 0  # records already counted
         self._noted_at: dict[tuple[str, str], float] = {}
         self._following: dict[str, float] = {}  # tickets whose record may follow
+        self._awaited: dict[str, tuple[float, str, str]] = {}  # tickets accepted on a slow disk
         self._own: dict[str, float] = {}  # the plant's own records without a message yet
         self._sent: set[str] = set()
         self._posted: deque[tuple[float, int]] = deque(maxlen=400)
@@ -93,6 +94,7 @@ class PlantObserver:
         }
         self._proved: set[tuple[str, str]] = set()
         self._hangs, self._hung_at = False, float("-inf")
+        self._stands, self._stood_at = False, float("-inf")
 
     def check(self, number: int, good: bool, now: float, saw: str) -> None:
         """Count a check, and raise if it fails.
@@ -169,11 +171,17 @@ class PlantObserver:
         saw = f"{what} was accepted from {person.name}, role {person.role.name.lower()}"
         self.check(4, enough, now, saw)
         self.kept(now)
-        record = self._disk.records.get(ticket.identity)
-        right = record is not None and (record.who, record.what) == (person.name, what)
-        self.check(11, right, now, f"{what} by {person.name} was accepted without its record")
+        if ticket.identity in self._disk.records or not self._disk.busy(now):
+            self._kept_record(ticket.identity, person.name, what, now)
+        else:
+            self._awaited[ticket.identity] = now, person.name, what
         self._accepted[person.name, what] += 1
         self._count(now)
+
+    def _kept_record(self, identity: str, who: str, what: str, now: float) -> None:
+        record = self._disk.records.get(identity)
+        right = record is not None and (record.who, record.what) == (who, what)
+        self.check(11, right, now, f"{what} by {who} was accepted without its record")
 
     def obeyed(self, who: str, what: str, now: float) -> None:
         """Note a command that the plant must take from anybody, and may record later."""
@@ -190,13 +198,19 @@ class PlantObserver:
         self._accepted = Counter(self._recorded)
         self._following.clear()
         self._own.clear()
-        self._hangs = False
+        self._awaited.clear()
+        self._hangs = self._stands = False
 
-    def hangs(self, now: float, *, on: bool) -> None:
-        """Note that the plant's messages wait, and may later go out together; or that they flow."""
+    def hangs(self, now: float, *, on: bool, stands: bool) -> None:
+        """Note that the plant's messages wait, and may later go out together; or that they flow.
+
+        ``stands``: nothing of its program runs.
+        """
         if on or self._hangs:
             self._hung_at = now
-        self._hangs = on
+        if stands or self._stands:
+            self._stood_at = now
+        self._hangs, self._stands = on, stands
 
     # -- messages --------------------------------------------------------------------------
 
@@ -248,13 +262,14 @@ class PlantObserver:
 
     def look(self, plant: PlantController | None, now: float) -> None:
         """Judge everything that must have happened by now; None: the plant does not run."""
-        self.hangs(now, on=self._hangs)
+        self.hangs(now, on=self._hangs, stands=self._stands)
         self._live(now)
         self._count(now)
         self._boards(now)
         if plant is None:
             return
-        if now - self._disk.well_since > RECORD_WITHIN and not self._disk.full:
+        well_since = max(self._disk.well_since, self._stood_at)
+        if now - well_since > RECORD_WITHIN and not (self._disk.full or self._disk.busy(now)):
             self._complete(now)
         self._shown(plant, now)
         self._proofs(plant, now)
@@ -283,6 +298,10 @@ class PlantObserver:
                 count, most = self._recorded[key], self._accepted[key]
                 saw = f"{count} records of {key[1]} by {key[0]}, who ordered it {most} times"
                 self.check(11, count == most, now, saw)
+        for identity, (at, who, what) in list(self._awaited.items()):
+            if now - at > RECORD_WITHIN:
+                del self._awaited[identity]
+                self._kept_record(identity, who, what, now)
         for identity, at in list(self._following.items()):
             if now - at > RECORD_WITHIN:
                 del self._following[identity]

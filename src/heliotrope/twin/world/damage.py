@@ -15,11 +15,12 @@ from heliotrope.twin.boards.bus import BusFaults
 from heliotrope.twin.records import RecordsDisk
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import Pod
 
 #: An order need not be carried out while a fault of these kinds lasts.
-_HINDERS = ("line", "bus", "plant")
+_HINDERS = ("line", "bus", "plant", "cluster_frozen")
 
 
 class SimulatedPlant(Protocol):
@@ -31,6 +32,7 @@ class SimulatedPlant(Protocol):
     plant: PlantController | None
     disk: RecordsDisk
     operator: Operator
+    instruments: Instruments
     faults: Counter[str]
 
     def pod_of(self, fault: Fault) -> Pod:
@@ -45,8 +47,8 @@ class SimulatedPlant(Protocol):
         """End the plant's program at once."""
         ...
 
-    def hang_plant(self, now: float, *, on: bool) -> None:
-        """Freeze the plant's program, or let it go on."""
+    def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
+        """Silence the plant's program, or freeze it, or let it go on."""
         ...
 
 
@@ -128,6 +130,8 @@ class Damage:
             pod.observer.disturbed(now, crashed=True)
         elif fault.kind == "plant_crash":
             of.crash_plant(now)
+        elif fault.kind == "gust":
+            of.instruments.gust(fault.size)
         else:
             _strangers(pod, pod.boards.index(board), fault)
 
@@ -136,16 +140,25 @@ class Damage:
         of = self._of
         everywhere = {fault.kind for _, fault in self._active}
         of.operator.away = "nobody_there" in everywhere
+        of.instruments.lies = dict.fromkeys(READINGS, "") | {
+            READINGS[fault.target % len(READINGS)]: fault.kind
+            for _, fault in self._active
+            if fault.kind.startswith("sensor")
+        }
         of.disk.set_full(now, full="audit_full" in everywhere)
+        slow = [fault.size for _, fault in self._active if fault.kind == "disk_slow"]
+        of.disk.set_slow(now, max(map(kinds.disk_delay, slow), default=0.0))
         for pod in of.pods:
             active = {fault.kind: fault for _, fault in self._active if of.pod_of(fault) is pod}
             if "cluster_crash" not in active and not pod.runs:
                 pod.start(group)
+            pod.freeze(on="cluster_frozen" in active and pod.runs)
             _apply_to(pod, active)
         # The plant does not start without room for its records.
         if "plant_crash" not in everywhere and not of.disk.full and of.plant is None:
             of.start_plant(group)
-        of.hang_plant(now, on="plant_silent" in everywhere)
+        frozen, silent = "plant_frozen" in everywhere, "plant_silent" in everywhere
+        of.hang_plant(now, silent=silent, frozen=frozen)
 
     def _supply(self, now: float) -> None:
         """Restore power to boards, including those that died during a flash write."""

@@ -37,12 +37,29 @@ KINDS = {
     "stranger_safe": (3, "a stranger sends DEFOCUS or STOW"),
     "noise": (4, "a stranger sends noise"),
 }
+#: What can go wrong in some worlds only, by name of the world.
+KINDS_OF_WORLDS = {
+    "frozen": {
+        "cluster_frozen": (8, "the program of the cluster stands still, and goes on"),
+        "plant_frozen": (4, "the program of the plant stands still, and goes on"),
+    },
+    "disk": {"disk_slow": (10, "the disk of the plant's records is slow")},
+    "sensors": {
+        "sensor_stuck": (3, "a sensor shows its last value for ever"),
+        "sensor_jumps": (2, "a sensor jumps"),
+        "sensor_silent": (3, "a sensor shows nothing"),
+        "sensor_nan": (2, "a sensor shows what is no number"),
+        "gust": (2, "a gust passes"),
+    },
+}
 #: Longest duration of a fault, s.
 _LONGEST = {
     "line_cut": 60.0, "line_one_way": 60.0, "line_bad": 60.0, "plant_silent": 60.0,
     "plant_crash": 40.0, "audit_full": 40.0, "nobody_there": 60.0,
     "cluster_crash": 40.0, "bus_bad": 60.0, "bus_stuck": 40.0, "bus_unplugged": 30.0,
     "power_cut": 20.0, "brown_out": 20.0, "flash_cut": 5.0, "time_lost": 60.0,
+    "sensor_stuck": 60.0, "sensor_jumps": 30.0, "sensor_silent": 60.0, "sensor_nan": 60.0,
+    "cluster_frozen": 90.0, "plant_frozen": 90.0, "disk_slow": 60.0,
 }  # fmt: skip
 #: A heliostat that is cut off for this long must be at stow, s.
 _LONG = 330.0
@@ -99,21 +116,23 @@ def drawn(
     only
         Kinds to draw from; () for all.
     worlds
-        Names of `worlds.WORLDS`; "swarm" draws the weights and the pause of this run.
+        Names of `worlds.WORLDS`: some add kinds, and "swarm" draws the weights and the pause of
+        this run.
 
     Raises
     ------
     InputError
         An unknown kind, or a pause that is not above 0.
     """
+    known = KINDS | {k: v for kinds in KINDS_OF_WORLDS.values() for k, v in kinds.items()}
     for kind in only:
-        if kind not in KINDS:
-            raise InputError(f"fault {kind!r} is not known; known: {', '.join(KINDS)}")
+        if kind not in known:
+            raise InputError(f"fault {kind!r} is not known; known: {', '.join(known)}")
     if not pause > 0.0:
         raise InputError(f"a pause of {pause} s between faults; it must be above 0")
     chance = random.Random(f"faults {seed}")
-    kinds = list(only or KINDS)
-    weighed = weights_of(worlds, seed, {kind: KINDS[kind][0] for kind in kinds})
+    kinds = list(only) or [*KINDS, *(k for w in worlds for k in KINDS_OF_WORLDS.get(w, {}))]
+    weighed = weights_of(worlds, seed, {kind: known[kind][0] for kind in kinds})
     weights = [weighed[kind] for kind in kinds]
     pause = pause_of(worlds, seed, pause)
     found: list[Fault] = []
@@ -141,6 +160,11 @@ def time_jump(size: float) -> float:
     """Return a jump of the cluster's time, s: from less than a second to years."""
     chance = random.Random(f"jump {size}")
     return chance.choice([-0.4, 0.4, -1.5, 2.5, -4.0, 7.0, -30.0, 100.0, -3600.0, 86400.0, -3e7])
+
+
+def disk_delay(size: float) -> float:
+    """Return the time that a slow disk takes for each piece of work, s."""
+    return random.Random(f"disk {size}").choice([0.05, 0.3, 1.0, 2.5, 20.0])
 
 
 def shrunk(

@@ -19,16 +19,17 @@ import numpy as np
 from heliotrope.links.clock import Clock, sleep_until
 from heliotrope.links.link import LinkClosedError
 from heliotrope.links.messages import Command, encode
+from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.plant.authority import Person, RefusedError, Role
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.parameters import TAKES_POSE
 from heliotrope.plant.tickets import Ticket
 from heliotrope.safety import FLUX_READING, Act
-from heliotrope.twin.boards.outfit import KEEP_OUT, RECEIVER, STANDBY
+from heliotrope.twin.boards.outfit import MACHINE, RECEIVER, STANDBY, Outfit
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.plant_observer import VOID_WITHIN, PlantObserver
 from heliotrope.twin.world.pod import PlantEar, Pod
-from heliotrope.twin.world.worlds import Habits
+from heliotrope.twin.world.worlds import Habits, narrow_limits
 
 OPERATOR = Person("operator", Role.OPERATOR)
 ENGINEER = Person("engineer", Role.ENGINEER)
@@ -57,12 +58,14 @@ class Operator:
         Seed of their actions, and how often they take each.
     observer, beams
         Told of each accepted command.
-    names
-        Names of the heliostats.
+    fits
+        The heliostats.
     pods
         Clusters whose lines the rogue uses.
+    keep_out
+        Middle of a keep-out volume, at which they aim now and then.
     flux
-        Returns the share of the beams on the receiver.
+        Returns the share of the beams on the receiver; None: sensors feed it.
 
     Attributes
     ----------
@@ -70,6 +73,8 @@ class Operator:
         Set by the owner; None while the plant does not run.
     away
         Whether nobody is on duty.
+    waits
+        Whether the plant's program is frozen, so that nobody can do anything.
     counts
         Number of actions of each kind.
     """
@@ -81,17 +86,19 @@ class Operator:
         habits: Habits,
         observer: PlantObserver,
         beams: BeamObserver,
-        names: Sequence[str],
+        fits: Sequence[Outfit],
         pods: Sequence[Pod],
-        flux: Callable[[], float],
+        keep_out: tuple[float, float, float],
+        flux: Callable[[], float] | None,
     ) -> None:
         self.plant: PlantController | None = None
-        self.away = False
+        self.away = self.waits = False
         self.counts: Counter[str] = Counter()
         self._clock, self._observer, self._flux = clock, observer, flux
         self._beams, self._habits = beams, habits
         self._chance = random.Random(f"operator {seed}")
-        self._names, self._pods = sorted(names), pods
+        self._fits, self._names = {fit.name: fit for fit in fits}, sorted(fit.name for fit in fits)
+        self._pods, self._keep_out = pods, keep_out
         self._duty = ENGINEER
         self._tokens: dict[str, int] = {}
         self._rest_until = 0.0
@@ -110,8 +117,9 @@ class Operator:
         while True:
             due = self._clock.monotonic() + 1.0
             plant = self.plant
-            if plant is not None and not self.away:
-                plant.put(FLUX_READING, self._flux())
+            if plant is not None and not (self.away or self.waits):
+                if self._flux is not None:
+                    plant.put(FLUX_READING, self._flux())
                 if plant.authority.grant is None:
                     self._take(plant, self._chance.choice([OPERATOR, ENGINEER]))
                 token = self._tokens.get(self._duty.name, 0)
@@ -163,7 +171,9 @@ class Operator:
         while True:
             await asyncio.sleep(self._chance.expovariate(1 / self._habits.pause))
             plant = self.plant
-            if plant is None or self.away or self._clock.monotonic() < self._rest_until:
+            if plant is None or self.away or self.waits:
+                continue
+            if self._clock.monotonic() < self._rest_until:
                 continue
             self._end_emergency(plant)
             self._acknowledge(plant)
@@ -181,6 +191,8 @@ class Operator:
                 ],
                 self._habits.weights,
             )[0]
+            if self._chance.random() < self._habits.calibrates:
+                does = self._calibrate
             does(plant)
             if self._chance.random() < 0.06:
                 await self._rogue()
@@ -219,7 +231,7 @@ class Operator:
     def _astray(self, plant: PlantController) -> None:
         """Ask for a motion that leads a beam through the keep-out volume; it must be refused."""
         name, mine = self._chance.choice(self._names), self._tokens.get(self._duty.name, 0)
-        point = self._points((name,), KEEP_OUT, 0.5)
+        point = self._points((name,), self._keep_out, 0.5)
         what = self._chance.choice(["AIM", "STANDBY", "SEARCH"])
         self.counts["commands"] += 1
         try:
@@ -292,20 +304,54 @@ class Operator:
     def _parameters(self, plant: PlantController) -> None:
         """Push two calibration items to one heliostat, mostly to one whose beam is safe."""
         self.counts["parameters"] += 1
-        chance, who = self._chance, self._duty
+        chance = self._chance
         items = {
             "biases": struct.pack("<ff", chance.gauss(0.0, 1e-4), chance.gauss(0.0, 1e-4)),
             "defocus": struct.pack("<ff", chance.uniform(0.08, 0.12), chance.uniform(0.05, 0.06)),
         }
-        token = self._tokens.get(who.name, 0)
+        self._push(plant, self._safe(plant), items)
+
+    def _safe(self, plant: PlantController) -> str:
+        """Return a heliostat, mostly one that may be written to."""
         safe = np.flatnonzero(plant.field.among(TAKES_POSE, plant.now()))
-        names = [plant.field.names[row] for row in safe] if chance.random() < 0.8 else self._names
+        names = [plant.field.names[row] for row in safe]
+        return self._chance.choice(names if names and self._chance.random() < 0.8 else self._names)
+
+    def _push(
+        self, plant: PlantController, name: str, items: dict[str, bytes], confirmed: str = ""
+    ) -> None:
+        who, token = self._duty, self._tokens.get(self._duty.name, 0)
         try:
-            ticket = plant.parameters(who, token, chance.choice(names or self._names), items)
+            ticket = plant.parameters(who, token, name, items, confirmed)
         except RefusedError:
             self.counts["refused"] += 1
             return
         self._accepted(who, token, ticket, "PARAMETERS")
+
+    def _calibrate(self, plant: PlantController) -> None:
+        """Change parameters of one heliostat: rightly, slightly wrongly, or much, unconfirmed."""
+        chance, name = self._chance, self._safe(plant)
+        fit = self._fits[name]
+        slight = {k: v + chance.gauss(0.0, 3e-4) for k, v in fit.causes.items()}
+        near = fit.mechanism.with_parameters(slight)
+        what = chance.choice(["right", "slight", "belief", "belief", "another", "much", "machine"])
+        self.counts[f"calibration {what}"] += 1
+        if what == "belief":
+            plant.want(name, chance.choice([fit.mechanism, near]))
+        elif what == "machine":
+            low, high = (chance.randrange(-2000, 2000) for _ in range(2))
+            stow = packed("stow", (MACHINE.stow[0] + low, MACHINE.stow[1] + high))
+            self._push(plant, name, chance.choice([{"stow": stow}, narrow_limits()]))
+        elif what in ("another", "much"):
+            wrong = {k: v + chance.choice([-1.0, 1.0]) * 0.02 for k, v in fit.causes.items()}
+            other = self._fits[chance.choice([n for n in self._names if n != name] or [name])]
+            source = other.mechanism if what == "another" else fit.mechanism.with_parameters(wrong)
+            if other is not fit or what == "much":
+                self._push(plant, name, {"armature": items_of(source)["armature"]})
+        else:
+            items = items_of(fit.mechanism if what == "right" else near)
+            some = {k: items[k] for k in ("armature", "biases")}
+            self._push(plant, name, some, chance.choice(["", "measured twice"]))
 
     # -- safety ----------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+import struct
 from collections import Counter
 from datetime import datetime
 
@@ -10,7 +11,8 @@ from heliotrope.cluster.controller import Cluster
 from heliotrope.cluster.memory import Kept
 from heliotrope.cluster.timekeeping import SystemTime
 from heliotrope.lcu import wire
-from heliotrope.links.clock import VirtualClock
+from heliotrope.lcu.journal import CODES_OF
+from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.connection import CarriedLink
 from heliotrope.links.in_process import MemoryLine
 from heliotrope.links.messages import (
@@ -76,6 +78,8 @@ class Pod:
         Observer of the plant; set by the owner.
     counts
         Messages to the plant, by kind.
+    freezes
+        Whether its program can be frozen.
     """
 
     def __init__(
@@ -90,6 +94,7 @@ class Pod:
         errors: PodErrors,
     ) -> None:
         self.name, self.boards, self.observer = name, boards, observer
+        self.freezes = errors.freezes
         self.intruder = Intruder(observer.frames, [b.outfit.address for b in boards])
         self._true, self._site, self._chance = clock, errors.site(site), chance
         drift = chance.choice([0.0, 50e-6, -50e-6, 200e-6])
@@ -132,7 +137,10 @@ class Pod:
         members = tuple(Member(o.name, self.addresses[o.name], o.serial, o.key) for o in fits)
         config = ClusterConfig(self.name, self._site, members)
         cluster = Cluster(config, self.bus, link, self.clock, keeper, self._kept)
-        self._running = [group.create_task(link.run()), group.create_task(cluster.run())]
+        context = context_of(self.name) if self.freezes else None
+        self._running = [
+            group.create_task(each, context=context) for each in (link.run(), cluster.run())
+        ]
 
     def crash(self) -> None:
         """Kill the program wherever it is; the network tells the plant."""
@@ -141,6 +149,13 @@ class Pod:
         self._running = []
         self.link = None
         self.line.drop()
+        self.freeze(on=False)
+
+    def freeze(self, *, on: bool) -> None:
+        """Freeze the program, or let it go on."""
+        loop = asyncio.get_running_loop()
+        if self.freezes and isinstance(loop, VirtualLoop):
+            (loop.freeze if on else loop.thaw)(self.name)
 
     # -- health ----------------------------------------------------------------------------
 
@@ -225,6 +240,9 @@ class PlantEar:
             self._beams.ordered_off(whom, now)
         elif isinstance(message, Command | Parameters):
             observer.ordered(self.order(message, now, known=self._plant.known(message.token)))
+            if isinstance(message, Parameters) and (stow := message.items().get("stow")):
+                one, two = struct.unpack(CODES_OF["stow"], stow)
+                observer.given_stow(message.heliostat, (one, two))
             if isinstance(message, Command):
                 self._beams.sent(message, message.heliostats or tuple(self._addresses), now)
 

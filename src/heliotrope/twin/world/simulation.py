@@ -12,7 +12,6 @@ import traceback
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -24,18 +23,17 @@ from heliotrope.field.target import Receiver
 from heliotrope.field.volumes import Sphere
 from heliotrope.geometry import FloatArray
 from heliotrope.lcu import ticks
-from heliotrope.links.clock import VirtualClock, VirtualLoop
+from heliotrope.links.clock import VirtualClock, VirtualLoop, context_of
 from heliotrope.links.tapped import TappedLink
-from heliotrope.mechanism.board_items import Wanted
+from heliotrope.mechanism.board_items import Wanted, items_of
 from heliotrope.plant.controller import PlantController
 from heliotrope.plant.settings import PlantSettings
-from heliotrope.safety import FLUX_READING, conditions
-from heliotrope.sun import Site, vector
+from heliotrope.safety import FLUX_READING, Alarm, conditions
+from heliotrope.sun import vector
 from heliotrope.twin.boards.board import Board
 from heliotrope.twin.boards.clocks import TickCounter
 from heliotrope.twin.boards.outfit import (
-    KEEP_OUT,
-    KEEP_OUT_RADIUS,
+    MACHINE,
     RECEIVER,
     STANDBY,
     Outfit,
@@ -45,29 +43,34 @@ from heliotrope.twin.boards.outfit import (
 from heliotrope.twin.invariants.beams import BeamObserver
 from heliotrope.twin.invariants.invariants import OFF, InvariantError, Observer, Violation
 from heliotrope.twin.invariants.plant_observer import PlantObserver
+from heliotrope.twin.invariants.sensors import SensorObserver
 from heliotrope.twin.records import AssignedDisk, RecordsDisk, SimulatedAudit
 from heliotrope.twin.world import faults as kinds
 from heliotrope.twin.world.damage import Damage
 from heliotrope.twin.world.faults import Fault
+from heliotrope.twin.world.instruments import READINGS, Instruments
 from heliotrope.twin.world.operator import Operator
 from heliotrope.twin.world.pod import PlantEar, Pod
-from heliotrope.twin.world.worlds import Habits, PodErrors, checked
+from heliotrope.twin.world.scene import Scene, scene_of
+from heliotrope.twin.world.worlds import Habits, PodErrors, checked, knows_boards, stored_by
 
-SITE = Site(37.4, -6.0, 100.0, name="simulation")
-START = datetime(2026, 6, 21, 9, tzinfo=UTC)
 #: Longest interval between two looks at the boards, and between two judgements of everything, s.
 LOOK, JUDGE = 0.2, 0.5
 #: The true sun is computed this often (s) and interpolated linearly, to within 1e-6 rad.
 _SUN_EVERY = 30.0
+#: The plant's program, for freezing it.
+_PLANT = "plant"
 #: Longest run: the sun must stay up.
 MOST_HOURS = 8.0
 #: With this few mirrors they join one at a time.
 SETTINGS = PlantSettings(join_rate=0.5, join_burst=1, sensors=frozenset({FLUX_READING}))
+#: The same plant in the world "sensors".
+MEASURED = replace(SETTINGS, sensors=frozenset(READINGS))
 #: Without the rows on the share of failed nodes, which one of three or four already exceeds.
 TABLE = tuple(row for row in conditions() if row.reading != "node_fault_share")
 
 
-def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: Site) -> Plant:
+def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], scene: Scene) -> Plant:
     """Return a plant of some heliostats, calibrated to the truth.
 
     Parameters
@@ -76,8 +79,8 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: 
         Heliostats.
     homes
         Names of the heliostats of each cluster.
-    site
-        Site of the plant.
+    scene
+        Site and keep-out volumes.
     """
     home = {name: cluster for cluster, names in homes.items() for name in names}
     names = tuple(each.name for each in fits)
@@ -88,8 +91,17 @@ def design_of(fits: Sequence[Outfit], homes: Mapping[str, Sequence[str]], site: 
     receiver = Receiver(
         "receiver", "planar", np.array(RECEIVER), np.array([0.0, 1.0, 0.0]), 6.0, 6.0
     )
-    house = Sphere("house", KEEP_OUT, KEEP_OUT_RADIUS)
-    return Plant("simulation", site, {"all": group}, receivers=(receiver,), keep_outs=(house,))
+    balls = tuple(Sphere(f"house {i}", *ball) for i, ball in enumerate(scene.keep_outs, 1))
+    groups = {"all": group}
+    return Plant("simulation", scene.site, groups, receivers=(receiver,), keep_outs=balls)
+
+
+def wanted_of(fits: Sequence[Outfit]) -> Wanted:
+    """Return what the boards of heliostats should store."""
+    wanted = Wanted()
+    for fit in fits:
+        wanted.set(fit.name, items_of(fit.mechanism, MACHINE))
+    return Wanted(wanted.items)
 
 
 @dataclass(frozen=True)
@@ -248,36 +260,41 @@ class Simulation:
         self.plan = plan
         self.faults: Counter[str] = Counter()
         self._chance = random.Random(f"simulation {plan.seed}")
-        self._clock = VirtualClock(loop.time, START)
+        scene = scene_of(plan.worlds, plan.seed, plan.seconds, plan.heliostats)
+        self._scene = scene
+        self._loop, self._clock = loop, VirtualClock(loop.time, scene.start)
         self.begin = loop.time()
         self._suns: dict[int, FloatArray] = {}
-        fits = outfits(plan.heliostats, plan.seed)
-        self.boards = [self._board(each) for each in fits]
+        fits = outfits(plan.heliostats, plan.seed, scene.places)
+        stored = stored_by(fits, plan.worlds, plan.seed)
+        self.boards = [self._board(each) for each in stored]
         self.pods = self._new_pods()
+        boards = {pod.name: pod.boards for pod in self.pods}
         self.beams = BeamObserver(
-            self.begin,
-            {pod.name: pod.boards for pod in self.pods},
-            self.sun,
-            held="held" in plan.worlds,
+            self.begin, boards, self.sun, scene.keep_outs, held="held" in plan.worlds
         )
+        self.readings = SensorObserver(self.begin, boards)
+        self.instruments = Instruments(self._clock, plan.seed, self._flux, self.readings)
+        self._measured = "sensors" in plan.worlds
         homes = {pod.name: tuple(b.outfit.name for b in pod.boards) for pod in self.pods}
-        self._design, self._homes = design_of(fits, homes, SITE), homes
+        self._design, self._homes = design_of(fits, homes, scene), homes
         # The boards' wanted items and assigned points survive the plant's program.
-        self._wanted, self._assigned = Wanted(), AssignedDisk()
+        self._wanted = wanted_of(fits) if knows_boards(plan.worlds) else Wanted()
+        self._assigned = AssignedDisk()
         self._assigned.keep({"STANDBY": {each.name: STANDBY for each in fits}})
         self.disk = RecordsDisk()
         observers = [pod.observer for pod in self.pods]
         self.observer = PlantObserver(self.begin, self.disk, SETTINGS, observers)
-        names = [each.name for each in fits]
         self.operator = Operator(
             self._clock,
             plan.seed,
             Habits.of(plan.worlds, plan.seed),
             self.observer,
             self.beams,
-            names,
+            fits,
             self.pods,
-            self._flux,
+            scene.keep_outs[0][0],
+            None if self._measured else self._flux,
         )
         self.plant: PlantController | None = None
         self._program: list[asyncio.Task[None]] = []
@@ -299,9 +316,10 @@ class Simulation:
         pods = []
         for i in range(count):
             part = self.boards[i * cut : (i + 1) * cut]
-            observer = Observer(part, self.begin, self.sun)
+            observer = Observer(part, self.begin, self.sun, self._scene.keep_outs)
+            site, start = self._scene.site, self._scene.start
             name, errors = f"C{i + 1}", PodErrors(self.plan.worlds, self.plan.seed, i)
-            pods.append(Pod(name, part, observer, self._clock, START, SITE, self._chance, errors))
+            pods.append(Pod(name, part, observer, self._clock, start, site, self._chance, errors))
         return pods
 
     def sun(self, now: float) -> FloatArray:
@@ -314,7 +332,7 @@ class Simulation:
     def _sun_at(self, place: int) -> FloatArray:
         found = self._suns.get(place)
         if found is None:
-            found = vector(START.timestamp() + _SUN_EVERY * place, SITE)
+            found = vector(self._scene.start.timestamp() + _SUN_EVERY * place, self._scene.site)
             self._suns[place] = found
         return found
 
@@ -340,29 +358,41 @@ class Simulation:
             pod.tap = TappedLink(link, self._clock, pod.ear)
             links[pod.name] = pod.tap
         audit = SimulatedAudit(self.disk, self._clock.utc().isoformat())
+        context = context_of(_PLANT)
         plant = self.plant = PlantController(
             self._design,
             links,
             self._clock,
             audit,
             clusters=self._homes,
-            settings=SETTINGS,
+            settings=MEASURED if self._measured else SETTINGS,
             wanted=self._wanted,
             assigned=self._assigned,
             table=TABLE,
             entropy=self._chance.randbytes,
-            on_alarm=lambda alarm: self.beams.alarmed(alarm, self._clock.monotonic()),
+            on_alarm=self._alarmed,
+            disk=self.disk.queue(self._clock, context) if "disk" in self.plan.worlds else None,
         )
         self.operator.begins(plant)
-        self._program = [group.create_task(link.run()) for link in links.values()]
-        self._program.append(group.create_task(plant.run()))
+        self.instruments.plant = plant
+        self._program = [
+            group.create_task(each, context=context)
+            for each in (*(link.run() for link in links.values()), plant.run())
+        ]
+
+    def _alarmed(self, alarm: Alarm) -> None:
+        self.beams.alarmed(alarm, self._clock.monotonic())
+        self.readings.alarmed(alarm)
 
     def crash_plant(self, now: float) -> None:
         """Kill the plant's program wherever it is; the network tells the clusters."""
         for task in self._program:
             task.cancel()
         self._program, self.plant = [], None
+        self._frozen(on=False)
+        self.disk.lose()
         self.operator.begins(None)
+        self.instruments.plant = None
         self.observer.ended(now)
         self.beams.ended()
         for pod in self.pods:
@@ -370,12 +400,21 @@ class Simulation:
             pod.line.drop()
             pod.observer.disturbed(now, crashed=True)
 
-    def hang_plant(self, now: float, *, on: bool) -> None:
-        """Freeze the plant's program, or let it go on."""
-        self.observer.hangs(now, on=on and self.plant is not None)
+    def hang_plant(self, now: float, *, silent: bool, frozen: bool) -> None:
+        """Silence the plant's program, or freeze it, or let it go on.
+
+        A silent one goes on without its lines; of a frozen one nothing runs, and persons wait.
+        """
+        runs = self.plant is not None
+        self.observer.hangs(now, on=(silent or frozen) and runs, stands=frozen and runs)
+        self._frozen(on=frozen and runs)
         for pod in self.pods:
             if pod.ear is not None:
-                pod.ear.hang(on=on)
+                pod.ear.hang(on=silent)
+
+    def _frozen(self, *, on: bool) -> None:
+        self.operator.waits = on
+        (self._loop.freeze if on else self._loop.thaw)(_PLANT)
 
     # -- the world -------------------------------------------------------------------------
 
@@ -392,10 +431,10 @@ class Simulation:
             for pod in self.pods:
                 pod.start(group)
             self.start_plant(group)
-            others = [
-                group.create_task(self.operator.keep()),
-                group.create_task(self.operator.work()),
-            ]
+            tasks = [self.operator.keep(), self.operator.work()]
+            if self._measured:
+                tasks.append(self.instruments.run())
+            others = [group.create_task(each) for each in tasks]
             await self._turn(damage, group)
             self.crash_plant(self._clock.monotonic())
             for pod in self.pods:
@@ -421,6 +460,9 @@ class Simulation:
                 self.observer.look(self.plant, now)
                 carried = {pod.name for pod in self.pods if pod.carried(now)}
                 self.beams.look(self.plant, carried, now)
+                if self._measured:
+                    runs = self.plant is not None and not self.operator.waits
+                    self.readings.look(carried, now, runs=runs)
                 judged = now + JUDGE
             times = [board.due(now) for board in self.boards]
             due = min(*times, damage.next, now + LOOK, end)
@@ -445,7 +487,7 @@ def run(plan: RunPlan) -> RunResult:
             outcome.seconds = loop.time() - begin
     outcome.checks = sum(
         (pod.observer.checks for pod in simulation.pods),
-        simulation.observer.checks + simulation.beams.checks,
+        simulation.observer.checks + simulation.beams.checks + simulation.readings.checks,
     )
     outcome.faults = simulation.faults
     outcome.counts = sum((pod.counts for pod in simulation.pods), simulation.operator.counts)

@@ -6,7 +6,9 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 
 from heliotrope.errors import InputError
+from heliotrope.mechanism.board_items import items_of, packed
 from heliotrope.sun import Site
+from heliotrope.twin.boards.outfit import MACHINE, Outfit
 
 #: Everything that a run may add, and its meaning.
 WORLDS = {
@@ -16,7 +18,17 @@ WORLDS = {
     "clock": "the clock of a cluster is wrong from the start, by a minute to an hour",
     "site": "the site of a cluster is wrong by up to 2.5 degrees of longitude or latitude",
     "addresses": "two boards of a cluster have exchanged addresses",
+    "frozen": "the programs of clusters and of the plant freeze for seconds to minutes and go on",
+    "disk": "the disk of the plant's records is slow now and then",
+    "place": "date, hour, site, field and keep-out volumes are drawn; these lie across the ways",
+    "sensors": "wind and flux are measured, by sensors that lie now and then",
+    "parameters": "boards store wrong parameters from the start",
+    "calibrations": "persons and beliefs change parameters, rightly or wrongly",
 }
+#: Name that lets each run draw its worlds: see `mixed`.
+ANY = "any"
+#: Worlds that hold, of which `mixed` chooses.
+MIX = ("calm", "swarm", "held", "frozen", "disk")
 
 
 def checked(worlds: Sequence[str]) -> None:
@@ -30,6 +42,13 @@ def checked(worlds: Sequence[str]) -> None:
     for name in worlds:
         if name not in WORLDS:
             raise InputError(f"world {name!r} is not known; known: {', '.join(WORLDS)}")
+
+
+def mixed(seed: int) -> tuple[str, ...]:
+    """Return worlds of `MIX` drawn from a seed: none, some or all of them."""
+    chance = random.Random(f"worlds {seed}")
+    share = chance.choice([0.0, 0.2, 0.5, 0.8])
+    return tuple(name for name in MIX if chance.random() < share)
 
 
 @dataclass(frozen=True)
@@ -46,23 +65,29 @@ class Habits:
         keep-out volume.
     idle
         Whether they command IDLE to all: heliostats at stow are stuck in it.
+    calibrates
+        Share of their actions that change parameters beyond those of every run.
     """
 
     pause: float = 2.0
     weights: tuple[float, ...] = (60, 14, 8, 4, 2, 3, 5, 4, 4)
     idle: bool = True
+    calibrates: float = 0.0
 
     @classmethod
     def of(cls, worlds: Sequence[str], seed: int) -> "Habits":
         """Return the habits of a run."""
-        calm = "calm" in worlds
-        habits = cls(4.0, (60, 10, 2, 0.2, 0.3, 0.3, 2, 2, 4), idle=False) if calm else cls()
+        calibrates = 0.15 if "calibrations" in worlds else 0.0
+        habits = cls(calibrates=calibrates)
+        if "calm" in worlds:
+            habits = cls(4.0, (60, 10, 2, 0.2, 0.3, 0.3, 2, 2, 4), False, calibrates)
         if "swarm" not in worlds:
             return habits
         chance = random.Random(f"habits {seed}")
         scales = [chance.choice([0.0, 0.1, 1.0, 1.0, 3.0]) for _ in habits.weights[1:]]
         weights = [w * s for w, s in zip(habits.weights[1:], scales, strict=True)]
-        return cls(chance.choice([1.0, 2.0, 5.0]), (habits.weights[0], *weights), habits.idle)
+        pause = chance.choice([1.0, 2.0, 5.0])
+        return replace(habits, pause=pause, weights=(habits.weights[0], *weights))
 
 
 def weights_of(worlds: Sequence[str], seed: int, weights: Mapping[str, float]) -> dict[str, float]:
@@ -81,6 +106,58 @@ def pause_of(worlds: Sequence[str], seed: int, pause: float) -> float:
     return pause * random.Random(f"pause {seed}").choice([0.5, 1.0, 3.0, 10.0])
 
 
+def knows_boards(worlds: Sequence[str]) -> bool:
+    """Whether the plant of a run knows what every board should store, as a real one does."""
+    return not {"parameters", "calibrations"}.isdisjoint(worlds)
+
+
+def stored_by(fits: Sequence[Outfit], worlds: Sequence[str], seed: int) -> list[Outfit]:
+    """Return heliostats with the items that their boards store at the start.
+
+    In the world "parameters" half of them store wrong ones: another mirror's, or their own with an
+    error from a scratch to a blunder, or limits that are too narrow.
+    """
+    if "parameters" not in worlds:
+        return list(fits)
+    chance = random.Random(f"parameters {seed}")
+    return [
+        replace(fit, items={**fit.items, **wrong_items(fit, fits, chance)})
+        if chance.random() < 0.5
+        else fit
+        for fit in fits
+    ]
+
+
+def wrong_items(fit: Outfit, fits: Sequence[Outfit], chance: random.Random) -> dict[str, bytes]:
+    """Return some wrong items of a heliostat."""
+    what = chance.choice(["another", "armature", "biases", "machine"])
+    if what == "another":
+        other = items_of(chance.choice(list(fits)).mechanism)
+        return {name: other[name] for name in ("location", "armature")}
+    size = chance.choice([1e-3, 5e-3, 30e-3])
+    if what == "armature":
+        causes = {k: v + chance.gauss(0.0, size) for k, v in fit.causes.items()}
+        return {"armature": items_of(fit.mechanism.with_parameters(causes))["armature"]}
+    if what == "biases":
+        return {"biases": packed("biases", (chance.gauss(0.0, size), chance.gauss(0.0, size)))}
+    return narrow_limits()
+
+
+def narrow_limits() -> dict[str, bytes]:
+    """Return the items of axes that move less and slower than those of `MACHINE`."""
+    axes = tuple(
+        replace(axis, low=axis.low + 1000, high=axis.high - 1000, rate=axis.rate // 2)
+        for axis in MACHINE.axes
+    )
+    ends = ("primary", "secondary")
+    return {
+        f"limits_{end}": packed(
+            f"limits_{end}", (axis.low, axis.high, axis.rate, axis.acceleration, axis.backlash)
+        )
+        for axis, end in zip(axes, ends, strict=True)
+    }
+
+
 class PodErrors:
     """What is wrong with one cluster from the start.
 
@@ -92,11 +169,17 @@ class PodErrors:
         Seed of the run.
     index
         Number of the cluster.
+
+    Attributes
+    ----------
+    freezes
+        Whether its program may be frozen.
     """
 
     def __init__(self, worlds: Sequence[str], seed: int, index: int) -> None:
         self._worlds = worlds
         self._name = f"{seed} {index}"
+        self.freezes = "frozen" in worlds
 
     def _chance(self, world: str) -> random.Random | None:
         return random.Random(f"{world} {self._name}") if world in self._worlds else None

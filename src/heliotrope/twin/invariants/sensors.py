@@ -1,0 +1,99 @@
+"""The observer of sensors: what the plant was given by them, and whether it acted.
+
+A reading beyond its limit, or one that fails to come, must be named by an alarm within 10 s, and
+takes every mirror off the receiver within 30 s: part of invariant 2. The limits are the observer's
+own. A sensor that shows a wrong value within its limits is no business of the observer: nobody
+could know.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
+
+from heliotrope.lcu import states
+from heliotrope.safety import Alarm
+from heliotrope.twin.boards.board import Board
+from heliotrope.twin.invariants.invariants import InvariantError, Violation
+
+#: By reading: names of the alarms any of which names it, the limit, and for how long beyond it, s.
+LIMITS = {
+    "wind_gust": (("wind_gust_stow", "wind_gust_defocus"), 15.0, 3.0),
+    "wind_mean": (("wind_mean_stow", "wind_mean_defocus"), 11.0, 0.0),
+    "receiver_flux": (("receiver_flux_high",), 1.0, 1.0),
+}
+#: A reading older than this counts as gone, s.
+GONE = 5.0
+#: From then on: time to name it, and to be off, s.
+NAMED_WITHIN, OFF_WITHIN = 10.0, 30.0
+
+
+class SensorObserver:
+    """Observes what sensors gave the plant, and the mirrors that should have left.
+
+    Parameters
+    ----------
+    start
+        Zero of the times that it reports, s.
+    boards
+        Boards by name of the cluster.
+
+    Attributes
+    ----------
+    checks
+        Number of checks of each invariant.
+    """
+
+    def __init__(self, start: float, boards: Mapping[str, Sequence[Board]]) -> None:
+        self.checks: Counter[int] = Counter()
+        self._start, self._boards = start, boards
+        self._value: dict[str, tuple[float, float]] = {}
+        self._since: dict[str, float | None] = dict.fromkeys(LIMITS)
+        self._alarms: set[str] = set()
+        self._started_at = start
+        self._cut_at = dict.fromkeys(boards, start)
+
+    def fed(self, name: str, value: float, now: float) -> None:
+        """Note a reading that the plant was given."""
+        if math.isfinite(value):
+            self._value[name] = value, now
+
+    def alarmed(self, alarm: Alarm) -> None:
+        """Note an alarm of the plant."""
+        (self._alarms.add if alarm.active else self._alarms.discard)(alarm.condition)
+
+    def look(self, carried: Set[str], now: float, *, runs: bool) -> None:
+        """Judge all readings; ``carried``: clusters that the plant reaches."""
+        for cluster in self._boards:
+            if cluster not in carried:
+                self._cut_at[cluster] = now
+        if not runs:  # a plant that starts has given its sensors no time yet
+            self._since, self._value = dict.fromkeys(LIMITS), {}
+            self._alarms.clear()
+            self._started_at = now
+            return
+        for name, (alarms, limit, delay) in LIMITS.items():
+            value, at = self._value.get(name, (0.0, self._started_at))
+            bad = value >= limit or now - at > GONE
+            before = self._since[name]
+            since = self._since[name] = None if not bad else now if before is None else before
+            if since is None:
+                continue
+            passed = now - since - delay
+            saw = f"{name} is {value:.3g}, {now - at:.1f} s old, for {passed:.1f} s, and no alarm"
+            named = bool(self._alarms.intersection(alarms))
+            self._check(named or passed <= NAMED_WITHIN, now, "plant", f"{saw} names it")
+            self._off(name, since + delay, now)
+
+    def _off(self, reading: str, since: float, now: float) -> None:
+        for cluster, boards in self._boards.items():
+            passed = now - max(since, self._cut_at[cluster])
+            for board in boards:
+                on = board.state in (states.TRACKING, states.SEARCHING)
+                saw = f"{states.STATES[board.state]} {passed:.1f} s after {reading} demanded it off"
+                good = not on or passed <= OFF_WITHIN
+                self._check(good, now, board.outfit.name, saw)
+
+    def _check(self, good: bool, now: float, subject: str, saw: str) -> None:
+        self.checks[2] += 1
+        if not good:
+            raise InvariantError(Violation(2, now - self._start, subject, saw))

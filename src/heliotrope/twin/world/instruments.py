@@ -1,0 +1,92 @@
+"""Sensors of a simulated plant, which may lie: wind, and flux on the receiver."""
+
+import math
+import random
+from collections.abc import Callable
+
+from heliotrope.links.clock import Clock, sleep_until
+from heliotrope.plant.controller import PlantController
+from heliotrope.safety import FLUX_READING
+from heliotrope.twin.invariants.sensors import SensorObserver
+
+#: Readings that the sensors of the world "sensors" give.
+READINGS = ("wind_gust", "wind_mean", "receiver_flux", FLUX_READING)
+#: Pause between two readings, s.
+_EVERY = 1.0
+
+
+class Instruments:
+    """The sensors of a run.
+
+    Parameters
+    ----------
+    clock
+        True time.
+    seed
+        Seed of the weather and of the lies.
+    flux
+        Returns the true share of the beams on the receiver.
+    observer
+        Told of each reading that the plant is given.
+
+    Attributes
+    ----------
+    plant
+        The plant that they feed; None while it does not run.
+    lies
+        Present lie of each reading: a kind of fault, "" for none.
+    """
+
+    def __init__(
+        self, clock: Clock, seed: int, flux: Callable[[], float], observer: SensorObserver
+    ) -> None:
+        self.plant: PlantController | None = None
+        self.lies = dict.fromkeys(READINGS, "")
+        self._clock, self._flux, self._observer = clock, flux, observer
+        self._begin = clock.monotonic()
+        self._chance = random.Random(f"sensors {seed}")
+        self._mean = self._chance.uniform(2.0, 8.0)
+        self._last: dict[str, float] = {}
+        self._gust: tuple[float, float] = (-math.inf, 0.0)
+
+    def gust(self, size: float) -> None:
+        """Let a gust pass, of 10 to 25 m/s for ``size`` of 0 to 1."""
+        self._gust = self._clock.monotonic(), 10.0 + 15.0 * size
+
+    def _true(self, name: str) -> float:
+        now = self._clock.monotonic()
+        if name == FLUX_READING:
+            return self._flux()
+        if name == "receiver_flux":
+            return 0.8 * self._flux()
+        mean = self._mean + 0.5 * math.sin((now - self._begin) / 97.0)
+        at, peak = self._gust
+        # The shape (1 - cos)/2 over 10.5 s, as of `twin.wind`.
+        passed = (now - at) / 10.5
+        gust = 0.5 * peak * (1.0 - math.cos(2.0 * math.pi * passed)) if 0.0 <= passed < 1.0 else 0.0
+        return mean if name == "wind_mean" else max(1.2 * mean, gust)
+
+    def _shown(self, name: str) -> float | None:
+        """Return what a sensor gives, None for nothing."""
+        lie, true = self.lies[name], self._true(name)
+        if lie == "sensor_silent":
+            return None
+        if lie == "sensor_nan":
+            return self._chance.choice([math.nan, math.inf, -math.inf])
+        if lie == "sensor_jumps" and self._chance.random() < 0.3:
+            return true * self._chance.choice([-1.0, 0.0, 3.0, 100.0])
+        if lie == "sensor_stuck":
+            return self._last.get(name, true)
+        return true
+
+    async def run(self) -> None:
+        """Feed the plant each second, without end."""
+        while True:
+            due = self._clock.monotonic() + _EVERY
+            for name in READINGS if self.plant is not None else ():
+                value = self._shown(name)
+                if value is not None and self.plant is not None:
+                    self._last[name] = value
+                    self.plant.put(name, value)
+                    self._observer.fed(name, value, self._clock.monotonic())
+            await sleep_until(self._clock, due)

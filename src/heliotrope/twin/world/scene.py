@@ -1,0 +1,89 @@
+"""The scene of a run: site, time, places of the heliostats, and keep-out volumes."""
+
+import math
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from heliotrope.sun import Site, vector
+from heliotrope.twin.boards.outfit import KEEP_OUT, KEEP_OUT_RADIUS, RECEIVER, STANDBY, Ball
+
+#: The sun is at least this high at the beginning and at the end of a drawn scene, rad.
+_LOWEST = math.radians(8.0)
+#: Nearest two heliostats, m.
+_APART = 6.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Where and when a run takes place.
+
+    Attributes
+    ----------
+    site, start
+        Site, and UTC at the beginning.
+    places
+        East and north of each heliostat, m; (): `outfits` draws them.
+    keep_outs
+        Balls that no beam may enter; the first is the one that persons aim at.
+    """
+
+    site: Site
+    start: datetime
+    places: tuple[tuple[float, float], ...] = ()
+    keep_outs: tuple[Ball, ...] = ((KEEP_OUT, KEEP_OUT_RADIUS),)
+
+
+#: The usual scene; its volume lies away from all natural ways.
+USUAL = Scene(Site(37.4, -6.0, 100.0, name="simulation"), datetime(2026, 6, 21, 9, tzinfo=UTC))
+
+
+def scene_of(worlds: Sequence[str], seed: int, seconds: float, heliostats: int) -> Scene:
+    """Return the scene of a run: drawn in the world "place", else the usual one."""
+    if "place" not in worlds:
+        return USUAL
+    chance = random.Random(f"place {seed}")
+    site, start = _when(chance, seconds)
+    places: list[tuple[float, float]] = []
+    while len(places) < heliostats:
+        bearing, away = chance.uniform(-math.pi, math.pi), chance.uniform(40.0, 150.0)
+        place = (away * math.sin(bearing), away * math.cos(bearing))
+        if all(math.dist(place, other) > _APART for other in places):
+            places.append(place)
+    balls = tuple(_ball(chance, places) for _ in range(chance.randint(1, 3)))
+    return Scene(site, start, tuple(places), balls)
+
+
+def _when(chance: random.Random, seconds: float) -> tuple[Site, datetime]:
+    """Return a site and a time from which the sun stays up."""
+    while True:
+        site = Site(
+            chance.uniform(-50.0, 50.0), chance.uniform(-180.0, 180.0), 100.0, name="simulation"
+        )
+        start = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(seconds=chance.uniform(0.0, 3.15e7))
+        ends = (start.timestamp(), start.timestamp() + seconds)
+        if all(math.asin(float(vector(at, site)[2])) > _LOWEST for at in ends):
+            return site, start
+
+
+def _ball(chance: random.Random, places: Sequence[tuple[float, float]]) -> Ball:
+    """Return a ball across a natural way of beams, clear of the mirrors and of the receiver."""
+    while True:
+        radius = chance.uniform(1.0, 5.0)
+        east, north = chance.choice(list(places))
+        goal = chance.choice([STANDBY, STANDBY, RECEIVER])
+        # On a beam at rest or at the aim; below one, on the way up; or anywhere about the tower.
+        share, low = chance.uniform(0.3, 0.95), chance.choice([1.0, 1.0, chance.random()])
+        middle = (
+            east + share * (goal[0] - east),
+            north + share * (goal[1] - north),
+            2.0 + low * share * (goal[2] - 2.0),
+        )
+        if chance.random() < 0.3:
+            middle = (
+                chance.uniform(-30.0, 30.0), chance.uniform(-30.0, 30.0), chance.uniform(5.0, 60.0)
+            )  # fmt: skip
+        clear = math.dist(middle, RECEIVER) > radius + 6.0
+        if clear and all(math.dist(middle, (*p, 2.0)) > radius + 8.0 for p in places):
+            return middle, radius
