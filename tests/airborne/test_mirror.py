@@ -249,7 +249,7 @@ def test_wrong_files_are_refused(tmp_path: Path) -> None:
     )
     for name, text in (
         ("other.npz", "no array 'slope' in it, only height"),
-        ("no.npz", "not an .npz file written by NumPy"),
+        ("no.npz", "it should be a slope map: an .npz file written by NumPy"),
         ("part.csv", "1 rows for 4 × 91 × 91 cells"),
         ("half.csv", "are not whole numbers"),
         ("missing.npz", "there is no such file"),

@@ -171,5 +171,5 @@ def test_entities_are_refused(tmp_path: Path, content: str) -> None:
 def test_nesting_without_end_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "deep.xml"
     path.write_text("<a>" * 100_000, encoding="utf-8")
-    with pytest.raises(FormatError, match="not well-formed XML"):
+    with pytest.raises(FormatError, match="nested too deeply: more than 64 levels"):
         heliok.read(path)

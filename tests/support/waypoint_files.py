@@ -3,7 +3,6 @@
 import csv
 import io
 import re
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,10 @@ import numpy as np
 from heliotrope.airborne.plan import waypoints
 from heliotrope.airborne.plan.waypoints import Mission
 from heliotrope.errors import FormatError
+from heliotrope.files.archives import read_members
 from heliotrope.files.json import read_json
-from heliotrope.files.text import check_file, read_text
+from heliotrope.files.limits import MIB
+from heliotrope.files.text import read_text
 
 _WPMZ, _KML, _LITCHI_HEADER = waypoints._WPMZ, waypoints._KML, waypoints._LITCHI_HEADER
 #: MAVLink's commands, as QGroundControl's plan holds them.
@@ -70,14 +71,9 @@ def read_wpml(path: str | Path) -> Mission:
     """
     from lxml import etree
 
-    file = check_file(path, "a DJI wayline in KMZ", binary=True)
-    try:
-        with zipfile.ZipFile(file) as archive:
-            text = {n: archive.read(f"wpmz/{n}") for n in ("template.kml", "waylines.wpml")}
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise FormatError(
-            file, f"not a KMZ with wpmz/template.kml and waylines.wpml ({error})"
-        ) from None
+    file, names = Path(path), ("wpmz/template.kml", "wpmz/waylines.wpml")
+    members = read_members(file, f"a KMZ with {' and '.join(names)}", names, most=4 * MIB)
+    text = {name.removeprefix("wpmz/"): body for name, body in members.items()}
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     try:
         roots = {name: etree.fromstring(body, parser) for name, body in text.items()}

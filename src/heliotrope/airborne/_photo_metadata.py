@@ -1,6 +1,7 @@
 """EXIF and XMP as DJI drones write them into their photographs, read and written."""
 
 import math
+import struct
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from heliotrope.errors import FormatError
+from heliotrope.files.limits import PHOTOGRAPH_PIXELS, check_count
 from heliotrope.geometry import FloatArray
 
 DJI = "http://www.dji.com/drone-dji/1.0/"
@@ -61,18 +63,21 @@ def read_metadata(path: str | Path) -> Metadata:
     FormatError
         If it is not an image, or its XMP is damaged.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL.JpegImagePlugin import jpeg_factory
 
     file = Path(path)
     try:
-        with Image.open(file) as image:
+        # Not Image.open: its limit of pixels is one for the whole process.
+        with file.open("rb") as stream, jpeg_factory(stream) as image:
             size, packet, exif = image.size, image.info.get("xmp", b""), image.getexif()
             tags = dict(exif.get_ifd(_EXIF_IFD))
     except FileNotFoundError:
         raise FormatError(file, "no such file; give a photograph") from None
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, LookupError, TypeError, struct.error) as error:
         text = str(error).split(":")[-1].strip() or "damaged"
         raise FormatError(file, f"not a readable image ({text}); copy it again") from None
+    pixels = size[0] * size[1]
+    check_count(file, pixels, PHOTOGRAPH_PIXELS, "pixels", "give a smaller photograph")
     values = _xmp(file, packet) if packet else {}
 
     def number(*names: str) -> float:

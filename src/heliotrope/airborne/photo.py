@@ -7,7 +7,6 @@ right, y down, z forward, and rotations from camera axes to ENU.
 import csv
 import io
 import math
-import tomllib
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -20,6 +19,8 @@ import numpy.typing as npt
 from heliotrope.airborne._photo_metadata import Metadata, read_metadata
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.camera import checked_pinhole, checked_pose, local_pixels
+from heliotrope.files.documents import read_toml
+from heliotrope.files.limits import check_entries, check_table
 from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import (
     FloatArray,
@@ -170,11 +171,7 @@ def read_camera(path: str | Path) -> LedCamera:
     FormatError
         If the file cannot be read, or a value is missing or wrong.
     """
-    text = read_text(path, "a camera file (TOML)")
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(path, f"not TOML ({error}); write size_px, focal_px, …") from None
+    table = read_toml(path, "a camera file (TOML)")
     lengths = {
         "size_px": 2, "focal_px": 2, "principal_point_px": 2, "distortion": 5, "led_offset_m": 3,
     }  # fmt: skip
@@ -248,7 +245,7 @@ def read_photos(
     place = Path(folder)
     if not place.is_dir():
         raise InputError(f"{place}: no such folder; give one with photographs")
-    files = sorted(f for f in place.iterdir() if f.suffix.lower() in SUFFIXES)
+    files = sorted(f for f in check_entries(place, place.iterdir()) if f.suffix.lower() in SUFFIXES)
     table = place / "photos.csv"
     rows = _read_table(table) if table.exists() else {}
     if not files and not rows:
@@ -327,7 +324,8 @@ def _of_metadata(found: Metadata, file: Path, origin: tuple[float, float, float]
 
 
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
-    reader = csv.DictReader(io.StringIO(read_text(path, "a table of photographs")))
+    what = "a table of photographs"
+    reader = csv.DictReader(io.StringIO(read_text(check_table(path, what), what)))
     columns = set(reader.fieldnames or ())
     places = ({"east_m", "north_m", "up_m"}, {"latitude_deg", "longitude_deg", "altitude_m"})
     needed = {"name", "yaw_deg", "pitch_deg", "roll_deg"}

@@ -5,15 +5,16 @@ deviations from the ideal surface, (F, H, W, 2); its signs are those of
 `heliotrope.airborne.mirror.MirrorShape`.
 """
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from heliotrope.airborne.mirror import MirrorShape
 from heliotrope.errors import FormatError, InputError
+from heliotrope.files.archives import read_arrays
 from heliotrope.files.cells import read_rows
-from heliotrope.files.text import check_file, write_file, write_text
+from heliotrope.files.limits import check_file
+from heliotrope.files.text import write_file, write_text
 from heliotrope.geometry import FloatArray, as_float
 
 _COLUMNS = ("facet", "row", "column", "slope_u_mrad", "slope_v_mrad")
@@ -144,15 +145,10 @@ def smooth_slopes(
 
 
 def _read_npz(file: Path) -> FloatArray:
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            if "slope" not in stored:
-                raise FormatError(file, f"no array 'slope' in it, only {', '.join(stored)}")
-            return as_float(stored["slope"])
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        if isinstance(error, FormatError):
-            raise
-        raise FormatError(file, "not an .npz file written by NumPy; write it again") from None
+    slope = read_arrays(file, "a slope map: an .npz file written by NumPy", ["slope"])["slope"]
+    if slope.dtype.kind not in "fiu":
+        raise FormatError(file, f"slopes are {slope.dtype}; they must be numbers")
+    return as_float(slope)
 
 
 def _read_csv(file: Path) -> FloatArray:

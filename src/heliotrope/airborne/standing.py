@@ -16,6 +16,7 @@ import numpy.typing as npt
 from heliotrope.airborne.mirror import orientation
 from heliotrope.errors import FormatError, InputError, UnknownNameError
 from heliotrope.field.heliostats import Heliostats
+from heliotrope.files.limits import check_table
 from heliotrope.files.text import read_text, write_text
 from heliotrope.geometry import FloatArray, as_float
 
@@ -131,7 +132,8 @@ def read_commands(
     UnknownNameError
         If a heliostat is not in the plant: the wrong field.
     """
-    reader = csv.DictReader(io.StringIO(read_text(path, "a table of commands")))
+    what = "a table of commands"
+    reader = csv.DictReader(io.StringIO(read_text(check_table(path, what), what)))
     columns = list(reader.fieldnames or ())
     counts = [c for c in ("count_1", "count_2") if c in columns]
     if "heliostat" not in columns or not counts:

@@ -25,7 +25,8 @@ from heliotrope.files.cells import (
     read_rows,
     rows_of,
 )
-from heliotrope.files.text import SIZE_LIMIT, write_file
+from heliotrope.files.limits import SIZE_LIMIT
+from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray, direction
 
 #: Kinds of sightings, with whether source and destination are at infinity.

@@ -156,11 +156,11 @@ class _PlanOrder:
 
 def _check_outputs(outputs: tuple[Path | None, ...], field: Path, sightings: Path | None) -> None:
     """Refuse an output that cannot be written, or that would replace an input."""
-    import tomllib
+    from heliotrope.files.documents import read_toml
 
     read = {path.resolve() for path in (field, sightings) if path is not None}
     if field.suffix.lower() == ".toml" and field.is_file():
-        table = tomllib.loads(field.read_text(encoding="utf-8-sig")).get("heliostats")
+        table = read_toml(field, "a plant file").get("heliostats")
         if isinstance(table, str):
             read.add((field.parent / table).resolve())
     for file in (path for path in outputs if path is not None):

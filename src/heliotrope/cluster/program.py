@@ -47,7 +47,8 @@ def line_of(file: Path | None) -> Callable[[], bool] | None:
 
     def flows() -> bool:
         try:
-            return file.read_bytes()[:1] == b"1"
+            with file.open("rb") as stream:
+                return stream.read(1) == b"1"
         except OSError:
             return False
 

@@ -1,9 +1,11 @@
 """Reading and writing files safely, with errors that name the file and the place in it.
 
+- `limits`: size, depth, count and expansion that no file may exceed, for all readers.
 - `text`: whole text files and binary files; written whole or not at all.
 - `json`, `xml`: documents whose values know their place in the file.
 - `documents`: TOML files of our own formats, checked against pydantic models. Its names stay
   there, because pydantic is slow to load.
+- `archives`: members of a ZIP and arrays of NumPy, measured before they are expanded.
 - `cells`: tables (CSV, Parquet) cell by cell, and times in ISO 8601.
 
 Begin with `read_text` and `write_text`.
@@ -23,9 +25,9 @@ from heliotrope.files.json import (
     JsonNode,
     read_json,
 )
+from heliotrope.files.limits import SIZE_LIMIT, check_file, check_table
 from heliotrope.files.text import (
-    SIZE_LIMIT,
-    check_file,
+    read_bytes,
     read_text,
     write_file,
     write_text,
@@ -40,9 +42,11 @@ __all__ = [
     "Rows",
     "XmlElement",
     "check_file",
+    "check_table",
     "find_heliostats",
     "format_time",
     "parse_time",
+    "read_bytes",
     "read_json",
     "read_parquet",
     "read_rows",

@@ -11,14 +11,27 @@ from decimal import Decimal
 from fractions import Fraction
 from itertools import repeat
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError, InputError, UnknownNameError
+from heliotrope.files.limits import (
+    COLUMNS,
+    PARQUET_CELLS,
+    PARQUET_EXPANDED,
+    PARQUET_SIZE,
+    check_count,
+    check_file,
+    check_table,
+)
 from heliotrope.files.text import read_text
 from heliotrope.geometry import FloatArray
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
 #: A column as it was read: texts, or what Parquet holds.
 Cells: TypeAlias = list[Any] | FloatArray
@@ -27,6 +40,8 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _TIME = re.compile(
     r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d(?::\d\d(?:[.,](\d+))?)?) ?(Z|[+-]\d\d(?::?\d\d)?)?", re.ASCII
 )
+#: Unknown names of a table for which close ones are suggested.
+_SUGGESTIONS = 20
 _TRUE, _FALSE = ("true", "1"), ("false", "0")
 
 
@@ -166,7 +181,7 @@ def read_rows(path: Path, what: str) -> Rows:
     FormatError
         If it cannot be read, or its header is unusable.
     """
-    text = read_text(path, what)
+    text = read_text(check_table(path, what), what)
     header = text.lstrip("\r\n").split("\n", maxsplit=1)[0]
     separator = max(",;\t", key=header.count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True)
@@ -188,10 +203,12 @@ def read_rows(path: Path, what: str) -> Rows:
     place = places.pop(0)
     while names and not names[-1]:
         names.pop()
+    seen: set[str] = set()
     for k, name in enumerate(names):
-        if not name or name in names[:k]:
+        if not name or name in seen:
             wrong = f"column {name} occurs twice" if name else f"column {k + 1} has no name"
             raise FormatError(path, f"{wrong}; name each column once", place)
+        seen.add(name)
     rows = Rows(path, places, {}, place)
     for i, cells in enumerate(table):
         while len(cells) > len(names) and not cells[-1].strip():
@@ -209,21 +226,22 @@ def read_parquet(path: Path, what: str) -> Rows:
     Raises
     ------
     FormatError
-        If it cannot be read.
+        If it cannot be read, has nested columns, or is beyond the limits of
+        `heliotrope.files.limits`.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    if not path.is_file():
-        raise FormatError(path, f"there is no such file; give the path of {what}")
+    check_file(path, what, binary=True, limit=PARQUET_SIZE)
     try:
         with pq.ParquetFile(path) as file:
+            _check_parquet(path, file.metadata)
+            texts = [field.name for field in file.schema_arrow if pa.types.is_string(field.type)]
+        # As a dictionary a text that recurs is in memory once.
+        with pq.ParquetFile(path, read_dictionary=texts) as file:
             table = file.read()
         names = [_tidy(name) for name in table.column_names]
-        cells: list[Cells] = [
-            column.to_numpy() if pa.types.is_float64(column.type) else column.to_pylist()
-            for column in table.columns
-        ]
+        cells = [_cells_of(column) for column in table.columns]
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error).split("\n", maxsplit=1)[0]
         raise FormatError(path, f"not a Parquet table ({reason}); it should be {what}") from None
@@ -231,6 +249,33 @@ def read_parquet(path: Path, what: str) -> Rows:
         raise FormatError(path, "two columns have the same name; name each column once")
     columns = dict(zip(names, cells, strict=True))
     return Rows(path, [f"row {i + 1}" for i in range(table.num_rows)], columns)
+
+
+def _check_parquet(path: Path, about: "pq.FileMetaData") -> None:
+    """Refuse a file whose stated columns, cells or expanded size are beyond the limits."""
+    check_count(path, about.num_columns, COLUMNS, "columns", "remove those that are not needed")
+    check_count(path, about.num_rows * about.num_columns, PARQUET_CELLS, "cells", "divide it")
+    size = sum(about.row_group(i).total_byte_size for i in range(about.num_row_groups))
+    check_count(path, size, PARQUET_EXPANDED, "expanded bytes", "divide the table")
+    for i in range(about.num_columns):
+        if about.schema.column(i).max_repetition_level:
+            raise FormatError(
+                path, "a column of lists; give single values", about.schema.column(i).path
+            )
+
+
+def _cells_of(column: "pa.ChunkedArray[Any]") -> Cells:
+    import pyarrow as pa
+
+    if pa.types.is_float64(column.type):
+        return np.asarray(column.to_numpy(), dtype=np.float64)
+    if not pa.types.is_dictionary(column.type):
+        return list(column.to_pylist())
+    cells: list[Any] = []
+    for chunk in column.chunks:
+        texts = chunk.dictionary.to_pylist()
+        cells += [None if i is None else texts[i] for i in chunk.indices.to_pylist()]
+    return cells
 
 
 def rows_of(names: Sequence[str]) -> dict[str, int]:
@@ -253,10 +298,17 @@ def find_heliostats(rows: Rows, column: str, names: Sequence[str]) -> npt.NDArra
     index = rows_of(names)
     rows.heliostat = rows.texts(column)
     found = np.array([index.get(n, index.get(n.strip(), -1)) for n in rows.heliostat], np.intp)
+    reasons = {"": "the cell is empty; name a heliostat"}
     for i in np.flatnonzero(found < 0):
         name = rows.heliostat[i]
-        text = str(UnknownNameError("heliostat", name, names)) if name else "the cell is empty"
-        rows.refuse(i, column, text if name else f"{text}; name a heliostat")
+        if name not in reasons:
+            # Close names are looked for among all names: seconds in a table of another field.
+            reasons[name] = (
+                str(UnknownNameError("heliostat", name, names))
+                if len(reasons) <= _SUGGESTIONS
+                else f"there is no heliostat {_shown(name)}"
+            )
+        rows.refuse(i, column, reasons[name])
     return found
 
 

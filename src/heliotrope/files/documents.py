@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from heliotrope.errors import FormatError
+from heliotrope.files.limits import TOML_SIZE, check_toml
 from heliotrope.files.text import read_text
 
 D = TypeVar("D", bound=BaseModel)
@@ -20,13 +21,15 @@ def read_toml(path: str | Path, what: str) -> dict[str, Any]:
     Raises
     ------
     FormatError
-        If it cannot be read or is not TOML.
+        If it cannot be read, is not TOML, or beyond the limits of `heliotrope.files.limits`.
     """
-    text = read_text(path, what)
+    text = read_text(path, what, TOML_SIZE)
+    check_toml(path, text)
     try:
         return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise FormatError(path, f"not valid TOML: {error}") from None
+    except ValueError as error:
+        # Not a TOMLDecodeError: an integer of thousands of digits.
+        raise FormatError(path, f"not valid TOML: {str(error)[:200]}") from None
 
 
 def read_document(

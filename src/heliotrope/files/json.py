@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from heliotrope.errors import FormatError
+from heliotrope.files.limits import check_json
 from heliotrope.files.text import read_text
 
 
@@ -101,14 +102,17 @@ def read_json(path: str | Path, what: str) -> JsonNode:
     Raises
     ------
     FormatError
-        If it is not a readable text file of a plausible size, or not JSON.
+        If it is not a readable text file of a plausible size, not JSON, or beyond the limits of
+        `heliotrope.files.limits`.
     """
     text = read_text(path, what)
+    check_json(path, text)
     try:
         return JsonNode(Path(path), json.loads(text))
-    except (json.JSONDecodeError, RecursionError) as error:
-        line = getattr(error, "lineno", 1)
-        reason = getattr(error, "msg", "nested too deeply")
+    except json.JSONDecodeError as error:
         raise FormatError(
-            path, f"not valid JSON ({reason}); the file may be cut off", f"line {line}"
+            path, f"not valid JSON ({error.msg}); the file may be cut off", f"line {error.lineno}"
         ) from None
+    except ValueError as error:
+        # An integer of thousands of digits.
+        raise FormatError(path, f"not usable JSON ({str(error)[:80]})") from None

@@ -6,54 +6,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 from heliotrope.errors import FormatError, InputError
-
-#: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
-SIZE_LIMIT = 64 * 2**20
+from heliotrope.files.limits import SIZE_LIMIT, check_count, check_file
 
 
-def check_file(path: str | Path, what: str, *, binary: bool = False) -> Path:
-    """Return the path if it is a readable file of a plausible size.
-
-    Parameters
-    ----------
-    path
-        The file.
-    what
-        Kind of file expected, as an error names it ("a HelioK file").
-    binary
-        Accept files that do not begin like text.
-
-    Raises
-    ------
-    FormatError
-        If it does not exist, is a folder, cannot be read, is empty, is larger than
-        64 MiB or does not begin like text.
-    """
-    file = Path(path)
-    try:
-        size = file.stat().st_size
-        with file.open("rb") as stream:
-            start = stream.read(4096)
-    except FileNotFoundError:
-        raise FormatError(file, f"there is no such file; give the path of {what}") from None
-    except IsADirectoryError:
-        raise FormatError(file, f"this is a folder; give the path of {what}") from None
-    except OSError as error:
-        raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
-    if not start:
-        raise FormatError(file, f"the file is empty; it should be {what}")
-    if size > SIZE_LIMIT:
-        raise FormatError(
-            file,
-            f"{size / 2**20:.0f} MiB exceed the limit of {SIZE_LIMIT / 2**20:.0f} MiB; "
-            f"this is not {what}",
-        )
-    if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise FormatError(file, f"the file is binary; it should be {what}")
-    return file
-
-
-def read_text(path: str | Path, what: str) -> str:
+def read_text(path: str | Path, what: str, limit: int = SIZE_LIMIT) -> str:
     """Return the text of a UTF-8 file (with or without a byte-order mark).
 
     Raises
@@ -61,13 +17,31 @@ def read_text(path: str | Path, what: str) -> str:
     FormatError
         As `check_file`, or if it is not UTF-8.
     """
-    file = check_file(path, what)
+    file = check_file(path, what, limit=limit)
     try:
-        return file.read_text(encoding="utf-8-sig")
+        # "\r\n" and "\r" become "\n", as in a text file that Python opens.
+        text = read_bytes(file, limit).decode("utf-8-sig")
+        return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
     except UnicodeDecodeError as error:
         raise FormatError(
             file, f"not UTF-8 text ({error.reason}); save it as UTF-8", f"byte {error.start}"
         ) from None
+
+
+def read_bytes(path: str | Path, limit: int = SIZE_LIMIT) -> bytes:
+    """Return the content of a file that has no more than ``limit`` bytes, now and in the end.
+
+    Raises
+    ------
+    FormatError
+        If it has more.
+    OSError
+        If it cannot be read.
+    """
+    with Path(path).open("rb") as stream:
+        content = stream.read(limit + 1)
+    check_count(path, len(content), limit, "bytes", "it is no file of this kind")
+    return content
 
 
 def write_file(path: str | Path, write: Callable[[BinaryIO], object]) -> None:

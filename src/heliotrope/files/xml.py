@@ -1,15 +1,19 @@
 """An XML document as a tree of frozen elements whose attributes are kept as text."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from xml.parsers import expat
 
 from heliotrope.errors import FormatError
-from heliotrope.files.text import check_file
+from heliotrope.files.limits import DEPTH, XML_PARTS, XML_TAG, check_count, check_file
+from heliotrope.files.text import read_bytes
+
+_LONG_TAG = re.compile(rb"<[^<]{%d}" % XML_TAG)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class XmlElement:
     """An element of an XML document.
 
@@ -68,31 +72,76 @@ def read_xml(path: str | Path, what: str) -> Document:
     Raises
     ------
     FormatError
-        If the file cannot be read, is not well-formed XML or has a document type
-        (which could define entities; none are needed).
+        If the file cannot be read, is not well-formed XML, has a document type (which could
+        define entities; none are needed) or is beyond the limits of `heliotrope.files.limits`.
     """
-    from lxml import etree
-
     file = check_file(path, what)
-    # Nothing is expanded, fetched or allowed to grow: a file may come from anywhere.
-    parser = etree.XMLParser(
-        resolve_entities=False, load_dtd=False, no_network=True, huge_tree=False
-    )
-    try:
-        tree: Any = etree.parse(str(file), parser)
-    except etree.XMLSyntaxError as error:
+    content = read_bytes(file)
+    tags = content.count(b"<")
+    check_count(file, tags, 2 * XML_PARTS, "tags", f"divide it; it should be {what}")
+    # The attributes of a tag are in memory as a whole before they can be counted.
+    if (found := _LONG_TAG.search(content)) is not None:
+        line = content.count(b"\n", 0, found.start()) + 1
         raise FormatError(
-            file, f"not well-formed XML ({error.msg}); it should be {what}", f"line {error.lineno}"
-        ) from None
-    if tree.docinfo.doctype:
-        raise FormatError(
-            file, "it has a document type (<!DOCTYPE), which could define entities; remove it"
+            file,
+            f"a tag or a text exceeds the limit of {XML_TAG // 1024:,} KiB; it should be {what}",
+            f"line {line}",
         )
-    return Document(_element(tree.getroot()), str(file))
+    builder = _Builder(file)
+    try:
+        builder.parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise FormatError(
+            file,
+            f"not well-formed XML ({expat.ErrorString(error.code)}); it should be {what}",
+            f"line {error.lineno}",
+        ) from None
+    return Document(builder.root, str(file))
 
 
-def _element(node: Any) -> XmlElement:
-    attributes = tuple((str(name), str(value)) for name, value in node.attrib.items())
-    # Comments and processing instructions have no text as tag.
-    children = tuple(_element(child) for child in node if isinstance(child.tag, str))
-    return XmlElement(node.tag, attributes, children, node.sourceline or 0)
+class _Builder:
+    """The tree of a document, built while it is parsed and bounded on the way."""
+
+    def __init__(self, file: Path) -> None:
+        self.root = XmlElement("")
+        self.parser = expat.ParserCreate(namespace_separator="}")
+        self.parser.ordered_attributes = True
+        # Nothing is expanded or fetched: a file may come from anywhere.
+        self.parser.StartDoctypeDeclHandler = self._refuse_type
+        self.parser.StartElementHandler = self._start
+        self.parser.EndElementHandler = self._end
+        self._file, self._parts = file, 0
+        self._open: list[tuple[str, tuple[tuple[str, str], ...], list[XmlElement], int]] = []
+
+    def _refuse_type(self, *_about: object) -> None:
+        raise FormatError(
+            self._file,
+            "it has a document type (<!DOCTYPE), which could define entities; remove it",
+            f"line {self.parser.CurrentLineNumber}",
+        )
+
+    def _start(self, tag: str, given: list[str]) -> None:
+        line = self.parser.CurrentLineNumber
+        self._parts += 1 + len(given) // 2
+        name, limit = "elements and attributes", XML_PARTS
+        check_count(self._file, self._parts, limit, name, "divide the file", f"line {line}")
+        if len(self._open) >= DEPTH:
+            raise FormatError(
+                self._file,
+                f"nested too deeply: more than {DEPTH} levels; write it flatter",
+                f"line {line}",
+            )
+        pairs = zip(map(_qualified, given[::2]), given[1::2], strict=True)
+        self._open.append((_qualified(tag), tuple(pairs), [], line))
+
+    def _end(self, _tag: str) -> None:
+        tag, attributes, children, line = self._open.pop()
+        element = XmlElement(tag, attributes, tuple(children), line)
+        if self._open:
+            self._open[-1][2].append(element)
+        else:
+            self.root = element
+
+
+def _qualified(name: str) -> str:
+    return "{" + name if "}" in name else name

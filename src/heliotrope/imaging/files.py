@@ -36,13 +36,14 @@ from PIL import (
 )
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.files.text import write_file
+from heliotrope.files.limits import PIXELS, check_entries
+from heliotrope.files.text import read_bytes, write_file
 from heliotrope.imaging.frame import Frame, Pixels
 
 #: Suffixes that `find_images` looks for; `read_image` goes by the content instead.
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 #: Default limit of `read_image`, pixels.
-LIMIT = 64_000_000
+LIMIT = PIXELS
 #: Smallest side of an image that can show a target, px.
 SMALLEST = 16
 
@@ -171,7 +172,7 @@ def find_images(folder: str | Path, recursive: bool = False) -> list[Path]:
             raise InputError(f"{place}: not a folder; give one with images")
         found = [
             item
-            for item in (place.rglob("*") if recursive else place.iterdir())
+            for item in check_entries(place, place.rglob("*") if recursive else place.iterdir())
             if item.suffix.lower() in IMAGE_SUFFIXES
             and not any(part.startswith(".") for part in item.relative_to(place).parts)
             and not item.is_dir()
@@ -203,7 +204,7 @@ def _content(file: Path, limit: int) -> tuple[bytes, float]:
                 f"{state.st_size / 2**20:.0f} MiB are more than {limit / 1e6:.3g} million "
                 "pixels can have; check that it is an image, or raise the limit",
             )
-        data = file.read_bytes()
+        data = read_bytes(file, most)
     except FileNotFoundError:
         if file.is_symlink():
             text = f"a link to {file.readlink()}, which does not exist; give an image file"
@@ -551,7 +552,7 @@ def _exposure(tags: Mapping[int, Any]) -> tuple[float, float]:
 def _own_values(text: str) -> dict[str, float]:
     """Return the numbers that `write_image` left in a PNG."""
     values = None
-    with suppress(ValueError):
+    with suppress(ValueError, RecursionError):
         values = json.loads(text)
     items = values.items() if isinstance(values, dict) else ()
     return {k: v for k, v in items if isinstance(v, int | float) and 0 < v < math.inf}

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError
 from heliotrope.field.formats.paint import read_calibration_properties
-from heliotrope.files.text import check_file
+from heliotrope.files import check_table
 from heliotrope.geometry import FloatArray, direction
 
 #: Columns of a log; a row needs a file name or id, a heliostat and two counts.
@@ -92,7 +92,7 @@ def read_log(path: str | Path) -> Log:
     """
     import pandas as pd
 
-    file = check_file(path, "a log of photographs (CSV)")
+    file = check_table(path, "a log of photographs (CSV)")
     try:
         table = pd.read_csv(file, dtype=str, keep_default_na=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:

@@ -7,6 +7,7 @@ its row counts the worst case, as if the sensor were gone. See `safety.condition
 
 import asyncio
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,7 +71,7 @@ class SensorFiles:
                 written = path.stat().st_mtime_ns
                 if written == self._written.get(name):
                     continue
-                value = float(path.read_text(encoding="ascii")[:_LONGEST])
+                value = float(_content(path))
                 if math.isfinite(value):
                     # The file that is there at the start may be old.
                     if name in self._written:
@@ -86,3 +87,12 @@ class SensorFiles:
                 found.problems[name] = problem
             self._problems[name] = problem
         return found
+
+
+def _content(path: Path) -> bytes:
+    """Return the start of a file; a pipe or an endless file does not hold up the reading."""
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        return os.read(handle, _LONGEST)
+    finally:
+        os.close(handle)

@@ -11,7 +11,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from heliotrope.airborne._photo_metadata import read_metadata
 from heliotrope.errors import FormatError
+from heliotrope.files.text import read_bytes
 from heliotrope.geometry import FloatArray, as_float
 
 Picture = npt.NDArray[np.uint8]
@@ -98,17 +100,20 @@ def decode(path: str | Path) -> Picture:
     Raises
     ------
     FormatError
-        If there is no file, or it is truncated or damaged.
+        If there is no file, it is truncated or damaged, or above the limits of
+        `heliotrope.files.limits`.
     """
     import cv2
 
     file = Path(path)
     try:
-        data = file.read_bytes()
+        data = read_bytes(file)
     except OSError as error:
         raise FormatError(file, f"cannot be read ({error.strerror}); give a photograph") from None
     if data[:2] == b"\xff\xd8" and b"\xff\xd9" not in data[-4096:]:
         raise FormatError(file, f"it breaks off after {len(data)} bytes; copy it again")
+    # Its header says how much memory decoding takes.
+    read_metadata(file)
     flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     if picture is None:

@@ -5,13 +5,12 @@ the image. A photograph that cannot be used is reported with the reason; it rais
 """
 
 import hashlib
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, fields
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -34,8 +33,9 @@ from heliotrope.airborne.evaluate.identification import (
 )
 from heliotrope.airborne.photo import LedCamera, Photo
 from heliotrope.airborne.standing import MirrorPoses
-from heliotrope.errors import HeliotropeError
+from heliotrope.errors import HeliotropeError, InputError
 from heliotrope.field.camera import undistort
+from heliotrope.files.archives import read_arrays
 from heliotrope.geometry import FloatArray
 
 if TYPE_CHECKING:
@@ -133,8 +133,9 @@ class PhotoReading:
     @classmethod
     def load(cls, path: Path) -> "PhotoReading":
         """Return what `save` wrote."""
-        with np.load(path, allow_pickle=False) as stored:
-            values = {f.name: stored[f.name] for f in fields(cls)}
+        values: dict[str, Any] = dict(
+            read_arrays(path, "a stored reading", [f.name for f in fields(cls)])
+        )
         return cls(
             **{
                 **values,
@@ -410,6 +411,6 @@ def _kept(path: Path) -> PhotoReading | None:
         return None
     try:
         return PhotoReading.load(path)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    except (InputError, ValueError):
         # Written by another version, or damaged: read the photograph again.
         return None

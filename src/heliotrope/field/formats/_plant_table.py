@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from heliotrope.errors import FormatError
-from heliotrope.files import check_file, write_file
+from heliotrope.files import check_table, read_parquet, write_file
 from heliotrope.geometry import FloatArray
 
 TEXTS = ("name", "group", "cluster")
@@ -68,9 +68,9 @@ def read_table(path: Path) -> HeliostatColumns:
     import pandas as pd
 
     if path.suffix == ".parquet":
-        frame = _read_parquet(path)
+        frame = pd.DataFrame(read_parquet(path, "the table of heliostats").columns)
     else:
-        check_file(path, "the table of heliostats")
+        check_table(path, "the table of heliostats")
         texts = dict.fromkeys(TEXTS, str)
         try:
             # pandas reads numbers to the last digit since 3.1.
@@ -99,19 +99,6 @@ def read_table(path: Path) -> HeliostatColumns:
     return HeliostatColumns(
         path, texts_read["name"], texts_read["group"], texts_read["cluster"], numbers, problems
     )
-
-
-def _read_parquet(path: Path) -> Any:
-    import pandas as pd
-    import pyarrow as pa
-
-    if not path.is_file():
-        raise FormatError(path, "there is no such file; give the table of heliostats")
-    try:
-        return pd.read_parquet(path)
-    except (pa.ArrowInvalid, OSError) as error:
-        reason = str(error).split("\n", maxsplit=1)[0]
-        raise FormatError(path, f"not a Parquet table: {reason}") from None
 
 
 def _check_names(path: Path, names: Sequence[str], problems: list[FormatError]) -> None:

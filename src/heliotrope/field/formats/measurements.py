@@ -12,7 +12,7 @@ import numpy as np
 
 from heliotrope.errors import FormatError
 from heliotrope.field.formats.paint import find_tower, read_calibration_properties, read_tower
-from heliotrope.files import check_file
+from heliotrope.files import check_table
 from heliotrope.geometry import FloatArray, direction, geodetic_to_enu
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def read_measurements(folder: str | Path, centroid: Centroid = "utis") -> Measur
 def _read_table(path: Path, centroid: Centroid) -> "pd.DataFrame":
     import pandas as pd
 
-    check_file(path, "a table of measurements")
+    check_table(path, "a table of measurements")
     try:
         frame = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (pd.errors.ParserError, pd.errors.EmptyDataError, UnicodeDecodeError) as error:

@@ -20,6 +20,7 @@ Facts from the sources and data of OpenCSP (Sandia National Laboratories).
 import csv
 import io
 import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +32,7 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Facets, Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import read_text
+from heliotrope.files import check_table, read_text
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -164,11 +165,11 @@ class _Table:
     def read(cls, path: str | Path, what: str, needed: tuple[str, ...]) -> "_Table":
         """Read a table that has at least the columns ``needed``."""
         file = Path(path)
-        reader = csv.reader(io.StringIO(read_text(file, what)), strict=True)
+        reader = csv.reader(io.StringIO(read_text(check_table(file, what), what)), strict=True)
         found = list(cls._cells(file, reader))
         header = found[0][1] if found else ()
-        for name in header:
-            if header.count(name) > 1:
+        for name, number in Counter(header).items():
+            if number > 1:
                 raise FormatError(file, f"column {name!r} occurs twice", "header")
         missing = [name for name in needed if name not in header]
         if missing:

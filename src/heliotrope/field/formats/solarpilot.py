@@ -32,7 +32,8 @@ import numpy.typing as npt
 from heliotrope.errors import FormatError, InputError
 from heliotrope.field.heliostats import Heliostats
 from heliotrope.field.plant import Plant
-from heliotrope.files import read_text
+from heliotrope.files import check_table, read_text
+from heliotrope.files.limits import ROWS, check_count
 from heliotrope.geometry import FloatArray
 from heliotrope.mechanism.kinds import UP, azimuth_elevation
 from heliotrope.sun import Site
@@ -121,7 +122,7 @@ def read_layout(path: str | Path) -> Layout:
         or a cell that does not fit its column; with line and column.
     """
     file = Path(path)
-    rows = _rows(file, read_text(file, _WHAT))
+    rows = _rows(file, read_text(check_table(file, _WHAT), _WHAT))
     width = len(rows[0][1])
     if width not in WIDTHS:
         raise FormatError(
@@ -168,6 +169,7 @@ def _rows(file: Path, text: str) -> list[tuple[int, list[str]]]:
     if ";" in text and any(piece.count(",") >= min(WIDTHS) - 1 for piece in text.split(";")):
         text = text.replace(";\r\n", "\n").replace(";\n", "\n").replace(";", "\n")
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip(" ,;\t")]
+    check_count(file, len(lines), ROWS, "rows", "divide the layout")
     if not lines:
         raise FormatError(file, "there is no heliostat in it; one line each is needed")
     separator = _separator(lines[-1][1])

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
-from zipfile import BadZipFile
 
 import numpy as np
 
 from heliotrope.errors import FormatError, InputError
-from heliotrope.files.text import check_file, write_file
+from heliotrope.files.archives import read_arrays
+from heliotrope.files.text import write_file
 from heliotrope.geometry import FloatArray
 from heliotrope.imaging.frame import Image
 from heliotrope.imaging.spots._shadow import Edge, border, find_edges, places
@@ -209,12 +209,14 @@ class EmptyTarget:
         FormatError
             If the file is not such a model.
         """
-        file = check_file(path, "a model of an empty target", binary=True)
+        file = Path(path)
+        held = read_arrays(
+            file, "a model of an empty target", ["reflectance", "weight", "memory", "targets"]
+        )
         try:
-            with np.load(file, allow_pickle=False) as held:
-                reflectance, weight = held["reflectance"], held["weight"]
-                memory, names = float(held["memory"]), tuple(str(n) for n in held["targets"])
-        except (ValueError, KeyError, OSError, EOFError, BadZipFile) as error:
+            reflectance, weight = held["reflectance"] + 0.0, held["weight"] + 0.0
+            memory, names = float(held["memory"]), tuple(str(n) for n in held["targets"])
+        except (ValueError, TypeError) as error:
             raise FormatError(
                 file, f"no model of an empty target ({error}); learn a new one from empty frames"
             ) from None

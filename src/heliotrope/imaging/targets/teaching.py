@@ -235,18 +235,18 @@ def write_with_pictures(plant: Plant, path: str | Path, folder: str | Path | Non
 
     Its table remains CSV or Parquet.
     """
-    import tomllib
     from operator import methodcaller
 
     from heliotrope.field.formats.plant_file import write_plant
+    from heliotrope.files.documents import read_toml
     from heliotrope.files.text import write_file
 
     place = Path(path)
     table = ""
     if place.exists():
         try:
-            table = str(tomllib.loads(place.read_text("utf-8-sig")).get("heliostats", ""))
-        except ValueError:
+            table = str(read_toml(place, "a plant file").get("heliostats", ""))
+        except FormatError:
             raise FormatError(place, "not a plant file; write to another place") from None
     codes = {m.code for t in plant.targets for m in t.marks if m.kind == "picture"}
     for code in codes if folder is not None else ():

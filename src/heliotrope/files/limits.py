@@ -1,0 +1,229 @@
+"""Limits of files that come from anywhere, and the checks that need no parser.
+
+Every reader checks size, count, depth and expansion before it spends memory on a file. At these
+limits no reader takes more than 1.5 GB or a minute; a file beyond one gets one line that names
+the file, the value, the limit and what to do.
+"""
+
+import csv
+import io
+import os
+import re
+import stat
+from collections.abc import Iterable
+from pathlib import Path
+
+from heliotrope.errors import FormatError
+
+MIB = 2**20
+#: Largest file that is read, bytes: a layout of 400,000 heliostats is 60 MB.
+SIZE_LIMIT = 64 * MIB
+#: Largest TOML file, bytes; its parser takes 200 bytes of memory for each byte.
+TOML_SIZE = 2 * MIB
+#: Most levels of a document in XML, JSON or TOML.
+DEPTH = 64
+#: Most parts of a dotted TOML key; the time and memory of its parser grow with their square.
+DOTTED_PARTS = 16
+#: Most elements and attributes of an XML document.
+XML_PARTS = 3_000_000
+#: Longest XML tag with its attributes, bytes.
+XML_TAG = MIB
+#: Most values of a JSON document, counted by its commas and brackets.
+JSON_VALUES = 2_000_000
+#: Most rows, columns and cells of a table in CSV.
+ROWS, COLUMNS, CELLS = 1_000_000, 1_000, 10_000_000
+#: Largest Parquet file, its size once expanded, bytes, and most of its cells.
+PARQUET_SIZE, PARQUET_EXPANDED, PARQUET_CELLS = 256 * MIB, 512 * MIB, 50_000_000
+#: Most bytes of an archive's members (.npz, .kmz) once they are expanded, and most members.
+EXPANDED, MEMBERS = 256 * MIB, 256
+#: Most pixels of an image: of a camera at a target, and of a drone's.
+PIXELS, PHOTOGRAPH_PIXELS = 64_000_000, 160_000_000
+#: Most entries of a folder of images.
+ENTRIES = 1_000_000
+
+
+_BLOCK = MIB
+_SEPARATORS = ",;\t"
+_JSON_TOKEN = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+"|(?P<bracket>[\[\]{}])', re.DOTALL)
+_PART = r'(?:"[^"\\\n]*+(?:\\.[^"\\\n]*+)*+"|' + r"'[^'\n]*+'|[\w+-]++)"
+# Brackets and dots inside strings and comments are text.
+_TOML_TOKEN = re.compile(
+    r'"""[^"\\]*+(?:(?:\\.|"(?!""))[^"\\]*+)*+"{3,5}'
+    r"|\'\'\'[^']*+(?:'(?!'')[^']*+)*+'{3,5}"
+    rf"|(?P<key>{_PART}(?:[ \t]*+\.[ \t]*+{_PART})*+)"
+    r"|\#[^\n]*+|(?P<bracket>[\[\]{}])",
+    re.DOTALL,
+)
+
+
+def check_file(
+    path: str | Path, what: str, *, binary: bool = False, limit: int = SIZE_LIMIT
+) -> Path:
+    """Return the path if it is a readable file of a plausible size.
+
+    Parameters
+    ----------
+    path
+        The file.
+    what
+        Kind of file expected, as an error names it ("a HelioK file").
+    binary
+        Accept files that do not begin like text.
+    limit
+        Largest size, bytes.
+
+    Raises
+    ------
+    FormatError
+        If it does not exist, is a folder, a device or a pipe, cannot be read, is empty, is larger
+        than the limit or does not begin like text.
+    """
+    file = Path(path)
+    try:
+        # A pipe without a writer would never open.
+        handle = os.open(file, os.O_RDONLY | os.O_NONBLOCK)
+        with os.fdopen(handle, "rb") as stream:
+            state = os.fstat(handle)
+            if stat.S_ISDIR(state.st_mode):
+                raise IsADirectoryError
+            if not stat.S_ISREG(state.st_mode):
+                raise FormatError(file, f"this is a device or a pipe; give a file: {what}")
+            start = stream.read(4096)
+    except FileNotFoundError:
+        raise FormatError(file, f"there is no such file; give the path of {what}") from None
+    except IsADirectoryError:
+        raise FormatError(file, f"this is a folder; give the path of {what}") from None
+    except OSError as error:
+        raise FormatError(file, f"cannot be read ({error.strerror}); it should be {what}") from None
+    if not start:
+        raise FormatError(file, f"the file is empty; it should be {what}")
+    if state.st_size > limit:
+        raise FormatError(
+            file,
+            f"{_mib(state.st_size)} MiB exceed the limit of {_mib(limit)} MiB; this is not {what}",
+        )
+    if not binary and b"\0" in start and not start.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise FormatError(file, f"the file is binary; it should be {what}")
+    return file
+
+
+def _mib(size: int) -> str:
+    return f"{size / MIB:.3g}" if size < 10 * MIB else f"{size / MIB:.0f}"
+
+
+def check_table(path: str | Path, what: str) -> Path:
+    """Return the path of a table in CSV if it has a plausible number of rows and cells.
+
+    Raises
+    ------
+    FormatError
+        As `check_file`, or if it has more rows, columns or cells than the limits.
+    """
+    file = check_file(path, what)
+    lines, separators = 1, dict.fromkeys(_SEPARATORS, 0)
+    columns = _columns(file)
+    with file.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            lines += max(block.count(b"\n"), block.count(b"\r"))
+            for separator in _SEPARATORS:
+                separators[separator] += block.count(separator.encode())
+    check_count(file, columns, COLUMNS, "columns", "remove those that are not needed", "line 1")
+    check_count(file, lines - 1, ROWS, "rows", "divide the table")
+    # A short row is filled up to the columns of the header.
+    cells = max(lines + max(separators.values()), lines * columns)
+    check_count(file, cells, CELLS, "cells", "divide the table")
+    return file
+
+
+def _columns(file: Path) -> int:
+    """Return the number of columns of the header, by the separator that gives the most."""
+    with file.open("rb") as stream:
+        text = stream.read(_BLOCK).decode("utf-8", "replace").lstrip("\r\n")
+    counts, problem = [], ""
+    for separator in filter(text.__contains__, _SEPARATORS):
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        try:
+            counts.append(len(next(reader, [])))
+        except csv.Error as error:
+            problem = str(error)
+    if problem and not counts:
+        raise FormatError(file, f"not a CSV table ({problem})", "line 1")
+    return max(counts, default=1)
+
+
+def check_count(
+    path: str | Path, count: int, limit: int, name: str, advice: str, where: str = ""
+) -> None:
+    """Raise FormatError if a file has more of something than the limit.
+
+    Parameters
+    ----------
+    path
+        The file.
+    count, limit
+        Number that it has, and the largest accepted.
+    name
+        Name of what is counted, in the plural.
+    advice
+        What to do, for the message.
+    where
+        Place in the file, for the message.
+    """
+    if count > limit:
+        raise FormatError(path, f"{count:,} {name} exceed the limit of {limit:,}; {advice}", where)
+
+
+def check_json(path: str | Path, text: str) -> None:
+    """Check the number and the depth of the values of a JSON document before it is parsed.
+
+    Raises
+    ------
+    FormatError
+        If it has more values or levels than the limits.
+    """
+    brackets = text.count("[") + text.count("{")
+    check_count(path, text.count(",") + brackets, JSON_VALUES, "values", "divide the file")
+    if brackets > DEPTH:
+        _check_depth(path, text, _JSON_TOKEN.finditer(text))
+
+
+def check_toml(path: str | Path, text: str) -> None:
+    """Check the depth and the dotted keys of a TOML document before it is parsed.
+
+    Raises
+    ------
+    FormatError
+        If it has more levels, or a key has more parts, than the limits.
+    """
+    if text.count("[") + text.count("{") > DEPTH:
+        _check_depth(path, text, _TOML_TOKEN.finditer(text))
+    if text.count(".") >= DOTTED_PARTS:
+        for token in _TOML_TOKEN.finditer(text):
+            if token.lastgroup == "key" and token.group().count(".") >= DOTTED_PARTS:
+                parts = len(re.findall(_PART, token.group()))
+                advice = "use tables of their own"
+                where = _line(text, token.start())
+                check_count(path, parts, DOTTED_PARTS, "parts of a dotted key", advice, where)
+
+
+def _check_depth(path: str | Path, text: str, tokens: Iterable["re.Match[str]"]) -> None:
+    depth = 0
+    for token in tokens:
+        if token.lastgroup == "bracket":
+            depth += 1 if token.group() in "[{" else -1
+            if depth > DEPTH:
+                where = _line(text, token.start())
+                raise FormatError(
+                    path, f"nested too deeply: more than {DEPTH} levels; write it flatter", where
+                )
+
+
+def _line(text: str, place: int) -> str:
+    return f"line {text.count(chr(10), 0, place) + 1}"
+
+
+def check_entries(folder: Path, entries: Iterable[Path]) -> Iterable[Path]:
+    """Yield the entries of a folder; raise FormatError at the first beyond the limit."""
+    for number, entry in enumerate(entries, 1):
+        check_count(folder, number, ENTRIES, "files", "divide the folder")
+        yield entry
