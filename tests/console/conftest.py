@@ -1,5 +1,6 @@
 """A plant at work with its console, for all tests of this folder."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -58,3 +59,21 @@ def signed_in(console: LiveConsole) -> Iterator[httpx.Client]:
         assert answer.status_code == 200
         client.headers["X-CSRF-Token"] = answer.json()["csrf"]
         yield client
+
+
+@pytest.fixture
+def person(console: LiveConsole) -> Iterator[Callable[..., httpx.Response]]:
+    """Send a request as somebody of a role who has signed in and gives their password again."""
+    with contextlib.ExitStack() as stack:
+        clients: dict[str, httpx.Client] = {}
+
+        def send(role: str, method: str, path: str, body: Any = None) -> httpx.Response:
+            if role not in clients:
+                made = httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False)
+                client = clients[role] = stack.enter_context(made)
+                answer = client.post("session", json={"name": role, "password": PASSWORD})
+                client.headers["X-CSRF-Token"] = answer.json()["csrf"]
+            body = {"own_password": PASSWORD, **(body or {})}
+            return clients[role].request(method, path, json=body)
+
+        yield send

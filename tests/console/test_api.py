@@ -172,13 +172,13 @@ def test_guessing_is_slowed(console: LiveConsole) -> None:
     console.call(lambda: console.server.app.state.console.attempts.good("address 127.0.0.1"))
 
 
-def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask) -> None:
+def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask, person: Ask) -> None:
     given = {"name": "guest", "role": "viewer", "password": "a long password"}
-    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    assert person("engineer", "POST", "accounts", given).status_code == 201
     with httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False) as client:
         client.post("session", json={"name": "guest", "password": "a long password"})
         assert client.get("session").status_code == 200
-        changed = ask("engineer", "PATCH", "accounts/guest", {"disabled": True})
+        changed = person("engineer", "PATCH", "accounts/guest", {"disabled": True})
         assert changed.json()["disabled"]
         assert client.get("session").status_code == 401
         again = client.post("session", json={"name": "guest", "password": "a long password"})
@@ -188,6 +188,7 @@ def test_a_disabled_account_is_out_at_once(console: LiveConsole, ask: Ask) -> No
 def test_no_secret_is_in_logs_or_files(
     console: LiveConsole,
     ask: Ask,
+    person: Ask,
     tokens: dict[str, str],
     caplog: pytest.LogCaptureFixture,
     capfd: pytest.CaptureFixture[str],
@@ -195,20 +196,20 @@ def test_no_secret_is_in_logs_or_files(
     """Log-ins, good and bad, tokens, new passwords: what is logged and kept holds none of it."""
     caplog.set_level(logging.DEBUG)
     given = {"name": "desk-5", "role": "operator", "password": "a very own password"}
-    ask("engineer", "POST", "accounts", given)
+    person("engineer", "POST", "accounts", given)
     with _client(console) as client:
         wrong = {"name": "desk-5", "password": "not quite the password"}
         assert client.post("session", json=wrong).status_code == 401
         answer = client.post("session", json={"name": "desk-5", "password": given["password"]})
         session, csrf = client.cookies["heliotrope_session"], answer.json()["csrf"]
         client.headers["X-CSRF-Token"] = csrf
-        label = {"label": "nightly", "role": "viewer"}
+        label = {"label": "nightly", "role": "viewer", "own_password": given["password"]}
         token = client.post("tokens", json=label).json()["secret"]
         with Client(token, console.address) as program:
             program.get("summary")
             with pytest.raises(RemoteError):
                 program.ask("POST", "stow", {"heliostats": ["nobody"]})
-    made = ask("engineer", "POST", "accounts/desk-5/password").json()["password"]
+    made = person("engineer", "POST", "accounts/desk-5/password").json()["password"]
     ask("engineer", "GET", "events")
     # What the clients of this test log of their own requests is not the console's.
     ours = [r.getMessage() for r in caplog.records if not r.name.startswith("http")]
@@ -235,13 +236,15 @@ def _client(console: LiveConsole) -> httpx.Client:
     return httpx.Client(base_url=f"{console.address}api/v1/", trust_env=False)
 
 
-def test_a_new_password_is_told_once_and_ends_sessions(console: LiveConsole, ask: Ask) -> None:
+def test_a_new_password_is_told_once_and_ends_sessions(
+    console: LiveConsole, ask: Ask, person: Ask
+) -> None:
     given = {"name": "desk-2", "role": "viewer", "password": "a long password"}
-    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    assert person("engineer", "POST", "accounts", given).status_code == 201
     with _client(console) as client:
         client.post("session", json={"name": "desk-2", "password": "a long password"})
         assert client.get("session").status_code == 200
-        made = ask("engineer", "POST", "accounts/desk-2/password").json()
+        made = person("engineer", "POST", "accounts/desk-2/password").json()
         assert client.get("session").status_code == 401
         old = client.post("session", json={"name": "desk-2", "password": "a long password"})
         assert old.status_code == 401
@@ -250,13 +253,13 @@ def test_a_new_password_is_told_once_and_ends_sessions(console: LiveConsole, ask
     events = ask("viewer", "GET", "events").text
     assert "new password for desk-2" in events
     assert made["password"] not in events + ask("engineer", "GET", "accounts").text
-    assert ask("engineer", "POST", "accounts/engineer/password").status_code == 409
-    assert ask("engineer", "POST", "accounts/nobody/password").status_code == 404
+    assert person("engineer", "POST", "accounts/engineer/password").status_code == 409
+    assert person("engineer", "POST", "accounts/nobody/password").status_code == 404
 
 
-def test_the_own_password(console: LiveConsole, ask: Ask) -> None:
+def test_the_own_password(console: LiveConsole, ask: Ask, person: Ask) -> None:
     given = {"name": "desk-3", "role": "viewer", "password": "a long password"}
-    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    assert person("engineer", "POST", "accounts", given).status_code == 201
     change = {"old": "not this one", "new": "another password"}
     with _client(console) as client, _client(console) as elsewhere:
         for one in (client, elsewhere):
@@ -276,9 +279,9 @@ def test_the_own_password(console: LiveConsole, ask: Ask) -> None:
     assert ask("viewer", "PUT", "session/password", change).status_code == 403
 
 
-def test_guessing_the_own_password_is_slowed(console: LiveConsole, ask: Ask) -> None:
+def test_guessing_the_own_password_is_slowed(console: LiveConsole, ask: Ask, person: Ask) -> None:
     given = {"name": "desk-4", "role": "viewer", "password": "a long password"}
-    assert ask("engineer", "POST", "accounts", given).status_code == 201
+    assert person("engineer", "POST", "accounts", given).status_code == 201
     with _client(console) as client:
         answer = client.post("session", json={"name": "desk-4", "password": "a long password"})
         client.headers["X-CSRF-Token"] = answer.json()["csrf"]
@@ -288,12 +291,12 @@ def test_guessing_the_own_password_is_slowed(console: LiveConsole, ask: Ask) -> 
     console.call(lambda: console.server.app.state.console.attempts.good("address 127.0.0.1"))
 
 
-def test_nobody_takes_away_their_own_role(ask: Ask) -> None:
-    answer = ask("engineer", "PATCH", "accounts/engineer", {"role": "viewer"})
+def test_nobody_takes_away_their_own_role(person: Ask) -> None:
+    answer = person("engineer", "PATCH", "accounts/engineer", {"role": "viewer"})
     assert answer.status_code == 409
 
 
-def test_sessions_and_tokens_end(console: LiveConsole, ask: Ask) -> None:
+def test_sessions_and_tokens_end(console: LiveConsole, ask: Ask, person: Ask) -> None:
     people, now = console.keeper.people, time.time()
     old = people.open_session("operator", now - 100.0, 50.0)
     _, late = people.add_token("operator", "late", "operator", now - 100.0, 50.0)
@@ -306,7 +309,7 @@ def test_sessions_and_tokens_end(console: LiveConsole, ask: Ask) -> None:
         assert client.get(url, headers=bearer).status_code == 401
         bearer = {"Authorization": f"Bearer {word}"}
         assert client.get(url, headers=bearer).status_code == 200
-        assert ask("operator", "DELETE", f"tokens/{kept.key}").status_code == 204
+        assert person("operator", "DELETE", f"tokens/{kept.key}").status_code == 204
         assert client.get(url, headers=bearer).status_code == 401
 
 
@@ -343,15 +346,69 @@ def test_the_store_is_asked_beside_the_loop(
 
 
 def test_a_token_is_made_in_a_session_only(signed_in: httpx.Client, ask: Ask) -> None:
-    given = {"label": "script", "role": "operator"}
+    given = {"label": "script", "role": "operator", "own_password": PASSWORD}
     assert ask("operator", "POST", "tokens", given).status_code == 403
     made = signed_in.post("tokens", json=given)
     assert made.status_code == 201
     listed = signed_in.get("tokens").json()
     assert {one["name"] for one in listed} == {"operator"}
     assert made.json()["secret"] not in str(listed)
-    above = signed_in.post("tokens", json={"label": "script", "role": "engineer"})
+    above = signed_in.post("tokens", json={**given, "role": "engineer"})
     assert above.status_code == 403
+
+
+#: Changes of accounts and tokens, which take over the plant in the wrong hands.
+CHANGES = (
+    ("POST", "accounts", {"name": "mallory", "role": "engineer", "password": "a long password"}),
+    ("PATCH", "accounts/viewer", {"role": "engineer"}),
+    ("PATCH", "accounts/viewer", {"disabled": True}),
+    ("PATCH", "accounts/operator", {"password": "a long password"}),
+    ("POST", "accounts/viewer/password", {}),
+    ("POST", "tokens", {"label": "script", "role": "viewer"}),
+    ("DELETE", "tokens/{key}", {}),
+)
+
+
+@pytest.mark.parametrize(("method", "path", "body"), CHANGES)
+def test_accounts_change_in_a_session_with_the_own_password_only(
+    console: LiveConsole, ask: Ask, person: Ask, method: str, path: str, body: dict[str, object]
+) -> None:
+    """A stolen token changes none, and neither does a stolen session without the password."""
+    people = console.keeper.people
+    key = people.tokens("viewer")[0].key
+    before = people.accounts(), {one.key for one in people.tokens()}
+    where, word = path.format(key=key), {"own_password": PASSWORD}
+    assert ask("engineer", method, where, {**body, **word}).status_code == 403
+    assert person("engineer", method, where, {**body, "own_password": "not it"}).status_code == 403
+    assert ask("engineer", method, where, body).status_code in (403, 422)
+    assert (people.accounts(), {one.key for one in people.tokens()}) == before
+
+
+def test_the_password_of_ones_own_name_needs_the_old_one(person: Ask) -> None:
+    change = {"password": "a long password"}
+    refused = person("engineer", "PATCH", "accounts/engineer", change)
+    assert refused.status_code == 409
+    assert "your own password" in refused.json()["detail"]
+
+
+@pytest.mark.parametrize(("role", "days"), [("engineer", 91), ("operator", 91), ("viewer", 366)])
+def test_no_token_lasts_long(person: Ask, role: str, days: int) -> None:
+    given = {"label": "long", "role": role, "days": days}
+    assert person("engineer", "POST", "tokens", given).status_code == 422
+    made = person("engineer", "POST", "tokens", {**given, "days": days - 1}).json()
+    assert made["expires"] - made["created"] == pytest.approx(86_400.0 * (days - 1))
+    assert person("engineer", "DELETE", f"tokens/{made['key']}").status_code == 204
+
+
+def test_tokens_end_with_the_password_of_their_owner(console: LiveConsole, person: Ask) -> None:
+    given = {"name": "desk-6", "role": "viewer", "password": "a long password"}
+    assert person("engineer", "POST", "accounts", given).status_code == 201
+    _, secret = console.keeper.people.add_token("desk-6", "old", "viewer", time.time())
+    with Client(secret, console.address) as program:
+        program.get("summary")
+        assert person("engineer", "POST", "accounts/desk-6/password").status_code == 200
+        with pytest.raises(RemoteError, match="sign in"):
+            program.get("summary")
 
 
 def _take(ask: Ask, role: str = "operator") -> None:

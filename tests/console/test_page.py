@@ -169,17 +169,23 @@ def test_an_engineer_keeps_the_accounts(field: LiveConsole, enter: Callable[[str
     dialog.locator("text=Add…").click()
     page.fill("dialog:last-of-type [name=name]", "desk-1")
     page.fill("dialog:last-of-type [name=password]", "long enough for it")
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
     page.click("dialog:last-of-type >> text='Create account'")
     row = dialog.locator("tr:has-text('desk-1')")
     row.wait_for()
     row.locator("select").select_option("operator")
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
+    page.click("dialog:last-of-type >> text='Change'")
     dialog.locator(".hx-told:has-text('desk-1: operator')").wait_for()
     assert people.account("desk-1").role == "operator"
     row.locator("text=New password").click()
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
     page.click("dialog:last-of-type >> text='Create'")
     word = dialog.locator(".hx-secret").inner_text()
     assert verify_password(people.account("desk-1").password_hash, word)
     row.locator("text=Disable").click()
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
+    page.click("dialog:last-of-type >> text='Disable'")
     row.locator("text=disabled").wait_for()
     assert people.account("desk-1").disabled
     # Told once: it is gone with whatever is done next.
@@ -195,10 +201,12 @@ def test_tokens_are_made_and_revoked(field: LiveConsole, enter: Callable[[str], 
     dialog.locator("text=Create…").click()
     page.fill("dialog:last-of-type [name=label]", "nightly")
     assert page.locator("dialog:last-of-type [name=role] option").all_inner_texts() == ["viewer"]
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
     page.click("dialog:last-of-type >> text='Create'")
     secret = dialog.locator(".hx-secret").inner_text()
     assert people.token(secret, time.time()).label == "nightly"
     dialog.locator("tr:has-text('nightly') >> text=Revoke").click()
+    page.fill("dialog:last-of-type [name=own_password]", PASSWORD)
     page.click("dialog:last-of-type >> text='Revoke'")
     dialog.locator("text=No token").wait_for()
     assert people.token(secret, time.time()) is None

@@ -128,8 +128,13 @@ class TestSessions:
         self, people: People, change: dict[str, str]
     ) -> None:
         secret = people.open_session("ben", 200.0, 60.0)
+        _, word = people.add_token("ben", "report", "viewer", 200.0)
+        _, other = people.add_token("anna", "report", "viewer", 200.0)
         people.change("ben", 201.0, **change)  # type: ignore[arg-type]
+        people.change("ben", 201.5, disabled=False)
         assert people.session(secret, 202.0) is None
+        assert people.token(word, 202.0) is None
+        assert people.token(other, 202.0) is not None
 
     def test_have_the_role_that_the_account_has_now(self, people: People) -> None:
         secret = people.open_session("ben", 200.0, 60.0)
@@ -152,6 +157,23 @@ class TestSessions:
 
 
 class TestTokens:
+    def test_last_no_longer_than_their_role_allows(self, people: People) -> None:
+        for role, days in (("viewer", 365), ("operator", 90)):
+            with pytest.raises(InputError, match=f"role {role} lasts at most {days}"):
+                people.add_token("ben", "long", role, 0.0, (days + 1) * 86_400.0)
+            made, secret = people.add_token("ben", "long", role, 0.0)
+            assert made.expires == days * 86_400.0
+            assert people.token(secret, made.expires - 1.0) is not None
+            assert people.token(secret, made.expires) is None
+
+    def test_of_earlier_programs_end_too(self, people: People, keeper: Keeper) -> None:
+        _, secret = people.add_token("ben", "ten years", "operator", 0.0)
+        table = tables.api_token
+        for expires in (None, 3650 * 86_400.0):
+            keeper.do(lambda c, at=expires: c.execute(table.update().values(expires=at)))
+            assert people.token(secret, 89 * 86_400.0) is not None
+            assert people.token(secret, 90 * 86_400.0) is None
+
     def test_act_for_their_account(self, people: People, keeper: Keeper) -> None:
         made, secret = people.add_token("ben", "report", "viewer", 200.0, 50.0)
         assert people.tokens("ben") == (made,)

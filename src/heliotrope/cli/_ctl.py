@@ -62,7 +62,9 @@ def token(
     label: Annotated[str, typer.Argument(help="Purpose of the token.")],
     name: Annotated[str, typer.Option(help="Name of your account.")] = "engineer",
     role: Annotated[str, typer.Option(help="viewer, operator or engineer.")] = "operator",
-    days: Annotated[float, typer.Option(help="Validity in days.")] = 90.0,
+    days: Annotated[
+        float, typer.Option(help="Validity in days: at most 365 for a viewer, 90 above.")
+    ] = 30.0,
     password: Annotated[
         str,
         typer.Option(prompt=True, hide_input=True, help="Password of your account; prompted for."),
@@ -71,7 +73,11 @@ def token(
     """Make an API token; it is printed once."""
     with _client(context, token=False) as client:
         client.sign_in(name, password)
-        made = client.ask("POST", "tokens", {"label": label, "role": role, "days": days})
+        made = client.ask(
+            "POST",
+            "tokens",
+            {"label": label, "role": role, "days": days, "own_password": password},
+        )
         client.ask("DELETE", "session")
     print(made["secret"])
 
@@ -93,16 +99,17 @@ def account(
     own = typer.prompt("Your password", hide_input=True)
     with _client(context, token=False) as client:
         client.sign_in(by, own)
+        again = {"own_password": own}
         if reset:
-            made = client.ask("POST", f"accounts/{name}/password")
+            made = client.ask("POST", f"accounts/{name}/password", again)
             print(f"new password of {name}, shown only now: {made['password']}")
         elif disable:
-            client.ask("PATCH", f"accounts/{name}", {"disabled": True})
+            client.ask("PATCH", f"accounts/{name}", {"disabled": True, **again})
         else:
             password = typer.prompt(
                 f"Password of {name}", hide_input=True, confirmation_prompt=True
             )
-            new = {"name": name, "role": role, "password": password}
+            new = {"name": name, "role": role, "password": password, **again}
             client.ask("POST", "accounts", new)
         client.ask("DELETE", "session")
     if not reset:

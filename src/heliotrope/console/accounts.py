@@ -88,23 +88,19 @@ async def sign_out(console: Here, who: Anyone, response: Response) -> None:
 async def own_password(
     console: Here, who: Anyone, request: Request, response: Response, given: models.OwnPassword
 ) -> None:
-    """Change your own password; all your sessions end, including this one."""
-    if who.by != "session":
-        raise HTTPException(403, "a token cannot change a password; sign in to do so")
-    try:
-        await checked(console, who.person.name, given.old, _address(request))
-    except HTTPException as error:
-        if error.status_code == 401:
-            raise HTTPException(403, "the current password is wrong") from None
-        raise
+    """Change your own password; your sessions, including this one, and your tokens end."""
+    await _confirm(console, who, request, given.old)
     await _set_password(console, who.person.name, given.new)
     response.delete_cookie(COOKIE, path="/", httponly=True, samesite="strict")
     console.operations.logbook.event("people", who.person.name, "has changed their password")
 
 
 @router.post("/accounts/{name}/password", response_model=models.GivenPassword, tags=["people"])
-async def reset_password(console: Here, who: Engineer, name: Named) -> models.GivenPassword:
-    """Give a person a new password, shown once; all their sessions end."""
+async def reset_password(
+    console: Here, who: Engineer, request: Request, name: Named, given: models.Confirmed
+) -> models.GivenPassword:
+    """Give a person a new password, shown once; all their sessions and tokens end."""
+    await _confirm(console, who, request, given.own_password)
     if name == who.person.name:
         raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if await console.ask(lambda: console.people.account(name)) is None:
@@ -124,9 +120,10 @@ async def accounts(console: Here, who: Engineer) -> list[models.AccountState]:
 
 @router.post("/accounts", response_model=models.AccountState, status_code=201, tags=["people"])
 async def new_account(
-    console: Here, who: Engineer, given: models.NewAccount
+    console: Here, who: Engineer, request: Request, given: models.NewAccount
 ) -> models.AccountState:
     """Create an account."""
+    await _confirm(console, who, request, given.own_password)
     kept = await _hashed(console, given.password)
     made = await console.ask(
         lambda: console.people.add(given.name, kept, given.role, console.now())
@@ -139,9 +136,12 @@ async def new_account(
 
 @router.patch("/accounts/{name}", response_model=models.AccountState, tags=["people"])
 async def change_account(
-    console: Here, who: Engineer, name: Named, given: models.AccountChange
+    console: Here, who: Engineer, request: Request, name: Named, given: models.AccountChange
 ) -> models.AccountState:
-    """Change the role or password of an account, or disable it."""
+    """Change the role or password of an account, or disable it; not yours."""
+    await _confirm(console, who, request, given.own_password)
+    if name == who.person.name and given.password is not None:
+        raise HTTPException(409, f"{name}: change your own password with PUT session/password")
     if name == who.person.name and (given.disabled or given.role not in (None, "engineer")):
         raise HTTPException(409, f"{name}: you cannot change your own role; ask another engineer")
     if await console.ask(lambda: console.people.account(name)) is None:
@@ -165,10 +165,11 @@ async def tokens(console: Here, who: Anyone) -> list[models.TokenState]:
 
 
 @router.post("/tokens", response_model=models.TokenState, status_code=201, tags=["people"])
-async def new_token(console: Here, who: Anyone, given: models.NewToken) -> models.TokenState:
+async def new_token(
+    console: Here, who: Anyone, request: Request, given: models.NewToken
+) -> models.TokenState:
     """Create a token for a program; its secret is shown in this answer only."""
-    if who.by != "session":
-        raise HTTPException(403, "a token cannot create tokens; sign in to do so")
+    await _confirm(console, who, request, given.own_password)
     if ROLES[given.role] > who.person.role:
         raise HTTPException(403, f"token: role {given.role} is higher than your own")
     lifetime = 86_400.0 * given.days
@@ -184,13 +185,34 @@ async def new_token(console: Here, who: Anyone, given: models.NewToken) -> model
 
 
 @router.delete("/tokens/{key}", status_code=204, tags=["people"])
-async def revoke(console: Here, who: Anyone, key: Named) -> None:
+async def revoke(
+    console: Here, who: Anyone, request: Request, key: Named, given: models.Confirmed
+) -> None:
     """Revoke a token: your own, or any as an engineer."""
+    await _confirm(console, who, request, given.own_password)
     found = await console.ask(lambda: console.people.tokens(_whose(who)))
     if key not in {one.key for one in found}:
         raise HTTPException(404, f"there is no token {key}")
     await console.ask(lambda: console.people.revoke_token(key))
     console.known.clear()
+
+
+async def _confirm(console: Console, who: Caller, request: Request, password: str) -> None:
+    """Check that a person is there: a session, and its owner's password once more.
+
+    Raises
+    ------
+    HTTPException
+        403 for a token or a wrong password; 429 after too many failures.
+    """
+    if who.by != "session":
+        raise HTTPException(403, "a token cannot change accounts or tokens; sign in to do so")
+    try:
+        await checked(console, who.person.name, password, _address(request))
+    except HTTPException as error:
+        if error.status_code == 401:
+            raise HTTPException(403, "your current password is wrong") from None
+        raise
 
 
 async def _hashed(console: Console, password: str) -> str:

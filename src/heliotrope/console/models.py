@@ -178,7 +178,13 @@ class Switch(Strict):
     on: bool
 
 
-class NewAccount(Strict):
+class Confirmed(Strict):
+    """A change of accounts or tokens, which needs your own password again."""
+
+    own_password: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class NewAccount(Confirmed):
     """A new account."""
 
     name: Name
@@ -186,7 +192,7 @@ class NewAccount(Strict):
     password: Annotated[str, Field(min_length=10, max_length=200)]
 
 
-class AccountChange(Strict):
+class AccountChange(Confirmed):
     """Changes to an account; null: unchanged."""
 
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")] | None = None
@@ -208,12 +214,12 @@ class GivenPassword(BaseModel):
     password: str
 
 
-class NewToken(Strict):
+class NewToken(Confirmed):
     """A token for a program."""
 
     label: Name
     role: Annotated[str, Field(pattern="^(viewer|operator|engineer)$")]
-    days: Annotated[float, Field(gt=0, le=3650)] = 90.0
+    days: Annotated[float, Field(gt=0, le=365)] = 30.0
 
 
 class TicketState(BaseModel):

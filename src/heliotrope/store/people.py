@@ -92,6 +92,10 @@ class ApiToken:
     last_used: float | None
 
 
+_DAY = 86_400.0
+#: Longest validity of a token by its role, s. What a viewer's token can do harms nobody, so the
+#: programs that only read need a new one once a year; those that command, every quarter.
+LONGEST = {"viewer": 365.0 * _DAY, "operator": 90.0 * _DAY, "engineer": 90.0 * _DAY}
 #: A secret of which only the SHA-256 is kept: random bytes.
 _SECRET = 32
 #: The last use of a token is recorded at most this often, s.
@@ -177,7 +181,7 @@ class People:
         role: str | None = None,
         disabled: bool | None = None,
     ) -> Account:
-        """Change an account. A new password, and disabling it, end its sessions.
+        """Change an account. A new password, and disabling it, end its sessions and tokens.
 
         Raises
         ------
@@ -201,7 +205,8 @@ class People:
             connection.execute(_ACCOUNT.update().where(_ACCOUNT.c.name == name).values(values))
             _check_engineers(connection, name)
             if password_hash is not None or disabled:
-                connection.execute(_SESSION.delete().where(_SESSION.c.name == name))
+                for table in (_SESSION, _TOKEN):
+                    connection.execute(table.delete().where(table.c.name == name))
             return _need(connection, name)
 
         return self._writer.do(work)
@@ -291,18 +296,26 @@ class People:
     ) -> tuple[ApiToken, str]:
         """Make a token of an account; return it with its secret, which is shown only now.
 
+        It expires ``lifetime`` s from now; None: after the `LONGEST` time of its role.
+
         Raises
         ------
         InputError
-            If its role is above that of the account.
+            If its role is above that of the account, or the lifetime above the longest.
         UnknownNameError
             An unknown account or role.
         StoreError
             If it could not be written.
         """
         _check_role(role)
+        longest = LONGEST[role]
+        if lifetime is not None and lifetime > longest:
+            raise InputError(
+                f"token {label!r}: {lifetime / _DAY:g} days; a token of role {role} lasts at most "
+                f"{longest / _DAY:g}"
+            )
         secret = self._secret()
-        expires = None if lifetime is None else now + lifetime
+        expires = now + (longest if lifetime is None else lifetime)
         made = ApiToken(_key(secret), name, label, role, now, expires, None)
 
         def work(connection: Connection) -> None:
@@ -325,7 +338,9 @@ class People:
             row = found.mappings().first()
         if row is None or row["disabled"]:
             return None
-        if row["expires"] is not None and row["expires"] <= now:
+        # Earlier programs made tokens that last for years, or for ever.
+        ends = row["created"] + LONGEST[row["role"]]
+        if now >= min(ends, row["expires"] if row["expires"] is not None else ends):
             return None
         self._note_use(row["key"], now)
         least = min(row["role"], row["owner_role"], key=ROLES.index)

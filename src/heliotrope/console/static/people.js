@@ -22,6 +22,10 @@ function open(title, fill) {
   show().catch(fail);
 }
 
+// Asks for one's own password, and other things: a change of accounts or tokens needs it. Null: cancelled.
+const OWN = { name: "own_password", label: "Your own password", type: "password" };
+const confirmed = (title, fields, confirm) => ask(title, [...fields, OWN], confirm);
+
 const once = (what, word) => [`${what}, shown only now: `, h("code", { className: "hx-secret" }, word)];
 const path = (name) => `accounts/${encodeURIComponent(name)}`;
 const ROLES = ["viewer", "operator", "engineer"];
@@ -29,16 +33,26 @@ const ROLES = ["viewer", "operator", "engineer"];
 export const people = () => open("People", async (done) => {
   const rows = await api("GET", "accounts");
   const role = (one) => (one.name === me.name ? one.role
-    : h("select", { "aria-label": `Role of ${one.name}`, onchange: (event) => done(async () => { await api("PATCH", path(one.name), { role: event.target.value }); return `${one.name}: ${event.target.value}`; }) },
+    : h("select", { "aria-label": `Role of ${one.name}`, onchange: (event) => done(async () => {
+      const chosen = event.target.value, given = await confirmed(`Make ${one.name} ${chosen}?`, [], "Change");
+      if (!given) return "";
+      await api("PATCH", path(one.name), { role: chosen, ...given });
+      return `${one.name}: ${chosen}`;
+    }) },
       ROLES.map((name) => h("option", { value: name, selected: name === one.role }, name))));
   const acts = (one) => (one.name === me.name ? h("span", { className: "hx-hint" }, "you") : h("div", { className: "hx-orders" },
-    button(one.disabled ? "Enable" : "Disable", () => done(async () => { await api("PATCH", path(one.name), { disabled: !one.disabled }); return `${one.name} is ${one.disabled ? "enabled" : "disabled"}`; })),
+    button(one.disabled ? "Enable" : "Disable", () => done(async () => {
+      const given = await confirmed(one.disabled ? `Enable ${one.name}?` : `Disable ${one.name}? Sessions and tokens end.`, [], one.disabled ? "Enable" : "Disable");
+      if (!given) return "";
+      await api("PATCH", path(one.name), { disabled: !one.disabled, ...given });
+      return `${one.name} is ${one.disabled ? "enabled" : "disabled"}`;
+    })),
     button("New password", () => done(async () => {
-      if (!await ask(`Create a new password for ${one.name}? The old password and all sessions end.`, [], "Create")) return "";
-      return once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`)).password);
+      const given = await confirmed(`Create a new password for ${one.name}? The old password, all sessions and tokens end.`, [], "Create");
+      return given ? once(`New password of ${one.name}`, (await api("POST", `${path(one.name)}/password`, given)).password) : "";
     }))));
   const add = button("Add…", () => done(async () => {
-    const given = await ask("New account", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
+    const given = await confirmed("New account", [{ name: "name", label: "Name" }, { name: "role", label: "Role", options: ROLES },
       { name: "password", label: "Password (at least 10 characters)", type: "password" }], "Create account");
     if (!given) return "";
     await api("POST", "accounts", given);
@@ -51,16 +65,17 @@ export const people = () => open("People", async (done) => {
 export const tokens = () => open("API tokens", async (done) => {
   const rows = await api("GET", "tokens");
   const revoke = (one) => button("Revoke", () => done(async () => {
-    if (!await ask(`Revoke ${one.label} of ${one.name}? Programs that use it are refused at once.`, [], "Revoke")) return "";
-    await api("DELETE", `tokens/${encodeURIComponent(one.key)}`);
+    const given = await confirmed(`Revoke ${one.label} of ${one.name}? Programs that use it are refused at once.`, [], "Revoke");
+    if (!given) return "";
+    await api("DELETE", `tokens/${encodeURIComponent(one.key)}`, given);
     return `${one.label} is revoked`;
   }));
   const make = button("Create…", () => done(async () => {
-    const given = await ask("New token for a program", [{ name: "label", label: "Purpose" },
-      { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "90" }], "Create");
+    const given = await confirmed("New token for a program: it ends with your password; at most 90 days, for a viewer 365", [{ name: "label", label: "Purpose" },
+      { name: "role", label: "Role", options: ROLES.slice(0, ROLES.indexOf(me.role) + 1) }, { name: "days", label: "Days", type: "number", value: "30" }], "Create");
     return given ? once(`Secret of ${given.label}`, (await api("POST", "tokens", { ...given, days: Number(given.days) })).secret) : "";
   }));
-  return [rows.length ? table([["Purpose", (r) => r.label], ["Owner", (r) => r.name], ["Role", (r) => r.role], ["Expires", (r) => day(r.expires)],
+  return [rows.length ? table([["Purpose", (r) => r.label], ["Owner", (r) => r.name], ["Role", (r) => r.role], ["Ends", (r) => day(r.expires)],
     ["Last used", (r) => day(r.last_used)], ["", revoke]], rows) : h("p", { className: "hx-hint" }, "No tokens."), h("div", { className: "hx-row" }, make)];
 });
 
